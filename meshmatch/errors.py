@@ -1,0 +1,52 @@
+"""The one error family: what is wrong in a line, and a hint what to do about it.
+
+Everything that the user's data or choices can cause is a `MeshmatchError`; anything else is a bug and keeps its traceback.
+"""
+
+
+class MeshmatchError(Exception):
+    """Something that the user can put right.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong, in one line.
+    hint : str
+        What to do about it, in one line; may be empty.
+    """
+
+    def __init__(self, message: str, hint: str = "") -> None:
+        self.message = _one_line(message)
+        self.hint = _one_line(hint)
+        super().__init__(self.message)
+
+    def __reduce__(self) -> tuple[type["MeshmatchError"], tuple[str, str]]:
+        return type(self), (self.message, self.hint)  # the hint survives a process pool
+
+
+class InputError(MeshmatchError):
+    """The user's file or data cannot be used."""
+
+
+class ModelError(MeshmatchError):
+    """A model's card, weights or registry entry is missing or wrong."""
+
+
+class TemplateError(MeshmatchError):
+    """A template is missing, damaged, or not the one that a model was trained with."""
+
+
+class OptionError(MeshmatchError):
+    """A choice that does not exist, or does not go with the others."""
+
+
+class OutputError(MeshmatchError):
+    """A result cannot be written."""
+
+
+class PoorFit(MeshmatchError):
+    """A fit was judged poor, and the caller asked for this to be an error."""
+
+
+def _one_line(text: str) -> str:
+    return " ".join(str(text).split())

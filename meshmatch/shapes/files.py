@@ -1,0 +1,122 @@
+"""Shapes from files and to files: one function each way, the format by suffix.
+
+Every vertex that the file lists stays, in the file's order, because a map has to answer for each of them:
+nothing is merged, split or dropped here (see `meshmatch.shapes.repair` for that). Polygons become fans of triangles.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.outputs import replace_on_success
+from meshmatch.shapes.formats import Raw, gltf, obj, off, ply, points, stl
+from meshmatch.shapes.shape import Shape
+
+_READERS: dict[str, Callable[[Path, bytes], Raw]] = {
+    ".ply": ply.read,
+    ".obj": obj.read,
+    ".off": off.read,
+    ".stl": stl.read,
+    ".glb": gltf.read,
+    ".gltf": gltf.read,
+    ".xyz": points.read_xyz,
+    ".npy": points.read_npy,
+}
+_WRITERS: dict[str, Callable[[Path, Shape], None]] = {
+    ".ply": ply.write,
+    ".obj": obj.write,
+    ".off": off.write,
+    ".stl": stl.write,
+    ".glb": gltf.write,
+    ".xyz": points.write_xyz,
+    ".npy": points.write_npy,
+}
+SUFFIXES = tuple(_READERS)
+"""The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf."""
+
+
+def load_shape(path: str | Path) -> Shape:
+    """Read a mesh or a point cloud as it is: all vertices, in file order, in the file's frame and unit.
+
+    A vertex whose position is not a number is kept in its place and marked in `Shape.invalid`; its `verts` row is then
+    the centroid of the others. The scene of a glb or gltf is one shape: its meshes one after the other, each where the
+    scene puts it. An stl has no shared vertices: every corner of every triangle is a vertex, 3 F of them.
+
+    Raises
+    ------
+    InputError
+        The file is missing, empty, cut short, of an unknown kind, or holds no usable vertex.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, not a file", "name one mesh or point cloud")
+    if not path.exists():
+        raise InputError(f"there is no file {path}", _similar(path))
+    if suffix not in _READERS:
+        raise InputError(
+            f"{path.name}: unknown kind of file {suffix or '(no suffix)'}",
+            f"meshmatch reads {', '.join(SUFFIXES)}",
+        )
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    if not data:
+        raise InputError(f"{path.name} is empty (0 bytes)", "was the download or the export cut short?")
+    raw = _READERS[suffix](path, data)
+    return _shape(path.name, raw)
+
+
+def save_shape(path: str | Path, shape: Shape) -> None:
+    """Write a shape, in the format that the suffix names. The file appears whole or not at all.
+
+    ply, obj, off, xyz and npy keep every bit of the positions; stl and glb hold 32-bit floats, and stl no shared vertices.
+    Colours go into ply, obj, off and glb. An invalid vertex is written as nan where the format allows (all but stl and
+    glb, which take its stand-in).
+
+    Raises
+    ------
+    OptionError
+        The suffix is not one that can be written, or holds no clouds (stl) or no faces (xyz, npy).
+    OutputError
+        The folder is missing or cannot be written.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in _WRITERS:
+        raise OptionError(
+            f"cannot write a shape as {suffix or '(no suffix)'}", f"choose one of {', '.join(_WRITERS)}"
+        )
+    if suffix == ".stl" and shape.is_cloud:
+        raise OptionError("an stl file cannot hold a point cloud", "choose .ply, .xyz or .npy")
+    if suffix in (".xyz", ".npy") and not shape.is_cloud:
+        raise OptionError(f"a {suffix} file cannot hold faces", "choose .ply, .obj, .off, .stl or .glb")
+    with replace_on_success(path) as temporary:
+        _WRITERS[suffix](temporary, shape)
+
+
+def _shape(name: str, raw: Raw) -> Shape:
+    if len(raw.verts) == 0:
+        raise InputError(f"{name} holds no vertices", "is it a mesh or a point cloud at all?")
+    # sqrt of the largest float: squared lengths must not overflow
+    usable = (np.abs(raw.verts) < 1e150).all(axis=1)
+    if usable.all():
+        return Shape(raw.verts, raw.faces, name, raw.colors)
+    if not usable.any():
+        raise InputError(f"{name}: no vertex has a finite position (all NaN)", "export it again")
+    verts = raw.verts.copy()
+    verts[~usable] = verts[usable].mean(axis=0)
+    return Shape(verts, raw.faces, name, raw.colors, ~usable)
+
+
+def _similar(path: Path) -> str:
+    from difflib import get_close_matches
+
+    if not path.parent.is_dir():
+        return f"there is no folder {path.parent} either"
+    names = [entry.name for entry in path.parent.iterdir() if entry.suffix.lower() in _READERS]
+    close = get_close_matches(path.name, names, n=1)
+    return f"did you mean {path.parent / close[0]}?" if close else "check the name and the folder"

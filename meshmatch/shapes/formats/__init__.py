@@ -1,0 +1,45 @@
+"""One module per file format: bytes to plain arrays, and a `Shape` to bytes.
+
+The readers are our own because the map must answer for every vertex that the file lists: libraries merge, split and
+reorder vertices on the way in (texture seams), and some allocate whatever a damaged header asks for.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Raw:
+    """What a file says, unchecked: verts (V, 3) float64 (maybe NaN), faces (F, 3) int64, colors (V, 4) in 0..1 or None."""
+
+    verts: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    colors: NDArray[np.float64] | None = None
+
+
+NO_FACES = np.empty((0, 3), np.int64)
+
+
+def damaged(name: str, what: str) -> InputError:
+    """The error for a file that does not hold what it promises."""
+    return InputError(f"{name}: {what}", "the file is damaged or was cut short; export or download it again")
+
+
+def fan(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Triangles (F, 3) of polygons: `corners` one polygon after the other, `sizes` (polygons,) corners of each.
+
+    A polygon a b c d ... becomes a b c, a c d, ...; one of fewer than 3 corners becomes nothing.
+    """
+    if len(sizes) and (sizes == 3).all():
+        return corners.reshape(-1, 3)
+    starts = np.cumsum(sizes) - sizes
+    triangles = np.maximum(sizes - 2, 0)
+    first = np.repeat(starts, triangles)
+    step = np.arange(len(first)) - np.repeat(np.cumsum(triangles) - triangles, triangles)
+    return np.stack([corners[first], corners[first + step + 1], corners[first + step + 2]], axis=1).reshape(
+        -1, 3
+    )

@@ -1,0 +1,305 @@
+"""glTF 2.0, binary (glb) and text (gltf): the triangles and points of a scene, where the scene puts them.
+
+Specification: Khronos glTF 2.0. A skinned mesh stands as its joints stand in the file (sections 3.7.3 and 5.28), so
+that it fits whatever hangs from the same joints. Animations, morph targets and materials are ignored.
+"""
+
+import base64
+import binascii
+import json
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.errors import InputError
+from meshmatch.shapes.formats import NO_FACES, Raw, damaged
+from meshmatch.shapes.shape import Shape
+
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+_POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
+
+
+def read(path: Path, data: bytes) -> Raw:
+    """All triangles and points of the scene, primitive after primitive, in the order in which its tree is walked."""
+    try:
+        return _Document(path, data).scene()
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise damaged(path.name, f"its scene makes no sense ({type(error).__name__}: {error})") from error
+
+
+def write(path: Path, shape: Shape) -> None:
+    """One node, one mesh; 32-bit floats, 32-bit indices."""
+    verts = shape.verts.astype("<f4")
+    views: list[tuple[NDArray[Any], dict[str, Any]]] = [
+        (
+            verts,
+            {
+                "componentType": 5126,
+                "type": "VEC3",
+                "min": verts.min(0).tolist(),
+                "max": verts.max(0).tolist(),
+            },
+        )
+    ]
+    primitive: dict[str, Any] = {
+        "attributes": {"POSITION": 0},
+        "mode": _POINTS if shape.is_cloud else _TRIANGLES,
+    }
+    if shape.colors is not None:
+        primitive["attributes"]["COLOR_0"] = len(views)
+        views.append((shape.colors.astype("<f4"), {"componentType": 5126, "type": "VEC4"}))
+    if not shape.is_cloud:
+        primitive["indices"] = len(views)
+        views.append((shape.faces.astype("<u4").reshape(-1), {"componentType": 5125, "type": "SCALAR"}))
+    accessors, buffer_views, at = [], [], 0
+    for k, (array, accessor) in enumerate(views):
+        accessors.append({"bufferView": k, "count": len(array), **accessor})
+        buffer_views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes})
+        at += array.nbytes
+    document = {
+        "asset": {"version": "2.0", "generator": "meshmatch"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": shape.name}],
+        "meshes": [{"primitives": [primitive], "name": shape.name}],
+        "accessors": accessors,
+        "bufferViews": buffer_views,
+        "buffers": [{"byteLength": at}],
+    }
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = b"glTF" + np.array([2, 28 + len(text) + at, len(text)], "<u4").tobytes() + b"JSON"
+    body = [head, text, np.array([at], "<u4").tobytes(), b"BIN\0", *(array.tobytes() for array, _ in views)]
+    path.write_bytes(b"".join(body))
+
+
+class _Document:
+    def __init__(self, path: Path, data: bytes) -> None:
+        self.path, self.name = path, path.name
+        self.body = b""
+        if data[:4] == b"glTF":
+            data = self._chunks(data)
+        elif path.suffix.lower() == ".glb":
+            raise InputError(
+                f"{self.name} is not a glb file: it does not begin with 'glTF'", "does the suffix fit?"
+            )
+        try:
+            self.json = json.loads(data)
+        except ValueError as error:
+            raise damaged(self.name, "its description is not JSON") from error
+        if not isinstance(self.json, dict) or "asset" not in self.json:
+            raise InputError(f"{self.name} is not a glTF file", "does the suffix fit the content?")
+        if str(self.json["asset"].get("version", "")).split(".")[0] != "2":
+            raise InputError(f"{self.name} is not glTF version 2", "export it as glTF 2.0")
+        for extension in self.json.get("extensionsRequired", []):
+            if extension in _COMPRESSED:
+                raise InputError(
+                    f"{self.name} is compressed ({extension})", "export it without mesh compression"
+                )
+        self.nodes = self.json.get("nodes", [])
+        self.buffers: dict[int, bytes] = {}
+        self.world: dict[int, NDArray[np.float64]] = {}
+
+    def _chunks(self, data: bytes) -> bytes:
+        """The JSON chunk; the binary one is kept in `body`."""
+        version, length, size = np.frombuffer(data[4:16].ljust(12, b"\0"), "<u4").tolist()
+        if version != 2:
+            raise InputError(f"{self.name} is glb version {version}", "export it as glTF 2.0")
+        if length > len(data) or 20 + size > len(data):
+            raise damaged(
+                self.name, f"it should be {max(length, 20 + size)} bytes long, but is only {len(data)}"
+            )
+        rest = data[20 + size :]
+        if rest[4:8] == b"BIN\0":
+            self.body = rest[8 : 8 + int.from_bytes(rest[:4], "little")]
+        return data[20 : 20 + size]
+
+    def scene(self) -> Raw:
+        verts: list[NDArray[np.float64]] = []
+        faces: list[NDArray[np.int64]] = []
+        colors: list[NDArray[np.float64] | None] = []
+        for node in self._walk():
+            if "mesh" not in self.nodes[node]:
+                continue
+            for primitive in self.json["meshes"][self.nodes[node]["mesh"]]["primitives"]:
+                if primitive.get("mode", _TRIANGLES) not in (_POINTS, _TRIANGLES, _STRIP, _FAN):
+                    continue  # lines
+                own = self._placed(self.nodes[node], node, primitive)
+                triangles = self._triangles(primitive, len(own))
+                if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
+                    raise damaged(self.name, f"a face names vertex {int(triangles.max())} of {len(own)}")
+                faces.append(triangles + sum(map(len, verts)))
+                verts.append(own)
+                colors.append(self._colors(primitive))
+        if not verts:
+            raise InputError(f"{self.name} holds no triangles and no points", "is there a mesh in its scene?")
+        painted = None
+        if any(color is not None for color in colors):
+            white = [np.ones((len(own), 4)) for own in verts]
+            painted = np.vstack([w if c is None else c for c, w in zip(colors, white, strict=True)])
+        return Raw(np.vstack(verts), np.vstack([NO_FACES, *faces]), painted)
+
+    def _walk(self) -> list[int]:
+        """Node numbers, depth first, parents before children; fills `world`."""
+        scenes = self.json.get("scenes")
+        if scenes:
+            roots = scenes[self.json.get("scene", 0)].get("nodes", [])
+        else:
+            roots = sorted(
+                set(range(len(self.nodes))) - {c for n in self.nodes for c in n.get("children", [])}
+            )
+        order: list[int] = []
+        stack = [(node, np.eye(4)) for node in reversed(roots)]
+        while stack:
+            node, parent = stack.pop()
+            if node in self.world:
+                raise damaged(self.name, f"node {node} hangs from two places")
+            self.world[node] = parent @ _local(self.nodes[node])
+            order.append(node)
+            stack += [(child, self.world[node]) for child in reversed(self.nodes[node].get("children", []))]
+        return order
+
+    def _placed(self, node: dict[str, Any], number: int, primitive: dict[str, Any]) -> NDArray[np.float64]:
+        """(V, 3) positions in the scene."""
+        attributes = primitive["attributes"]
+        own = np.hstack(
+            [self._accessor(attributes["POSITION"]), np.ones((self._count(attributes["POSITION"]), 1))]
+        )
+        if "skin" not in node or "JOINTS_0" not in attributes:
+            return np.asarray(own @ self.world[number].T)[:, :3]
+        skin = self.json["skins"][node["skin"]]
+        bones = np.stack([self.world[joint] for joint in skin["joints"]])
+        if "inverseBindMatrices" in skin:
+            inverse = self._accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+            bones = bones @ inverse[: len(bones)]
+        moved, total = np.zeros((len(own), 4)), np.zeros((len(own), 1))
+        for k in range(8):
+            if f"JOINTS_{k}" not in attributes:
+                break
+            joints = self._accessor(attributes[f"JOINTS_{k}"], whole=True).astype(np.int64)
+            weights = self._accessor(attributes[f"WEIGHTS_{k}"])
+            for column in range(4):
+                weight = weights[:, column : column + 1]
+                moved += weight * np.einsum("vij,vj->vi", bones[joints[:, column]], own)
+                total += weight
+        return np.asarray(
+            np.where(total > 0, moved / np.where(total > 0, total, 1.0), own @ self.world[number].T)
+        )[:, :3]
+
+    def _triangles(self, primitive: dict[str, Any], V: int) -> NDArray[np.int64]:
+        mode = primitive.get("mode", _TRIANGLES)
+        if mode == _POINTS:
+            return NO_FACES
+        if "indices" in primitive:
+            corners = self._accessor(primitive["indices"], whole=True).astype(np.int64).ravel()
+        else:
+            corners = np.arange(V)
+        if mode == _TRIANGLES:
+            return corners[: len(corners) // 3 * 3].reshape(-1, 3)
+        if len(corners) < 3:
+            return NO_FACES
+        a, b, c = corners[:-2], corners[1:-1], corners[2:]
+        if mode == _FAN:
+            return np.stack([np.full_like(b, corners[0]), b, c], axis=1)
+        odd = np.arange(len(a)) % 2 == 1
+        return np.stack([np.where(odd, b, a), np.where(odd, a, b), c], axis=1)
+
+    def _colors(self, primitive: dict[str, Any]) -> NDArray[np.float64] | None:
+        if "COLOR_0" not in primitive["attributes"]:
+            return None
+        values = self._accessor(primitive["attributes"]["COLOR_0"])
+        out = np.ones((len(values), 4))
+        out[:, : values.shape[1]] = np.clip(np.nan_to_num(values), 0.0, 1.0)
+        return out
+
+    def _count(self, number: int) -> int:
+        return int(self.json["accessors"][number]["count"])
+
+    def _accessor(self, number: int, whole: bool = False) -> NDArray[np.float64]:
+        """(count, width) values; whole numbers that stand for 0..1 or -1..1 are divided unless `whole`."""
+        accessor = self.json["accessors"][number]
+        count, width = int(accessor["count"]), _WIDTHS[accessor["type"]]
+        kind = np.dtype(_COMPONENTS[accessor["componentType"]])
+        if "bufferView" in accessor:
+            view = self.json["bufferViews"][accessor["bufferView"]]
+            values = self._view(view, accessor.get("byteOffset", 0), count, width, kind)
+        else:  # zeros, then filled sparsely
+            bound = sum(b.get("byteLength", 0) for b in self.json.get("buffers", []))
+            if not 0 <= count <= max(bound, 1):
+                raise damaged(self.name, f"it promises {count} values that it does not hold")
+            values = np.zeros((count, width), kind)
+        if "sparse" in accessor:
+            sparse = accessor["sparse"]
+            many = int(sparse["count"])
+            where, what = sparse["indices"], sparse["values"]
+            views = self.json["bufferViews"]
+            rows = self._view(
+                views[where["bufferView"]], where.get("byteOffset", 0), many, 1,
+                np.dtype(_COMPONENTS[where["componentType"]]),
+            )  # fmt: skip
+            values = values.copy()
+            values[rows[:, 0]] = self._view(
+                views[what["bufferView"]], what.get("byteOffset", 0), many, width, kind
+            )
+        out = values.astype(np.float64)
+        if accessor.get("normalized") and not whole and kind.kind in "iu":
+            out = np.maximum(out / np.iinfo(kind).max, -1.0)
+        return out
+
+    def _view(
+        self, view: dict[str, Any], offset: int, count: int, width: int, kind: np.dtype[Any]
+    ) -> NDArray[Any]:
+        data = self._buffer(view["buffer"])
+        start = view.get("byteOffset", 0) + offset
+        row = width * kind.itemsize
+        stride = view.get("byteStride", 0) or row
+        end = start + stride * (count - 1) + row if count else start
+        if min(start, count, offset) < 0 or stride < row or end > len(data):
+            raise damaged(self.name, f"it needs {end} bytes of data, but holds {len(data)}")
+        return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
+
+    def _buffer(self, number: int) -> bytes:
+        if number not in self.buffers:
+            uri = self.json["buffers"][number].get("uri")
+            if uri is None:
+                self.buffers[number] = self.body
+            elif uri.startswith("data:"):
+                try:
+                    self.buffers[number] = base64.b64decode(uri.split(",", 1)[1], validate=True)
+                except (binascii.Error, IndexError) as error:
+                    raise damaged(self.name, "its embedded data is not base64") from error
+            else:
+                file = (self.path.parent / unquote(uri)).resolve()
+                if not file.is_relative_to(self.path.parent.resolve()):
+                    raise InputError(
+                        f"{self.name} wants data outside its folder: {uri}", "copy the data beside it"
+                    )
+                if not file.is_file():
+                    raise InputError(
+                        f"{self.name} needs the file {uri}, which is not there", "copy it beside the gltf"
+                    )
+                self.buffers[number] = file.read_bytes()
+        return self.buffers[number]
+
+
+def _local(node: dict[str, Any]) -> NDArray[np.float64]:
+    """(4, 4) matrix of a node: given by columns, or translation, rotation (x y z w) and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
+    norm = x * x + y * y + z * z + w * w
+    s = 2.0 / norm if norm > 0 else 0.0
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
+        [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
+        [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
+    ]
+    matrix[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix

@@ -1,0 +1,86 @@
+"""Wavefront OBJ: positions and faces. Texture and normal indices of a corner are ignored, so seams split nothing."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.errors import InputError
+from meshmatch.shapes.formats import NO_FACES, Raw, damaged, fan
+from meshmatch.shapes.formats.text import columns, numbers, words_per_line
+from meshmatch.shapes.shape import Shape
+
+_VERTEX = re.compile(rb"^[ \t]*v[ \t]([^\n]*)", re.MULTILINE)
+_FACE = re.compile(rb"^[ \t]*fo?[ \t]([^\n]*)", re.MULTILINE)
+
+
+def read(path: Path, data: bytes) -> Raw:
+    """One vertex per ``v`` line, in their order; with colours where six numbers are given."""
+    name = path.name
+    if b"\0" in data[:4096]:
+        raise InputError(f"{name} is not an obj file: it is binary", "does the suffix fit the content?")
+    if b"\n" not in data:
+        data = data.replace(b"\r", b"\n")
+    if b"\\" in data:
+        data = re.sub(rb"\\\r?\n", b" ", data)
+    if b"#" in data:
+        data = re.sub(rb"#[^\n]*", b"", data)
+    lines = _VERTEX.findall(data)
+    if not lines:
+        raise InputError(
+            f"{name} holds no vertices: it has no 'v' lines", "is it a mesh or a point cloud at all?"
+        )
+    text = b"\n".join(lines)
+    counts = words_per_line(text)
+    if len(counts) < len(lines) or counts.min() < 3:
+        raise damaged(name, "a vertex has fewer than 3 coordinates")
+    values = numbers(name, text)
+    colors = None
+    if counts.min() >= 6:
+        colors = np.ones((len(counts), 4))
+        colors[:, :3] = _channels(columns(values, counts, 3, 6))
+    return Raw(columns(values, counts, 0, 3), _faces(name, data, len(lines)), colors)
+
+
+def write(path: Path, shape: Shape) -> None:
+    """Positions with every digit that they have."""
+    verts = shape.verts
+    if shape.invalid is not None:
+        verts = np.where(shape.invalid[:, None], np.nan, verts)
+    if shape.colors is None:
+        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in verts.tolist()]
+    else:
+        rows = np.hstack([verts, shape.colors[:, :3]]).tolist()
+        lines = [f"v {x!r} {y!r} {z!r} {r!r} {g!r} {b!r}" for x, y, z, r, g, b in rows]
+    lines += [f"f {a} {b} {c}" for a, b, c in (shape.faces + 1).tolist()]
+    path.write_text("\n".join(["# meshmatch", *lines, ""]))
+
+
+def _faces(name: str, data: bytes, V: int) -> NDArray[np.int64]:
+    lines = _FACE.findall(data)
+    if not lines:
+        return NO_FACES
+    text = b"\n".join(lines)
+    if b"/" in text:
+        text = re.sub(rb"/[^\s]*", b"", text)  # position/texture/normal: the first alone
+    values = numbers(name, text)
+    if not (np.abs(values) < 2**53).all() or (values != np.trunc(values)).any():
+        raise damaged(name, "a face names a vertex that is not a whole number")
+    corners = values.astype(np.int64)
+    sizes = words_per_line(text)
+    if (corners == 0).any():
+        raise damaged(name, "a face names vertex 0, but obj files count from 1")
+    if (corners < 0).any():  # from the last vertex before the face backwards
+        before = np.array([match.start() for match in _VERTEX.finditer(data)])
+        sized = [match.start() for match in _FACE.finditer(data) if match.group(1).strip()]
+        seen = np.repeat(np.searchsorted(before, np.array(sized)), sizes)
+        corners = np.where(corners < 0, corners + seen + 1, corners)
+    if corners.min() < 1 or corners.max() > V:
+        raise damaged(name, f"a face names vertex {int(corners.max())}, but there are only {V} vertices")
+    return fan(corners - 1, sizes)
+
+
+def _channels(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    values = np.nan_to_num(values)
+    return np.clip(values / (255.0 if (values > 1).any() else 1.0), 0.0, 1.0)

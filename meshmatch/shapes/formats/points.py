@@ -1,0 +1,66 @@
+"""Point clouds without a header to speak of: xyz text and NumPy arrays."""
+
+from pathlib import Path
+
+import numpy as np
+
+from meshmatch.errors import InputError
+from meshmatch.shapes.formats import NO_FACES, Raw, damaged
+from meshmatch.shapes.formats.text import columns, numbers, words_per_line
+from meshmatch.shapes.shape import Shape
+
+
+def read_xyz(path: Path, data: bytes) -> Raw:
+    """x y z at the start of each line, split by space, comma or semicolon; further columns are ignored."""
+    name = path.name
+    if b"\0" in data[:4096]:
+        raise InputError(f"{name} is not a text file of points", "does the suffix fit the content?")
+    lines = [
+        line.split(b"#", 1)[0] for line in data.translate(bytes.maketrans(b",;\r", b"  \n")).split(b"\n")
+    ]
+    filled = [line for line in lines if line.strip()]
+    if filled and len(filled[0].split()) == 1 and filled[0].strip() == str(len(filled) - 1).encode():
+        filled = filled[1:]  # a first line with the number of points
+    if not filled:
+        raise InputError(f"{name} holds no points", "each line should be: x y z")
+    text = b"\n".join(filled)
+    counts = words_per_line(text)
+    if counts.min() < 3:
+        short = int(np.flatnonzero(counts < 3)[0])
+        raise damaged(name, f"point {short} has only {int(counts[short])} of 3 coordinates")
+    return Raw(columns(numbers(name, text), counts, 0, 3), NO_FACES)
+
+
+def read_npy(path: Path, data: bytes) -> Raw:
+    """An array (N, 3) of points, or (N, 6) with normals, which are ignored."""
+    name = path.name
+    try:
+        # mapped, not loaded: a header that promises more than the file holds allocates nothing
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError, SyntaxError, TypeError) as error:
+        if "Python objects" in str(error) or "pickle" in str(error):
+            raise InputError(
+                f"{name} does not hold an array of numbers", "save points as an (N, 3) array"
+            ) from error
+        raise damaged(name, "it is not a whole npy file") from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        raise InputError(f"{name} does not hold an array of numbers", "save points as an (N, 3) array")
+    if array.ndim != 2 or array.shape[1] not in (3, 6):
+        raise InputError(
+            f"{name} holds an array of {array.shape}, not a point cloud",
+            "points are an array of (N, 3), or (N, 6)",
+        )
+    return Raw(np.array(array[:, :3], np.float64), NO_FACES)
+
+
+def write_xyz(path: Path, shape: Shape) -> None:
+    """A line for each point, with every digit that it has."""
+    verts = shape.verts if shape.invalid is None else np.where(shape.invalid[:, None], np.nan, shape.verts)
+    path.write_text("".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in verts.tolist()))
+
+
+def write_npy(path: Path, shape: Shape) -> None:
+    """(N, 3) float64."""
+    verts = shape.verts if shape.invalid is None else np.where(shape.invalid[:, None], np.nan, shape.verts)
+    with path.open("wb") as file:
+        np.save(file, verts, allow_pickle=False)
