@@ -1,0 +1,239 @@
+"""How good a map is: errors where the truth is known, coverage and distortion where it is not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from meshmatch.errors import InputError
+from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.shape import Shape
+
+SKIN_M2 = 1.9
+CM_PER_UNIT = 100.0 * float(np.sqrt(SKIN_M2))
+"""Centimetres in one sqrt(area) of a person with 1.9 m2 of skin."""
+
+LOST_CM = 15.0
+"""An error above this is a lost limb; a pair whose mean lies above it is a flip."""
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Errors of a map, one for each point whose truth is known.
+
+    Parameters
+    ----------
+    values : (N,) float32
+        Distance between predicted and true point along the target's surface, over the square root of its
+        area.
+    """
+
+    values: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        values = np.array(self.values, dtype=np.float32).reshape(-1)
+        if not values.size or not np.isfinite(values).all() or values.min() < 0:
+            raise ValueError("errors must be finite and 0 or more, and there must be one")
+        values.setflags(write=False)
+        object.__setattr__(self, "values", values)
+
+    @property
+    def cm(self) -> NDArray[np.float32]:
+        """The same in centimetres, the target scaled to 1.9 m2 of skin."""
+        scaled: NDArray[np.float32] = self.values * np.float32(CM_PER_UNIT)
+        return scaled
+
+    @property
+    def mean(self) -> float:
+        """Mean, in units of sqrt(area)."""
+        return float(self.values.mean(dtype=np.float64))
+
+    @property
+    def median(self) -> float:
+        """Median, in units of sqrt(area)."""
+        return float(np.median(self.values))
+
+    @property
+    def mean_cm(self) -> float:
+        """Mean, in centimetres at 1.9 m2."""
+        return self.mean * CM_PER_UNIT
+
+    @property
+    def median_cm(self) -> float:
+        """Median, in centimetres at 1.9 m2."""
+        return self.median * CM_PER_UNIT
+
+    def share_over(self, cm: float = LOST_CM) -> float:
+        """Share (0..1) of the points whose error exceeds `cm`."""
+        return float((self.values > cm / CM_PER_UNIT).mean())
+
+    def curve(self, thresholds: ArrayLike) -> NDArray[np.float64]:
+        """Share (0..1) of the points with an error of at most each threshold, in units of sqrt(area)."""
+        ordered = np.sort(self.values.astype(np.float64))
+        shares: NDArray[np.float64] = np.searchsorted(ordered, np.asarray(thresholds), side="right") / len(
+            ordered
+        )
+        return shares
+
+    @classmethod
+    def joined(cls, several: Sequence[Errors]) -> Errors:
+        """All points of several maps together."""
+        return cls(np.concatenate([errors.values for errors in several]))
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How much of a target a map reaches: low where many source vertices crowd on few of the target.
+
+    A source with fewer vertices than the target cannot reach all of them: `vertices` is at most V_src /
+    V_tgt.
+    """
+
+    vertices: float
+    """Share (0..1) of the target's vertices that are hit."""
+    area: float
+    """Share (0..1) of the target's area that belongs to them."""
+
+
+def map_errors(
+    index: ArrayLike, source_points: ArrayLike, target_points: ArrayLike, geodesics: GeodesicDistances
+) -> Errors:
+    """Errors at known points: is ``index[source_points[n]]`` the vertex ``target_points[n]``?
+
+    Parameters
+    ----------
+    index : (V_src,) int
+        The map.
+    source_points, target_points : (N,) int
+        Vertex ids of the same N points on the source and on the target.
+    geodesics
+        Of the target.
+
+    Raises
+    ------
+    InputError
+        The lists differ in length or name a vertex that is not there.
+    """
+    index, a, b = (np.asarray(ids) for ids in (index, source_points, target_points))
+    if a.shape != b.shape or a.ndim != 1 or not a.size:
+        raise InputError(
+            f"the truth needs one target point for each source point, not {a.shape} and {b.shape}"
+        )
+    for ids, size, side in ((a, len(index), "source"), (b, geodesics.V, "target")):
+        if ids.dtype.kind not in "iu" or ids.min() < 0 or ids.max() >= size:
+            raise InputError(f"the truth names points that are not among the {size} vertices of the {side}")
+    return Errors(geodesics.between(index[a], b).astype(np.float32))
+
+
+def coverage(index: ArrayLike, target: Shape) -> Coverage:
+    """Share of the target's vertices, and of its area, that ``index`` ``(V_src,)`` hits."""
+    hit = np.zeros(target.V, dtype=bool)
+    hit[np.asarray(index)] = True
+    total = float(target.vertex_areas.sum())
+    area = float(target.vertex_areas[hit].sum()) / total if total > 0 else float(hit.mean())
+    return Coverage(float(hit.mean()), area)
+
+
+def distortion(
+    index: ArrayLike,
+    source: GeodesicDistances,
+    target: GeodesicDistances,
+    rng: np.random.Generator,
+    samples: int = 80,
+) -> float:
+    """Mean change of the distance between two points under a map, in units of sqrt(area).
+
+    Compares ``samples`` random source vertices pairwise; both shapes in units of their own sqrt(area). 0 for
+    an isometry; a random map between two bodies has about 0.45. It needs no truth, and sees no left-right
+    flip.
+    """
+    index = np.asarray(index)
+    chosen = rng.choice(source.V, size=min(samples, source.V), replace=False)
+    images, column = np.unique(index[chosen], return_inverse=True)
+    before = np.concatenate([rows[:, chosen] for _, rows in source.chunks(chosen)])
+    after = np.concatenate([rows[:, images] for _, rows in target.chunks(images)])[np.ix_(column, column)]
+    pairs = np.triu_indices(len(chosen), k=1)
+    return float(np.abs(before - after)[pairs].mean()) if len(chosen) > 1 else 0.0
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All that can be said about one map. `errors` is there where the truth is known, `distortion` between
+    meshes.
+    """
+
+    coverage: Coverage
+    distortion: float | None = None
+    errors: Errors | None = None
+    geodesic: str = GEODESIC
+
+    def as_dict(self, threshold_cm: float = LOST_CM) -> Mapping[str, Any]:
+        """Plain numbers for a JSON line; lengths in sqrt(area) x 100 and, for people, in cm at 1.9 m2 of
+        skin.
+        """
+        record: dict[str, Any] = {
+            "coverage_vertices": self.coverage.vertices,
+            "coverage_area": self.coverage.area,
+            "distortion": self.distortion,
+        }
+        if self.errors is not None:
+            record |= {
+                "points": int(self.errors.values.size),
+                "mean_x100": 100 * self.errors.mean,
+                "median_x100": 100 * self.errors.median,
+                "mean_cm": self.errors.mean_cm,
+                "median_cm": self.errors.median_cm,
+                "threshold_cm": threshold_cm,
+                "share_over_threshold": self.errors.share_over(threshold_cm),
+                "geodesic": self.geodesic,
+            }
+        return record
+
+
+def evaluate_map(
+    vertex_map: VertexMap,
+    source: Shape,
+    target: Shape,
+    source_points: ArrayLike | None = None,
+    target_points: ArrayLike | None = None,
+    *,
+    rng: np.random.Generator | None = None,
+) -> Evaluation:
+    """Coverage, distortion (if both shapes are meshes) and, where the truth is given, errors.
+
+    Parameters
+    ----------
+    source_points, target_points : (N,) int, optional
+        The truth, as in `map_errors`. With `target_points` alone, entry i belongs to vertex i of the source.
+    rng
+        Chooses the points of `distortion`; ``default_rng(0)`` if none is given.
+
+    Raises
+    ------
+    InputError
+        The map does not belong to these shapes, or the truth to them; the truth is given and the target is a
+        cloud.
+    """
+    if vertex_map.source_vertices != source.V or vertex_map.index.max() >= target.V:
+        raise InputError(
+            f"{vertex_map!r} does not fit {source.name or 'the source'} ({source.V} vertices) and "
+            f"{target.name or 'the target'} ({target.V})"
+        )
+    errors = stretched = None
+    if target_points is not None:
+        if source_points is None:
+            source_points = np.arange(source.V)
+        errors = map_errors(vertex_map.index, source_points, target_points, GeodesicDistances(target))
+    if not source.is_cloud and not target.is_cloud:
+        stretched = distortion(
+            vertex_map.index,
+            GeodesicDistances(source),
+            GeodesicDistances(target),
+            rng or np.random.default_rng(0),
+        )
+    return Evaluation(coverage(vertex_map.index, target), stretched, errors)

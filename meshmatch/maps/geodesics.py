@@ -1,0 +1,186 @@
+"""Distances along a surface: Dijkstra on the edges and on the straight diagonals across each edge.
+
+A path along edges alone is about 3 % too long. Two triangles that share an edge can be unfolded into one
+plane without stretching; where the straight line between their far corners crosses the shared edge, that line
+lies on the surface and its length is exact. Adding these diagonals to the graph brings the error to between
+1 and 2.5 %, always upwards: every path of the graph lies on the surface, so no distance is underestimated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
+
+from meshmatch.errors import InputError
+from meshmatch.shapes.shape import Shape
+
+CHUNK_BYTES = 64_000_000
+GEODESIC = "Dijkstra on edges and unfolded diagonals"
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Arcs = tuple[IntArray, IntArray, FloatArray]
+
+
+def edge_arcs(verts: FloatArray, faces: IntArray) -> Arcs:
+    """Every edge once: ends ``(E,)``, ends ``(E,)``, length ``(E,)`` in the unit of ``verts``."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0)
+    i, j = edges[:, 0], edges[:, 1]
+    return i, j, np.linalg.norm(verts[i] - verts[j], axis=1)
+
+
+def diagonal_arcs(verts: FloatArray, faces: IntArray) -> Arcs:
+    """Straight lines between the far corners of every two neighbouring faces, unfolded into one plane.
+
+    Only lines that cross the shared edge are kept: elsewhere the shortest way runs over a vertex, and the
+    edges know it already. At a non-manifold edge the faces are taken two by two in their order in ``faces``.
+    """
+    ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    far = faces[:, [2, 0, 1]].reshape(-1)
+    ends = np.sort(ends, axis=1)
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    ends, far = ends[order], far[order]
+    shared = np.flatnonzero((ends[1:] == ends[:-1]).all(axis=1) & (far[1:] != far[:-1]))
+    a, b = ends[shared, 0], ends[shared, 1]
+    c, d = far[shared], far[shared + 1]
+
+    along = verts[b] - verts[a]
+    length = np.linalg.norm(along, axis=1)
+    fine = length > 0
+    a, c, d, along, length = a[fine], c[fine], d[fine], along[fine], length[fine]
+    along = along / length[:, None]
+    x_c, y_c = _in_the_plane_of(verts[c] - verts[a], along)
+    x_d, y_d = _in_the_plane_of(verts[d] - verts[a], along)
+    height = y_c + y_d
+    crossing = (x_c * y_d + x_d * y_c) / np.where(height > 0, height, 1.0)
+    valid = (height > 0) & (crossing >= 0) & (crossing <= length)
+    return c[valid], d[valid], np.hypot(x_c - x_d, height)[valid]
+
+
+def _in_the_plane_of(offset: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
+    x = np.einsum("ij,ij->i", offset, along)
+    return x, np.linalg.norm(offset - x[:, None] * along, axis=1)
+
+
+def surface_graph(verts: FloatArray, faces: IntArray) -> csr_matrix:
+    """Symmetric sparse graph ``(V, V)`` of edges, diagonals, seams and bridges.
+
+    *Seams*: vertices at the same place are joined at no cost (OBJ and glTF files split them). *Bridges*: a
+    separate component is joined to the largest one by the shortest straight line between their vertices, so
+    that every distance is finite; a mean over a body with loose eyes must not lose a point.
+    """
+    size = len(verts)
+    i, j, length = (
+        np.concatenate(p) for p in zip(edge_arcs(verts, faces), diagonal_arcs(verts, faces), strict=True)
+    )
+    first, other = _coincident(verts)
+    i, j = np.concatenate([i, first]), np.concatenate([j, other])
+    length = np.concatenate([length, np.zeros(len(first))])
+    count, part = connected_components(
+        csr_matrix((np.ones(len(i)), (i, j)), shape=(size, size)), directed=False
+    )
+    if count > 1:
+        bi, bj = _bridges(verts, part)
+        i, j = np.concatenate([i, bi]), np.concatenate([j, bj])
+        length = np.concatenate([length, np.linalg.norm(verts[bi] - verts[bj], axis=1)])
+    # An explicit zero would vanish from the sparse graph, and repeated entries would be added up.
+    length = np.maximum(length, 1e-12 * max(float(np.ptp(verts)), 1e-300))
+    i, j = np.minimum(i, j), np.maximum(i, j)
+    order = np.lexsort((length, j, i))
+    i, j, length = i[order], j[order], length[order]
+    keep = np.ones(len(i), dtype=bool)
+    keep[1:] = (i[1:] != i[:-1]) | (j[1:] != j[:-1])
+    i, j, length = i[keep], j[keep], length[keep]
+    rows, columns = np.concatenate([i, j]), np.concatenate([j, i])
+    return csr_matrix((np.concatenate([length, length]), (rows, columns)), shape=(size, size))
+
+
+def _coincident(verts: FloatArray) -> tuple[IntArray, IntArray]:
+    order = np.lexsort(verts.T)
+    same = np.flatnonzero((verts[order[1:]] == verts[order[:-1]]).all(axis=1))
+    return order[same].astype(np.int64), order[same + 1].astype(np.int64)
+
+
+def _bridges(verts: FloatArray, part: NDArray[np.int32]) -> tuple[IntArray, IntArray]:
+    largest = int(np.bincount(part).argmax())
+    main = np.flatnonzero(part == largest)
+    rest = np.flatnonzero(part != largest)
+    gap, nearest = cKDTree(verts[main]).query(verts[rest])
+    order = np.lexsort((gap, part[rest]))
+    _, first = np.unique(part[rest][order], return_index=True)
+    chosen = order[first]
+    return rest[chosen].astype(np.int64), main[nearest[chosen]].astype(np.int64)
+
+
+class GeodesicDistances:
+    """Distances along the surface of one shape: build the graph once, ask many times.
+
+    Parameters
+    ----------
+    shape
+        A shape with faces. A cloud has no surface: measure on the mesh that it came from (`InputError`).
+    unit
+        Length by which every distance is divided; ``None``: the square root of the surface area.
+
+    Distances are those of `surface_graph`: 1 to 2.5 % above the exact ones, measured on bodies of 5,000
+    vertices.
+    """
+
+    def __init__(self, shape: Shape, unit: float | None = None) -> None:
+        if shape.is_cloud:
+            raise InputError(
+                f"{shape.name or 'the shape'} has no faces, so it has no distances along a surface",
+                "measure on the mesh that the points came from",
+            )
+        self.unit = float(np.sqrt(shape.area)) if unit is None else float(unit)
+        if not self.unit > 0:
+            raise InputError(f"{shape.name or 'the shape'} has no surface area")
+        faces = shape.faces
+        if shape.invalid is not None:  # its place is a stand-in: a path over it would cut through the body
+            faces = faces[~shape.invalid[faces].any(axis=1)]
+        self.graph = surface_graph(shape.verts, faces)
+
+    @property
+    def V(self) -> int:
+        """Number of vertices."""
+        return int(self.graph.shape[0])
+
+    def rows(self, sources: IntArray) -> FloatArray:
+        """All distances from ``sources`` ``(S,)``: ``(S, V)`` float64. See `chunks` for bounded memory."""
+        found = dijkstra(self.graph, directed=True, indices=np.asarray(sources, dtype=np.int64))
+        return np.asarray(found).reshape(-1, self.V) / self.unit
+
+    def chunks(self, sources: IntArray, chunk_bytes: int = CHUNK_BYTES) -> Iterator[tuple[int, FloatArray]]:
+        """The rows of many sources, a chunk at a time: ``(first, rows)`` with ``rows`` of shape ``(<=n,
+        V)``.
+        """
+        step = max(1, chunk_bytes // (8 * self.V))
+        for first in range(0, len(sources), step):
+            yield first, self.rows(sources[first : first + step])
+
+    def between(self, a: IntArray, b: IntArray) -> FloatArray:
+        """Distances ``(N,)`` between vertices ``a[n]`` and ``b[n]``, one Dijkstra for each different one in
+        the side that has fewer of them."""
+        a, b = np.asarray(a, dtype=np.int64), np.asarray(b, dtype=np.int64)
+        if a.shape != b.shape or a.ndim != 1:
+            raise ValueError(f"two lists of vertices of one length are needed, not {a.shape} and {b.shape}")
+        # Where the two agree there is nothing to measure: an identity costs nothing.
+        result = np.zeros(len(a))
+        apart = np.flatnonzero(a != b)
+        starts, column = np.unique(a[apart], return_inverse=True)
+        other = b[apart]
+        ends, end_column = np.unique(other, return_inverse=True)
+        if len(ends) < len(starts):
+            starts, column, other = ends, end_column, a[apart]
+        order = np.argsort(column, kind="stable")
+        bounds = np.searchsorted(column[order], np.arange(len(starts) + 1))
+        for first, rows in self.chunks(starts):
+            mine = order[bounds[first] : bounds[first + len(rows)]]
+            result[apart[mine]] = rows[column[mine] - first, other[mine]]
+        return result

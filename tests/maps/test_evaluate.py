@@ -1,0 +1,122 @@
+"""Errors, coverage and distortion by hand; the curve as a file."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.maps import VertexMap
+from meshmatch.maps.curve import draw_curves
+from meshmatch.maps.evaluate import CM_PER_UNIT, Errors, coverage, distortion, evaluate_map, map_errors
+from meshmatch.maps.geodesics import GeodesicDistances
+from meshmatch.shapes import Shape
+from tests.maps.solids import bumpy_sphere, grid
+
+
+def test_a_unit_is_137_point_8_centimetres() -> None:
+    assert pytest.approx(137.84, abs=0.01) == CM_PER_UNIT
+    errors = Errors(np.array([0.0, 0.1, 0.2, 0.5]))
+    assert errors.mean == pytest.approx(0.2)
+    assert errors.median == pytest.approx(0.15)
+    assert errors.mean_cm == pytest.approx(27.568, abs=1e-3)
+    assert errors.share_over(15.0) == 0.5  # 13.8 cm is not, 27.6 cm is
+    assert errors.curve([0.0, 0.15, 1.0]).tolist() == [0.25, 0.5, 1.0]
+
+
+@pytest.mark.parametrize("values", [[], [np.nan], [np.inf], [-0.1]])
+def test_errors_leave_nothing_out(values: list[float]) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        Errors(np.array(values))
+
+
+def test_errors_by_hand() -> None:
+    sheet = grid(2, 2)  # area 4, so a unit is 2
+    index = np.arange(9)
+    index[0] = 2  # two to the right: 2 / 2 = 1
+    geodesics = GeodesicDistances(sheet)
+    assert map_errors(index, np.arange(9), np.arange(9), geodesics).values.tolist() == [1.0] + [0.0] * 8
+    assert map_errors(index, [0, 1], [2, 0], geodesics).values.tolist() == [0.0, 0.5]
+    for bad in (([0, 1], [0]), ([0, 9], [0, 1]), ([0, 1], [0, 9]), ([-1], [0]), ([], [])):
+        with pytest.raises(InputError):
+            map_errors(index, np.array(bad[0], int), np.array(bad[1], int), geodesics)
+
+
+def test_errors_do_not_depend_on_the_unit_of_the_file() -> None:
+    shape = bumpy_sphere(8, 9)
+    large = Shape(shape.verts * 1000, shape.faces)
+    index = np.random.default_rng(0).permutation(shape.V)
+    truth = np.arange(shape.V)
+    small, big = (map_errors(index, truth, truth, GeodesicDistances(s)).values for s in (shape, large))
+    assert small == pytest.approx(big, rel=1e-5)
+    assert small.mean() > 0.1
+
+
+def test_coverage_by_hand() -> None:
+    sheet = grid(1, 2)
+    everything = coverage(np.arange(6), sheet)
+    assert (everything.vertices, everything.area) == (1.0, pytest.approx(1.0))
+    one = coverage(np.ones(100, int), sheet)
+    assert one.vertices == pytest.approx(1 / 6)
+    assert one.area == pytest.approx(
+        1 / 4
+    )  # three of the four triangles touch it, a third of each is its own
+
+
+def test_distortion_is_0_for_an_isometry_and_grows() -> None:
+    shape = bumpy_sphere(10, 12)
+    moved = Shape(7 * shape.verts[:, [1, 2, 0]] + 3, shape.faces)
+    a, b = GeodesicDistances(shape), GeodesicDistances(moved)
+    rng = np.random.default_rng(0)
+    assert distortion(np.arange(shape.V), a, b, rng) == pytest.approx(0, abs=1e-9)
+    swapped = np.arange(shape.V)
+    swapped[::4] = 0
+    some = distortion(swapped, a, b, np.random.default_rng(0))
+    much = distortion(rng.integers(0, shape.V, shape.V), a, b, np.random.default_rng(0))
+    assert 0.01 < some < much
+    assert distortion(swapped, a, b, np.random.default_rng(0)) == some
+
+
+def test_evaluate_map() -> None:
+    shape = bumpy_sphere(10, 12, "ball")
+    truth = np.arange(shape.V)
+    record = evaluate_map(VertexMap.identity(shape), shape, shape, target_points=truth).as_dict()
+    assert record["mean_cm"] == 0 and record["share_over_threshold"] == 0 and record["distortion"] == 0
+    assert record["points"] == shape.V and record["coverage_vertices"] == 1
+    blind = evaluate_map(VertexMap.identity(shape), shape, shape)
+    assert blind.errors is None and "mean_cm" not in blind.as_dict()
+    cloud = Shape(shape.verts, np.zeros((0, 3), int), "dots")
+    assert evaluate_map(VertexMap.identity(cloud), cloud, cloud).distortion is None
+    with pytest.raises(InputError, match="does not fit"):
+        evaluate_map(VertexMap.identity(shape), shape, grid(1, 1))
+    with pytest.raises(InputError, match="no faces"):
+        evaluate_map(VertexMap.identity(cloud), cloud, cloud, target_points=truth)
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"), dtype=int)
+
+
+def test_the_curve_is_a_picture_of_the_errors(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for name, scale in (("good", 0.01), ("bad", 0.5)):
+        draw_curves({name: Errors(rng.random(500) * scale)}, tmp_path / f"{name}.png")
+    good, bad = pixels(tmp_path / "good.png"), pixels(tmp_path / "bad.png")
+    assert good.shape == (600, 900, 3)
+    blue = [(p[:, :, 2] - p[:, :, 0] > 100) for p in (good, bad)]
+    # Columns at the axis' right end: the good curve runs along the top, the bad one has not got there.
+    assert blue[0][20:40, 700:860].any() and not blue[1][20:40, 700:860].any()
+
+
+def test_curve_refusals(tmp_path: Path) -> None:
+    errors = Errors(np.zeros(3))
+    with pytest.raises(OptionError, match="PNG"):
+        draw_curves({"a": errors}, tmp_path / "a.pdf")
+    for curves, rest in (({}, {}), ({"a": errors}, {"limit": 0}), ({"a": errors}, {"unit": "inch"})):
+        with pytest.raises(OptionError, match="a curve needs"):
+            draw_curves(curves, tmp_path / "a.png", **rest)
+    assert not list(tmp_path.iterdir())
+    draw_curves({"a": errors, "b": errors}, tmp_path / "a.png", 8, unit="x100", size=(300, 200))
+    assert pixels(tmp_path / "a.png").shape == (200, 300, 3)

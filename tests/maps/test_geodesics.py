@@ -1,0 +1,129 @@
+"""Distances along a surface: by hand, against exact ones, by law."""
+
+import igl
+import numpy as np
+import pytest
+from scipy.sparse.csgraph import dijkstra
+
+from meshmatch.errors import InputError
+from meshmatch.maps.geodesics import GeodesicDistances, diagonal_arcs, edge_arcs, surface_graph
+from meshmatch.shapes import Shape
+from tests.maps.solids import bumpy_sphere, grid
+
+
+def test_the_unfolded_diagonal_of_a_square_is_its_other_diagonal() -> None:
+    square = grid(1, 1)
+    i, j, length = diagonal_arcs(square.verts, square.faces)
+    assert {*i, *j} == {1, 2}
+    assert length == pytest.approx([np.sqrt(2)])
+    assert len(edge_arcs(square.verts, square.faces)[0]) == 5
+
+
+def test_a_fold_does_not_shorten_the_diagonal() -> None:
+    verts = grid(1, 1).verts.copy()
+    # Fold the corner 1 over the edge 0-3: it comes to lie on corner 2, but the way along the paper stays.
+    verts[1] = verts[2]
+    i, j, length = diagonal_arcs(verts, grid(1, 1).faces)
+    assert {*i, *j} == {1, 2}
+    assert length == pytest.approx([np.sqrt(2)])
+
+
+def test_no_diagonal_where_the_straight_line_leaves_the_two_faces() -> None:
+    # A dart: both far corners lie far beyond one end of the shared edge.
+    verts = np.array([[0, 0, 0], [1, 0, 0], [3, 1, 0], [3, -1, 0]], dtype=float)
+    faces = np.array([[0, 1, 2], [1, 0, 3]])
+    assert len(diagonal_arcs(verts, faces)[0]) == 0
+
+
+def test_unit_of_distance() -> None:
+    sheet = grid(3, 4, step=2.0)  # area 48
+    raw = GeodesicDistances(sheet, unit=1.0).rows(np.array([0]))[0]
+    assert raw[4] == pytest.approx(8.0)
+    assert raw[3 * 5] == pytest.approx(6.0)
+    assert GeodesicDistances(sheet).rows(np.array([0]))[0] == pytest.approx(raw / np.sqrt(48))
+
+
+def test_against_exact_geodesics() -> None:
+    shape = bumpy_sphere()
+    found = GeodesicDistances(shape, unit=1.0).rows(np.arange(0, shape.V, 97))
+    edges = surface_graph(shape.verts, shape.faces)
+    with_diagonals, without = [], []
+    for source, row in zip(range(0, shape.V, 97), found, strict=True):
+        exact = igl.exact_geodesic(shape.verts, shape.faces, VS=np.array([source]), VT=np.arange(shape.V))
+        assert (row >= exact - 1e-7).all(), "a path on the surface cannot be shorter than the shortest"
+        with_diagonals.append((row - exact).mean() / exact.mean())
+        i, j, length = edge_arcs(shape.verts, shape.faces)
+        plain = edges.copy()
+        plain.data[:] = 0
+        plain[i, j] = length
+        plain[j, i] = length
+        plain.eliminate_zeros()
+        without.append((dijkstra(plain, indices=source) - exact).mean() / exact.mean())
+    assert np.mean(with_diagonals) < 0.02
+    assert np.mean(with_diagonals) < 0.4 * np.mean(without)
+
+
+def test_rows_are_symmetric_and_obey_the_triangle_inequality() -> None:
+    shape = bumpy_sphere(10, 12)
+    table = GeodesicDistances(shape).rows(np.arange(shape.V))
+    assert np.allclose(table, table.T, atol=1e-12)
+    assert (table <= table[:, 5][:, None] + table[5][None] + 1e-12).all()
+    assert (np.diag(table) == 0).all()
+
+
+def test_chunks_and_pairs_agree_with_rows() -> None:
+    shape = bumpy_sphere(10, 12)
+    geodesics = GeodesicDistances(shape)
+    table = geodesics.rows(np.arange(shape.V))
+    tiny = 8 * shape.V * 7  # seven rows at a time
+    parts = list(geodesics.chunks(np.arange(shape.V), chunk_bytes=tiny))
+    assert [first for first, _ in parts] == list(range(0, shape.V, 7))
+    assert np.array_equal(np.concatenate([rows for _, rows in parts]), table)
+    rng = np.random.default_rng(0)
+    for few in (3, shape.V):  # the smaller side decides from where Dijkstra starts
+        a, b = rng.integers(0, few, 200), rng.integers(0, shape.V, 200)
+        assert geodesics.between(a, b) == pytest.approx(table[a, b], abs=1e-12)
+        assert geodesics.between(b, a) == pytest.approx(table[a, b], abs=1e-12)
+    assert geodesics.between(np.arange(9), np.arange(9)).tolist() == [0.0] * 9
+    with pytest.raises(ValueError, match="one length"):
+        geodesics.between(np.arange(3), np.arange(4))
+
+
+def test_a_seam_costs_nothing() -> None:
+    sheet = grid(2, 2, name="cut")
+    # The same sheet as two halves that share no vertex, as an OBJ with texture seams has them.
+    left = sheet.faces[(sheet.verts[sheet.faces][:, :, 0] <= 1).all(axis=1)]
+    right = sheet.faces[(sheet.verts[sheet.faces][:, :, 0] >= 1).all(axis=1)]
+    cut = Shape(np.concatenate([sheet.verts, sheet.verts]), np.concatenate([left, right + 9]), "cut")
+    row = GeodesicDistances(cut, unit=1.0).rows(np.array([0]))[0]
+    assert row[9 + 2] == pytest.approx(2.0)
+    assert row[9 + 0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_separate_part_is_bridged_at_its_nearest_point() -> None:
+    near, far = grid(2, 2).verts, grid(1, 1).verts + np.array([5.0, 0, 0])
+    both = Shape(np.concatenate([near, far]), np.concatenate([grid(2, 2).faces, grid(1, 1).faces + 9]))
+    row = GeodesicDistances(both, unit=1.0).rows(np.array([0]))[0]
+    assert np.isfinite(row).all()
+    assert row[9] == pytest.approx(2 + 3)
+    assert row[10] == pytest.approx(2 + 3 + 1)
+
+
+def test_a_vertex_without_a_position_is_no_shortcut() -> None:
+    shape = bumpy_sphere(10, 12)
+    verts = shape.verts.copy()
+    verts[30] = 0  # the middle of the body
+    invalid = np.arange(shape.V) == 30
+    broken = Shape(verts, shape.faces, "broken", invalid=invalid)
+    before = GeodesicDistances(shape, unit=1.0).rows(np.array([29]))[0]
+    after = GeodesicDistances(broken, unit=1.0).rows(np.array([29]))[0]
+    assert (after[~invalid] >= before[~invalid] - 1e-12).all()
+    assert np.isfinite(after).all()
+
+
+def test_a_cloud_and_a_shape_without_area_are_refused() -> None:
+    with pytest.raises(InputError, match="no faces") as caught:
+        GeodesicDistances(Shape(np.eye(3), np.zeros((0, 3), int), "dots"))
+    assert "mesh" in caught.value.hint
+    with pytest.raises(InputError, match="no surface area"):
+        GeodesicDistances(Shape(np.zeros((3, 3)), np.array([[0, 1, 2]]), "flat"))

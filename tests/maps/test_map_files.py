@@ -1,0 +1,196 @@
+"""Every format: write then read is the same value; damaged or wrong files are told apart in words."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat, savemat
+
+from meshmatch.errors import InputError, OptionError, OutputError
+from meshmatch.maps import MAP_SUFFIXES, VertexMap, load_map, save_map
+from tests.maps.test_vertex_map import A, B, C, random_map
+
+CARRIES = {
+    ".npy": ("index",),
+    ".txt": ("index",),
+    ".csv": ("index", "face", "barycentric", "confidence"),
+}
+EVERYTHING = (
+    *("index", "face", "barycentric", "confidence", "source", "target", "verdict", "reasons"),
+    *("source_vertices", "target_vertices", "source_hash", "target_hash"),
+)
+
+
+def same(a: VertexMap, b: VertexMap, names: tuple[str, ...]) -> None:
+    for name in names:
+        one, other = getattr(a, name), getattr(b, name)
+        assert type(one) is type(other), name
+        if isinstance(one, np.ndarray):
+            assert one.dtype == other.dtype, name
+            assert np.array_equal(one, other), name
+        else:
+            assert one == other, name
+
+
+@pytest.mark.parametrize("suffix", MAP_SUFFIXES)
+@pytest.mark.parametrize("kind", ["rich", "bare", "identity", "one vertex"])
+def test_write_then_read(tmp_path: Path, suffix: str, kind: str) -> None:
+    m = {
+        "rich": random_map(A, B, 5),
+        "bare": VertexMap("", "", np.array([4, 0, 4])),
+        "identity": VertexMap.identity(C),
+        "one vertex": VertexMap("a", "b", np.array([3]), reasons=("just one",), verdict="poor"),
+    }[kind]
+    path = tmp_path / f"map{suffix}"
+    save_map(path, m)
+    same(load_map(path), m, CARRIES.get(suffix, EVERYTHING))
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("suffix", MAP_SUFFIXES)
+def test_the_shapes_fill_in_what_the_file_leaves_out(tmp_path: Path, suffix: str) -> None:
+    m = random_map(A, B, 6)
+    save_map(tmp_path / f"map{suffix}", m)
+    found = load_map(tmp_path / f"map{suffix}", A, B)
+    same(
+        found,
+        m,
+        ("index", "source", "target", "source_vertices", "target_vertices", "source_hash", "target_hash"),
+    )
+
+
+@pytest.mark.parametrize("suffix", MAP_SUFFIXES)
+def test_the_same_map_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
+    for name in ("one", "two"):
+        save_map(tmp_path / f"{name}{suffix}", random_map(A, B, 7))
+    assert (tmp_path / f"one{suffix}").read_bytes() == (tmp_path / f"two{suffix}").read_bytes()
+
+
+def test_npy_is_what_the_documents_say(tmp_path: Path) -> None:
+    save_map(tmp_path / "map.NPY", random_map(A, B, 1))
+    index = np.load(tmp_path / "map.NPY")
+    assert index.dtype == np.int64 and index.shape == (A.V,)
+
+
+def test_mat_counts_from_one_too(tmp_path: Path) -> None:
+    m = random_map(A, B, 1)
+    save_map(tmp_path / "map.mat", m)
+    content = loadmat(tmp_path / "map.mat")
+    assert np.array_equal(content["matlab_index"].ravel(), m.index + 1)
+    assert np.array_equal(content["index"].ravel(), m.index)
+
+
+def test_maps_of_other_programs(tmp_path: Path) -> None:
+    expected = [2, 0, 1]
+    np.save(tmp_path / "column.npy", np.array(expected, dtype=np.uint16)[:, None])
+    savemat(tmp_path / "double.mat", {"index": np.array(expected, dtype=float)})
+    (tmp_path / "spaces.txt").write_text("# from somewhere\n2\n0\n\n1\n")
+    (tmp_path / "excel.csv").write_text(
+        "﻿source_vertex, target_vertex\r\n0,2\r\n1,0\r\n2,1\r\n", encoding="utf-8"
+    )
+    (tmp_path / "list.json").write_text("[2, 0, 1]")
+    np.savez(tmp_path / "short.npz", index=np.array(expected))
+    for path in sorted(tmp_path.iterdir()):
+        assert load_map(path).index.tolist() == expected, path.name
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.npy", b"", "is empty"),
+        ("a.npy", b"not an array", "cannot|can be read"),
+        ("a.npz", b"PK\x03\x04 cut", "can be read"),
+        ("a.mat", b"MATLAB 5.0 MAT-file" + b" " * 200, "can be read"),
+        ("a.mat", b"short", "can be read"),
+        ("a.json", b"{", "can be read"),
+        ("a.json", b'{"map": [1]}', "no 'index'"),
+        ("a.json", b'{"index": ["a"]}', "whole numbers"),
+        ("a.json", b'"index"', "can be read"),
+        ("a.txt", b"1\ntwo\n", "two"),
+        ("a.txt", b"1.5\n", "1.5"),
+        ("a.csv", b"x,y\n1,2\n", "target_vertex"),
+        ("a.csv", b"source_vertex,target_vertex\n1,2\n0,3\n", "in order"),
+        ("a.csv", b"source_vertex,target_vertex\n0,2\n1\n", "can be read"),
+        ("a.csv", b"source_vertex,target_vertex,confidence\n0,2,nan\n", "0..1"),
+    ],
+)
+def test_damaged_files(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        load_map(tmp_path / name)
+    assert name in caught.value.message
+    assert "\n" not in str(caught.value)
+
+
+def test_a_truncated_npy_and_a_pickle(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.arange(1000))
+    whole = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "a.npy").write_bytes(whole[:2000])
+    with pytest.raises(InputError, match=r"a\.npy"):
+        load_map(tmp_path / "a.npy")
+    np.save(tmp_path / "b.npy", np.array([{}], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="allow_pickle"):
+        load_map(tmp_path / "b.npy")
+    np.savez(tmp_path / "c.npz", index=np.array([0]), face=np.array([{}], dtype=object))
+    with pytest.raises(InputError, match="allow_pickle"):
+        load_map(tmp_path / "c.npz")
+
+
+def test_missing_files_folders_and_suffixes(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no file"):
+        load_map(tmp_path / "none.npy")
+    (tmp_path / "folder.npy").mkdir()
+    with pytest.raises(InputError, match="not a file"):
+        load_map(tmp_path / "folder.npy")
+    for call in (
+        lambda: load_map(tmp_path / "a.xls"),
+        lambda: save_map(tmp_path / "a", VertexMap.identity(A)),
+    ):
+        with pytest.raises(OptionError, match="cannot be kept") as caught:
+            call()
+        assert ".npz" in caught.value.hint
+    with pytest.raises(OutputError, match="no folder"):
+        save_map(tmp_path / "deeper" / "a.npy", VertexMap.identity(A))
+
+
+def test_a_map_of_another_source_or_target(tmp_path: Path) -> None:
+    path = tmp_path / "map.npy"
+    np.save(path, np.zeros(7, dtype=int))
+    with pytest.raises(InputError, match="maps 7 vertices, but a has 12"):
+        load_map(path, A, B)
+    np.save(path, np.full(A.V, B.V + 5))
+    with pytest.raises(InputError, match=r"map\.npy: .* only 16"):
+        load_map(path, A, B)
+    np.save(path, np.arange(A.V) + B.V - A.V + 1)
+    with pytest.raises(InputError, match="has only 16") as caught:
+        load_map(path, A, B)
+    assert "1-based" in caught.value.hint
+    save_map(tmp_path / "map.json", random_map(A, C, 0))
+    with pytest.raises(InputError, match=rf"leads to a shape of {C.V} vertices, but b has 16"):
+        load_map(tmp_path / "map.json", A, B)
+    record = json.loads((tmp_path / "map.json").read_text())
+    record["face"][0], record["target_vertices"] = 10_000, -1
+    record["index"] = [0] * A.V
+    (tmp_path / "map.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match="names face 10000"):
+        load_map(tmp_path / "map.json", A, B)
+
+
+@pytest.mark.parametrize("suffix", MAP_SUFFIXES)
+def test_the_wrong_direction_is_named(tmp_path: Path, suffix: str) -> None:
+    save_map(tmp_path / f"map{suffix}", random_map(B, A, 0))
+    with pytest.raises(
+        InputError, match="runs the wrong way: it has 16 entries and b has 16 vertices"
+    ) as caught:
+        load_map(tmp_path / f"map{suffix}", A, B)
+    assert "so it maps b to a" in caught.value.message
+    assert "swap" in caught.value.hint
+
+
+def test_a_shape_that_has_changed_is_mentioned(tmp_path: Path) -> None:
+    save_map(tmp_path / "map.npz", random_map(A, B, 0))
+    moved = type(A)(A.verts * 2, A.faces, "a")
+    found = load_map(tmp_path / "map.npz", moved, B)
+    assert any("another version of the source" in reason for reason in found.reasons)
+    assert found.source_hash == moved.hash

@@ -1,0 +1,165 @@
+"""The noun: what it accepts, what it refuses, how two are joined."""
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import InputError
+from meshmatch.maps import VertexMap
+from meshmatch.shapes import Shape
+from tests.maps.solids import bumpy_sphere, grid
+
+
+def random_map(source: Shape, target: Shape, seed: int) -> VertexMap:
+    rng = np.random.default_rng(seed)
+    face = rng.integers(-1, target.F, source.V)
+    weights = rng.dirichlet(np.ones(3), source.V)
+    weights[face < 0] = [1, 0, 0]
+    corner = target.faces[face, weights.argmax(axis=1)]
+    index = np.where(face < 0, rng.integers(0, target.V, source.V), corner)
+    return VertexMap.between(
+        source,
+        target,
+        index,
+        face=face,
+        barycentric=weights,
+        confidence=rng.random(source.V).astype(np.float32),
+        verdict="fair",
+        reasons=(f"made up with seed {seed}", "µ and é survive"),
+    )
+
+
+A, B, C, D = grid(2, 3, name="a"), grid(3, 3, name="b"), bumpy_sphere(6, 7, "c"), grid(4, 4, name="d")
+
+
+def test_between_knows_both_shapes() -> None:
+    m = random_map(A, B, 0)
+    assert (m.source, m.target) == ("a", "b")
+    assert (m.source_vertices, m.target_vertices) == (A.V, B.V)
+    assert (m.source_hash, m.target_hash) == (A.hash, B.hash)
+    assert repr(m) == "VertexMap(a -> b, 12 -> 16 vertices, fair)"
+
+
+def test_a_bare_list_is_a_map_with_unknowns() -> None:
+    m = VertexMap("a", "b", np.array([2, 0, 1], dtype=np.int32))
+    assert m.index.dtype == np.int64
+    assert m.target_vertices == -1 and m.source_vertices == 3
+    assert m.face.tolist() == [-1] * 3
+    assert m.barycentric.tolist() == [[1, 0, 0]] * 3
+    assert m.confidence.dtype == np.float32 and m.confidence.tolist() == [1] * 3
+    assert m.verdict == "unknown"
+
+
+def test_arrays_are_its_own_and_read_only() -> None:
+    index = np.array([1, 0])
+    m = VertexMap("", "", index)
+    index[0] = 0
+    assert m.index.tolist() == [1, 0]
+    for array in (m.index, m.face, m.barycentric, m.confidence):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message", "hint"),
+    [
+        ({"index": np.array([0, 16])}, "has only 16", "another shape"),
+        ({"index": np.array([1, 16])}, "has only 16", "1-based"),
+        ({"index": np.array([-1, 3])}, "start at 0", ""),
+        ({"index": np.zeros((2, 2), int)}, "list of", ""),
+        ({"index": np.zeros(0, int)}, "list of", ""),
+        ({"index": np.array([0.5, 1])}, "whole numbers", ""),
+        ({"index": np.array(["0", "1"])}, "whole numbers", ""),
+        ({"index": np.array([0.0, np.nan])}, "whole numbers", ""),
+        ({"source_vertices": 3}, "2 entries for 3", ""),
+        ({"target_vertices": 0}, "needs vertices", ""),
+        ({"face": np.array([0])}, "face must be an array", ""),
+        ({"face": np.array([0, -2])}, "face -2", ""),
+        ({"barycentric": np.ones((2, 3))}, "sum to 1", ""),
+        ({"barycentric": np.array([[1, 0, 0], [2, -1, 0]])}, "sum to 1", ""),
+        ({"barycentric": np.full((2, 3), np.nan)}, "sum to 1", ""),
+        ({"confidence": np.array([0, 1.5])}, "0..1", ""),
+        ({"confidence": np.array([0, np.nan])}, "0..1", ""),
+        ({"verdict": "splendid"}, "verdict", ""),
+    ],
+)
+def test_refusals(change: dict, message: str, hint: str) -> None:
+    fields = {"source": "a", "target": "b", "index": np.array([0, 1]), "target_vertices": 16, **change}
+    with pytest.raises(InputError, match=message) as caught:
+        VertexMap(**fields)
+    assert hint in caught.value.hint
+
+
+def test_a_face_that_the_target_lacks_is_refused() -> None:
+    with pytest.raises(InputError, match=r"face 18, but b has only 18"):
+        VertexMap.between(A, B, np.zeros(A.V, int), face=np.full(A.V, B.F))
+
+
+def test_identity() -> None:
+    m = VertexMap.identity(C)
+    assert np.array_equal(m.index, np.arange(C.V))
+    assert np.array_equal(m.points(C), C.verts)
+    assert m.verdict == "good"
+
+
+def test_points_lie_where_face_and_weights_say() -> None:
+    m = random_map(A, B, 1)
+    points = m.points(B)
+    for i in range(A.V):
+        if m.face[i] < 0:
+            assert np.array_equal(points[i], B.verts[m.index[i]])
+        else:
+            assert points[i] == pytest.approx(m.barycentric[i] @ B.verts[B.faces[m.face[i]]])
+    with pytest.raises(InputError, match="leads to b with 16"):
+        m.points(C)
+    with pytest.raises(InputError, match="has only 12"):
+        VertexMap("", "", np.array([14])).points(A)
+
+
+def test_composition_follows_both_maps_and_is_associative() -> None:
+    ab, bc, cd = random_map(A, B, 1), random_map(B, C, 2), random_map(C, D, 3)
+    ac = ab.compose(bc)
+    assert (ac.source, ac.target, ac.source_hash, ac.target_hash) == ("a", "c", A.hash, C.hash)
+    for i in range(A.V):
+        assert ac.index[i] == bc.index[ab.index[i]]
+        assert ac.points(C)[i] == pytest.approx(bc.points(C)[ab.index[i]])
+        assert ac.confidence[i] == min(ab.confidence[i], bc.confidence[ab.index[i]])
+    assert ac.reasons == ("made up with seed 1", "µ and é survive", "made up with seed 2")
+    left, right = ac.compose(cd), ab.compose(bc.compose(cd))
+    for name in ("index", "face", "barycentric", "confidence", "reasons", "verdict"):
+        assert np.array_equal(getattr(left, name), getattr(right, name)), name
+
+
+def test_identity_is_neutral() -> None:
+    ab = random_map(A, B, 4)
+    before, after = VertexMap.identity(A).compose(ab), ab.compose(VertexMap.identity(B))
+    for name in ("index", "face", "barycentric", "confidence", "verdict"):
+        assert np.array_equal(getattr(before, name), getattr(ab, name)), name
+    assert np.array_equal(after.index, ab.index)
+
+
+def test_the_worse_verdict_wins() -> None:
+    good, poor = VertexMap.identity(A), VertexMap.between(A, A, np.arange(A.V), verdict="poor")
+    unknown = VertexMap.between(A, A, np.arange(A.V))
+    assert good.compose(poor).verdict == poor.compose(good).verdict == "poor"
+    assert good.compose(unknown).verdict == "unknown"
+    assert unknown.compose(poor).verdict == "poor"
+
+
+def test_maps_that_do_not_meet_are_not_joined() -> None:
+    ab = random_map(A, B, 1)
+    with pytest.raises(InputError, match="cannot join a -> b with c -> d") as caught:
+        ab.compose(random_map(C, D, 2))
+    assert "16 vertices" in caught.value.message and f"{C.V} vertices" in caught.value.message
+    assert caught.value.hint == "the first must end where the second starts"
+    with pytest.raises(InputError) as caught:
+        ab.compose(random_map(C, B, 2))
+    assert "wrong way round" in caught.value.hint
+    moved = Shape(B.verts + 1, B.faces, "b")  # as many vertices, another geometry
+    with pytest.raises(InputError, match="cannot join"):
+        ab.compose(random_map(moved, C, 2))
+    # Where hashes are not known the counts decide.
+    assert ab.compose(VertexMap("b", "x", np.arange(16))).target == "x"
+    with pytest.raises(InputError, match="cannot join"):
+        ab.compose(VertexMap("b", "x", np.arange(15)))
+    with pytest.raises(InputError, match="matched to vertex"):
+        VertexMap("a", "b", np.array([0, 20])).compose(VertexMap("b", "x", np.arange(15)))
