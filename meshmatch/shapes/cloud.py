@@ -1,35 +1,133 @@
-"""What a point cloud does not say by itself: how much surface a point stands for, and which way that faces."""
+"""What a point cloud does not say by itself: how much surface a point stands for, and which way that faces.
+
+A cloud of more than `LARGEST` points is judged by a random part of it, so that a million points cost seconds.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.shapes.shape import Floats
+from meshmatch.shapes.orientation import agreeing_flips
+from meshmatch.shapes.shape import Floats, Ints
+
+LARGEST = 20_000
 
 
-def local_areas(points: Floats, invalid: NDArray[np.bool_] | None = None, neighbours: int = 16) -> Floats:
-    """(V,) area that each point stands for, squared units; 0 for an invalid one."""
-    from scipy.spatial import cKDTree
+def local_areas(points: Floats, invalid: NDArray[np.bool_] | None = None) -> Floats:
+    """(V,) area that each point stands for, squared units; 0 for an invalid one.
 
-    valid = np.ones(len(points), bool) if invalid is None else ~invalid
-    own = points[valid]
-    k = min(neighbours, len(own) - 1)
+    Among points scattered with density n over a surface, the disc that just holds a point's k nearest others has an
+    area of k / n on average, so pi r_k^2 / k is an unbiased estimate of 1 / n, the area per point. Noise makes r
+    larger than that, by a nearly constant amount once r is well above it: where neighbourhoods are not flat, k grows
+    to half a per cent of the points and only the growth of r^2 from k / 3 to k counts. Where limbs are thinner than
+    the neighbourhood the result is some per cent low (measured: -2 to -10 % of area for bodies).
+    """
     areas = np.zeros(len(points))
-    if k < 1:
+    valid = np.arange(len(points)) if invalid is None else np.flatnonzero(~invalid)
+    own = points[valid]
+    if len(own) < 4:
         return areas
-    distance, _ = cKDTree(own).query(own, k + 1)
-    areas[valid] = np.pi * distance[:, -1] ** 2 / k
+    part, distance, index = _neighbourhoods(own)
+    k, noisy = _size(part, index)
+    squared = distance**2
+    discs = np.pi * squared[:, k] / k
+    # a lone point far away stands for no more than its share
+    discs = np.minimum(discs, 25.0 * np.median(discs))
+    total = discs.sum()
+    if noisy and total > 0:
+        growth = np.pi * (squared[:, k] - squared[:, k // 3]) / (k - k // 3)
+        discs *= min(max(growth.mean() * len(part) / total, 0.2), 1.0)
+    if len(part) == len(own):
+        areas[valid] = discs
+    else:
+        shares = discs[_nearest(part, own)]
+        areas[valid] = shares * (discs.sum() / shares.sum()) if shares.sum() > 0 else 0.0
     return areas
 
 
-def estimate_normals(
-    points: Floats, invalid: NDArray[np.bool_] | None = None, neighbours: int = 16
-) -> Floats:
-    """(V, 3) unit normals: the direction in which the neighbourhood is thinnest, away from the centroid."""
+def estimate_normals(points: Floats, invalid: NDArray[np.bool_] | None = None) -> Floats:
+    """(V, 3) unit normals: where the neighbourhood is thinnest; zeros for an invalid point.
+
+    Signs are made to agree between neighbours (Hoppe et al. 1992, section 3.3), then each connected part is turned to
+    face away from its own centre; for an open or very noisy cloud that can be wrong, so treat the sign with care.
+    """
+    normals = np.zeros((len(points), 3))
+    valid = np.arange(len(points)) if invalid is None else np.flatnonzero(~invalid)
+    own = points[valid]
+    if len(own) < 4:
+        return normals
+    part, _, index = _neighbourhoods(own)
+    k, _ = _size(part, index)
+    found = np.linalg.eigh(_spread(part, index[:, : k + 1]))[1][:, :, 0]
+    near = index[:, 1 : min(k, 8) + 1]
+    pairs = np.stack([np.repeat(np.arange(len(part)), near.shape[1]), near.ravel()], axis=1)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    cosine = np.einsum("ni,ni->n", found[pairs[:, 0]], found[pairs[:, 1]])
+    flip, component = agreeing_flips(len(part), pairs, cosine < 0, 1.0 - np.abs(cosine))
+    found[flip] *= -1.0
+    sizes = np.bincount(component)
+    center = np.stack([np.bincount(component, weights=part[:, i]) for i in range(3)], axis=1) / sizes[:, None]
+    away = np.einsum("ni,ni->n", part - center[component], found)
+    found[np.bincount(component, weights=away)[component] < 0] *= -1.0
+    normals[valid] = found if len(part) == len(own) else found[_nearest(part, own)]
+    return normals
+
+
+def stray_points(points: Floats) -> NDArray[np.bool_]:
+    """(V,) True for a point that lies three times further from its neighbours than these from theirs."""
     from scipy.spatial import cKDTree
 
-    own = points
-    _, index = cKDTree(own).query(own, min(neighbours, len(own)))
-    local = own[index] - own[index].mean(axis=1, keepdims=True)
-    normals = np.linalg.svd(np.einsum("vki,vkj->vij", local, local))[2][:, 2]
-    outward = np.einsum("vi,vi->v", normals, own - own.mean(axis=0))
-    return np.where(outward[:, None] < 0, -normals, normals)
+    if len(points) < 20:
+        return np.zeros(len(points), bool)
+    part = _part(points)
+    tree = cKDTree(part)
+    k = 8
+    own_reach = tree.query(part, k + 1)[0][:, -1]
+    if len(part) == len(points):
+        reach, (_, index) = own_reach, tree.query(part, k + 1)
+    else:
+        distance, index = tree.query(points, k + 1)
+        reach = distance[:, -1]
+    usual = np.median(own_reach[index[:, 1:]], axis=1)
+    return np.asarray((reach > 3.0 * usual) & (reach > 3.0 * np.median(own_reach)))
+
+
+def _part(points: Floats) -> Floats:
+    if len(points) <= LARGEST:
+        return points
+    return points[np.sort(np.random.default_rng(0).choice(len(points), LARGEST, replace=False))]
+
+
+def _neighbourhoods(points: Floats) -> tuple[Floats, Floats, Ints]:
+    """The points to judge by, and distance and index (P, k + 1) of their neighbours, themselves first."""
+    from scipy.spatial import cKDTree
+
+    part = _part(points)
+    most = min(max(len(part) // 200, 12), len(part) - 1)
+    distance, index = cKDTree(part).query(part, most + 1)
+    return part, distance, index
+
+
+def _size(part: Floats, index: Ints) -> tuple[int, bool]:
+    """How many neighbours to look at, and whether noise makes the cloud thick at the scale of its spacing."""
+    few = int(np.clip(len(part) // 500, 6, 12))
+    few = min(few, index.shape[1] - 1)
+    some = slice(None, None, max(len(part) // 3000, 1))
+    values = np.linalg.eigvalsh(_spread(part, index[some, : min(12, index.shape[1] - 1) + 1]))
+    thick = np.median(values[:, 0] / np.maximum(values[:, 1], 1e-300))
+    # measured on bodies: below 0.15 without noise, 0.2 at noise of 0.3 % of the diagonal, 0.5 at 1 %
+    blend = float(np.clip((thick - 0.15) / 0.35, 0.0, 1.0))
+    k = round(few ** (1.0 - blend) * (index.shape[1] - 1) ** blend)
+    return max(k, min(3, index.shape[1] - 1)), blend > 0
+
+
+def _spread(points: Floats, index: Ints) -> Floats:
+    """(N, 3, 3) covariance of each neighbourhood."""
+    local = points[index]
+    local = local - local.mean(axis=1, keepdims=True)
+    return np.asarray(local.transpose(0, 2, 1) @ local)
+
+
+def _nearest(part: Floats, points: Floats) -> Ints:
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(part).query(points)[1])

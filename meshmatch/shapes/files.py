@@ -102,7 +102,7 @@ def _shape(name: str, raw: Raw) -> Shape:
     if len(raw.verts) == 0:
         raise InputError(f"{name} holds no vertices", "is it a mesh or a point cloud at all?")
     # sqrt of the largest float: squared lengths must not overflow
-    usable = (np.abs(raw.verts) < 1e150).all(axis=1)
+    usable = np.asarray((np.abs(raw.verts) < 1e150).all(axis=1))
     if usable.all():
         return Shape(raw.verts, raw.faces, name, raw.colors)
     if not usable.any():

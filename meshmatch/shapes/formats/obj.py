@@ -8,11 +8,8 @@ from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged, fan
-from meshmatch.shapes.formats.text import columns, numbers, words_per_line
+from meshmatch.shapes.formats.text import columns, lines_of, numbers, without_slashes, words_per_line
 from meshmatch.shapes.shape import Shape
-
-_VERTEX = re.compile(rb"^[ \t]*v[ \t]([^\n]*)", re.MULTILINE)
-_FACE = re.compile(rb"^[ \t]*fo?[ \t]([^\n]*)", re.MULTILINE)
 
 
 def read(path: Path, data: bytes) -> Raw:
@@ -26,21 +23,23 @@ def read(path: Path, data: bytes) -> Raw:
         data = re.sub(rb"\\\r?\n", b" ", data)
     if b"#" in data:
         data = re.sub(rb"#[^\n]*", b"", data)
-    lines = _VERTEX.findall(data)
-    if not lines:
+    (text, vertex_lines), (faces_text, face_lines), (old, old_lines) = lines_of(data, b"v", b"f", b"fo")
+    if len(old_lines):
+        faces_text, face_lines = faces_text + b"\n" + old, np.concatenate([face_lines, old_lines])
+    if len(vertex_lines) == 0:
         raise InputError(
             f"{name} holds no vertices: it has no 'v' lines", "is it a mesh or a point cloud at all?"
         )
-    text = b"\n".join(lines)
     counts = words_per_line(text)
-    if len(counts) < len(lines) or counts.min() < 3:
+    if len(counts) < len(vertex_lines) or counts.min() < 3:
         raise damaged(name, "a vertex has fewer than 3 coordinates")
     values = numbers(name, text)
     colors = None
     if counts.min() >= 6:
         colors = np.ones((len(counts), 4))
         colors[:, :3] = _channels(columns(values, counts, 3, 6))
-    return Raw(columns(values, counts, 0, 3), _faces(name, data, len(lines)), colors)
+    faces = _faces(name, faces_text, face_lines, vertex_lines)
+    return Raw(columns(values, counts, 0, 3), faces, colors)
 
 
 def write(path: Path, shape: Shape) -> None:
@@ -57,24 +56,25 @@ def write(path: Path, shape: Shape) -> None:
     path.write_text("\n".join(["# meshmatch", *lines, ""]))
 
 
-def _faces(name: str, data: bytes, V: int) -> NDArray[np.int64]:
-    lines = _FACE.findall(data)
-    if not lines:
-        return NO_FACES
-    text = b"\n".join(lines)
+def _faces(
+    name: str, text: bytes, lines: NDArray[np.int64], vertex_lines: NDArray[np.int64]
+) -> NDArray[np.int64]:
     if b"/" in text:
-        text = re.sub(rb"/[^\s]*", b"", text)  # position/texture/normal: the first alone
+        text = without_slashes(text)  # position/texture/normal: the first alone
     values = numbers(name, text)
+    if len(values) == 0:
+        return NO_FACES
     if not (np.abs(values) < 2**53).all() or (values != np.trunc(values)).any():
         raise damaged(name, "a face names a vertex that is not a whole number")
     corners = values.astype(np.int64)
     sizes = words_per_line(text)
+    if len(sizes) < len(lines):
+        raise damaged(name, "a face has no corners")
+    V = len(vertex_lines)
     if (corners == 0).any():
         raise damaged(name, "a face names vertex 0, but obj files count from 1")
     if (corners < 0).any():  # from the last vertex before the face backwards
-        before = np.array([match.start() for match in _VERTEX.finditer(data)])
-        sized = [match.start() for match in _FACE.finditer(data) if match.group(1).strip()]
-        seen = np.repeat(np.searchsorted(before, np.array(sized)), sizes)
+        seen = np.repeat(np.searchsorted(vertex_lines, lines), sizes)
         corners = np.where(corners < 0, corners + seen + 1, corners)
     if corners.min() < 1 or corners.max() > V:
         raise damaged(name, f"a face names vertex {int(corners.max())}, but there are only {V} vertices")

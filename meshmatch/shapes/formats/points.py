@@ -1,5 +1,6 @@
 """Point clouds without a header to speak of: xyz text and NumPy arrays."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +16,14 @@ def read_xyz(path: Path, data: bytes) -> Raw:
     name = path.name
     if b"\0" in data[:4096]:
         raise InputError(f"{name} is not a text file of points", "does the suffix fit the content?")
-    lines = [
-        line.split(b"#", 1)[0] for line in data.translate(bytes.maketrans(b",;\r", b"  \n")).split(b"\n")
-    ]
-    filled = [line for line in lines if line.strip()]
-    if filled and len(filled[0].split()) == 1 and filled[0].strip() == str(len(filled) - 1).encode():
-        filled = filled[1:]  # a first line with the number of points
-    if not filled:
-        raise InputError(f"{name} holds no points", "each line should be: x y z")
-    text = b"\n".join(filled)
+    text = data.translate(bytes.maketrans(b",;\r", b"  \n"))
+    if b"#" in text:
+        text = re.sub(rb"#[^\n]*", b"", text)
     counts = words_per_line(text)
+    if len(counts) > 1 and counts[0] == 1 and text.split(None, 1)[0] == str(len(counts) - 1).encode():
+        text, counts = text.split(None, 1)[1], counts[1:]  # a first line with the number of points
+    if len(counts) == 0:
+        raise InputError(f"{name} holds no points", "each line should be: x y z")
     if counts.min() < 3:
         short = int(np.flatnonzero(counts < 3)[0])
         raise damaged(name, f"point {short} has only {int(counts[short])} of 3 coordinates")

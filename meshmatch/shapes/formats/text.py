@@ -1,5 +1,6 @@
 """Numbers out of text, fast: whole files at a time, no loop over lines."""
 
+import re
 import warnings
 
 import numpy as np
@@ -42,14 +43,49 @@ def numbers(name: str, text: bytes) -> NDArray[np.float64]:
 
 def words_per_line(text: bytes) -> NDArray[np.int64]:
     """How many words each non-blank line of `text` has."""
+    if not text:
+        return np.empty(0, np.int64)
     characters = np.frombuffer(text, np.uint8)
     space = _SPACE[characters]
     begins = ~space
     begins[1:] &= space[:-1]
-    before = np.cumsum(begins)  # words begun up to here
-    ends = np.append(before[characters == 10], before[-1] if len(before) else 0)
-    counts = np.diff(ends, prepend=0)
+    before = np.searchsorted(np.flatnonzero(begins), np.flatnonzero(characters == 10))
+    counts = np.diff(before, prepend=0, append=np.count_nonzero(begins))
     return counts[counts > 0].astype(np.int64)
+
+
+def lines_of(text: bytes, *words: bytes) -> list[tuple[bytes, NDArray[np.int64]]]:
+    """For each of the given first words: its lines without that word, one after the other, and which lines they are.
+
+    Spaces in front of the word are allowed.
+    """
+    characters = np.frombuffer(text + b"\n", np.uint8)
+    ends = np.flatnonzero(characters == 10)
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    if ((characters[starts] == 32) | (characters[starts] == 9)).any():
+        return lines_of(re.sub(rb"^[ \t]+", b"", text, flags=re.MULTILINE), *words)
+    lengths = np.diff(ends, prepend=-1)
+    out = []
+    for word in words:
+        chosen = lengths > len(word) + 1
+        for k, letter in enumerate(word):
+            chosen &= characters[np.minimum(starts + k, ends)] == letter
+        chosen &= _SPACE[characters[np.minimum(starts + len(word), ends)]]
+        kept = characters[np.repeat(chosen, lengths)]
+        first = np.cumsum(lengths[chosen]) - lengths[chosen]
+        for k in range(len(word)):
+            kept[first + k] = 32
+        out.append((kept.tobytes(), np.flatnonzero(chosen)))
+    return out
+
+
+def without_slashes(text: bytes) -> bytes:
+    """Each word up to its first slash: 1/2/3 becomes 1."""
+    characters = np.frombuffer(b" " + text, np.uint8)
+    slash = characters == 47
+    marks = np.flatnonzero(slash | _SPACE[characters])
+    behind = np.repeat(slash[marks], np.diff(marks, append=len(characters)))
+    return characters[~behind].tobytes()
 
 
 def columns(

@@ -1,0 +1,126 @@
+"""Making neighbours agree which side is out: one tool for faces of a mesh and for normals of a cloud."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.shapes.shape import Floats, Ints
+from meshmatch.shapes.topology import Edges, directed_edges
+
+
+def agreeing_flips(
+    count: int, pairs: Ints, differ: NDArray[np.bool_], cost: Floats
+) -> tuple[NDArray[np.bool_], Ints]:
+    """Which of `count` things to flip so that neighbours agree along a minimum spanning forest.
+
+    Parameters
+    ----------
+    count : int
+    pairs : (N, 2) int64
+        Neighbours.
+    differ : (N,) bool
+        True where the two disagree as they are.
+    cost : (N,) float64
+        Small where a pair's word counts.
+
+    Returns
+    -------
+    flip : (count,) bool
+        Relative to an arbitrary member of each component.
+    component : (count,) int64
+        Number of the component that each thing is in.
+    """
+    from scipy.sparse import coo_array, csr_array
+    from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+
+    low, high = pairs.min(axis=1), pairs.max(axis=1)
+    order = np.argsort(low * count + high, kind="stable")
+    keys = (low * count + high)[order]
+    first = order[np.flatnonzero(np.diff(keys, prepend=-1))]  # a pair named twice would add up
+    low, high, differ, cost = low[first], high[first], differ[first], cost[first]
+    # scipy takes an explicit 0 for no edge; the sign is stored beside the cost
+    graph = coo_array((1.0 + cost, (low, high)), (count, count)).tocsr()
+    forest = minimum_spanning_tree(graph)
+    components, component = connected_components(graph, directed=False)
+    component = component.astype(np.int64)
+    # one more node joins all components, so that a single walk reaches everything
+    roots = np.full(components, -1, np.int64)
+    roots[component[::-1]] = np.arange(count)[::-1]
+    tree = forest.tocoo()
+    rows = np.concatenate([tree.row, np.full(components, count)])
+    columns = np.concatenate([tree.col, roots])
+    walk = csr_array((np.ones(len(rows)), (rows, columns)), (count + 1, count + 1))
+    _, parent = breadth_first_order(walk, count, directed=False, return_predecessors=True)
+    parent = parent.astype(np.int64)
+    parent[count] = count
+    inner = np.flatnonzero(parent[:count] < count)
+    a, b = np.minimum(inner, parent[inner]), np.maximum(inner, parent[inner])
+    place = np.searchsorted(low * count + high, a * count + b)
+    flip = np.zeros(count + 1, bool)
+    flip[inner] = differ[place]
+    while True:  # pointer doubling: the path to the root halves each time
+        if (parent == count).all():
+            return flip[:count], component
+        flip ^= flip[parent]
+        parent = parent[parent]
+
+
+def turn_faces(verts: Floats, faces: Ints, cross: Floats, edges: Edges) -> tuple[Ints, int]:
+    """Faces turned so that neighbours agree and the shape is not inside out, and how many were turned.
+
+    A part whose faces disagreed is turned outwards by the sign of its volume; if they agreed everywhere, the shape is
+    turned as a whole, and only if its volume is clearly negative. An edge of more than two faces joins nothing.
+
+    Parameters
+    ----------
+    verts : (V, 3) float64
+    faces : (F, 3) int64
+    cross : (F, 3) float64
+        Normal of each face, twice its area long.
+    edges : Edges
+        Of these faces.
+    """
+    flip = np.zeros(len(faces), bool)
+    areas = 0.5 * np.sqrt(np.einsum("fi,fi->f", cross, cross))
+    corner = verts[faces[:, 0]]
+    total = areas.sum()
+    disagreeing = edges.disagreeing
+    if disagreeing.any():
+        flip, part, wrong = _flips(faces, edges)
+        weight = np.maximum(np.bincount(part, weights=areas), 1e-300)
+        center = np.stack([np.bincount(part, weights=areas * corner[:, i]) for i in range(3)], axis=1)
+        above = np.einsum("fi,fi->f", corner - (center / weight[:, None])[part], cross) / 6.0
+        volume = np.bincount(part, weights=np.where(flip, -above, above))
+        # a sheet has no outside: then as few faces as possible are turned
+        many = np.bincount(part, weights=np.where(flip, areas, -areas)) > 0
+        turn = np.where(np.abs(volume) > 1e-3 * weight**1.5, volume < 0, many)
+        flip = np.where(wrong[part], flip ^ turn[part], False)
+    # the volume under each face, seen from the middle
+    above = np.einsum("fi,fi->f", corner - areas @ corner / total, cross) / 6.0
+    if np.where(flip, -above, above).sum() < -1e-3 * total**1.5:
+        flip = ~flip
+    if not flip.any():
+        return faces, 0
+    turned = faces.copy()
+    turned[flip] = turned[flip][:, ::-1]
+    return turned, int(flip.sum())
+
+
+def _flips(faces: Ints, edges: Edges) -> tuple[NDArray[np.bool_], Ints, NDArray[np.bool_]]:
+    """(F,) faces to flip so that all agree, (F,) their part, and for each part whether any disagreed."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    disagreeing = edges.disagreeing
+    face = np.argsort(directed_edges(faces)) % len(faces)
+    two = edges.begins[edges.sizes == 2]
+    first, second = face[two], face[two + 1]
+    # faces that agree already are one thing: far fewer are left to walk through
+    same = ~disagreeing
+    graph = coo_array((np.ones(same.sum(), np.int8), (first[same], second[same])), (len(faces), len(faces)))
+    groups, group = connected_components(graph, directed=False)
+    pairs = np.stack([group[first[disagreeing]], group[second[disagreeing]]], axis=1).astype(np.int64)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]  # a band with one side, like that of Moebius, is left as it is
+    flip, part = agreeing_flips(groups, pairs, np.ones(len(pairs), bool), np.zeros(len(pairs)))
+    wrong = np.zeros(int(part.max()) + 1, bool)
+    wrong[part[pairs[:, 0]]] = True
+    return flip[group], part[group], wrong

@@ -1,0 +1,129 @@
+"""Which rows, edges and faces belong together: sorting instead of loops, for a million of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.shapes.shape import Ints
+
+_MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+
+
+def same_rows(rows: NDArray[np.float64] | Ints) -> Ints:
+    """(N,) for each row the first row that is equal to it: itself where it is the first. 0.0 equals -0.0."""
+    own = np.arange(len(rows))
+    if len(rows) < 2:
+        return own
+    hashed = _hash(rows)
+    ordered = np.sort(hashed)
+    if not (ordered[1:] == ordered[:-1]).any():
+        return own
+    order = np.argsort(hashed)
+    ordered = hashed[order]
+    begins = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    sizes = np.diff(np.append(begins, len(rows)))
+    first = np.empty(len(rows), np.int64)
+    first[order] = np.repeat(np.minimum.reduceat(order, begins), sizes)
+    if (rows == rows[first]).all():
+        return first
+    # two different rows with one hash: the slow way
+    _, index, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return np.asarray(index[inverse.ravel()], np.int64)
+
+
+def face_parts(faces: Ints, V: int) -> Ints:
+    """(F,) number of the connected part that each face is in; faces that share a vertex are connected."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    F = len(faces)
+    # faces x vertices: each face points to its three corners, which needs no sorting
+    indices = np.asarray(faces.ravel() + F, np.int32 if V + F < 2**31 else np.int64)
+    pointers = np.concatenate([np.arange(0, 3 * F + 1, 3), np.full(V, 3 * F)]).astype(indices.dtype)
+    graph = csr_array((np.ones(3 * F, np.int8), indices, pointers), shape=(F + V, F + V))
+    _, label = connected_components(graph, directed=False)
+    _, part = np.unique(label[:F], return_inverse=True)
+    return np.asarray(part, np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """The edges of faces, sorted once for several questions.
+
+    Parameters
+    ----------
+    ordered : (3 F,) int64
+        Twice the number of each edge of each face, plus 1 if the face runs from the smaller vertex to the larger.
+    begins, sizes : (E,) int64
+        Where each edge begins in `ordered`, and how many faces it has.
+    """
+
+    ordered: Ints
+    begins: Ints
+    sizes: Ints
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many edges have one face (open), and how many have more than two (non-manifold)."""
+        return int((self.sizes == 1).sum()), int((self.sizes > 2).sum())
+
+    @property
+    def disagreeing(self) -> NDArray[np.bool_]:
+        """For each edge of exactly two faces: do both run along it the same way?"""
+        two = self.begins[self.sizes == 2]
+        return np.asarray(self.ordered[two] == self.ordered[two + 1])
+
+
+def edges_of(faces: Ints) -> Edges:
+    """Sort the edges of `faces`."""
+    ordered = np.sort(directed_edges(faces))
+    group = ordered >> 1
+    begins = np.flatnonzero(np.concatenate([[True], group[1:] != group[:-1]]))
+    return Edges(ordered, begins, np.diff(np.append(begins, len(group))))
+
+
+def directed_edges(faces: Ints) -> Ints:
+    """(3 F,) the numbers that `Edges.ordered` sorts: F of the edges 0-1, then of 1-2, then of 2-0."""
+    columns = np.ascontiguousarray(faces.T)
+    start, end = columns.ravel(), columns[[1, 2, 0]].ravel()
+    return np.asarray(2 * (np.minimum(start, end) * _stride(faces) + np.maximum(start, end)) + (start < end))
+
+
+def open_edges(faces: Ints) -> Ints:
+    """(N, 2) vertices of the edges that have one face."""
+    keys = np.sort(edge_keys(faces))
+    alone = np.concatenate([[True], keys[1:] != keys[:-1]])
+    alone[:-1] &= alone[1:].copy()
+    V = _stride(faces)
+    return np.stack([keys[alone] // V, keys[alone] % V], axis=1)
+
+
+def edge_keys(faces: Ints, chosen: NDArray[np.bool_] | None = None) -> Ints:
+    """(3 F,) one number for each edge of each face, the same in both directions; F edges 0-1, then 1-2, then 2-0.
+
+    `chosen` leaves out faces, but keeps the numbers as they are with all.
+    """
+    some = faces if chosen is None else faces[chosen]
+    start = some.T.ravel()
+    end = np.roll(some, -1, axis=1).T.ravel()
+    return np.asarray(np.minimum(start, end) * _stride(faces) + np.maximum(start, end))
+
+
+def _stride(faces: Ints) -> int:
+    return int(faces.max()) + 1 if len(faces) else 1
+
+
+def is_watertight(faces: Ints) -> bool:
+    """True if every edge has exactly two faces."""
+    return len(faces) > 0 and edges_of(faces).counts == (0, 0)
+
+
+def _hash(rows: NDArray[np.float64] | Ints) -> NDArray[np.uint64]:
+    bits = np.ascontiguousarray(rows + 0 if rows.dtype.kind == "i" else rows + 0.0).view(np.uint64)
+    total = np.zeros(len(rows), np.uint64)
+    for k in range(rows.shape[1]):
+        total ^= bits[:, k]
+        total *= _MIX[k % 3]
+        total ^= total >> np.uint64(29)
+    return total
