@@ -109,7 +109,7 @@ class Shape:
     @cached_property
     def face_areas(self) -> Floats:
         """(F,) areas, squared units of the file."""
-        return _frozen(0.5 * np.sqrt(np.einsum("fi,fi->f", self.face_vectors, self.face_vectors)))
+        return _frozen(0.5 * np.sqrt(squared_lengths(self.face_vectors)))
 
     @cached_property
     def face_normals(self) -> Floats:
@@ -243,6 +243,11 @@ def cross_product(a: Floats, b: Floats) -> Floats:
     return out
 
 
+def squared_lengths(vectors: Floats) -> Floats:
+    """(N,) squared length of each row."""
+    return np.asarray(np.einsum("ni,ni->n", vectors, vectors))
+
+
 def _read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
     """An own, contiguous, read-only array; one that is all of this already is shared, not copied."""
     if isinstance(values, np.ndarray) and values.dtype == dtype and values.base is None:
@@ -262,5 +267,5 @@ def _frozen(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _unit(vectors: Floats) -> Floats:
-    lengths = np.sqrt(np.einsum("ni,ni->n", vectors, vectors))
+    lengths = np.sqrt(squared_lengths(vectors))
     return vectors / np.where(lengths > 0, lengths, 1.0)[:, None]

@@ -43,8 +43,9 @@ def face_parts(faces: Ints, V: int) -> Ints:
     pointers = np.concatenate([np.arange(0, 3 * F + 1, 3), np.full(V, 3 * F)]).astype(indices.dtype)
     graph = csr_array((np.ones(3 * F, np.int8), indices, pointers), shape=(F + V, F + V))
     _, label = connected_components(graph, directed=False)
-    _, part = np.unique(label[:F], return_inverse=True)
-    return np.asarray(part, np.int64)
+    used = np.zeros(F + V, np.int64)  # a vertex without a face is no part
+    used[label[:F]] = 1
+    return np.asarray((np.cumsum(used) - 1)[label[:F]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,28 +87,23 @@ def edges_of(faces: Ints) -> Edges:
 def directed_edges(faces: Ints) -> Ints:
     """(3 F,) the numbers that `Edges.ordered` sorts: F of the edges 0-1, then of 1-2, then of 2-0."""
     columns = np.ascontiguousarray(faces.T)
-    start, end = columns.ravel(), columns[[1, 2, 0]].ravel()
-    return np.asarray(2 * (np.minimum(start, end) * _stride(faces) + np.maximum(start, end)) + (start < end))
+    return 2 * edge_keys(faces, _stride(faces)) + (columns < columns[[1, 2, 0]]).ravel()
 
 
 def open_edges(faces: Ints) -> Ints:
     """(N, 2) vertices of the edges that have one face."""
-    keys = np.sort(edge_keys(faces))
+    V = _stride(faces)
+    keys = np.sort(edge_keys(faces, V))
     alone = np.concatenate([[True], keys[1:] != keys[:-1]])
     alone[:-1] &= alone[1:].copy()
-    V = _stride(faces)
     return np.stack([keys[alone] // V, keys[alone] % V], axis=1)
 
 
-def edge_keys(faces: Ints, chosen: NDArray[np.bool_] | None = None) -> Ints:
-    """(3 F,) one number for each edge of each face, the same in both directions; F edges 0-1, then 1-2, then 2-0.
-
-    `chosen` leaves out faces, but keeps the numbers as they are with all.
-    """
-    some = faces if chosen is None else faces[chosen]
-    start = some.T.ravel()
-    end = np.roll(some, -1, axis=1).T.ravel()
-    return np.asarray(np.minimum(start, end) * _stride(faces) + np.maximum(start, end))
+def edge_keys(faces: Ints, V: int) -> Ints:
+    """(3 F,) one number for each edge of each face, the same both ways; F of the edges 0-1, then 1-2, then 2-0."""
+    columns = np.ascontiguousarray(faces.T)
+    start, end = columns.ravel(), columns[[1, 2, 0]].ravel()
+    return np.asarray(np.minimum(start, end) * V + np.maximum(start, end))
 
 
 def _stride(faces: Ints) -> int:

@@ -1,0 +1,90 @@
+"""Which connected parts of a mesh belong to the object, and which are dirt or another object."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.shapes.shape import Floats, Ints, squared_lengths
+from meshmatch.shapes.topology import face_parts
+
+STRAY_SHARE = 0.02
+"""A part with less than this share of the largest part's area is stray."""
+_FAR = 0.25  # gap between two big parts, in diagonals of the largest, from which they count as apart
+_NEAR = 0.05  # gap up to which a small part belongs to a shape that is made of small parts
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """What `find_parts` found.
+
+    Parameters
+    ----------
+    stray : (F,) bool
+        Faces of stray parts.
+    stray_parts, kept : int
+        How many parts are stray, and how many are not.
+    far : int
+        How many of the kept ones are big but lie far from the rest.
+    far_share : float
+        Their share of the surface, in 0..1.
+    """
+
+    stray: NDArray[np.bool_]
+    stray_parts: int
+    kept: int
+    far: int
+    far_share: float
+
+
+def find_parts(verts: Floats, faces: Ints, cross: Floats) -> Parts:
+    """Judge the connected parts of a mesh; `cross` (F, 3) is the normal of each face, twice its area long."""
+    part = face_parts(faces, len(verts))
+    if part.max() == 0:
+        return Parts(np.zeros(len(faces), bool), 0, 1, 0, 0.0)
+    areas = np.bincount(part, weights=0.5 * np.sqrt(squared_lengths(cross)))
+    largest = int(areas.argmax())
+    small = areas < STRAY_SHARE * areas[largest]
+    big = np.flatnonzero(~small)
+    # the body grows from the largest part by all big parts that are near
+    body = np.array([largest])
+    while len(body) < len(big):
+        gap, diagonal = _gaps(verts, faces, part, body, np.setdiff1d(big, body))
+        near = np.setdiff1d(big[gap[big] <= _FAR * diagonal], body)
+        if len(near) == 0:
+            break
+        body = np.concatenate([body, near])
+    far = np.setdiff1d(big, body)
+    stray = small.copy()
+    if areas[small].sum() > 0.1 * areas.sum():
+        gap, diagonal = _gaps(verts, faces, part, big, np.flatnonzero(small))
+        stray &= gap > _NEAR * diagonal
+    share = float(areas[far].sum() / areas.sum())
+    return Parts(stray[part], int(stray.sum()), len(areas) - int(stray.sum()), len(far), share)
+
+
+def _gaps(verts: Floats, faces: Ints, part: Ints, body: Ints, others: Ints) -> tuple[Floats, float]:
+    """Distance (parts,) of each of the `others` to the parts in `body`, 0 for the rest; and the body's diagonal."""
+    from scipy.spatial import cKDTree
+
+    count = int(part.max()) + 1
+    theirs, ours = np.isin(np.arange(count), others), np.isin(np.arange(count), body)
+    anchor = _corners(faces[ours[part]], len(verts))
+    diagonal = float(np.linalg.norm(np.ptp(verts[anchor], axis=0)))
+    gap = np.zeros(count)
+    if len(others):
+        chosen = theirs[part]
+        corners = _corners(faces[chosen], len(verts))
+        of_vertex = np.zeros(len(verts), np.int64)
+        of_vertex[faces[chosen]] = part[chosen, None]
+        distance = cKDTree(verts[anchor[:: max(len(anchor) // 20_000, 1)]]).query(verts[corners])[0]
+        gap[others] = np.inf
+        np.minimum.at(gap, of_vertex[corners], distance)
+    return gap, diagonal
+
+
+def _corners(faces: Ints, V: int) -> Ints:
+    """The vertices that these faces use, in order."""
+    used = np.zeros(V, bool)
+    used[faces.ravel()] = True
+    return np.flatnonzero(used)
