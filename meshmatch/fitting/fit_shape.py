@@ -1,0 +1,188 @@
+"""Lay a model's template on a shape: orientation, network, refinement, verdict."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from meshmatch.errors import OptionError
+from meshmatch.fitting.fit import FAIR_RESIDUAL, GOOD_RESIDUAL, Fit, axis_name
+from meshmatch.fitting.latent import LatentRefineConfig, refine_code
+from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual
+from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
+from meshmatch.fitting.orientation import Hypothesis, axis_vector, forced_frames, propose
+from meshmatch.fitting.scan import Scan
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.models.trained import TrainedModel
+from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.templates.template import Template
+
+Refine = Literal["none", "latent", "nodes"]
+REFINEMENTS: tuple[Refine, ...] = ("none", "latent", "nodes")
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How hard to look and how to refine.
+
+    samples : points drawn on the surface; hypotheses : orientations laid on; finalists : of which this many
+    are refined before the better one is kept; copies : turned copies that vote on the orientation.
+    """
+
+    refine: Refine = "nodes"
+    seed: int = 0
+    up: str | None = None
+    front: str | None = None
+    samples: int = 8000
+    copies: int = 64
+    hypotheses: int = 4
+    finalists: int = 2
+    nodes: NodeRefineConfig = field(default_factory=NodeRefineConfig)
+    latent: LatentRefineConfig = field(default_factory=LatentRefineConfig)
+
+    def __post_init__(self) -> None:
+        if self.refine not in REFINEMENTS:
+            raise OptionError(f"no refinement {self.refine!r}", f"choose one of {', '.join(REFINEMENTS)}")
+
+
+@lru_cache(maxsize=4)
+def node_system(template: Template) -> NodeSystem:
+    """The template's least-squares system, built once."""
+    return NodeSystem(template)
+
+
+def fit_shape(
+    model: TrainedModel,
+    shape: Shape,
+    config: FitConfig | None = None,
+    landmarks: tuple[np.ndarray, np.ndarray] | None = None,
+    progress: Progress | None = None,
+) -> Fit:
+    """Lay the model's template on a repaired shape.
+
+    Parameters
+    ----------
+    landmarks : (template vertices (N,), positions (N, 3) in the shape's file frame), optional
+    progress : callable, optional
+        Called with (what is going on, share done).
+
+    Returns
+    -------
+    Fit
+
+    Raises
+    ------
+    OptionError
+        An axis that is none, or up and front along one axis.
+    """
+    config = config or FitConfig()
+    began = time.monotonic()
+    tell = progress or (lambda what, share: None)
+    rng = np.random.default_rng(config.seed)
+    system = node_system(model.template)
+    frame, scan = take_samples(shape, config.samples, rng)
+    tell("orientation", 0.0)
+    found = _hypotheses(model, scan, config)
+    candidates = []
+    for number, guess in enumerate(found):
+        candidates.append(lay_on(model.network, system, model.template.core, scan, guess.rotation, guess.centre, rng))
+        tell("orientation", (number + 1) / len(found))
+    candidates.sort(key=lambda candidate: candidate.residual)
+    best = _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell)
+    core_frame = frame.compose(Frame(1.0, best.rotation.T, best.centre))
+    points = system.moved(best.vectors)
+    distance = _vertex_distance(core_frame.apply(shape.verts), points)
+    verdict, reasons = judge(best.residual, scan.turned(best.rotation, best.centre), points)
+    return Fit(
+        template_hash=model.template.hash,
+        frame=core_frame,
+        points=points,
+        vectors=best.vectors,
+        faces=system.faces,
+        residual=best.residual,
+        vertex_distance=distance,
+        verdict=verdict,
+        reasons=reasons,
+        up=axis_name(core_frame.rotation[1]),
+        front=axis_name(core_frame.rotation[2]),
+        seconds=time.monotonic() - began,
+        seed=config.seed,
+    )
+
+
+def take_samples(shape: Shape, P: int, rng: np.random.Generator) -> tuple[Frame, Scan]:
+    """Frame of a shape (area 1, centroid 0) and samples of it in that frame."""
+    frame = sqrt_area_frame(shape)
+    samples = sample_surface(shape, P, rng)
+    return frame, Scan(frame.apply(samples.points), samples.normals @ frame.rotation.T)
+
+
+def _hypotheses(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypothesis]:
+    """Core frames to try: the aligner's, or those that obey the user's axes."""
+    voted = propose(model.network, scan.points[:2048], config.copies, config.hypotheses, config.seed)
+    if config.up is None and config.front is None:
+        return voted
+    up = axis_vector(config.up) if config.up else None
+    front = axis_vector(config.front) if config.front else None
+    if up is not None and front is not None and abs(up @ front) > 0.5:
+        raise OptionError("up and front lie along the same axis", "choose two different axes")
+    obeying = [
+        guess
+        for guess in voted
+        if (up is None or guess.rotation[:, 1] @ up > 0.5) and (front is None or guess.rotation[:, 2] @ front > 0.5)
+    ]
+    return obeying or forced_frames(up, front)
+
+
+def _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell) -> Candidate:
+    if config.refine == "none":
+        return candidates[0]
+    refined = []
+    finalists = candidates[: config.finalists] if config.refine == "nodes" else candidates[:1]
+    for number, candidate in enumerate(finalists):
+        local = scan.turned(candidate.rotation, candidate.centre)
+
+        def report(done: int, total: int, number: int = number) -> None:
+            tell("refinement", (number + done / total) / len(finalists))
+
+        if config.refine == "latent":
+            vectors = refine_code(model.network, model.template, local, config.latent, rng, report)
+        else:
+            fixed = None
+            if landmarks is not None:
+                positions = (frame.apply(landmarks[1]) - candidate.centre) @ candidate.rotation
+                fixed = (landmarks[0], positions)
+            vectors = refine_nodes(system, local, candidate.vectors, config.nodes, fixed, progress=report)
+        residual = two_way_residual(system, local, vectors)
+        refined.append(Candidate(candidate.rotation, candidate.centre, vectors, residual))
+    return min(refined, key=lambda candidate: candidate.residual)
+
+
+def _vertex_distance(verts: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return cKDTree(points).query(verts)[0]
+
+
+def judge(residual: float, scan: Scan, points: np.ndarray) -> tuple[str, tuple[str, ...]]:
+    """Verdict on a fit and the reasons, in words."""
+    reasons = []
+    if residual > GOOD_RESIDUAL:
+        reasons.append(f"template and shape stay {100 * residual:.1f} % of sqrt(area) apart on average")
+    gap = cKDTree(points).query(scan.points)[0]
+    missed = float((gap > 0.06).mean())
+    if missed > 0.02:
+        reasons.append(f"{100 * missed:.0f} % of the shape is not reached by the template")
+    empty = float((cKDTree(scan.points).query(points)[0] > 0.06).mean())
+    if empty > 0.02:
+        reasons.append(f"{100 * empty:.0f} % of the template lies where the shape has no surface")
+    if residual > FAIR_RESIDUAL or missed > 0.06 or empty > 0.06:
+        return "poor", tuple(reasons)
+    return ("fair" if reasons else "good"), tuple(reasons)

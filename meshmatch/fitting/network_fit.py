@@ -1,0 +1,77 @@
+"""The network's own fit: core frame, code, learned corrections, for every hypothesis of the orientation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from meshmatch.fitting.scan import Scan, with_normals
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.models.deformer import Deformer
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One way to lay the template on a scan.
+
+    rotation, centre : the core frame, scan = R core + centre
+    vectors : (K, 3) node vectors in the core frame
+    residual : mean normal-compatible distance, both ways, in units of sqrt(area)
+    """
+
+    rotation: np.ndarray
+    centre: np.ndarray
+    vectors: np.ndarray
+    residual: float
+
+
+def rigid_motion(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Best rigid motion target ~ R source + t (Kabsch); rows are points."""
+    a, b = source.mean(0), target.mean(0)
+    U, _, Vh = np.linalg.svd((target - b).T @ (source - a))
+    U[:, 2] *= np.sign(np.linalg.det(U @ Vh))
+    R = U @ Vh
+    return R, b - R @ a
+
+
+def two_way_residual(system: NodeSystem, scan: Scan, vectors: np.ndarray, cap: float = 0.1) -> float:
+    """Mean of the capped 6-D nearest-neighbour distances, template to scan and back."""
+    from scipy.spatial import cKDTree
+
+    moved = system.moved(vectors)
+    seen = with_normals(moved, system.normals(moved))
+    forward = scan.tree.query(seen[::2])[0]
+    back = cKDTree(seen).query(with_normals(scan.points[::2], scan.normals[::2]))[0]
+    return float(0.5 * np.minimum(forward, cap).mean() + 0.5 * np.minimum(back, cap).mean())
+
+
+@torch.inference_mode()
+def predict(model: Deformer, scan: Scan, draws: int, rng: np.random.Generator, points: int = 2048) -> np.ndarray:
+    """Mean prediction over several draws of points: node vectors (K, 3) for a scan in its core frame."""
+    count = min(points, len(scan.points))
+    chosen = np.stack([rng.choice(len(scan.points), count, replace=False) for _ in range(draws)])
+    clouds = torch.from_numpy(scan.points[chosen]).float()
+    return model(clouds).mean(0).double().numpy()
+
+
+def lay_on(
+    model: Deformer,
+    system: NodeSystem,
+    core: np.ndarray,
+    scan: Scan,
+    rotation: np.ndarray,
+    centre: np.ndarray,
+    rng: np.random.Generator,
+    rounds: int = 2,
+    draws: int = 2,
+) -> Candidate:
+    """Predict, move the core frame to where the prediction puts the core, predict again."""
+    for turn in range(rounds):
+        local = scan.turned(rotation, centre)
+        vectors = predict(model, local, draws, rng)
+        if turn < rounds - 1:
+            R, t = rigid_motion(system.verts[core], system.moved(vectors)[core])
+            rotation, centre = rotation @ R, rotation @ t + centre
+    return Candidate(rotation, centre, vectors, two_way_residual(system, local, vectors))

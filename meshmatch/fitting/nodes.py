@@ -1,0 +1,140 @@
+"""Gauss-Newton on the node vectors: from the network's fit to the surface.
+
+Each step pairs template and scan both ways by normal-compatible neighbours, weighs the pairs robustly,
+and solves one linear system. The prior keeps the deformation gradient at every strain point near a rotated
+copy of the network's own, R_g F_g(network) with R_g the best local rotation: the surface may bend to meet
+the scan but not stretch along it, which Chamfer and normals cannot see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from meshmatch.fitting.scan import Scan, with_normals
+from meshmatch.fitting.system import NodeSystem
+
+
+@dataclass(frozen=True)
+class NodeRefineConfig:
+    """Schedule and weights of the node refinement; lengths in units of sqrt(area).
+
+    From the first step to the last the strain weight and the robust scale fall geometrically.
+    """
+
+    steps: int = 20
+    strain_first: float = 0.3
+    strain_last: float = 0.01
+    scale_first: float = 0.06
+    scale_last: float = 0.012
+    point_share: float = 0.1
+    normal_cosine: float = 0.2
+    back_points: int = 4000
+    damping: float = 1e-4
+    landmark_weight: float = 0.05
+
+
+def refine_nodes(
+    system: NodeSystem,
+    scan: Scan,
+    vectors: np.ndarray,
+    config: NodeRefineConfig,
+    landmarks: tuple[np.ndarray, np.ndarray] | None = None,
+    one_sided: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> np.ndarray:
+    """Fit node vectors (K, 3) to a scan in the core frame; returns better node vectors.
+
+    Parameters
+    ----------
+    landmarks : (template vertices (N,), positions (N, 3)), optional
+        Pairs that the fit honours.
+    one_sided : bool
+        The scan is a part of the shape: template points without a partner are left to the prior.
+    """
+    start = system.deformation_gradient(vectors)
+    for step in range(config.steps):
+        t = step / max(config.steps - 1, 1)
+        strain = config.strain_first ** (1 - t) * config.strain_last**t
+        scale = config.scale_first ** (1 - t) * config.scale_last**t
+        weights, pulls = pair_terms(system, scan, vectors, scale, config, one_sided)
+        if landmarks is not None:
+            _add_landmarks(weights, pulls, landmarks, config.landmark_weight)
+        targets = nearest_rotations(system.deformation_gradient(vectors), start) @ start
+        share = 1.0 / len(targets)
+        vectors = system.solve(weights, pulls, strain * share, targets, config.damping / system.K, vectors)
+        if progress is not None:
+            progress(step + 1, config.steps)
+    return vectors
+
+
+def nearest_rotations(F: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Rotations R_g (G, 3, 3) that bring start_g closest to F_g (orthogonal Procrustes)."""
+    U, _, Vh = np.linalg.svd(F @ start.transpose(0, 2, 1))
+    flip = np.linalg.det(U @ Vh)
+    U[:, :, 2] *= flip[:, None]
+    return U @ Vh
+
+
+def pair_terms(
+    system: NodeSystem,
+    scan: Scan,
+    vectors: np.ndarray,
+    scale: float,
+    config: NodeRefineConfig,
+    one_sided: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (V, 6) and pulls (V, 3) of the current pairs, both directions, each summing to about one half."""
+    moved = system.moved(vectors)
+    normals = system.normals(moved)
+    V = len(moved)
+    seen = with_normals(moved, normals)
+    to_scan = scan.tree.query(seen)[1]
+    area = vertex_areas(moved, system.faces)
+    forward = area / area.sum() * robust_weight(moved - scan.points[to_scan], scale)
+    forward *= (normals * scan.normals[to_scan]).sum(1) > config.normal_cosine
+    if one_sided:
+        forward *= np.linalg.norm(moved - scan.points[to_scan], axis=1) < 3 * scale
+
+    pick = np.arange(0, len(scan.points), max(1, len(scan.points) // config.back_points))
+    to_template = cKDTree(seen).query(with_normals(scan.points[pick], scan.normals[pick]))[1]
+    back = robust_weight(moved[to_template] - scan.points[pick], scale) / len(pick)
+    back *= (normals[to_template] * scan.normals[pick]).sum(1) > config.normal_cosine
+
+    at = np.concatenate([np.arange(V), to_template])
+    point = np.concatenate([scan.points[to_scan], scan.points[pick]])
+    normal = np.concatenate([scan.normals[to_scan], scan.normals[pick]])
+    weight = 0.5 * np.concatenate([forward, back])
+    return _accumulate(at, point, normal, weight, config.point_share, V)
+
+
+def _accumulate(at, point, normal, weight, share, V) -> tuple[np.ndarray, np.ndarray]:
+    """Sum w (n n^T + share I) and its product with the point, per template vertex."""
+    x, y, z = normal.T
+    entries = np.stack([x * x + share, x * y, x * z, y * y + share, y * z, z * z + share], 1) * weight[:, None]
+    along = (normal * point).sum(1, keepdims=True)
+    pull = weight[:, None] * (normal * along + share * point)
+    weights = np.stack([np.bincount(at, entries[:, k], V) for k in range(6)], 1)
+    pulls = np.stack([np.bincount(at, pull[:, k], V) for k in range(3)], 1)
+    return weights, pulls
+
+
+def _add_landmarks(weights, pulls, landmarks, weight) -> None:
+    at, position = landmarks
+    np.add.at(weights, (at[:, None], np.array([0, 3, 5])), weight)
+    np.add.at(pulls, at, weight * position)
+
+
+def robust_weight(offset: np.ndarray, scale: float) -> np.ndarray:
+    """Geman-McClure weight of offsets (N, 3)."""
+    return 1.0 / np.square(1.0 + np.square(offset).sum(1) / scale**2)
+
+
+def vertex_areas(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """A third of the area of the faces around each vertex (V,)."""
+    a, b, c = (verts[faces[:, k]] for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.bincount(faces.reshape(-1), np.repeat(area / 3, 3), len(verts))

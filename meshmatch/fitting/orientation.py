@@ -1,0 +1,104 @@
+"""Which way is up, which way is front: core frames that the aligner proposes, and the best of them.
+
+The aligner is asked about many turned copies of the scan. Every answer is a vote for one rotation of the
+scan; votes that agree form a hypothesis. Asking again from the voted frame sharpens it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from meshmatch.errors import OptionError
+from meshmatch.models.deformer import Deformer
+from meshmatch.models.neighbours import nearest
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A proposed core frame: scan = R core + centre. ``votes`` is the share of copies that agree."""
+
+    rotation: np.ndarray
+    centre: np.ndarray
+    votes: float
+
+
+def turned_copies(count: int, seed: int) -> np.ndarray:
+    """Well-spread rotations (count, 3, 3), the first of them the identity."""
+    rotations = Rotation.random(count, random_state=np.random.default_rng(seed)).as_matrix()
+    rotations[0] = np.eye(3)
+    return rotations
+
+
+@torch.inference_mode()
+def ask_aligner(model: Deformer, points: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Core frames (N, 3, 3), (N, 3) of the scan, each read off one turned copy (rows x -> turn x)."""
+    assert model.aligner is not None
+    middle = points.mean(0)
+    # Turning the basis the other way is cheaper than turning and indexing the scan N times.
+    basis = model.aligner.basis.numpy()
+    tree_queries = torch.from_numpy(np.einsum("mk,nkl->nml", basis, turns).reshape(1, -1, 3)).float()
+    cloud = torch.from_numpy(points - middle).float()[None]
+    offsets = nearest(tree_queries, cloud)[1].view(len(turns), -1, 3)
+    matrices = torch.from_numpy(turns).float()
+    features = (offsets @ matrices.transpose(1, 2)) * 5.0
+    R, t = model.align(features)
+    back = matrices.transpose(1, 2)
+    return (back @ R).double().numpy(), (back @ t[..., None])[..., 0].double().numpy() + middle
+
+
+def propose(
+    model: Deformer, points: np.ndarray, copies: int = 48, keep: int = 4, seed: int = 0
+) -> list[Hypothesis]:
+    """Hypotheses of the core frame, most voted first.
+
+    Parameters
+    ----------
+    points : (P, 3) samples in the scan frame
+    copies : how many turned copies vote
+    keep : how many hypotheses to return at most
+    """
+    rotations, centres = ask_aligner(model, points, turned_copies(copies, seed))
+    # Second look: from its own proposed frame the network knows the pose best.
+    rotations, centres = ask_aligner(model, points, rotations.transpose(0, 2, 1))
+    trace = np.einsum("nij,mij->nm", rotations, rotations)
+    angle = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    close = angle < 30
+    free = np.ones(len(rotations), bool)
+    found: list[Hypothesis] = []
+    while free.any() and len(found) < keep:
+        support = (close & free).sum(1) * free
+        leader = int(support.argmax())
+        members = close[leader] & free
+        mean = Rotation.from_matrix(rotations[members]).mean().as_matrix()
+        found.append(Hypothesis(mean, np.median(centres[members], 0), members.mean()))
+        free &= ~members
+    return found
+
+
+def axis_vector(name: str) -> np.ndarray:
+    """Unit vector of an axis name such as "y", "+y" or "-z"."""
+    sign = -1.0 if name.startswith("-") else 1.0
+    axis = name.lstrip("+-").lower()
+    if axis not in ("x", "y", "z") or len(name) > 2:
+        raise OptionError(f"{name!r} is no axis", "write x, y or z, with - for the opposite direction")
+    return sign * np.eye(3)["xyz".index(axis)]
+
+
+def forced_frames(up: np.ndarray | None, front: np.ndarray | None, turns: int = 12) -> list[Hypothesis]:
+    """Core frames that obey given axes: all turns about the one that is given, or the only one if both are."""
+    along, other = (up, front) if up is not None else (front, None)
+    assert along is not None
+    seed = other if other is not None else np.roll(along, 1)
+    across = seed - (seed @ along) * along
+    across /= np.linalg.norm(across)
+    frames = []
+    for turn in range(1 if other is not None else turns):
+        angle = 2 * np.pi * turn / turns
+        second = np.cos(angle) * across + np.sin(angle) * np.cross(along, across)
+        y, z = (along, second) if up is not None else (second, along)
+        frames.append(Hypothesis(np.stack([np.cross(y, z), y, z], 1), np.zeros(3), 1.0 / turns))
+    return frames

@@ -1,0 +1,115 @@
+"""From two fits of one template to a map between the shapes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from meshmatch.errors import OptionError
+from meshmatch.fitting.fit import Fit
+from meshmatch.maps.surface import Footpoints, Surface
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.repair import Repaired
+from meshmatch.shapes.shape import Shape
+
+# Distance (units of sqrt(area)) at which confidence has fallen to about 0.37.
+_FIT_SCALE = 0.03
+_ORDER = {"good": 0, "fair": 1, "poor": 2}
+
+
+def build_map(
+    source: Repaired, source_fit: Fit, target: Repaired, target_fit: Fit, polish: str = "auto", workers: int = 1
+) -> VertexMap:
+    """Carry every source vertex through the template to the target.
+
+    Source vertex -> closest point of the template as fitted to the source -> the same point of the template as
+    fitted to the target -> closest point of the target; neighbours must face the same way.
+
+    Parameters
+    ----------
+    source, target : Repaired
+        The shapes as they were fitted; the map is of their *original* vertices.
+
+    Raises
+    ------
+    OptionError
+        If the two fits are of different templates.
+    """
+    if source_fit.template_hash != target_fit.template_hash:
+        raise OptionError(
+            f"the fits use different templates ({source_fit.template_hash}, {target_fit.template_hash})",
+            "fit both shapes with the same model",
+        )
+    landed, confidence = carry(source.shape, source_fit, target.shape, target_fit, workers)
+    index = _nearest_corner(target.shape, landed)
+    worst = max(source_fit, target_fit, key=lambda fit: _ORDER[fit.verdict])
+    reasons = tuple(
+        f"{part.shape.name}: {reason}"
+        for part, fit in ((source, source_fit), (target, target_fit))
+        for reason in fit.reasons
+    )
+    whole = source.original_to_repaired
+    face, weights = _original_faces(target, landed)
+    return VertexMap.between(
+        source.original,
+        target.original,
+        index=target.kept_vertex[index][whole],
+        face=face[whole],
+        barycentric=weights[whole],
+        confidence=confidence.astype(np.float32)[whole],
+        verdict=worst.verdict,
+        reasons=reasons,
+    )
+
+
+def carry(
+    source: Shape, source_fit: Fit, target: Shape, target_fit: Fit, workers: int = 1
+) -> tuple[Footpoints, np.ndarray]:
+    """Where on the target every source vertex lands, and a confidence in 0..1."""
+    points, normals = in_core_frame(source, source_fit)
+    template = Surface(source_fit.points, source_fit.faces, vertex_normals(source_fit.points, source_fit.faces))
+    foot = template.query(points, normals, workers)
+    corners = source_fit.faces[foot.face]
+    moved = np.einsum("nk,nkd->nd", foot.barycentric, target_fit.points[corners])
+    target_normals = vertex_normals(target_fit.points, target_fit.faces)
+    facing = _unit(np.einsum("nk,nkd->nd", foot.barycentric, target_normals[corners]))
+    if target.is_cloud:
+        facing = np.zeros_like(facing)
+    there, there_normals = in_core_frame(target, target_fit)
+    landed = Surface(there, target.faces, there_normals).query(moved, facing, workers)
+    confidence = np.exp(-np.square(foot.distance / _FIT_SCALE) - np.square(landed.distance / _FIT_SCALE))
+    return landed, confidence
+
+
+def _nearest_corner(target: Shape, landed: Footpoints) -> np.ndarray:
+    """The vertex that stands for a point of a face: its heaviest corner."""
+    if target.is_cloud:
+        return landed.vertex
+    return target.faces[landed.face, landed.barycentric.argmax(1)]
+
+
+def _original_faces(target: Repaired, landed: Footpoints) -> tuple[np.ndarray, np.ndarray]:
+    """Faces and weights in the numbering of the file; -1 where a face was not in the file as it is."""
+    if target.shape.is_cloud:
+        return landed.face, landed.barycentric
+    return target.original_face(landed.face, landed.barycentric)
+
+
+def in_core_frame(shape: Shape, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and unit normals (V, 3) of a shape where its fit lives; zero normals for a cloud."""
+    if shape.is_cloud:
+        return fit.frame.apply(shape.verts), np.zeros_like(shape.verts)
+    return fit.frame.apply(shape.verts), shape.vertex_normals @ fit.frame.rotation.T
+
+
+def vertex_normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area-weighted unit vertex normals (V, 3)."""
+    a, b, c = (verts[faces[:, k]] for k in range(3))
+    face_vectors = np.cross(b - a, c - a)
+    summed = np.stack(
+        [np.bincount(faces.reshape(-1), np.repeat(face_vectors[:, k], 3), len(verts)) for k in range(3)], 1
+    )
+    return _unit(summed)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-20)

@@ -1,0 +1,111 @@
+"""Closest points on a surface among those that face the same way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+# How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area).
+NORMAL_WEIGHT = 0.15
+_CHUNK = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Footpoints:
+    """Closest points of N queries: vertex (N,), face (N,) or -1, barycentric (N, 3), distance (N,)."""
+
+    vertex: NDArray[np.int64]
+    face: NDArray[np.int64]
+    barycentric: NDArray[np.float64]
+    distance: NDArray[np.float64]
+
+
+class Surface:
+    """A mesh (or cloud) arranged for many closest-point queries; lengths in units of sqrt(area).
+
+    Parameters
+    ----------
+    verts : (V, 3)
+    faces : (F, 3), F = 0 for a cloud
+    normals : (V, 3) unit normals, zeros where unknown
+    """
+
+    def __init__(self, verts: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> None:
+        self.verts, self.faces, self.normals = verts, faces, normals
+        used = np.unique(faces) if len(faces) else np.arange(len(verts))
+        self._used = used
+        self._tree = cKDTree(np.concatenate([verts[used], NORMAL_WEIGHT * normals[used]], 1))
+        self._start, self._around = _faces_around(faces, len(verts))
+
+    def query(self, points: np.ndarray, normals: np.ndarray, workers: int = 1) -> Footpoints:
+        """Closest points to (N, 3) points with normals (N, 3)."""
+        N = len(points)
+        vertex = np.empty(N, np.int64)
+        face = np.full(N, -1, np.int64)
+        weights = np.zeros((N, 3))
+        distance = np.empty(N)
+        for low in range(0, N, _CHUNK):
+            part = slice(low, min(low + _CHUNK, N))
+            sought = np.concatenate([points[part], NORMAL_WEIGHT * normals[part]], 1)
+            vertex[part] = self._used[self._tree.query(sought, workers=workers)[1]]
+            if len(self.faces):
+                face[part], weights[part], distance[part] = self._on_faces(points[part], vertex[part])
+            else:
+                distance[part] = np.linalg.norm(points[part] - self.verts[vertex[part]], axis=1)
+        if not len(self.faces):
+            weights[:, 0] = 1.0
+        return Footpoints(vertex, face, weights, distance)
+
+    def _on_faces(self, points: np.ndarray, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        counts = self._start[vertex + 1] - self._start[vertex]
+        query = np.repeat(np.arange(len(points)), counts)
+        within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        face = self._around[np.repeat(self._start[vertex], counts) + within]
+        weights = closest_on_triangles(points[query], *(self.verts[self.faces[face, k]] for k in range(3)))
+        foot = np.einsum("nk,nkd->nd", weights, self.verts[self.faces[face]])
+        squared = np.square(foot - points[query]).sum(1)
+        order = np.lexsort((squared, query))
+        best = order[np.searchsorted(query[order], np.arange(len(points)))]
+        return face[best], weights[best], np.sqrt(squared[best])
+
+
+def _faces_around(faces: np.ndarray, V: int) -> tuple[np.ndarray, np.ndarray]:
+    """Faces at every vertex in compressed rows: start (V + 1,), face (3 F,)."""
+    corner = faces.reshape(-1)
+    order = np.argsort(corner, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=V))])
+    return start, order // 3
+
+
+def closest_on_triangles(points: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Barycentric weights (N, 3) of the closest point of triangle (a, b, c)[n] to points[n].
+
+    The plane's foot where it lies inside, else the closest point of the nearest edge.
+    """
+    ab, ac, ap = b - a, c - a, points - a
+    d00, d01, d11 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
+    d20, d21 = (ap * ab).sum(1), (ap * ac).sum(1)
+    scale = np.maximum(d00 * d11 - d01 * d01, 1e-300)
+    v = (d11 * d20 - d01 * d21) / scale
+    w = (d00 * d21 - d01 * d20) / scale
+    inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (d00 * d11 - d01 * d01 > 1e-14 * d00 * d11)
+    result = np.stack([1 - v - w, v, w], 1)
+    out = np.flatnonzero(~inside)
+    if len(out):
+        corners = (a[out], b[out], c[out])
+        best = np.full(len(out), np.inf)
+        for i, j in ((0, 1), (1, 2), (2, 0)):
+            along = corners[j] - corners[i]
+            t = ((points[out] - corners[i]) * along).sum(1) / np.maximum((along * along).sum(1), 1e-300)
+            t = np.clip(t, 0, 1)
+            squared = np.square(corners[i] + t[:, None] * along - points[out]).sum(1)
+            closer = squared < best
+            best = np.where(closer, squared, best)
+            rows = out[closer]
+            result[rows] = 0.0
+            result[rows, i] = 1 - t[closer]
+            result[rows, j] = t[closer]
+    return result

@@ -1,0 +1,46 @@
+"""Decoders: a shape code to one displacement vector per node."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from meshmatch.models.layers import residual_mlp
+
+
+class FlatDecoder(nn.Module):
+    """One residual MLP from the code to all node vectors at once."""
+
+    def __init__(self, code: int, width: int, depth: int, K: int) -> None:
+        super().__init__()
+        self.network = residual_mlp(code, width, depth, 3 * K)
+
+    def forward(self, code: torch.Tensor) -> torch.Tensor:
+        """code (B, D) -> node vectors (B, K, 3)."""
+        return self.network(code).unflatten(-1, (-1, 3))
+
+
+class NodeDecoder(nn.Module):
+    """The paper's decoder: [q_i, code] -> MLP shared over nodes, 2 tanh at the end.
+
+    The code's part of the first layer is computed once per shape and broadcast over the nodes: the same
+    numbers for a fraction of the cost.
+    """
+
+    def __init__(self, code: int, nodes: torch.Tensor, width: int = 1024) -> None:
+        super().__init__()
+        self.nodes: torch.Tensor
+        self.register_buffer("nodes", nodes)
+        self.from_code = nn.Linear(code, width)
+        self.from_node = nn.Linear(3, width, bias=False)
+        sizes = [width, width // 2, width // 4]
+        layers: list[nn.Module] = [nn.BatchNorm1d(width), nn.ReLU()]
+        for a, b in zip(sizes[:-1], sizes[1:], strict=True):
+            layers += [nn.Linear(a, b), nn.BatchNorm1d(b), nn.ReLU()]
+        layers.append(nn.Linear(sizes[-1], 3))
+        self.network = nn.Sequential(*layers)
+
+    def forward(self, code: torch.Tensor) -> torch.Tensor:
+        """code (B, D) -> node vectors (B, K, 3)."""
+        hidden = self.from_code(code)[:, None] + self.from_node(self.nodes)  # B K width
+        return 2 * torch.tanh(self.network(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])

@@ -1,0 +1,131 @@
+"""The network of a category: points in, node vectors of the template's field out.
+
+Frames. ``scan frame``: centroid 0, surface area 1, any rotation. ``core frame``: the scan turned and shifted
+so that the fitted template's core (a body's torso; the whole shape elsewhere) lies on the template's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import torch
+from torch import nn
+
+from meshmatch.errors import ModelError
+from meshmatch.fields.mls import apply_shape_functions
+from meshmatch.models.decoder import FlatDecoder, NodeDecoder
+from meshmatch.models.encoder import BasisEncoder, PointEncoder
+from meshmatch.models.layers import residual_mlp
+from meshmatch.models.neighbours import two_way_offsets
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes and choices of a deformer; saved in the model card."""
+
+    encoder: Literal["basis", "point"] = "basis"
+    decoder: Literal["flat", "node"] = "flat"
+    code: int = 512
+    width: int = 768
+    depth: int = 2
+    basis: int = 768
+    align_basis: int = 512
+    align_width: int = 512
+    corrections: int = 3
+    correct_width: int = 640
+
+    @staticmethod
+    def from_dict(values: dict) -> NetworkConfig:
+        known = NetworkConfig.__dataclass_fields__
+        unknown = sorted(set(values) - set(known))
+        if unknown:
+            raise ModelError(f"unknown network options: {', '.join(unknown)}", "update meshmatch")
+        return NetworkConfig(**values)
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+
+PAPER = NetworkConfig(encoder="point", decoder="node", width=1024, align_basis=0, corrections=0)
+
+
+def rotation_from_six(six: torch.Tensor) -> torch.Tensor:
+    """Gram-Schmidt on two predicted columns (B, 6) -> rotations (B, 3, 3)."""
+    a = nn.functional.normalize(six[:, :3], dim=-1)
+    b = six[:, 3:] - (a * six[:, 3:]).sum(-1, keepdim=True) * a
+    b = nn.functional.normalize(b, dim=-1)
+    return torch.stack([a, b, torch.linalg.cross(a, b)], -1)
+
+
+class Deformer(nn.Module):
+    """Aligner, encoder, decoder and correctors around one template's nodes.
+
+    Parameters
+    ----------
+    nodes : tensor (K, 3)
+        Control nodes in the template frame.
+    anchors : tensor (A, 3), anchor_phi : tensor (A, K)
+        Points of the template where a correction looks at the scan, and the field's shape functions there.
+    basis, align_basis : tensors (M, 3), (N, 3)
+        Basis points of encoder and aligner; ignored (may be empty) where the config does not use them.
+    """
+
+    def __init__(
+        self,
+        config: NetworkConfig,
+        nodes: torch.Tensor,
+        anchors: torch.Tensor,
+        anchor_phi: torch.Tensor,
+        basis: torch.Tensor,
+        align_basis: torch.Tensor,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        K, A = len(nodes), len(anchors)
+        self.nodes: torch.Tensor
+        self.anchors: torch.Tensor
+        self.anchor_phi: torch.Tensor
+        self.register_buffer("nodes", nodes)
+        self.register_buffer("anchors", anchors)
+        self.register_buffer("anchor_phi", anchor_phi)
+        if config.encoder == "basis":
+            self.encoder: nn.Module = BasisEncoder(basis, config.width, config.depth, config.code)
+        else:
+            self.encoder = PointEncoder(config.code)
+        if config.decoder == "flat":
+            self.decoder: nn.Module = FlatDecoder(config.code, config.width, 1, K)
+        else:
+            self.decoder = NodeDecoder(config.code, nodes, config.width)
+        self.aligner = (
+            BasisEncoder(align_basis, config.align_width, 2, 9) if config.align_basis else None
+        )
+        self.corrector = residual_mlp(A * 10, config.correct_width, 1, 3 * K) if config.corrections else None
+
+    @property
+    def K(self) -> int:
+        return len(self.nodes)
+
+    def align(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Aligner features -> rotation R (B, 3, 3) and centre t (B, 3) of the core: scan = R core + t."""
+        assert self.aligner is not None
+        out = self.aligner(features)
+        return rotation_from_six(out[:, :6]), out[:, 6:]
+
+    def correct(self, vectors: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """One learned registration step.
+
+        vectors (B, K, 3) and scan points (B, P, 3), both in the core frame -> better vectors.
+        """
+        assert self.corrector is not None
+        moved = apply_shape_functions(self.anchor_phi, vectors)  # B A 3
+        seen = two_way_offsets(self.anchors + moved, points)
+        features = torch.cat([seen[..., :6] * 10.0, seen[..., 6:], moved * 3.0], -1)
+        return vectors + 0.1 * self.corrector(features.flatten(1)).unflatten(-1, (-1, 3))
+
+    def forward(self, points: torch.Tensor) -> torch.Tensor:
+        """Scan points in the core frame (B, P, 3) -> node vectors (B, K, 3)."""
+        vectors = self.decoder(self.encoder(self.encoder.features(points)))
+        for _ in range(self.config.corrections):
+            vectors = self.correct(vectors, points)
+        return vectors

@@ -1,0 +1,58 @@
+"""A trained model ready for use: card, template, network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from meshmatch.errors import ModelError
+from meshmatch.models.card import ModelCard
+from meshmatch.models.checkpoint import load_weights
+from meshmatch.models.deformer import Deformer, NetworkConfig
+from meshmatch.models.registry import find_model
+from meshmatch.templates.template import Template, load_template
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedModel:
+    """What fitting needs of a category. ``network`` is in evaluation mode, on the CPU."""
+
+    card: ModelCard
+    template: Template
+    network: Deformer
+
+
+def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
+    """A network of the right shape whose weights and buffers are still to be read; K nodes."""
+    return Deformer(
+        config,
+        nodes=torch.zeros(K, 3),
+        anchors=torch.zeros(K, 3),
+        anchor_phi=torch.zeros(K, K),
+        basis=torch.zeros(config.basis, 3),
+        align_basis=torch.zeros(max(config.align_basis, 1), 3),
+    )
+
+
+def load_model(name: str | Path = "human") -> TrainedModel:
+    """Load a model by its registry name or folder.
+
+    Raises
+    ------
+    ModelError
+        Unknown name, damaged files, or a template that is not the one the model was trained with.
+    """
+    folder, card = find_model(name)
+    template = load_template(folder / "template.safetensors")
+    if template.hash != card.template_hash:
+        raise ModelError(
+            f"model {card.name} was trained with another template ({card.template_hash}, not {template.hash})",
+            "add the model again from its source",
+        )
+    network = blank_deformer(NetworkConfig.from_dict(card.network), template.K)
+    expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
+    network.load_state_dict(load_weights(folder / "weights.safetensors", expected))
+    network.eval()
+    return TrainedModel(card, template, network)

@@ -1,0 +1,216 @@
+"""The only composer: two files in, a map out. The command line and Python users take the same road."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from meshmatch.config import set_threads
+from meshmatch.errors import InputError, OptionError
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_shape import FitConfig, Refine
+from meshmatch.fitting.fit_shape import fit_shape as lay_template
+from meshmatch.maps.build import build_map
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.trained import TrainedModel, load_model
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.repair import Repaired, repair
+from meshmatch.shapes.shape import Shape
+
+# What is going on, on which shape, and which share of it is done.
+Progress = Callable[[str, str, float], None]
+# Pairs of corresponding points: vertices of the source (N,), vertices of the target (N,).
+LandmarkPairs = tuple[np.ndarray, np.ndarray]
+MINIMUM_FACES = 50
+MINIMUM_POINTS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class MatchResult:
+    """What `match` found: the map, both fits, the time in seconds, and what repair did to each shape."""
+
+    map: VertexMap
+    source_fit: Fit
+    target_fit: Fit
+    seconds: float
+    notes: tuple[str, ...]
+
+
+def match(
+    source: Shape | str | Path,
+    target: Shape | str | Path,
+    *,
+    model: str | Path = "human",
+    refine: Refine = "nodes",
+    polish: str = "auto",
+    seed: int = 0,
+    up: str | None = None,
+    front: str | None = None,
+    landmarks: LandmarkPairs | None = None,
+    workers: int = 2,
+    progress: Progress | None = None,
+) -> MatchResult:
+    """Match two shapes: for every vertex of the source its vertex on the target.
+
+    Parameters
+    ----------
+    source, target : Shape or path
+        Meshes of the model's category in any unit, turn and resolution.
+    model : str
+        Name in the registry, or a model folder.
+    refine : {"nodes", "latent", "none"}
+        Gauss-Newton on the nodes, the paper's search over codes, or the network alone.
+    up, front : str, optional
+        Axes of both files, such as "y" or "-z"; searched where not given.
+    landmarks : (source vertices (N,), target vertices (N,)), optional
+        Known pairs, which the map then honours.
+    workers : int
+        Threads; two fits run side by side.
+
+    Returns
+    -------
+    MatchResult
+        ``result.map.index[i]`` is the vertex of the target matched to vertex i of the source.
+
+    Raises
+    ------
+    MeshmatchError
+        The user's files or choices; see `meshmatch.errors`.
+    """
+    began = time.monotonic()
+    loaded = read_model(model)
+    shapes = [as_shape(source), as_shape(target)]
+    clean = [usable(shape) for shape in shapes]
+    config = FitConfig(refine=refine, seed=seed, up=up, front=front)
+    set_threads(1 if workers > 1 else workers)
+    names = _apart(shapes[0].name, shapes[1].name)
+
+    def one(number: int) -> Fit:
+        def tell(what: str, share: float) -> None:
+            if progress is not None:
+                progress(what, names[number], share)
+
+        return lay_template(loaded, clean[number].shape, config, None, tell)
+
+    with ThreadPoolExecutor(max(1, min(2, workers))) as pool:
+        fits = list(pool.map(one, (0, 1)))
+    if landmarks is not None:
+        fits = _honour(loaded, clean, fits, landmarks, config)
+    found = build_map(clean[0], fits[0], clean[1], fits[1], polish=polish, workers=workers)
+    notes = tuple(f"{shape.name}: {note}" for shape, part in zip(shapes, clean, strict=True) for note in part.notes)
+    return MatchResult(found, fits[0], fits[1], time.monotonic() - began, notes)
+
+
+def register(
+    shape: Shape | str | Path,
+    *,
+    model: str | Path = "human",
+    refine: Refine = "nodes",
+    seed: int = 0,
+    up: str | None = None,
+    front: str | None = None,
+    progress: Progress | None = None,
+) -> Fit:
+    """Lay the model's template on one shape; see `match` for the parameters."""
+    shape = as_shape(shape)
+
+    def tell(what: str, share: float) -> None:
+        if progress is not None:
+            progress(what, shape.name, share)
+
+    config = FitConfig(refine=refine, seed=seed, up=up, front=front)
+    return lay_template(read_model(model), usable(shape).shape, config, None, tell)
+
+
+def fit_shape(
+    shape: Shape, *, model: str | Path = "human", refine: Refine = "nodes", seed: int = 0
+) -> Fit:
+    """`register` for shapes that are loaded already."""
+    return register(shape, model=model, refine=refine, seed=seed)
+
+
+def map_between(
+    source: Shape, source_fit: Fit, target: Shape, target_fit: Fit, *, polish: str = "auto", workers: int = 1
+) -> VertexMap:
+    """The map between two shapes that were fitted with the same model."""
+    return build_map(usable(source), source_fit, usable(target), target_fit, polish=polish, workers=workers)
+
+
+@lru_cache(maxsize=2)
+def read_model(name: str | Path) -> TrainedModel:
+    """Load a model once."""
+    return load_model(name)
+
+
+def as_shape(shape: Shape | str | Path) -> Shape:
+    """A shape, loaded if it is a path."""
+    return shape if isinstance(shape, Shape) else load_shape(shape)
+
+
+@lru_cache(maxsize=2)
+def usable(shape: Shape) -> Repaired:
+    """Repair a shape and refuse what cannot be fitted.
+
+    Raises
+    ------
+    InputError
+        Too few faces or points, no extent, or two large parts far apart.
+    """
+    clean = repair(shape)
+    fixed = clean.shape
+    if fixed.is_cloud and fixed.V < MINIMUM_POINTS:
+        raise InputError(f"{shape.name} has only {fixed.V} points", f"at least {MINIMUM_POINTS} are needed")
+    if not fixed.is_cloud and fixed.F < MINIMUM_FACES:
+        raise InputError(
+            f"{shape.name} has only {fixed.F} usable triangles", f"at least {MINIMUM_FACES} are needed to see a shape"
+        )
+    if not fixed.area > 0:
+        raise InputError(f"{shape.name} has no surface area", "are all its points the same, or on a line?")
+    if clean.far_parts:
+        raise InputError(
+            f"{shape.name} holds {clean.far_parts + 1} large parts far apart",
+            "save each object as a file of its own",
+        )
+    return clean
+
+
+def _honour(
+    model: TrainedModel, clean: list[Repaired], fits: list[Fit], landmarks: LandmarkPairs, config: FitConfig
+) -> list[Fit]:
+    """Fit again with known pairs.
+
+    A pair is carried to the template through the first fits; the template point between the two answers is
+    then pulled to the landmark on both shapes.
+    """
+    from meshmatch.fitting.landmarks import template_vertices
+
+    places = []
+    for part, chosen in zip(clean, landmarks, strict=True):
+        chosen = np.asarray(chosen, np.int64)
+        if chosen.ndim != 1 or len(chosen) == 0 or chosen.min() < 0:
+            raise OptionError("landmarks must be lists of vertex numbers", "one pair of vertices a line")
+        if chosen.max() >= len(part.original_to_repaired):
+            raise OptionError(
+                f"landmark vertex {chosen.max()} is not on {part.shape.name}, which has "
+                f"{len(part.original_to_repaired)} vertices",
+                "numbers start at 0; the source comes first",
+            )
+        places.append(part.shape.verts[part.original_to_repaired[chosen]])
+    if len(places[0]) != len(places[1]):
+        raise OptionError("landmarks must come in pairs", "one pair of vertices a line")
+    at = template_vertices(model.template, fits, places)
+    return [
+        lay_template(model, part.shape, config, (at, place))
+        for part, place in zip(clean, places, strict=True)
+    ]
+
+
+def _apart(source: str, target: str) -> tuple[str, str]:
+    """Names to show, told apart where they are the same."""
+    return (source, target) if source != target else (f"{source} (source)", f"{target} (target)")

@@ -1,0 +1,149 @@
+"""A template bundle: the mesh that is moved, its control nodes and its labels."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from meshmatch.errors import TemplateError
+from meshmatch.outputs import replace_on_success
+from meshmatch.shapes.shape import Shape
+
+SCHEMA = 1
+_ARRAYS = ("verts", "faces", "dense_verts", "dense_faces", "nodes", "labels", "core")
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """The reference shape of a category.
+
+    Frame: surface area 1, area-weighted centroid at 0; human templates stand y up, face +z, left hand at +x.
+
+    Attributes
+    ----------
+    name : str
+    shape : Shape
+        Low resolution mesh: what fitting moves. V vertices.
+    dense : Shape
+        High resolution mesh of the same surface, for `register` and pictures.
+    nodes : float64 array (K, 3)
+        Control nodes.
+    radius : float
+        Support radius of every node.
+    labels : int64 array (V,)
+        Part of each vertex, an index into ``label_names``.
+    label_names : tuple of str
+    core : int64 array (C,)
+        Vertices that move together as nearly one rigid piece and fix the category's frame (a torso;
+        every vertex where a category has no such part).
+    pose, source, licence : str
+    """
+
+    name: str
+    shape: Shape
+    dense: Shape
+    nodes: np.ndarray
+    radius: float
+    labels: np.ndarray
+    label_names: tuple[str, ...]
+    core: np.ndarray
+    pose: str = ""
+    source: str = ""
+    licence: str = ""
+
+    def __post_init__(self) -> None:
+        if self.nodes.ndim != 2 or self.nodes.shape[1] != 3 or not np.isfinite(self.nodes).all():
+            raise TemplateError(f"template {self.name}: nodes must be finite with shape (K, 3)")
+        if self.labels.shape != (self.shape.V,) or self.labels.min() < 0:
+            raise TemplateError(f"template {self.name}: one label per vertex is needed")
+        if len(self.label_names) <= self.labels.max():
+            raise TemplateError(f"template {self.name}: a label has no name")
+        if len(self.core) < 3 or self.core.min() < 0 or self.core.max() >= self.shape.V:
+            raise TemplateError(f"template {self.name}: the core needs at least three valid vertices")
+        if not self.radius > 0:
+            raise TemplateError(f"template {self.name}: the radius must be positive")
+
+    @property
+    def K(self) -> int:
+        return len(self.nodes)
+
+    @cached_property
+    def hash(self) -> str:
+        """First 16 hex digits of the SHA-256 of everything that a model depends on."""
+        digest = hashlib.sha256()
+        for array in (self.shape.verts, self.shape.faces, self.nodes, np.array([self.radius]), self.core):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()[:16]
+
+
+def save_template(template: Template, path: str | Path) -> None:
+    """Write a bundle as one safetensors file (arrays, and a JSON header for the words)."""
+    arrays = {
+        "verts": template.shape.verts,
+        "faces": template.shape.faces.astype(np.int32),
+        "dense_verts": template.dense.verts.astype(np.float32),
+        "dense_faces": template.dense.faces.astype(np.int32),
+        "nodes": template.nodes,
+        "labels": template.labels.astype(np.int32),
+        "core": template.core.astype(np.int32),
+    }
+    words = {
+        "schema": SCHEMA,
+        "name": template.name,
+        "radius": template.radius,
+        "label_names": list(template.label_names),
+        "pose": template.pose,
+        "source": template.source,
+        "licence": template.licence,
+        "hash": template.hash,
+    }
+    with replace_on_success(path) as temporary:
+        save_file(
+            {name: np.ascontiguousarray(a) for name, a in arrays.items()}, temporary, {"template": json.dumps(words)}
+        )
+
+
+def load_template(path: str | Path) -> Template:
+    """Read a bundle and check its hash.
+
+    Raises
+    ------
+    TemplateError
+        If the file is missing, damaged, of another schema, or does not match its hash.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise TemplateError(f"no template bundle at {path}", "make one with `meshmatch prepare`")
+    try:
+        with safe_open(str(path), framework="np") as file:
+            words = json.loads((file.metadata() or {})["template"])
+            if set(file.keys()) != set(_ARRAYS):
+                raise KeyError("arrays")
+            arrays = {name: file.get_tensor(name) for name in _ARRAYS}
+    except (SafetensorError, KeyError, ValueError, OSError) as error:
+        raise TemplateError(f"{path.name} is not a template bundle", "make one with `meshmatch prepare`") from error
+    if words.get("schema") != SCHEMA:
+        raise TemplateError(f"{path.name} has template schema {words.get('schema')}, not {SCHEMA}", "update meshmatch")
+    template = Template(
+        name=words["name"],
+        shape=Shape(arrays["verts"].astype(np.float64), arrays["faces"].astype(np.int64), words["name"]),
+        dense=Shape(arrays["dense_verts"].astype(np.float64), arrays["dense_faces"].astype(np.int64), words["name"]),
+        nodes=arrays["nodes"].astype(np.float64),
+        radius=float(words["radius"]),
+        labels=arrays["labels"].astype(np.int64),
+        label_names=tuple(words["label_names"]),
+        core=arrays["core"].astype(np.int64),
+        pose=words["pose"],
+        source=words["source"],
+        licence=words["licence"],
+    )
+    if template.hash != words["hash"]:
+        raise TemplateError(f"{path.name} is damaged: its content does not match its hash", "make or fetch it again")
+    return template

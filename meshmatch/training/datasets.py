@@ -1,0 +1,120 @@
+"""Training batches, drawn statelessly: batch s is a function of (seed, s), which makes resuming exact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from meshmatch.models.encoder import BasisEncoder
+from meshmatch.training.bodies import sample_bodies
+from meshmatch.training.rig import Rig
+from meshmatch.training.scans import (
+    ScanConfig,
+    bump,
+    normalise,
+    random_rotations,
+    rigid_fit,
+    sample_scan,
+    small_rotations,
+)
+
+# Draws shapes with the template's connectivity: (count, generator) -> vertices (count, V, 3), any unit.
+Source = Callable[[int, torch.Generator], torch.Tensor]
+
+
+def body_source(rig: Rig) -> Source:
+    """Generated human bodies without end."""
+    return lambda count, generator: sample_bodies(rig, count, generator)
+
+
+def registered_source(shapes: torch.Tensor) -> Source:
+    """A fixed set of registered shapes (N, V, 3), drawn with replacement."""
+    return lambda count, generator: shapes[torch.randint(len(shapes), (count,), generator=generator)]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """One training batch; lengths in units of sqrt(surface area).
+
+    points : (B, P, 3) scan in a roughly right core frame
+    targets : (B, M, 3) where the template's loss points belong, same frame
+    encode_features : what the encoder reads of ``points``
+    align_features, align_rotation, align_centre : the aligner's input (any turn) and answer
+    """
+
+    points: torch.Tensor
+    targets: torch.Tensor
+    encode_features: torch.Tensor
+    align_features: torch.Tensor | None = None
+    align_rotation: torch.Tensor | None = None
+    align_centre: torch.Tensor | None = None
+
+    def to(self, device: torch.device) -> Batch:
+        return Batch(*(None if v is None else v.to(device) for v in vars(self).values()))
+
+
+@dataclass(frozen=True, eq=False)
+class BatchDataset(torch.utils.data.Dataset):
+    """Item s is the batch of training step s.
+
+    Attributes
+    ----------
+    template_core : (C, 3) template vertices of the core, template frame; core : (C,) their indices
+    loss_points : (M,) vertex indices that are supervised
+    scans_per_shape : each drawn shape is scanned this many times
+    """
+
+    source: Source
+    faces: torch.Tensor
+    template_core: torch.Tensor
+    core: torch.Tensor
+    loss_points: torch.Tensor
+    encoder: torch.nn.Module
+    aligner: BasisEncoder | None
+    scan: ScanConfig
+    shapes: int = 32
+    scans_per_shape: int = 2
+    seed: int = 0
+    length: int = 1
+
+    def __len__(self) -> int:
+        return self.length
+
+    def generator(self, step: int) -> torch.Generator:
+        # A large odd multiplier keeps the streams of different seeds apart.
+        return torch.Generator().manual_seed((self.seed * 2_654_435_761 + step) % (2**63))
+
+    @torch.no_grad()
+    def __getitem__(self, step: int) -> Batch:
+        generator = self.generator(step)
+        verts = self.source(self.shapes, generator)
+        scale = verts.flatten(1).std(1)[:, None, None]
+        verts = bump(verts / scale * 0.3, self.scan.bumps, generator)
+        verts, areas = normalise(verts, self.faces)
+        if self.scans_per_shape > 1:
+            verts = verts.repeat_interleave(self.scans_per_shape, 0)
+            areas = areas.repeat_interleave(self.scans_per_shape, 0)
+        B = len(verts)
+        size = 1 + self.scan.scale * torch.randn(B, 1, 1, generator=generator).clamp(-2, 2)
+        verts = verts * size
+        points = sample_scan(verts, areas, self.faces, self.scan, generator)
+        R, t = rigid_fit(self.template_core, verts[:, self.core])
+
+        # The roughly right frame in which the encoder works: x_core = S R^T (x - t) + shift.
+        turn = small_rotations(B, generator) @ R.transpose(1, 2)
+        shift = 0.03 * torch.randn(B, 1, 3, generator=generator)
+        in_core = (points - t[:, None]) @ turn.transpose(1, 2) + shift
+        targets = (verts[:, self.loss_points] - t[:, None]) @ turn.transpose(1, 2) + shift
+        features = self.encoder.features(in_core)
+        if self.aligner is None:
+            return Batch(in_core, targets, features)
+        # The aligner sees the scan centred on its own points and turned anywhere.
+        middle = points.mean(1, keepdim=True)
+        anywhere = random_rotations(B, generator)
+        turned = (points - middle) @ anywhere.transpose(1, 2)
+        centre = (anywhere @ (t - middle[:, 0])[..., None])[..., 0]
+        return Batch(
+            in_core, targets, features, self.aligner.features(turned), anywhere @ R, centre
+        )

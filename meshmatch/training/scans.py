@@ -1,0 +1,111 @@
+"""Turn clean generated shapes into what a scanner or a modeller delivers: samples, noise, holes, any turn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from meshmatch.training.poses import DEGREE, rotation_from_vector
+
+
+@dataclass(frozen=True)
+class ScanConfig:
+    """How rough the simulated scans are. Lengths in units of sqrt(surface area)."""
+
+    points: int = 2048
+    noise: float = 0.012
+    holes: float = 0.3
+    outliers: float = 0.1
+    density: float = 0.6
+    bumps: float = 0.004
+    scale: float = 0.04
+
+
+def surface_area(verts: torch.Tensor, faces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Face areas (B, F) and their area-weighted centroid (B, 3)."""
+    a, b, c = (verts[:, faces[:, k]] for k in range(3))
+    area = 0.5 * torch.linalg.cross(b - a, c - a).square().sum(-1).sqrt()
+    centroid = (area[..., None] * (a + b + c)).sum(1) / (3 * area.sum(1, keepdim=True))
+    return area, centroid
+
+
+def normalise(verts: torch.Tensor, faces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Scale every shape to area 1 with its centroid at 0; returns vertices and normalised face areas."""
+    area, centroid = surface_area(verts, faces)
+    total = area.sum(1)
+    return (verts - centroid[:, None]) / total.sqrt()[:, None, None], area / total[:, None]
+
+
+def random_rotations(B: int, generator: torch.Generator) -> torch.Tensor:
+    """Uniform rotations (B, 3, 3) from random unit quaternions."""
+    q = torch.nn.functional.normalize(torch.randn(B, 4, generator=generator), dim=1)
+    w, x, y, z = q.unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def rigid_fit(source: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Best rigid motion: target ~ R source + t (Kabsch), batched. source (N, 3), target (B, N, 3)."""
+    centre = target.mean(1)
+    covariance = (target - centre[:, None]).transpose(1, 2) @ (source - source.mean(0))
+    U, _, Vh = torch.linalg.svd(covariance)
+    sign = torch.det(U @ Vh)
+    U = torch.cat([U[..., :2], U[..., 2:] * sign[:, None, None]], -1)
+    R = U @ Vh
+    return R, centre - (R @ source.mean(0)[:, None])[..., 0]
+
+
+def small_rotations(B: int, generator: torch.Generator) -> torch.Tensor:
+    """Mostly a few degrees, sometimes tens: what an aligner gets wrong."""
+    size = torch.where(torch.rand(B, 1, generator=generator) < 0.75, 6.0, 18.0) * DEGREE
+    return rotation_from_vector(size * torch.randn(B, 3, generator=generator))
+
+
+def bump(verts: torch.Tensor, amplitude: float, generator: torch.Generator) -> torch.Tensor:
+    """Smooth random displacement (clothes, soft tissue, another modeller's hand), unit: sqrt(area)."""
+    B = len(verts)
+    size = amplitude * torch.rand(B, 1, 1, generator=generator)
+    for frequency in (8.0, 20.0):
+        direction = torch.randn(B, 3, 3, generator=generator) * frequency
+        phase = torch.rand(B, 1, 3, generator=generator) * 6.283
+        verts = verts + size * torch.sin(verts @ direction + phase)
+    return verts
+
+
+def sample_scan(
+    verts: torch.Tensor, areas: torch.Tensor, faces: torch.Tensor, config: ScanConfig, generator: torch.Generator
+) -> torch.Tensor:
+    """Points (B, P, 3) on the surface, with uneven density, holes, noise and outliers."""
+    B, P = len(verts), config.points
+    a, b, c = (verts[:, faces[:, k]] for k in range(3))
+    centres = (a + b + c) / 3  # B F 3
+    chance = areas.clone()
+    waves = torch.randn(B, 3, 1, generator=generator) * 4
+    strength = config.density * torch.rand(B, 1, generator=generator)
+    chance = chance * (strength * torch.sin((centres @ waves)[..., 0])).exp()
+    # A hole swallows everything within a ball around a random surface point.
+    for _ in range(2):
+        here = torch.randint(centres.shape[1], (B,), generator=generator)
+        middle = centres[torch.arange(B), here]
+        radius = 0.16 * torch.rand(B, generator=generator)
+        radius = radius * (torch.rand(B, generator=generator) < config.holes)
+        inside = (centres - middle[:, None]).square().sum(-1) < radius[:, None] ** 2
+        chance = torch.where(inside, chance * 1e-4, chance)
+    pick = torch.multinomial(chance, P, True, generator=generator)  # B P
+    corner = faces[pick]  # B P 3
+    weight = torch.rand(B, P, 2, generator=generator)
+    weight = torch.where(weight.sum(-1, keepdim=True) > 1, 1 - weight, weight)
+    rows = torch.arange(B)[:, None]
+    a, b, c = (verts[rows, corner[..., k]] for k in range(3))
+    points = a + weight[..., :1] * (b - a) + weight[..., 1:] * (c - a)
+    sigma = config.noise * torch.rand(B, 1, 1, generator=generator) ** 3
+    points = points + sigma * torch.randn(B, P, 3, generator=generator)
+    stray = torch.rand(B, P, generator=generator) < (
+        0.02 * (torch.rand(B, 1, generator=generator) < config.outliers)
+    )
+    return torch.where(stray[..., None], 0.5 * torch.randn(B, P, 3, generator=generator), points)

@@ -1,0 +1,100 @@
+"""From a template and a source of shapes to an untrained network, its data and its loss points."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from meshmatch.fields.mls import Kernel, build_field
+from meshmatch.models.deformer import Deformer, NetworkConfig
+from meshmatch.shapes.sampling import farthest_points
+from meshmatch.templates.template import Template
+from meshmatch.training.datasets import BatchDataset, Source
+from meshmatch.training.losses import LossPoints
+from meshmatch.training.scans import ScanConfig
+
+
+def fill_basis(points: torch.Tensor, M: int, generator: torch.Generator) -> torch.Tensor:
+    """Basis points (M, 3) spread where shapes of the category are: farthest points of jittered samples."""
+    flat = points.flatten(0, 1)
+    flat = flat[torch.randperm(len(flat), generator=generator)[:20_000]]
+    jittered = flat + 0.06 * torch.randn(len(flat), 3, generator=generator)
+    # Farthest points run to the outliers of a set: leave out the outermost ones first.
+    keep = jittered.norm(dim=1) < torch.quantile(jittered.norm(dim=1), 0.995)
+    jittered = jittered[keep]
+    return jittered[torch.from_numpy(farthest_points(jittered.double().numpy(), M))]
+
+
+def anchor_vertices(template: Template, A: int) -> np.ndarray:
+    """Template vertices (A,) where corrections look at the scan."""
+    return farthest_points(template.shape.verts, A)
+
+
+def build_deformer(
+    template: Template, source: Source, network: NetworkConfig, scan: ScanConfig, kernel: Kernel, seed: int
+) -> Deformer:
+    """An untrained network for a template, its basis points laid where the source's shapes are."""
+    torch.manual_seed(seed)
+    nodes = torch.from_numpy(template.nodes).float()
+    anchors = template.shape.verts[anchor_vertices(template, template.K)]
+    anchor_phi = build_field(anchors, template.nodes, template.radius, kernel).phi.to_dense()
+    empty = torch.zeros(1, 3)
+    basis = align_basis = empty
+    if network.encoder == "basis" or network.align_basis:
+        probe = NetworkConfig(align_width=8, width=8, depth=0, correct_width=8)
+        blank = Deformer(probe, nodes, torch.from_numpy(anchors).float(), anchor_phi, empty, empty)
+        data = build_dataset(template, source, blank, scan, shapes=48, scans_per_shape=2, seed=seed)
+        generator = torch.Generator().manual_seed(seed)
+        batch = data[0]
+        basis = fill_basis(batch.points, network.basis, generator)
+        if network.align_basis:
+            turned = batch.points - batch.points.mean(1, keepdim=True)
+            direction = torch.nn.functional.normalize(torch.randn(turned.shape, generator=generator), dim=-1)
+            ball = turned.norm(dim=-1, keepdim=True) * direction
+            align_basis = fill_basis(ball, network.align_basis, generator)
+    torch.manual_seed(seed)
+    return Deformer(network, nodes, torch.from_numpy(anchors).float(), anchor_phi, basis, align_basis)
+
+
+def loss_vertices(template: Template, M: int) -> np.ndarray:
+    return farthest_points(template.shape.verts, min(M, template.shape.V))
+
+
+def build_dataset(
+    template: Template,
+    source: Source,
+    model: Deformer,
+    scan: ScanConfig,
+    shapes: int,
+    scans_per_shape: int,
+    seed: int,
+    length: int = 1,
+    supervised: int = 1000,
+) -> BatchDataset:
+    """Batches of a source for a model, supervised on ``supervised`` template vertices."""
+    verts = torch.from_numpy(np.array(template.shape.verts)).float()
+    core = torch.from_numpy(template.core)
+    return BatchDataset(
+        source=source,
+        faces=torch.from_numpy(np.array(template.shape.faces)),
+        template_core=verts[core],
+        core=core,
+        loss_points=torch.from_numpy(loss_vertices(template, supervised)),
+        encoder=model.encoder,
+        aligner=model.aligner,
+        scan=scan,
+        shapes=shapes,
+        scans_per_shape=scans_per_shape,
+        seed=seed,
+        length=length,
+    )
+
+
+def build_loss_points(
+    template: Template, kernel: Kernel, supervised: int = 1000, strained: int = 400
+) -> LossPoints:
+    """Dense shape functions at the supervised vertices; their gradient at the first ``strained`` of them."""
+    verts = template.shape.verts[loss_vertices(template, supervised)]
+    field = build_field(verts, template.nodes, template.radius, kernel)
+    gradient = field.gradient.to_dense()[: 3 * strained]
+    return LossPoints(torch.from_numpy(verts).float(), field.phi.to_dense(), gradient)
