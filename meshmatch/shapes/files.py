@@ -66,7 +66,8 @@ def load_shape(path: str | Path) -> Shape:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
     if not data:
         raise InputError(f"{path.name} is empty (0 bytes)", "was the download or the export cut short?")
-    raw = _READERS[suffix](path, data)
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
+        raw = _READERS[suffix](path, data)
     return _shape(path.name, raw)
 
 
@@ -101,8 +102,8 @@ def save_shape(path: str | Path, shape: Shape) -> None:
 def _shape(name: str, raw: Raw) -> Shape:
     if len(raw.verts) == 0:
         raise InputError(f"{name} holds no vertices", "is it a mesh or a point cloud at all?")
-    # sqrt of the largest float: squared lengths must not overflow
-    usable = np.asarray((np.abs(raw.verts) < 1e150).all(axis=1))
+    # squared areas must not overflow; a position of 1e60 is no position either
+    usable = np.asarray((np.abs(raw.verts) < 1e60).all(axis=1))
     if usable.all():
         return Shape(raw.verts, raw.faces, name, raw.colors)
     if not usable.any():

@@ -80,7 +80,7 @@ def edges_of(faces: Ints) -> Edges:
     """Sort the edges of `faces`."""
     ordered = np.sort(directed_edges(faces))
     group = ordered >> 1
-    begins = np.flatnonzero(np.concatenate([[True], group[1:] != group[:-1]]))
+    begins = np.flatnonzero(np.diff(group, prepend=-1))
     return Edges(ordered, begins, np.diff(np.append(begins, len(group))))
 
 
@@ -94,8 +94,9 @@ def open_edges(faces: Ints) -> Ints:
     """(N, 2) vertices of the edges that have one face."""
     V = _stride(faces)
     keys = np.sort(edge_keys(faces, V))
-    alone = np.concatenate([[True], keys[1:] != keys[:-1]])
-    alone[:-1] &= alone[1:].copy()
+    alone = np.ones(len(keys), bool)
+    alone[1:] &= keys[1:] != keys[:-1]
+    alone[:-1] &= keys[1:] != keys[:-1]
     return np.stack([keys[alone] // V, keys[alone] % V], axis=1)
 
 

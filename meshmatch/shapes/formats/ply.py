@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged, fan
-from meshmatch.shapes.formats.ply_body import BinaryBody, Column, Element, Property, TextBody
+from meshmatch.shapes.formats.ply_body import BinaryBody, Element, Property, TextBody
 from meshmatch.shapes.shape import Shape
 
 _TYPES = {

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
@@ -36,7 +37,7 @@ def read_npy(path: Path, data: bytes) -> Raw:
     try:
         # mapped, not loaded: a header that promises more than the file holds allocates nothing
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError, SyntaxError, TypeError) as error:
+    except (ValueError, OSError, EOFError, SyntaxError, TypeError, TokenError) as error:
         if "Python objects" in str(error) or "pickle" in str(error):
             raise InputError(
                 f"{name} does not hold an array of numbers", "save points as an (N, 3) array"

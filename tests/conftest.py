@@ -1,0 +1,84 @@
+"""Small shapes made of nothing but NumPy, and the evaluation data where it is there."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: many small products
+
+import numpy as np
+import pytest
+
+from meshmatch.shapes.shape import Shape
+
+
+@pytest.fixture(scope="session")
+def bench() -> Path:
+    """The folder of evaluation data beside the repository; tests that need it are skipped without it."""
+    folder = Path(__file__).resolve().parents[2] / "shared" / "bench"
+    if not folder.is_dir():
+        pytest.skip(f"no evaluation data at {folder}")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def cube() -> Shape:
+    """The unit cube [0, 1]^3: 8 vertices, 12 triangles, outward."""
+    verts = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return Shape(verts, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]), "cube")
+
+
+@pytest.fixture(scope="session")
+def make_sphere() -> Callable[[int], Shape]:
+    """Unit spheres: an icosahedron whose triangles are split in four as often as asked."""
+    return icosphere
+
+
+@pytest.fixture(scope="session")
+def sphere() -> Shape:
+    """The unit sphere: 642 vertices, 1280 triangles, outward."""
+    return icosphere(3)
+
+
+@pytest.fixture(scope="session")
+def torus() -> Shape:
+    """Radii 1 and 0.4 around the z axis: 1600 vertices, 3200 triangles, outward."""
+    n, m = 50, 32
+    u, v = np.meshgrid(np.arange(n) * 2 * np.pi / n, np.arange(m) * 2 * np.pi / m, indexing="ij")
+    ring = 1 + 0.4 * np.cos(v)
+    verts = np.stack([ring * np.cos(u), ring * np.sin(u), 0.4 * np.sin(v)], axis=-1).reshape(-1, 3)
+    a = np.arange(n * m).reshape(n, m)
+    b = np.roll(a, -1, axis=0)
+    c, d = np.roll(b, -1, axis=1), np.roll(a, -1, axis=1)
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    return Shape(verts, faces, "torus")
+
+
+def icosphere(splits: int) -> Shape:
+    """The unit sphere with 20 * 4^splits triangles, outward."""
+    g = (1 + 5**0.5) / 2
+    verts = np.array(
+        [
+            *[(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g)],
+            *[(0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)],
+        ],
+        float,
+    )
+    faces = np.array(
+        [
+            *[(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2)],
+            *[(10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5)],
+            *[(2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)],
+        ]
+    )
+    for _ in range(splits):
+        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        unique, inverse = np.unique(edges, axis=0, return_inverse=True)
+        ab, bc, ca = len(verts) + inverse.reshape(3, -1)
+        a, b, c = faces.T
+        verts = np.concatenate([verts, verts[unique].mean(axis=1)])
+        faces = np.concatenate(
+            [np.stack(t, 1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+        )
+    return Shape(verts / np.linalg.norm(verts, axis=1, keepdims=True), faces, f"sphere{splits}")

@@ -1,0 +1,169 @@
+"""Shape and Frame: by hand on a cube, then the laws."""
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import InputError
+from meshmatch.shapes.shape import Frame, Shape
+
+
+def test_cube_by_hand(cube: Shape) -> None:
+    assert (cube.V, cube.F, cube.is_cloud) == (8, 12, False)
+    assert cube.area == pytest.approx(6.0)
+    np.testing.assert_allclose(cube.face_areas, 0.5)
+    np.testing.assert_allclose(cube.bounds, [[0, 0, 0], [1, 1, 1]])
+    assert cube.diagonal == pytest.approx(3**0.5)
+    centers = cube.verts[cube.faces].mean(axis=1)
+    np.testing.assert_allclose(np.abs(cube.face_normals).max(axis=1), 1.0)
+    assert (np.einsum("fi,fi->f", cube.face_normals, centers - 0.5) > 0.4).all()  # outward
+
+
+def test_sphere_normals_point_outward(sphere: Shape) -> None:
+    np.testing.assert_allclose(np.linalg.norm(sphere.vertex_normals, axis=1), 1.0)
+    assert np.einsum("vi,vi->v", sphere.vertex_normals, sphere.verts).min() > 0.999
+    assert sphere.area == pytest.approx(4 * np.pi, rel=0.02)
+    assert sphere.vertex_areas.sum() == pytest.approx(sphere.area)
+
+
+def test_vertex_normals_are_weighted_by_area() -> None:
+    verts = [[0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 1]]
+    shape = Shape(verts, [[0, 1, 2], [0, 2, 3]])  # areas 4.5 up and 1.5 along x
+    np.testing.assert_allclose(shape.vertex_normals[0], np.array([1.5, 0, 4.5]) / np.hypot(1.5, 4.5))
+    np.testing.assert_allclose(shape.vertex_normals[1], [0, 0, 1])
+
+
+def test_flat_face_has_a_zero_normal_and_no_nan() -> None:
+    shape = Shape([[0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 5, 5]], [[0, 1, 2]])
+    assert shape.area == 0
+    assert (shape.face_normals == 0).all()
+    assert (shape.vertex_normals == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("verts", "faces", "words"),
+    [
+        (np.zeros((3, 2)), [[0, 1, 2]], "must be an array of (V, 3)"),
+        (np.zeros(3), [], "must be an array of (V, 3)"),
+        (np.zeros((0, 3)), [], "has no vertices"),
+        (np.zeros((3, 3)), [[0, 1]], "must be an array of (F, 3)"),
+        (np.zeros((3, 3)), [[0, 1, 3]], "names vertex 3, but there are only 3"),
+        (np.zeros((3, 3)), [[0, 1, -1]], "names vertex -1"),
+        (np.zeros((3, 3)), [[0.0, 1.0, 2.0]], "must be integers"),
+        ([[0, 0, np.nan]], [], "not finite"),
+        ([[0, 0, np.inf]], [], "not finite"),
+        ([["a", 0, 0]], [], "not an array of numbers"),
+    ],
+)
+def test_shape_refuses(verts: object, faces: object, words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Shape(verts, faces, "thing")
+    assert words in caught.value.message
+    assert "thing" in caught.value.message
+
+
+def test_shape_refuses_wrong_colors_and_flags() -> None:
+    with pytest.raises(InputError, match="colors must be"):
+        Shape(np.zeros((2, 3)), [], colors=np.zeros((2, 3)))
+    with pytest.raises(InputError, match="invalid must be"):
+        Shape(np.zeros((2, 3)), [], invalid=np.zeros(3, bool))
+
+
+def test_arrays_are_its_own_and_read_only() -> None:
+    verts, faces = np.zeros((3, 3)), np.array([[0, 1, 2]])
+    shape = Shape(verts, faces)
+    verts[0] = 9
+    faces[0] = 0
+    assert shape.verts[0, 0] == 0
+    assert shape.faces[0, 2] == 2
+    for array in (shape.verts, shape.faces, shape.face_areas, shape.vertex_normals, shape.bounds):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+    assert verts.flags.writeable  # the caller's array was not frozen
+    assert Shape(shape.verts, shape.faces).verts is shape.verts  # and nothing is copied twice
+
+
+def test_read_only_view_of_a_writable_array_is_copied() -> None:
+    base = np.zeros((3, 3))
+    view = base[:]
+    view.setflags(write=False)
+    shape = Shape(view, [])
+    base[0] = 9
+    assert shape.verts[0, 0] == 0
+
+
+def test_lists_and_small_integers_are_welcome() -> None:
+    shape = Shape([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.array([[0, 1, 2]], np.uint8))
+    assert shape.verts.dtype == np.float64
+    assert shape.faces.dtype == np.int64
+    assert Shape([[0, 0, 0]], None).faces.shape == (0, 3)
+
+
+def test_hash_names_the_geometry(cube: Shape) -> None:
+    assert len(cube.hash) == 16
+    assert Shape(cube.verts.copy(), cube.faces.copy(), "other name").hash == cube.hash
+    moved = cube.verts.copy()
+    moved[0, 0] += 1e-12
+    assert Shape(moved, cube.faces).hash != cube.hash
+    assert Shape(cube.verts, cube.faces[::-1]).hash != cube.hash
+    assert Shape(cube.verts, []).hash != cube.hash
+
+
+def test_invalid_vertices_have_no_area(cube: Shape) -> None:
+    invalid = np.zeros(8, bool)
+    invalid[0] = True
+    shape = Shape(cube.verts, cube.faces, invalid=invalid)
+    touching = (cube.faces == 0).any(axis=1)
+    assert shape.area == pytest.approx(0.5 * (~touching).sum())
+    np.testing.assert_allclose(shape.face_areas[touching], 0)
+    assert Shape(cube.verts, cube.faces, invalid=np.zeros(8, bool)).invalid is None
+
+
+def turned(seed: int) -> np.ndarray:
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return q * np.sign(np.linalg.det(q))
+
+
+def test_frame_by_hand() -> None:
+    quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])  # x to y
+    frame = Frame(2.0, quarter, [1, 0, 0])
+    np.testing.assert_allclose(frame.apply([3, 0, 0]), [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(frame.undo([0, 1, 0]), [3, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(frame.apply_vectors([2, 0, 0]), [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(frame.undo_vectors([0, 1, 0]), [2, 0, 0], atol=1e-15)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 0.3, 1750.0])
+def test_frame_laws(scale: float) -> None:
+    rng = np.random.default_rng(1)
+    frame = Frame(scale, turned(2), rng.normal(size=3) * scale)
+    other = Frame(2.5, turned(3), rng.normal(size=3))
+    points = rng.normal(size=(5, 4, 3)) * scale
+    np.testing.assert_allclose(frame.undo(frame.apply(points)), points, rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(frame.apply(frame.undo(points)), points, rtol=0, atol=1e-12 * max(scale, 1))
+    composed = frame.compose(other)
+    np.testing.assert_allclose(composed.apply(points), other.apply(frame.apply(points)), atol=1e-10)
+    np.testing.assert_allclose(
+        composed.undo(points), frame.undo(other.undo(points)), rtol=1e-9, atol=1e-9 * scale
+    )
+    same = frame.compose(Frame.identity())
+    np.testing.assert_allclose(same.apply(points), frame.apply(points), atol=1e-12)
+    np.testing.assert_array_equal(Frame.identity().apply(points), points)
+    difference = frame.undo_vectors(points[0, 0]) - (frame.undo(points[0, 0]) - frame.undo([0, 0, 0]))
+    np.testing.assert_allclose(difference, 0, atol=1e-12 * max(scale**2, scale))
+
+
+@pytest.mark.parametrize(
+    ("scale", "rotation", "center"),
+    [
+        (0.0, np.eye(3), np.zeros(3)),
+        (-1.0, np.eye(3), np.zeros(3)),
+        (np.nan, np.eye(3), np.zeros(3)),
+        (1.0, np.diag([1, 1, -1]), np.zeros(3)),
+        (1.0, 2 * np.eye(3), np.zeros(3)),
+        (1.0, np.eye(4), np.zeros(3)),
+        (1.0, np.eye(3), [0, 0, np.inf]),
+    ],
+)
+def test_frame_refuses(scale: float, rotation: np.ndarray, center: np.ndarray) -> None:
+    with pytest.raises(InputError, match="frame"):
+        Frame(scale, rotation, center)

@@ -1,0 +1,127 @@
+"""The ground: errors, output files, threads, lazy public names."""
+
+import errno
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import meshmatch
+from meshmatch import errors
+from meshmatch.config import set_threads
+from meshmatch.errors import InputError, MeshmatchError, OutputError
+from meshmatch.outputs import replace_on_success
+
+
+def test_error_has_a_line_and_a_hint() -> None:
+    error = InputError("cannot\n read  it", "try\nagain")
+    assert (error.message, error.hint, str(error)) == ("cannot read it", "try again", "cannot read it")
+    assert InputError("x").hint == ""
+
+
+def test_every_error_is_one_family() -> None:
+    names = ["InputError", "ModelError", "TemplateError", "OptionError", "OutputError", "PoorFit"]
+    assert all(issubclass(getattr(errors, name), MeshmatchError) for name in names)
+    assert not issubclass(MeshmatchError, (OSError, ValueError))
+
+
+def test_error_keeps_its_hint_through_a_process_pool() -> None:
+    error = pickle.loads(pickle.dumps(OutputError("a", "b")))
+    assert type(error) is OutputError
+    assert (error.message, error.hint) == ("a", "b")
+
+
+def test_output_appears_whole(tmp_path: Path) -> None:
+    with replace_on_success(tmp_path / "map.npy") as temporary:
+        assert temporary.suffix == ".npy"
+        assert temporary.parent == tmp_path
+        temporary.write_text("new")
+        assert not (tmp_path / "map.npy").exists()
+    assert (tmp_path / "map.npy").read_text() == "new"
+    assert [p.name for p in tmp_path.iterdir()] == ["map.npy"]
+
+
+@pytest.mark.parametrize("stop", [ValueError, KeyboardInterrupt])
+def test_failed_output_leaves_the_old_one(tmp_path: Path, stop: type[BaseException]) -> None:
+    (tmp_path / "a.txt").write_text("old")
+    with pytest.raises(stop), replace_on_success(tmp_path / "a.txt") as temporary:
+        temporary.write_text("half")
+        raise stop
+    assert (tmp_path / "a.txt").read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_output_folder_is_checked_before_the_work(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OutputError, match="no folder") as caught,
+        replace_on_success(tmp_path / "no" / "a.npy"),
+    ):
+        pytest.fail("the block must not run")
+    assert "mkdir" in caught.value.hint
+    with pytest.raises(OutputError, match="it is a folder"), replace_on_success(tmp_path):
+        pytest.fail("the block must not run")
+
+
+def test_folder_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: Path, **_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "touch", refuse)  # root may write anywhere
+    with pytest.raises(OutputError, match="Permission denied"), replace_on_success(tmp_path / "a.npy"):
+        pytest.fail("the block must not run")
+
+
+def test_full_disk_is_an_output_error_but_a_missing_input_is_not(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OutputError, match="No space left"),
+        replace_on_success(tmp_path / "a.npy") as temporary,
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device", str(temporary))
+    with pytest.raises(FileNotFoundError), replace_on_success(tmp_path / "a.npy"):
+        (tmp_path / "other").read_bytes()
+
+
+def test_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.setenv("MKL_NUM_THREADS", "7")
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
+    monkeypatch.setenv("NUMEXPR_NUM_THREADS", "7")
+    told = []
+    torch = type("torch", (), {"set_num_threads": staticmethod(told.append)})
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    set_threads(3)
+    assert (os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"], told) == ("3", "3", [3])
+    with pytest.raises(ValueError, match="at least one"):
+        set_threads(0)
+
+
+def test_public_names() -> None:
+    from meshmatch.shapes.files import load_shape
+
+    assert meshmatch.load_shape is load_shape
+    assert {"Shape", "match", "register", "VertexMap", "__version__"} <= set(dir(meshmatch))
+    with pytest.raises(AttributeError, match="no attribute 'lod_shape'"):
+        _ = meshmatch.lod_shape
+
+
+def test_importing_the_package_and_the_ground_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, meshmatch, meshmatch.errors, meshmatch.outputs, meshmatch.config\n"
+        "print([m for m in ('numpy', 'scipy', 'torch', 'trimesh', 'pymeshlab') if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_loading_a_shape_needs_neither_torch_nor_a_mesh_library(tmp_path: Path) -> None:
+    (tmp_path / "a.xyz").write_text("0 0 0\n1 0 0\n0 1 0\n")
+    code = (
+        "import sys, meshmatch\n"
+        f"meshmatch.load_shape({str(tmp_path / 'a.xyz')!r})\n"
+        "print([m for m in ('scipy', 'torch', 'trimesh', 'pymeshlab', 'fast_simplification') if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
