@@ -33,7 +33,7 @@ class Errors:
         area.
     """
 
-    values: NDArray[np.float32]
+    values: NDArray[np.floating[Any]]
 
     def __post_init__(self) -> None:
         values = np.array(self.values, dtype=np.float32).reshape(-1)
@@ -43,9 +43,9 @@ class Errors:
         object.__setattr__(self, "values", values)
 
     @property
-    def cm(self) -> NDArray[np.float32]:
+    def cm(self) -> NDArray[np.floating[Any]]:
         """The same in centimetres, the target scaled to 1.9 m2 of skin."""
-        scaled: NDArray[np.float32] = self.values * np.float32(CM_PER_UNIT)
+        scaled: NDArray[np.floating[Any]] = self.values * np.float32(CM_PER_UNIT)
         return scaled
 
     @property

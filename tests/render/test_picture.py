@@ -39,7 +39,7 @@ def pixels(path: Path) -> np.ndarray:
 
 
 def something(picture: np.ndarray) -> np.ndarray:
-    return (picture < 250).any(axis=2)
+    return np.asarray((picture < 250).any(axis=2))
 
 
 def draw(tmp_path: Path, *panels: object, **rest: object) -> np.ndarray:

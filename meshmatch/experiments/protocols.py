@@ -1,0 +1,107 @@
+"""The development benchmark's sets: which shapes, which pairs, and what is true.
+
+The data are described in ``bench/README.md`` beside them. In short, *landmark k is the same body point on
+every shape of a set*, and a set differs from another in how a landmark names its vertex:
+
+- ``shrec19``: ``N.landmarks.npy`` (6890,) vertex ids; the pairs of ``pairs.txt``.
+- ``scape``: vertex i is landmark i on every shape (the triangulations differ); all ordered pairs.
+- ``faust``: ``tr_reg_NNN.landmarks.npy`` (5000,) vertex ids; all ordered pairs, of one subject or of two. Ten
+  consecutive numbers are one subject.
+
+Several landmarks may share a vertex where a mesh is coarser than the landmarks. All of them count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.shape import Shape
+
+Pair = tuple[str, str]
+SET_NAMES = ("shrec19", "scape", "faust")
+
+
+@dataclass(frozen=True)
+class BenchSet:
+    """One set of the benchmark: names of shapes and ordered pairs ``(source, target)`` of them."""
+
+    name: str
+    folder: Path
+    shapes: tuple[str, ...]
+    pairs: tuple[Pair, ...]
+
+    def path(self, shape: str) -> Path:
+        """The file of a shape."""
+        return self.folder / f"{shape}.ply"
+
+    def shape(self, shape: str) -> Shape:
+        """The shape as its file has it: every vertex, in the file's order."""
+        return load_shape(self.path(shape))
+
+    def landmarks(self, shape: str) -> NDArray[np.int64]:
+        """Vertex id of every landmark ``(N,)``; N is the same for every shape of a set."""
+        return _landmarks(self.path(shape), self.name == "scape")
+
+    def group(self, pair: Pair) -> str:
+        """What kind of pair this is within its set; empty where there is only one kind."""
+        if self.name != "faust":
+            return ""
+        return "same subject" if len({_faust_subject(name) for name in pair}) == 1 else "cross subject"
+
+
+def load_set(name: str, data: Path) -> BenchSet:
+    """Find a set in the benchmark's folder and list its shapes and pairs.
+
+    Raises
+    ------
+    OptionError
+        There is no set of this name.
+    InputError
+        The folder lacks the set, or a file that the pairs name.
+    """
+    if name not in SET_NAMES:
+        raise OptionError(f"there is no set '{name}'", f"choose from {', '.join(SET_NAMES)}")
+    folder = Path(data) / name
+    shapes = tuple(sorted((path.stem for path in folder.glob("*.ply")), key=_by_number))
+    if not shapes:
+        raise InputError(
+            f"no shapes in {folder}", "--data names the folder that holds shrec19, scape and faust"
+        )
+    if name == "shrec19":
+        lines = (folder / "pairs.txt").read_text(encoding="ascii").split("\n")
+        pairs = tuple((words[0], words[1]) for words in (line.split() for line in lines) if words)
+    else:
+        pairs = tuple(permutations(shapes, 2))
+    missing = sorted({shape for pair in pairs for shape in pair} - set(shapes))
+    if missing:
+        raise InputError(f"{folder} lacks {', '.join(missing)}, named by its pairs")
+    return BenchSet(name, folder, shapes, pairs)
+
+
+def _by_number(name: str) -> tuple[int, str]:
+    return (int(name), "") if name.isdigit() else (0, name)
+
+
+def _faust_subject(name: str) -> int:
+    return int(name.removeprefix("tr_reg_")) // 10
+
+
+@cache
+def _landmarks(path: Path, every_vertex: bool) -> NDArray[np.int64]:
+    shape = load_shape(path)
+    if every_vertex:
+        ids = np.arange(shape.V)
+    else:
+        ids = np.load(path.with_suffix(".landmarks.npy"), allow_pickle=False).astype(np.int64)
+    if ids.ndim != 1 or not ids.size or ids.min() < 0 or ids.max() >= shape.V:
+        raise InputError(f"the landmarks of {path} do not name its vertices")
+    ids.setflags(write=False)
+    return ids

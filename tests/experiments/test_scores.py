@@ -1,0 +1,230 @@
+"""The protocol on a small benchmark with known maps, and on the real one where it is there."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from meshmatch.errors import InputError, OptionError, OutputError
+from meshmatch.experiments import distances
+from meshmatch.experiments.distances import TruthDistances
+from meshmatch.experiments.protocols import SET_NAMES, load_set
+from meshmatch.experiments.report import commit, print_table
+from meshmatch.experiments.scores import SetScores, evaluate_set
+from meshmatch.maps.evaluate import CM_PER_UNIT, map_errors
+from meshmatch.maps.geodesics import GeodesicDistances
+from tests.experiments.small_bench import BODY, build, truth
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(tmp_path_factory.mktemp("bench"))
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache") / "made" / "by us"
+
+
+def test_pairs_and_groups(small: Path) -> None:
+    shrec, scape, faust = (load_set(name, small) for name in SET_NAMES)
+    assert shrec.shapes == ("1", "2", "10")
+    assert shrec.pairs == (("1", "2"), ("1", "10"), ("10", "2"))
+    assert scape.pairs == (("mesh000", "mesh001"), ("mesh001", "mesh000"))
+    assert len(faust.pairs) == 6
+    assert [pair for pair in faust.pairs if faust.group(pair) == "same subject"] == [
+        ("tr_reg_000", "tr_reg_001"),
+        ("tr_reg_001", "tr_reg_000"),
+    ]
+    assert {scape.group(pair) for pair in scape.pairs} == {""}
+
+
+def test_sets_that_are_not_there(small: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="no set 'tosca'"):
+        load_set("tosca", small)
+    with pytest.raises(InputError, match="no shapes"):
+        load_set("scape", tmp_path)
+    broken = build(tmp_path)
+    (broken / "shrec19" / "pairs.txt").write_text("1 2\n7 1\n")
+    with pytest.raises(InputError, match="lacks 7"):
+        load_set("shrec19", broken)
+    (broken / "shrec19" / "pairs.txt").write_text("1 2\n")
+    np.save(broken / "shrec19" / "1.landmarks.npy", np.array([BODY.V]))
+    with pytest.raises(InputError, match="do not name its vertices"):
+        load_set("shrec19", broken).landmarks("1")
+
+
+@pytest.mark.parametrize("name", SET_NAMES)
+def test_right_maps_have_no_error(small: Path, kept: Path, name: str) -> None:
+    bench = load_set(name, small)
+    scores = evaluate_set(bench, {pair: truth(*pair) for pair in bench.pairs}, cache=kept)
+    record = scores.as_dict()
+    assert record["pairs"] == len(bench.pairs) and record["complete"]
+    assert record["points_per_pair"] == BODY.V
+    assert record["mean_cm"] == record["share_over_15cm"] == record["flips"] == record["worst"][0][2] == 0
+
+
+@pytest.mark.parametrize("name", SET_NAMES)
+def test_errors_are_those_of_the_plain_way(small: Path, kept: Path, name: str) -> None:
+    bench = load_set(name, small)
+    rng = np.random.default_rng(0)
+    maps = {pair: rng.integers(0, BODY.V, BODY.V) for pair in bench.pairs}
+    scores = evaluate_set(name, maps, data=small, cache=kept)
+    total = []
+    for source, target in bench.pairs:
+        expected = map_errors(
+            maps[source, target],
+            bench.landmarks(source),
+            bench.landmarks(target),
+            GeodesicDistances(bench.shape(target)),
+        )
+        assert scores.errors[source, target].values == pytest.approx(expected.values, rel=1e-3)
+        total.append(expected.mean_cm)
+    assert scores.joined.mean_cm == pytest.approx(np.mean(total), rel=1e-3)
+    assert scores.as_dict()["median_pair_cm"] == pytest.approx(np.median(total), rel=1e-3)
+    assert scores.flips == 1.0 and scores.joined.mean_cm > 40
+    worst = scores.as_dict()["worst"][0]
+    assert worst[2] == pytest.approx(max(total), abs=0.1)
+
+
+def test_one_pair_of_three_is_wrong(small: Path, kept: Path) -> None:
+    bench = load_set("shrec19", small)
+    maps = {pair: truth(*pair) for pair in bench.pairs}
+    maps["1", "10"] = np.zeros(BODY.V, dtype=int)
+    scores = evaluate_set(bench, maps, cache=kept)
+    assert scores.flips == pytest.approx(1 / 3)
+    assert next(iter(scores.means_cm)) == ("1", "10")
+    assert scores.joined.median == 0 and scores.joined.mean > 0.1
+
+
+def test_groups_share_the_pairs(small: Path, kept: Path) -> None:
+    bench = load_set("faust", small)
+    maps = {pair: truth(*pair) for pair in bench.pairs}
+    maps["tr_reg_000", "tr_reg_001"] = np.zeros(BODY.V, dtype=int)
+    cross, same = evaluate_set(bench, maps, cache=kept).groups()
+    assert (cross.group, len(cross.errors), cross.joined.mean) == ("cross subject", 4, 0)
+    assert (same.group, len(same.errors)) == ("same subject", 2) and same.flips == 0.5
+    assert same.expected == 2 and cross.as_dict()["complete"]
+
+
+def test_nothing_is_left_out_in_silence(small: Path, kept: Path) -> None:
+    bench = load_set("shrec19", small)
+    maps = {pair: truth(*pair) for pair in bench.pairs[:2]}
+    with pytest.raises(InputError, match=r"1 maps are missing, the first 10 -> 2"):
+        evaluate_set(bench, maps, cache=kept)
+    part = evaluate_set(bench, maps, cache=kept, pairs=bench.pairs[:2])
+    assert not part.as_dict()["complete"] and part.expected == 3
+    with pytest.raises(InputError, match="has no pair 2 -> 1"):
+        evaluate_set(bench, maps, cache=kept, pairs=[("2", "1")])
+    with pytest.raises(InputError, match="nothing to evaluate"):
+        evaluate_set(bench, maps, cache=kept, pairs=[])
+    for bad in (np.zeros(3, int), np.full(BODY.V, BODY.V), np.full(BODY.V, -1), np.zeros(BODY.V)):
+        with pytest.raises(InputError, match="shrec19 1 -> 2"):
+            evaluate_set(bench, {("1", "2"): bad}, cache=kept, pairs=[("1", "2")])
+    with pytest.raises(InputError, match="where is"):
+        evaluate_set("shrec19", maps)
+
+
+def test_distances_are_computed_once(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = load_set("scape", small)
+    shape, landmarks = bench.shape("mesh000"), np.array([5, 3, 5, 70])
+    first = TruthDistances(shape, landmarks, tmp_path)
+    index = np.array([5, 8, 1, 70])
+    (errors,) = first.errors([index])
+    assert errors[0] == errors[3] == 0 and (errors[1:3] > 0).all()
+    assert np.load(first.path).shape == (3, shape.V)
+    monkeypatch.setattr(distances, "GeodesicDistances", None)  # would fail if it were asked again
+    monkeypatch.setattr(distances, "READ_BYTES", 1)  # one row at a time
+    again = TruthDistances(bench.shape("mesh000"), landmarks, tmp_path)
+    assert np.array_equal(again.errors([index])[0], errors)
+    one, other = again.errors([index, index[::-1]])
+    assert np.array_equal(one, errors) and not np.array_equal(other, errors)
+    # Another shape, or other landmarks, are other distances.
+    paths = {
+        first.path,
+        TruthDistances(bench.shape("mesh001"), landmarks, tmp_path).path,
+        TruthDistances(shape, landmarks[:2], tmp_path).path,
+    }
+    assert len(paths) == 3
+
+
+def test_a_folder_that_cannot_be_made(small: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    bench = load_set("scape", small)
+    with pytest.raises(OutputError, match="cannot keep distances") as caught:
+        TruthDistances(bench.shape("mesh000"), np.arange(3), tmp_path / "file" / "folder").prepare()
+    assert "--cache" in caught.value.hint
+
+
+def test_the_default_folder_can_be_moved(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(distances.CACHE_VARIABLE, str(tmp_path))
+    assert distances.default_folder() == tmp_path
+    monkeypatch.delenv(distances.CACHE_VARIABLE)
+    assert distances.default_folder().name == "geodesics"
+
+
+def test_the_table(small: Path, kept: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bench = load_set("faust", small)
+    pairs = bench.pairs[:3]
+    scores: SetScores = evaluate_set(bench, {p: truth(*p) for p in pairs}, cache=kept, pairs=pairs)
+    print_table([scores])
+    text = capsys.readouterr().out
+    assert "3 of 6" in text and "same subject" in text and "1 of 4" in text
+    assert "Not all pairs were measured" in text
+    assert "Dijkstra" in text
+
+
+def test_commit_without_git(tmp_path: Path) -> None:
+    assert commit(tmp_path) == "unknown"
+
+
+def test_the_real_sets_have_the_protocols_pairs(bench: Path) -> None:
+    counts = {
+        name: (len(found.shapes), len(found.pairs)) for name in SET_NAMES for found in [load_set(name, bench)]
+    }
+    assert counts["shrec19"][1] == len((bench / "shrec19" / "pairs.txt").read_text().split()) // 2
+    assert counts["scape"] == (20, 380)
+    assert counts["faust"] == (30, 870)
+    faust = load_set("faust", bench)
+    assert sum(faust.group(pair) == "same subject" for pair in faust.pairs) == 270
+    for name, points in (("shrec19", 6890), ("scape", 12_500), ("faust", 5000)):
+        found = load_set(name, bench)
+        for shape in found.shapes[:3]:
+            assert found.landmarks(shape).shape == (points,)
+
+
+def test_truth_of_the_real_sets_is_a_map_of_the_surface(bench: Path) -> None:
+    """Landmarks next to each other on one shape are so on the next: ids are not shifted, mirrored or
+    shuffled.
+    """
+    for name in SET_NAMES:
+        found = load_set(name, bench)
+        a, b = found.shapes[0], found.shapes[-1]
+        one, other = found.shape(a), found.shape(b)
+        landmark = np.full(one.V, -1)
+        landmark[found.landmarks(a)] = np.arange(len(found.landmarks(a)))
+        corners = landmark[one.faces]
+        placed = other.verts[found.landmarks(b)[corners[(corners >= 0).all(axis=1)]]]
+        longest = np.linalg.norm(placed - np.roll(placed, 1, axis=1), axis=2).max(axis=1) / np.sqrt(
+            other.area
+        )
+        assert np.median(longest) * CM_PER_UNIT < 5
+        normals = np.cross(placed[:, 1] - placed[:, 0], placed[:, 2] - placed[:, 0])
+        nearest = cKDTree(other.verts).query(placed[:, 0])[1]
+        outward = np.einsum("ni,ni->n", normals, other.vertex_normals[nearest])
+        assert (outward[outward != 0] > 0).mean() > 0.85
+
+
+def test_a_real_pair(bench: Path, tmp_path: Path) -> None:
+    found = load_set("faust", bench)
+    pair = ("tr_reg_000", "tr_reg_011")
+    source, target = (found.landmarks(name) for name in pair)
+    right = np.zeros(found.shape(pair[0]).V, dtype=np.int64)
+    right[source] = target
+    random = np.random.default_rng(0).integers(0, found.shape(pair[1]).V, len(right))
+    good = evaluate_set(found, {pair: right}, cache=tmp_path, pairs=[pair])
+    bad = evaluate_set(found, {pair: random}, cache=tmp_path, pairs=[pair])
+    assert good.joined.mean_cm < 1.0  # not 0: several landmarks share a vertex of the source
+    assert good.joined.median == 0
+    assert 70 < bad.joined.mean_cm < 110
