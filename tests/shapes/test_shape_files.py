@@ -1,0 +1,640 @@
+"""Reading and writing shapes: every vertex of the file in its order, for every format; and clean words for bad files."""
+
+import json
+import re
+import struct
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import InputError, OptionError, OutputError
+from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]])
+QUAD_AND_TRIANGLE = [[0, 1, 2], [0, 2, 3], [0, 1, 4]]
+
+
+def load(folder: Path, name: str, content: str | bytes) -> Shape:
+    path = folder / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return load_shape(path)
+
+
+def check(shape: Shape) -> None:
+    np.testing.assert_array_equal(shape.verts, CORNERS)
+    np.testing.assert_array_equal(shape.faces, QUAD_AND_TRIANGLE)
+
+
+# --- by hand, one format after the other ---------------------------------------------------------------------------
+
+
+PLY_HEADER = """ply
+format {format} 1.0
+comment by hand
+element vertex 5
+property float x
+property float y
+property float z
+element face 2
+property list uchar int vertex_indices
+end_header
+"""
+
+
+def test_ply_text_with_a_polygon(tmp_path: Path) -> None:
+    rows = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n.5 .5 1\n4 0 1 2 3\n3 0 1 4\n"
+    check(load(tmp_path, "a.ply", PLY_HEADER.format(format="ascii") + rows))
+    check(load(tmp_path, "b.ply", (PLY_HEADER.format(format="ascii") + rows).replace("\n", "\r\n")))
+    check(load(tmp_path, "c.PLY", PLY_HEADER.format(format="ascii").replace("indices", "index") + rows))
+
+
+@pytest.mark.parametrize(("order", "name"), [("<", "binary_little_endian"), (">", "binary_big_endian")])
+def test_ply_binary_with_a_polygon(tmp_path: Path, order: str, name: str) -> None:
+    body = struct.pack(order + "15f", *CORNERS.ravel())
+    body += struct.pack(order + "B4i", 4, 0, 1, 2, 3) + struct.pack(order + "B3i", 3, 0, 1, 4)
+    check(load(tmp_path, "a.ply", PLY_HEADER.format(format=name).encode() + body))
+
+
+def test_ply_with_everything_at_once(tmp_path: Path) -> None:
+    header = """ply
+format binary_little_endian 1.0
+obj_info scanned
+element camera 1
+property double focal
+element vertex 5
+property uchar red
+property double x
+property double y
+property double z
+property uchar green
+property uchar blue
+property list uchar short neighbours
+element face 3
+property list uchar uint vertex_indices
+property list ushort float texcoord
+property int label
+element edge 1
+property int vertex1
+end_header
+"""
+    body = struct.pack("<d", 35.0)
+    for k, (x, y, z) in enumerate(CORNERS):
+        body += struct.pack("<BdddBB", 255, x, y, z, k, 51) + struct.pack(f"<B{k}h", k, *range(k))
+    for k, face in enumerate(QUAD_AND_TRIANGLE):
+        body += (
+            struct.pack("<B3I", 3, *face) + struct.pack(f"<H{2 * k}f", 2 * k, *[0.5] * (2 * k)) + b"\1\0\0\0"
+        )
+    shape = load(tmp_path, "a.ply", header.encode() + body + b"\0\0\0\0")
+    check(shape)
+    assert shape.colors is not None
+    np.testing.assert_allclose(shape.colors[:, 0], 1.0)
+    np.testing.assert_allclose(shape.colors[:, 1], np.arange(5) / 255)
+    np.testing.assert_allclose(shape.colors[:, 2:], [[0.2, 1.0]] * 5)
+
+
+def test_ply_text_with_lists_of_unequal_length_among_the_vertices(tmp_path: Path) -> None:
+    header = PLY_HEADER.format(format="ascii").replace(
+        "property float y", "property list uchar int n\nproperty float y"
+    )
+    rows = "0 0 0 0\n1 2 7 8 0 0\n1 1 9 1 0\n0 0 1 0\n.5 3 1 2 3 .5 1\n4 0 1 2 3\n3 0 1 4\n"
+    check(load(tmp_path, "a.ply", header + rows))
+
+
+def test_ply_triangle_strips_turn_every_second_one(tmp_path: Path) -> None:
+    header = PLY_HEADER.format(format="ascii").replace("element face 2", "element tristrips 1")
+    rows = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n.5 .5 1\n9 0 1 2 3 -1 2 3 4 0\n"
+    shape = load(tmp_path, "a.ply", header + rows)
+    np.testing.assert_array_equal(shape.faces, [[0, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 0]])
+
+
+def test_ply_text_colours_follow_the_header_not_the_values(tmp_path: Path) -> None:
+    body = "0 0 0 0 1 1\n1 0 0 1 0 0\n0 1 0 0 0 1\n"
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {c}\n" for c in "xyz")
+    bytes_ = head + "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n" + body
+    reals = bytes_.replace("uchar", "float")
+    dark, light = load(tmp_path, "a.ply", bytes_), load(tmp_path, "b.ply", reals)
+    np.testing.assert_allclose(dark.colors, np.column_stack([light.colors[:, :3] / 255, np.ones(3)]))
+    assert light.colors.max() == 1.0
+
+
+OBJ = """# a comment with v 1 2 3
+mtllib x.mtl
+v 0 0 0
+v 1 0 0   # and another
+vn 0 0 1
+v 1 1 0
+vt 0.5 0.5
+  v 0 1 0
+g part
+v 0.5 0.5 1 1.0
+usemtl skin
+f {quad}
+l 1 2
+s off
+f {triangle}
+"""
+
+
+@pytest.mark.parametrize(
+    ("quad", "triangle"),
+    [
+        ("1 2 3 4", "1 2 5"),
+        ("1/1 2/1 3/1 4/1", "1/1 2/1 5/1"),
+        ("1//1 2//1 3//1 4//1", "1//1 2//1 5//1"),
+        ("1/1/1 2/1/1 3/1/1 4/1/1", "1/1/1\t2/1/1 \\\n5/1/1"),
+        ("-5 -4 -3 -2", "-5/-1/-1 -4/-1/-1 -1/-1/-1"),
+    ],
+)
+def test_obj(tmp_path: Path, quad: str, triangle: str) -> None:
+    text = OBJ.format(quad=quad, triangle=triangle)
+    check(load(tmp_path, "a.obj", text))
+    check(load(tmp_path, "b.obj", text.replace("\n", "\r\n")))
+    check(load(tmp_path, "c.obj", text.rstrip("\n")))
+
+
+def test_obj_counts_back_from_where_the_face_stands(tmp_path: Path) -> None:
+    shape = load(tmp_path, "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 0 0 1\nf -1 -2 -3\n")
+    np.testing.assert_array_equal(shape.faces, [[0, 1, 2], [3, 2, 1]])
+
+
+def test_obj_seams_split_nothing_and_unused_vertices_stay(tmp_path: Path) -> None:
+    text = "v 9 9 9\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 0\nvt 0 0\nvt 1 1\nf 2/1 3/1 4/1\nf 4/2 3/2 2/2\n"
+    shape = load(tmp_path, "a.obj", text)
+    assert shape.V == 5
+    np.testing.assert_array_equal(shape.faces, [[1, 2, 3], [3, 2, 1]])
+
+
+def test_obj_colours(tmp_path: Path) -> None:
+    shape = load(tmp_path, "a.obj", "v 0 0 0 1 0 0\nv 1 0 0 0 .5 0\nv 0 1 0 0 0 1\nf 1 2 3\n")
+    np.testing.assert_allclose(shape.colors, [[1, 0, 0, 1], [0, 0.5, 0, 1], [0, 0, 1, 1]])
+
+
+@pytest.mark.parametrize(
+    "head", ["OFF\n5 2 0\n", "OFF 5 2 0\n", "OFF5 2 0\n", "# by\nOFF # x\n\n5 2\n", "OFF\r\n5 2 0\r\n"]
+)
+def test_off(tmp_path: Path, head: str) -> None:
+    rows = "0 0 0\n1 0 0\n1 1 0 # corner\n\n0 1 0\n.5 .5 1\n4 0 1 2 3 255 0 0\n3 0 1 4\n"
+    check(load(tmp_path, "a.off", head + rows))
+
+
+def test_off_with_colours_and_normals(tmp_path: Path) -> None:
+    rows = "".join(f"{x} {y} {z} 0 0 1 255 0 51 255\n" for x, y, z in CORNERS)
+    shape = load(tmp_path, "a.off", "CNOFF\n5 2 0\n" + rows + "4 0 1 2 3\n3 0 1 4\n")
+    check(shape)
+    np.testing.assert_allclose(shape.colors, [[1, 0, 0.2, 1]] * 5)
+
+
+def test_stl_has_three_vertices_a_triangle(tmp_path: Path) -> None:
+    triangles = CORNERS[np.array(QUAD_AND_TRIANGLE)]
+    text = "solid x\n"
+    binary = b"solid, says the header of many binary files".ljust(80) + struct.pack("<I", 3)
+    for a, b, c in triangles:
+        corners = "".join(f"vertex {x} {y} {z}\n" for x, y, z in (a, b, c))
+        text += f"facet normal 0 0 0\nouter loop\n{corners}endloop\nendfacet\n"
+        binary += struct.pack("<12fH", 0, 0, 0, *a, *b, *c, 0)
+    for shape in (load(tmp_path, "a.stl", text + "endsolid x\n"), load(tmp_path, "b.stl", binary)):
+        np.testing.assert_array_equal(shape.verts, triangles.reshape(-1, 3))
+        np.testing.assert_array_equal(shape.faces, np.arange(9).reshape(3, 3))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0 0 0\n1 2 3\n4 5 6\n",
+        "0,0,0\n1,2,3\n4,5,6",
+        "3\n0 0 0\n1 2 3\n4 5 6\n",
+        "# x y z\n0 0 0 9 9 9\n\n1 2 3 9 9 9\r\n4\t5 6 9 9 9 # last\n",
+        "0;0;0;1\n1;2;3\n4;5;6;1;2\n",
+    ],
+)
+def test_xyz(tmp_path: Path, text: str) -> None:
+    shape = load(tmp_path, "a.xyz", text)
+    assert shape.is_cloud
+    np.testing.assert_array_equal(shape.verts, [[0, 0, 0], [1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16])
+@pytest.mark.parametrize("width", [3, 6])
+def test_npy(tmp_path: Path, kind: type, width: int) -> None:
+    points = np.arange(7 * width).reshape(7, width).astype(kind)
+    np.save(tmp_path / "a.npy", np.asfortranarray(points))
+    shape = load_shape(tmp_path / "a.npy")
+    assert shape.is_cloud
+    np.testing.assert_array_equal(shape.verts, points[:, :3])
+
+
+# --- glTF ----------------------------------------------------------------------------------------------------------
+
+
+def gltf(folder: Path, name: str, document: dict, *arrays: np.ndarray) -> Shape:
+    """Write arrays as one buffer each, with an accessor of the same number, and load the result."""
+    views, accessors, body = [], [], b""
+    kinds = {"float32": 5126, "uint8": 5121, "uint16": 5123, "uint32": 5125}
+    for k, array in enumerate(arrays):
+        wide = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}[1 if array.ndim == 1 else array.shape[1]]
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": array.nbytes})
+        accessors.append(
+            {"bufferView": k, "componentType": kinds[array.dtype.name], "count": len(array), "type": wide}
+        )
+        body += array.tobytes() + b"\0" * (-array.nbytes % 4)
+    document = {"asset": {"version": "2.0"}, "bufferViews": views, "accessors": accessors, **document}
+    (folder / "data.bin").write_bytes(body)
+    document["buffers"] = [{"uri": "data.bin", "byteLength": len(body)}]
+    if name.endswith(".gltf"):
+        return load(folder, name, json.dumps(document))
+    del document["buffers"][0]["uri"]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
+    return load(folder, name, b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
+
+
+TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+
+
+@pytest.mark.parametrize("name", ["a.glb", "a.gltf"])
+def test_gltf_scene_places_its_meshes(tmp_path: Path, name: str) -> None:
+    document = {
+        "scene": 0,
+        "scenes": [{"nodes": [1]}],
+        "nodes": [
+            {"mesh": 0, "translation": [10, 0, 0], "scale": [2, 2, 2]},
+            {"children": [2, 0], "rotation": [0, 0, 2**-0.5, 2**-0.5]},  # x to y
+            {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 5, 1]},
+            {"mesh": 0, "name": "not in the scene"},
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    }
+    shape = gltf(tmp_path, name, document, TRIANGLE, np.array([2, 1, 0], np.uint16))
+    expected = [[0, 0, 5], [0, 1, 5], [-1, 0, 5], [0, 10, 0], [0, 12, 0], [-2, 10, 0]]
+    np.testing.assert_allclose(shape.verts, expected, atol=1e-6)
+    np.testing.assert_array_equal(shape.faces, [[2, 1, 0], [5, 4, 3]])
+
+
+def test_gltf_strips_fans_points_and_unindexed(tmp_path: Path) -> None:
+    five = np.vstack([TRIANGLE, TRIANGLE[:2] + 3]).astype(np.float32)
+    primitives = [{"attributes": {"POSITION": 0}, "mode": mode} for mode in (5, 6, 0, 4, 1)]
+    document = {"nodes": [{"mesh": 0}], "meshes": [{"primitives": primitives}]}
+    shape = gltf(tmp_path, "a.glb", document, five)
+    assert shape.V == 20  # lines (mode 1) are no surface
+    strip, fan = [[0, 1, 2], [2, 1, 3], [2, 3, 4]], [[5, 6, 7], [5, 7, 8], [5, 8, 9]]
+    np.testing.assert_array_equal(shape.faces, [*strip, *fan, [15, 16, 17]])
+
+
+def test_gltf_skin_stands_as_its_joints_do(tmp_path: Path) -> None:
+    joints = np.array([[0, 1, 0, 0]] * 3, np.uint8)
+    weights = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0.5, 0.5, 0, 0]], np.float32)
+    bind = np.tile(np.eye(4, dtype=np.float32).ravel(), (2, 1))
+    bind[1, 12:15] = [-1, 0, 0]  # the second joint was bound at x = 1
+    document = {
+        "scenes": [{"nodes": [0, 1, 2]}],
+        "nodes": [
+            {"mesh": 0, "skin": 0, "translation": [100, 100, 100]},  # ignored: a skin moves by joints alone
+            {"translation": [0, 0, 7]},
+            {"translation": [1, 0, 9]},
+        ],
+        "skins": [{"joints": [1, 2], "inverseBindMatrices": 3}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "JOINTS_0": 1, "WEIGHTS_0": 2}}]}],
+    }
+    shape = gltf(tmp_path, "a.glb", document, TRIANGLE, joints, weights, bind)
+    np.testing.assert_allclose(shape.verts, TRIANGLE + [[0, 0, 7], [0, 0, 9], [0, 0, 8]], atol=1e-6)
+
+
+def test_gltf_colours_sparse_and_strided_data(tmp_path: Path) -> None:
+    rows = np.zeros((3, 4), np.float32)
+    rows[:, :3] = TRIANGLE
+    document = {
+        "nodes": [{"mesh": 0}],
+        "meshes": [
+            {
+                "primitives": [
+                    {"attributes": {"POSITION": 0, "COLOR_0": 1}},
+                    {"attributes": {"POSITION": 2}},
+                ]
+            }
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 48, "byteStride": 16},
+            {"buffer": 0, "byteOffset": 48, "byteLength": 12},
+            {"buffer": 0, "byteOffset": 60, "byteLength": 4},
+            {"buffer": 0, "byteOffset": 64, "byteLength": 12},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5121, "count": 3, "type": "VEC4", "normalized": True},
+            {
+                "componentType": 5126,
+                "count": 3,
+                "type": "VEC3",
+                "sparse": {
+                    "count": 1,
+                    "indices": {"bufferView": 2, "componentType": 5121},
+                    "values": {"bufferView": 3},
+                },
+            },
+        ],
+    }
+    colours = np.array([[255, 0, 0, 255], [0, 51, 0, 255], [0, 0, 0, 0]], np.uint8)
+    parts = [rows, colours, np.array([2, 0, 0, 0], np.uint8), np.array([[4, 5, 6]], np.float32)]
+    shape = gltf(tmp_path, "a.glb", document, *parts)
+    np.testing.assert_allclose(shape.verts, [*TRIANGLE, [0, 0, 0], [0, 0, 0], [4, 5, 6]])
+    expected = [[1, 0, 0, 1], [0, 0.2, 0, 1], [0, 0, 0, 0], *[[1, 1, 1, 1]] * 3]
+    np.testing.assert_allclose(shape.colors, expected)
+
+
+def test_gltf_that_cannot_be_used(tmp_path: Path) -> None:
+    document = {"nodes": [{"mesh": 0}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}
+    with pytest.raises(InputError, match="compressed"):
+        gltf(tmp_path, "a.glb", document | {"extensionsRequired": ["KHR_draco_mesh_compression"]}, TRIANGLE)
+    with pytest.raises(InputError, match="hangs from two places"):
+        nodes = [{"children": [1]}, {"children": [0]}]
+        gltf(tmp_path, "a.glb", document | {"nodes": nodes, "scenes": [{"nodes": [0]}]}, TRIANGLE)
+    with pytest.raises(InputError, match="names vertex 7"):
+        primitives = [{"attributes": {"POSITION": 0}, "indices": 1}]
+        gltf(
+            tmp_path,
+            "a.glb",
+            document | {"meshes": [{"primitives": primitives}]},
+            TRIANGLE,
+            np.array([0, 1, 7], np.uint8),
+        )
+    with pytest.raises(InputError, match="no triangles and no points"):
+        gltf(tmp_path, "a.glb", {"nodes": [{}]}, TRIANGLE)
+    with pytest.raises(InputError, match="makes no sense"):
+        gltf(tmp_path, "a.glb", {"nodes": [{"mesh": 3}]}, TRIANGLE)
+    with pytest.raises(InputError, match="not glTF version 2"):
+        load(tmp_path, "a.gltf", '{"asset": {"version": "1.0"}}')
+    with pytest.raises(InputError, match=r"needs the file gone\.bin"):
+        views = {
+            "bufferViews": [{"buffer": 0, "byteLength": 36}],
+            "buffers": [{"uri": "gone.bin", "byteLength": 36}],
+        }
+        accessor = {"accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}]}
+        load(tmp_path, "a.gltf", json.dumps({"asset": {"version": "2.0"}, **document, **views, **accessor}))
+    with pytest.raises(InputError, match="outside its folder"):
+        views["buffers"][0]["uri"] = "../../secret.bin"
+        load(tmp_path, "a.gltf", json.dumps({"asset": {"version": "2.0"}, **document, **views, **accessor}))
+
+
+# --- write, then read ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".glb", ".stl", ".xyz", ".npy"])
+@pytest.mark.parametrize("cloud", [False, True])
+@pytest.mark.parametrize("colored", [False, True])
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("broken", [False, True])
+def test_write_then_read(
+    tmp_path: Path, sphere: Shape, suffix: str, cloud: bool, colored: bool, single: bool, broken: bool
+) -> None:
+    rng = np.random.default_rng(0)
+    verts = sphere.verts * 1750 + 1e3
+    verts = verts.astype(np.float32) if single else verts
+    invalid = rng.random(sphere.V) < 0.05 if broken else None
+    colors = rng.integers(0, 256, (sphere.V, 4)) / 255 if colored else None
+    shape = Shape(verts, [] if cloud else sphere.faces, "s", colors, invalid)
+    if (suffix == ".stl" and cloud) or (suffix in (".xyz", ".npy") and not cloud):
+        with pytest.raises(OptionError, match="cannot hold"):
+            save_shape(tmp_path / f"s{suffix}", shape)
+        assert not list(tmp_path.iterdir())
+        return
+    save_shape(tmp_path / f"s{suffix}", shape)
+    assert [p.name for p in tmp_path.iterdir()] == [f"s{suffix}"]
+    back = load_shape(tmp_path / f"s{suffix}")
+    if suffix == ".stl":
+        np.testing.assert_array_equal(back.verts, shape.verts[shape.faces].reshape(-1, 3).astype(np.float32))
+        return
+    np.testing.assert_array_equal(back.faces, shape.faces)
+    if broken and suffix != ".glb":
+        np.testing.assert_array_equal(back.invalid, invalid)
+        np.testing.assert_array_equal(back.verts[~invalid], shape.verts[~invalid])
+        np.testing.assert_allclose(back.verts[invalid], [shape.verts[~invalid].mean(axis=0)] * invalid.sum())
+    else:
+        expected = shape.verts.astype(np.float32) if suffix == ".glb" else shape.verts
+        np.testing.assert_array_equal(back.verts, expected)
+    if colored and suffix in (".ply", ".off", ".glb"):
+        np.testing.assert_allclose(back.colors, colors, atol=1e-7)
+    elif colored and suffix == ".obj":
+        np.testing.assert_allclose(back.colors[:, :3], colors[:, :3], atol=1e-12)
+    else:
+        assert back.colors is None
+
+
+def test_ply_is_single_only_where_that_loses_nothing(tmp_path: Path, cube: Shape) -> None:
+    save_shape(tmp_path / "a.ply", cube)
+    save_shape(tmp_path / "b.ply", Shape(cube.verts + 0.1, cube.faces))
+    assert b"property float x" in (tmp_path / "a.ply").read_bytes()
+    assert b"property double x" in (tmp_path / "b.ply").read_bytes()
+
+
+def test_writing_to_where_it_cannot_go(tmp_path: Path, cube: Shape) -> None:
+    with pytest.raises(OutputError, match="no folder"):
+        save_shape(tmp_path / "no" / "a.ply", cube)
+    with pytest.raises(OptionError, match=r"cannot write a shape as \.gltf"):
+        save_shape(tmp_path / "a.gltf", cube)
+
+
+# --- bad files -----------------------------------------------------------------------------------------------------
+
+HUGE = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        *[(f"a{suffix}", b"", "0 bytes") for suffix in SUFFIXES],
+        *[(f"a{suffix}", b"\x89PNG\r\n\x1a\n" + bytes(500), "") for suffix in SUFFIXES],
+        *[(f"a{suffix}", b"<html><body>Not found</body></html>\n", "") for suffix in SUFFIXES],
+        ("a.txt", b"1 2 3", "unknown kind of file .txt"),
+        ("a", b"1 2 3", "unknown kind of file (no suffix)"),
+        ("a.ply", HUGE.format("binary_little_endian", 10**9).encode() + bytes(24), "fewer vertex rows"),
+        ("a.ply", HUGE.format("ascii", 10**9).encode() + b"1 2 3\n", "fewer vertex rows"),
+        ("a.ply", HUGE.format("ascii", -1).encode() + b"1 2 3\n", "fewer vertex rows"),
+        ("a.ply", HUGE.format("ascii", 0).encode(), "no vertices"),
+        ("a.ply", HUGE.format("ascii", 2).encode() + b"1 2 3\n4 5", "fewer vertex rows"),
+        ("a.ply", HUGE.format("ascii", 1).encode() + b"1 two 3\n", "'two' where a number should be"),
+        ("a.ply", HUGE.format("ascii", 1).encode() + b"nan nan nan\n", "all NaN"),
+        ("a.ply", HUGE.format("morse", 1).encode() + b"1 2 3\n", "header line 'format morse 1.0'"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no x, y and z"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement face 0\nend_header\n", "names no vertices"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\n", "header has no end"),
+        ("a.ply", PLY_HEADER.format(format="ascii").encode() + b"0 0 0\n" * 5 + b"3 0 1 9\n3 0 1 2", "names vertex 9"),
+        ("a.ply", PLY_HEADER.format(format="ascii").encode() + b"0 0 0\n" * 5 + b"3 0 1 2\n3 0", "fewer face rows"),
+        ("a.ply", PLY_HEADER.format(format="binary_little_endian").encode() + bytes(60) + b"\3" + bytes(12) + b"\xff" * 9, "fewer face rows"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "names vertex 4, but there are only 3"),
+        ("a.obj", b"v 0 0 0\nf 0 0 0\n", "count from 1"),
+        ("a.obj", b"v 0 0\n", "fewer than 3 coordinates"),
+        ("a.obj", b"v 0 0 0\nf 1 1 1.5\n", "not a whole number"),
+        ("a.obj", b"v 0 0 0\nv x 0 0\n", "'x' where a number should be"),
+        ("a.obj", b"f 1 2 3\n", "no 'v' lines"),
+        ("a.obj", b"v nan nan nan\n", "all NaN"),
+        ("a.off", b"OFF\n1000000000 1 0\n0 0 0\n", "promises 1000000000 vertices"),
+        ("a.off", b"OFF\n2 1 0\n0 0 0\n1 1 1\n", "only 2 lines"),
+        ("a.off", b"OFF\n1 1 0\n0 0 0\n4 0 0 0\n", "fewer corners than it says"),
+        ("a.off", b"OFF BINARY\n", "binary"),
+        ("a.stl", b"x".ljust(80) + struct.pack("<I", 10**9) + bytes(50), "promises 1000000000 triangles"),
+        ("a.stl", b"solid x\nfacet normal 0 0 0\nouter loop\nvertex 0 0 0\n", "middle of a triangle"),
+        ("a.stl", b"x".ljust(84, b"\0"), "no vertices"),
+        ("a.glb", b"glTF" + struct.pack("<III4s", 2, 10**9, 10**9, b"JSON"), "should be"),
+        ("a.xyz", b"# nothing\n", "no points"),
+        ("a.xyz", b"1 2 3\n4 5\n", "point 1 has only 2 of 3"),
+    ],
+)  # fmt: skip
+def test_bad_files_are_explained(tmp_path: Path, name: str, content: bytes, words: str) -> None:
+    tracemalloc.start()
+    with pytest.raises(InputError) as caught:
+        load(tmp_path, name, content)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert words in caught.value.message
+    assert name in caught.value.message
+    assert "\n" not in caught.value.message + caught.value.hint
+    assert caught.value.hint
+    assert peak < 5e6  # whatever the header says
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    (tmp_path / "human.ply").touch()
+    with pytest.raises(InputError, match="there is no file") as caught:
+        load_shape(tmp_path / "humn.ply")
+    assert "human.ply" in caught.value.hint
+    with pytest.raises(InputError, match="is a folder"):
+        load_shape(tmp_path)
+    with pytest.raises(InputError, match="there is no file") as caught:
+        load_shape(tmp_path / "no" / "a.ply")
+    assert "no folder" in caught.value.hint
+
+
+def test_npy_is_never_unpickled(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.array([{"a": 1}] * 3, object), allow_pickle=True)
+    with pytest.raises(InputError, match="not hold an array of numbers"):
+        load_shape(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize(
+    ("array", "words"),
+    [
+        (np.zeros((4, 4)), "holds an array of (4, 4)"),
+        (np.zeros(9), "holds an array of (9,)"),
+        (np.zeros((0, 3)), ""),
+        (np.zeros((3, 3), complex), "not hold an array of numbers"),
+        (np.full((3, 3), np.nan), "all NaN"),
+    ],
+)
+def test_npy_of_something_else(tmp_path: Path, array: np.ndarray, words: str) -> None:
+    np.save(tmp_path / "a.npy", array)
+    with pytest.raises(InputError) as caught:
+        load_shape(tmp_path / "a.npy")
+    assert words in caught.value.message
+
+
+def test_npy_header_that_claims_a_billion_points(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros((100, 3)))
+    data = (tmp_path / "a.npy").read_bytes()
+    with pytest.raises(InputError, match="not a whole npy file"):
+        load(tmp_path, "b.npy", data.replace(b"(100, 3)", b"(999999999, 3)").replace(b"      \n", b"\n", 1))
+    with pytest.raises(InputError, match="not a whole npy file"):
+        load(tmp_path, "c.npy", data[:-1])
+
+
+def test_some_nan_vertices_keep_their_place(tmp_path: Path) -> None:
+    shape = load(
+        tmp_path, "a.obj", "v 0 0 0\nv 2 0 0\nv nan 0 0\nv 0 inf 0\nv 1 1 1e99\nv 4 3 0\nf 1 2 6\nf 1 2 3\n"
+    )
+    assert shape.V == 6
+    np.testing.assert_array_equal(shape.invalid, [False, False, True, True, True, False])
+    np.testing.assert_allclose(shape.verts[2:5], [[2, 1, 0]] * 3)  # the middle of the others
+    np.testing.assert_allclose(shape.bounds, [[0, 0, 0], [4, 3, 0]])
+
+
+@pytest.mark.parametrize("word", ["nan", "-nan", "NaN", "-nan(ind)", "1.#QNAN", "inf", "-Inf"])
+def test_every_spelling_of_not_a_number(tmp_path: Path, word: str) -> None:
+    head = HUGE.format("ascii", 2)
+    shape = load(tmp_path, "a.ply", f"{head}1 2 3\n4 {word} 6\n")
+    np.testing.assert_array_equal(shape.invalid, [False, True])
+
+
+def test_any_damage_gives_a_shape_or_a_clean_error(tmp_path: Path, make_sphere) -> None:
+    """Cut, change and drop bytes at random: never another exception."""
+    rng = np.random.default_rng(0)
+    mesh = make_sphere(0)
+    mesh = Shape(mesh.verts, mesh.faces, "s", rng.random((mesh.V, 4)))
+    outcomes = {"shape": 0, "error": 0}
+    for suffix in (".ply", ".obj", ".off", ".stl", ".glb", ".xyz", ".npy"):
+        shape = Shape(mesh.verts, []) if suffix in (".xyz", ".npy") else mesh
+        save_shape(tmp_path / f"good{suffix}", shape)
+        good = (tmp_path / f"good{suffix}").read_bytes()
+        for trial in range(120):
+            data = bytearray(good)
+            if trial % 3 == 0:
+                data = data[: rng.integers(len(data))]
+            elif trial % 3 == 1:
+                data[rng.integers(min(len(data), 400))] = rng.integers(256)
+            else:
+                start = rng.integers(len(data))
+                del data[start : start + rng.integers(1, 30)]
+            try:
+                load(tmp_path, f"bad{suffix}", bytes(data))
+                outcomes["shape"] += 1
+            except InputError:
+                outcomes["error"] += 1
+    assert min(outcomes.values()) > 100  # both kinds were met
+
+
+# --- real files ----------------------------------------------------------------------------------------------------
+
+
+def test_every_ply_of_the_bench_has_the_counts_of_its_header(bench: Path) -> None:
+    files = sorted(bench.rglob("*.ply"))
+    assert len(files) > 100
+    for path in files:
+        head = path.read_bytes()[:2000]
+        V, F = (int(re.search(rb"element %s (\d+)" % key, head).group(1)) for key in (b"vertex", b"face"))
+        shape = load_shape(path)
+        assert (shape.V, shape.F, shape.invalid) == (V, F, None), path
+
+
+def test_textured_cow_keeps_its_v_lines(bench: Path) -> None:
+    path = bench / "textured" / "spot_triangulated.obj"
+    rows = [line.split()[1:4] for line in path.read_text().splitlines() if line.startswith("v ")]
+    shape = load_shape(path)
+    np.testing.assert_array_equal(shape.verts, np.array(rows, float))
+    assert shape.V < sum(line.startswith("vt ") for line in path.read_text().splitlines())
+
+
+@pytest.mark.parametrize("name", ["Rogue.glb", "Rogue_Hooded.glb"])
+def test_game_characters_keep_every_vertex(bench: Path, name: str) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    data = (bench / "textured" / name).read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    primitives = [
+        p for n in document["nodes"] if "mesh" in n for p in document["meshes"][n["mesh"]]["primitives"]
+    ]
+    accessors = document["accessors"]
+    shape = load_shape(bench / "textured" / name)
+    assert shape.V == sum(accessors[p["attributes"]["POSITION"]]["count"] for p in primitives)
+    assert 3 * shape.F == sum(accessors[p["indices"]]["count"] for p in primitives)
+    other = trimesh.load(bench / "textured" / name, process=False).to_geometry()
+    np.testing.assert_allclose(shape.bounds, other.bounds, atol=1e-5)
+    assert shape.area == pytest.approx(other.area, rel=1e-5)
+
+
+def test_plies_agree_with_an_independent_reader(bench: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    for path in [*sorted(bench.glob("shrec19/*.ply"))[:4], *sorted(bench.glob("heart/*.ply"))[:2]]:
+        other = trimesh.load(path, process=False)
+        shape = load_shape(path)
+        np.testing.assert_array_equal(shape.verts, other.vertices)
+        np.testing.assert_array_equal(shape.faces, other.faces)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".glb"])
+def test_an_independent_reader_reads_what_is_written(tmp_path: Path, sphere: Shape, suffix: str) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    save_shape(tmp_path / f"s{suffix}", sphere)
+    other = trimesh.load(tmp_path / f"s{suffix}", process=False, force="mesh")
+    np.testing.assert_allclose(other.vertices, sphere.verts, atol=1e-7)
+    np.testing.assert_array_equal(other.faces, sphere.faces)
