@@ -32,12 +32,14 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
     temporary = folder / f".{path.stem[:80]}.{secrets.token_hex(4)}{path.suffix}"
     try:
         temporary.touch(exist_ok=False)  # tells now, not after minutes of work
+        mode = temporary.stat().st_mode  # some writers make files that only their owner may read
     except OSError as error:
         raise OutputError(
             f"cannot write {path}: {error.strerror}", "choose another folder with -o"
         ) from error
     try:
         yield temporary
+        temporary.chmod(mode)
         os.replace(temporary, path)
     except OSError as error:
         if error.filename in (None, str(temporary), temporary):

@@ -12,6 +12,7 @@ basis), and the 4 x 4 moment matrices stay well conditioned.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Literal
 
@@ -115,7 +116,7 @@ def build_field(
     P, K = len(points), len(nodes)
     radii = np.broadcast_to(np.asarray(radius, np.float64), (K,))
     row, column = support_pairs(points, nodes, radii)
-    x, q, r = (torch.from_numpy(np.ascontiguousarray(a)) for a in (points, nodes, radii))
+    x, q, r = (torch.from_numpy(np.array(a)) for a in (points, nodes, radii))
     at, of = torch.from_numpy(row), torch.from_numpy(column)
     offset = x[at] - q[of]
     weight, slope = kernel_weights(offset.norm(dim=1), r[of], kernel)
@@ -164,11 +165,16 @@ def _check_support(moment: torch.Tensor) -> None:
 def _assemble(at, of, phi, gradient, P, K) -> Field:
     counts = torch.bincount(at, minlength=P)
     start = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
-    values = torch.sparse_csr_tensor(start, of, phi.float(), (P, K))
+    values = _csr(start, of, phi, (P, K))
     rows = (3 * at[:, None] + torch.arange(3)).T.flatten()
     order = torch.argsort(rows, stable=True)
     start3 = torch.cat([torch.zeros(1, dtype=torch.int64), counts.repeat_interleave(3).cumsum(0)])
-    slopes = torch.sparse_csr_tensor(
-        start3, of.repeat(3)[order], gradient.T.flatten()[order].float(), (3 * P, K)
-    )
+    slopes = _csr(start3, of.repeat(3)[order], gradient.T.flatten()[order], (3 * P, K))
     return Field(values, slopes)
+
+
+def _csr(start: torch.Tensor, column: torch.Tensor, values: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    with warnings.catch_warnings():
+        # Torch announces its CSR layout as beta at the first use: nothing a user could act on.
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(start, column, values.float(), size, check_invariants=True)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,14 +16,16 @@ from meshmatch.fitting.fit import FAIR_RESIDUAL, GOOD_RESIDUAL, Fit, axis_name
 from meshmatch.fitting.latent import LatentRefineConfig, refine_code
 from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
-from meshmatch.fitting.orientation import Hypothesis, axis_vector, forced_frames, propose
+from meshmatch.fitting.orientation import Hypothesis, axis_vector, forced_frames, propose, standing_grid, with_flips
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
-from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Frame, Shape
 from meshmatch.templates.template import Template
+
+if TYPE_CHECKING:
+    from meshmatch.models.trained import TrainedModel
 
 Refine = Literal["none", "latent", "nodes"]
 REFINEMENTS: tuple[Refine, ...] = ("none", "latent", "nodes")
@@ -34,8 +36,9 @@ Progress = Callable[[str, float], None]
 class FitConfig:
     """How hard to look and how to refine.
 
-    samples : points drawn on the surface; hypotheses : orientations laid on; finalists : of which this many
-    are refined before the better one is kept; copies : turned copies that vote on the orientation.
+    samples : points drawn on the surface, of which coarse_samples see every orientation; hypotheses : voted
+    orientations, each tried with its flips; finalists : of which this many are refined before the better one is
+    kept; copies : turned copies that vote on the orientation.
     """
 
     refine: Refine = "nodes"
@@ -43,8 +46,9 @@ class FitConfig:
     up: str | None = None
     front: str | None = None
     samples: int = 8000
-    copies: int = 64
-    hypotheses: int = 4
+    coarse_samples: int = 2048
+    copies: int = 48
+    hypotheses: int = 2
     finalists: int = 2
     nodes: NodeRefineConfig = field(default_factory=NodeRefineConfig)
     latent: LatentRefineConfig = field(default_factory=LatentRefineConfig)
@@ -91,12 +95,16 @@ def fit_shape(
     system = node_system(model.template)
     frame, scan = take_samples(shape, config.samples, rng)
     tell("orientation", 0.0)
-    found = _hypotheses(model, scan, config)
-    candidates = []
-    for number, guess in enumerate(found):
-        candidates.append(lay_on(model.network, system, model.template.core, scan, guess.rotation, guess.centre, rng))
-        tell("orientation", (number + 1) / len(found))
+    guesses = _hypotheses(model, scan, config)
+    coarse = Scan(scan.points[: config.coarse_samples], scan.normals[: config.coarse_samples])
+    rough = []
+    for number, guess in enumerate(guesses):
+        rough.append(_lay(model, system, coarse, guess, rng, rounds=1, draws=1, stride=1))
+        tell("orientation", 0.7 * (number + 1) / len(guesses))
+    rough.sort(key=lambda candidate: candidate.residual)
+    candidates = [_lay(model, system, scan, guess, rng) for guess in rough[: config.finalists + 1]]
     candidates.sort(key=lambda candidate: candidate.residual)
+    tell("orientation", 1.0)
     best = _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell)
     core_frame = frame.compose(Frame(1.0, best.rotation.T, best.centre))
     points = system.moved(best.vectors)
@@ -119,6 +127,10 @@ def fit_shape(
     )
 
 
+def _lay(model: TrainedModel, system: NodeSystem, scan: Scan, guess: Hypothesis | Candidate, rng, **how) -> Candidate:
+    return lay_on(model.network, system, model.template.core, scan, guess.rotation, guess.centre, rng, **how)
+
+
 def take_samples(shape: Shape, P: int, rng: np.random.Generator) -> tuple[Frame, Scan]:
     """Frame of a shape (area 1, centroid 0) and samples of it in that frame."""
     frame = sqrt_area_frame(shape)
@@ -127,8 +139,11 @@ def take_samples(shape: Shape, P: int, rng: np.random.Generator) -> tuple[Frame,
 
 
 def _hypotheses(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypothesis]:
-    """Core frames to try: the aligner's, or those that obey the user's axes."""
-    voted = propose(model.network, scan.points[:2048], config.copies, config.hypotheses, config.seed)
+    """Core frames to try: the aligner's (or a grid where there is none), or those that obey the user's axes."""
+    if model.network.aligner is None:
+        voted = standing_grid(scan.points.mean(0))
+    else:
+        voted = with_flips(propose(model.network, scan.points[:2048], config.copies, config.hypotheses, config.seed))
     if config.up is None and config.front is None:
         return voted
     up = axis_vector(config.up) if config.up else None

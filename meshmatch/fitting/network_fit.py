@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from meshmatch.fitting.scan import Scan, with_normals
 from meshmatch.fitting.system import NodeSystem
@@ -36,14 +37,17 @@ def rigid_motion(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np
     return R, b - R @ a
 
 
-def two_way_residual(system: NodeSystem, scan: Scan, vectors: np.ndarray, cap: float = 0.1) -> float:
-    """Mean of the capped 6-D nearest-neighbour distances, template to scan and back."""
-    from scipy.spatial import cKDTree
+def two_way_residual(
+    system: NodeSystem, scan: Scan, vectors: np.ndarray, stride: int = 2, cap: float = 0.1
+) -> float:
+    """Mean of the capped 6-D nearest-neighbour distances, template to scan and back.
 
+    Every ``stride``-th point of both is asked for its neighbour.
+    """
     moved = system.moved(vectors)
     seen = with_normals(moved, system.normals(moved))
-    forward = scan.tree.query(seen[::2])[0]
-    back = cKDTree(seen).query(with_normals(scan.points[::2], scan.normals[::2]))[0]
+    forward = scan.tree.query(seen[::stride])[0]
+    back = cKDTree(seen).query(with_normals(scan.points[::stride], scan.normals[::stride]))[0]
     return float(0.5 * np.minimum(forward, cap).mean() + 0.5 * np.minimum(back, cap).mean())
 
 
@@ -66,12 +70,16 @@ def lay_on(
     rng: np.random.Generator,
     rounds: int = 2,
     draws: int = 2,
+    stride: int = 2,
 ) -> Candidate:
-    """Predict, move the core frame to where the prediction puts the core, predict again."""
+    """Predict, move the core frame to where the prediction puts the core, predict again.
+
+    ``draws`` point samples are averaged each time; ``stride`` coarsens the residual.
+    """
     for turn in range(rounds):
         local = scan.turned(rotation, centre)
         vectors = predict(model, local, draws, rng)
         if turn < rounds - 1:
             R, t = rigid_motion(system.verts[core], system.moved(vectors)[core])
             rotation, centre = rotation @ R, rotation @ t + centre
-    return Candidate(rotation, centre, vectors, two_way_residual(system, local, vectors))
+    return Candidate(rotation, centre, vectors, two_way_residual(system, local, vectors, stride))

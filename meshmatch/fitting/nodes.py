@@ -25,12 +25,12 @@ class NodeRefineConfig:
     From the first step to the last the strain weight and the robust scale fall geometrically.
     """
 
-    steps: int = 20
-    strain_first: float = 0.3
-    strain_last: float = 0.01
-    scale_first: float = 0.06
-    scale_last: float = 0.012
-    point_share: float = 0.1
+    steps: int = 10
+    strain_first: float = 0.003
+    strain_last: float = 0.0001
+    scale_first: float = 0.1
+    scale_last: float = 0.03
+    point_share: float = 0.3
     normal_cosine: float = 0.2
     back_points: int = 4000
     damping: float = 1e-4

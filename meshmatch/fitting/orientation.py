@@ -79,6 +79,27 @@ def propose(
     return found
 
 
+# Turns of the core frame that a vote may be wrong by: about face, upside down, on its head, a quarter either way.
+_FLIPS = Rotation.from_rotvec(
+    np.pi * np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 1], [0, 0.5, 0], [0, -0.5, 0]])
+).as_matrix()
+
+
+def with_flips(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
+    """Every hypothesis and its flips; front and back of a body look alike to a vote, not to a fit."""
+    return [
+        Hypothesis(guess.rotation @ flip, guess.centre, guess.votes) for flip in _FLIPS for guess in hypotheses
+    ]
+
+
+def standing_grid(centre: np.ndarray) -> list[Hypothesis]:
+    """Six axes up, twelve turns about each: for networks without an aligner."""
+    grid = []
+    for axis in np.concatenate([np.eye(3), -np.eye(3)]):
+        grid += [Hypothesis(guess.rotation, centre, guess.votes) for guess in forced_frames(axis, None)]
+    return grid
+
+
 def axis_vector(name: str) -> np.ndarray:
     """Unit vector of an axis name such as "y", "+y" or "-z"."""
     sign = -1.0 if name.startswith("-") else 1.0

@@ -18,6 +18,7 @@ from meshmatch.training.scans import (
     rigid_fit,
     sample_scan,
     small_rotations,
+    yaw_rotations,
 )
 
 # Draws shapes with the template's connectivity: (count, generator) -> vertices (count, V, 3), any unit.
@@ -103,8 +104,12 @@ class BatchDataset(torch.utils.data.Dataset):
         R, t = rigid_fit(self.template_core, verts[:, self.core])
 
         # The roughly right frame in which the encoder works: x_core = S R^T (x - t) + shift.
-        turn = small_rotations(B, generator) @ R.transpose(1, 2)
-        shift = 0.03 * torch.randn(B, 1, 3, generator=generator)
+        if self.scan.upright:
+            t = points.mean(1)
+            turn, shift = yaw_rotations(B, generator), torch.zeros(B, 1, 3)
+        else:
+            turn = small_rotations(B, generator) @ R.transpose(1, 2)
+            shift = 0.03 * torch.randn(B, 1, 3, generator=generator)
         in_core = (points - t[:, None]) @ turn.transpose(1, 2) + shift
         targets = (verts[:, self.loss_points] - t[:, None]) @ turn.transpose(1, 2) + shift
         features = self.encoder.features(in_core)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
-from meshmatch.shapes.decimate import decimate
-from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig, choose_nodes
+from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.prepare import make_template
 from meshmatch.templates.template import Template
 from meshmatch.training.bodies import skin
 from meshmatch.training.poses import forward_kinematics, still_pose
@@ -50,19 +48,6 @@ def body_parts(rig: Rig) -> tuple[np.ndarray, tuple[str, ...]]:
     return of_joint[rig.weights.argmax(1).numpy()], tuple(names)
 
 
-def low_resolution(rig: Rig, faces: int = 10_000) -> tuple[np.ndarray, np.ndarray]:
-    """Decimate the rig's mesh onto a subset of its own vertices: kept indices (V,), faces (F, 3)."""
-    dense = standing_body(rig, "T")
-    small = decimate(dense, faces)
-    nearest = cKDTree(dense.verts).query(small.verts)[1]
-    keep, renumbered = np.unique(nearest, return_inverse=True)
-    corners = renumbered[small.faces]
-    proper = (
-        (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
-    )
-    return keep, corners[proper]
-
-
 def standing_body(rig: Rig, pose: str) -> Shape:
     """The mean identity in a template pose, metres."""
     arms, legs = POSES[pose]
@@ -73,29 +58,21 @@ def standing_body(rig: Rig, pose: str) -> Shape:
     return Shape(verts.double().numpy(), rig.faces.numpy(), f"human-{pose}")
 
 
-def human_template(
-    rig: Rig, keep: np.ndarray, faces: np.ndarray, pose: str, config: NodeConfig
-) -> Template:
-    """Template of the mean body. ``rig`` carries the full mesh; ``keep``, ``faces`` its low resolution."""
-    dense = standing_body(rig, pose)
-    low = Shape(dense.verts[keep], faces, dense.name)
-    frame = sqrt_area_frame(low)
-    low = Shape(frame.apply(low.verts), faces, low.name)
+def human_template(rig: Rig, pose: str, config: NodeConfig, low: tuple[np.ndarray, np.ndarray]) -> Template:
+    """Template of the mean body. ``rig`` carries the full mesh; ``low`` is its low resolution (vertices, faces)."""
     labels, names = body_parts(rig)
-    labels = labels[keep]
     core = np.flatnonzero(np.isin(labels, [names.index(part) for part in _CORE]))
-    return Template(
-        name=f"human-{pose}",
-        shape=low,
-        dense=Shape(frame.apply(dense.verts), dense.faces, dense.name),
-        nodes=choose_nodes(low, config, labels),
-        radius=config.radius,
+    return make_template(
+        standing_body(rig, pose),
+        f"human-{pose}",
+        config,
         labels=labels,
         label_names=names,
         core=core,
         pose=pose,
         source=SOURCE,
         licence=LICENCE,
+        low=low,
     )
 
 

@@ -87,6 +87,7 @@ class Trainer:
             model.parameters(), lr=config.rate, betas=(0.9, 0.99), weight_decay=config.weight_decay, fused=True
         )
         self.step = 0
+        self.seconds = 0.0
 
     def save(self, path: Path) -> None:
         """Write everything that the next step depends on (rank 0 only)."""
@@ -98,12 +99,13 @@ class Trainer:
             arrays |= {f"optimiser.{index}.{n}": torch.as_tensor(t) for n, t in state.items()}
         arrays = {n: t.detach().cpu().contiguous().clone() for n, t in arrays.items()}
         with replace_on_success(path) as temporary:
-            save_file(arrays, temporary, {"step": str(self.step), "seed": str(self.config.seed)})
+            save_file(arrays, temporary, {"step": str(self.step), "seconds": f"{self.seconds:.1f}"})
 
     def load(self, path: Path) -> None:
         """Continue exactly where :meth:`save` was called."""
         with safe_open(str(path), framework="pt") as file:
             self.step = int(file.metadata()["step"])
+            self.seconds = float(file.metadata().get("seconds", 0.0))
             arrays = {n: file.get_tensor(n) for n in file.keys()}
         self.model.load_state_dict(_part(arrays, "model."))
         for n, tensor in _part(arrays, "average.").items():
@@ -136,6 +138,7 @@ class Trainer:
             worker_init_fn=_one_thread,
         )
         began = saved = time.monotonic()
+        before = self.seconds
         sums: dict[str, torch.Tensor] = {}
         self.model.train()
         for batch in loader:
@@ -154,6 +157,7 @@ class Trainer:
             for name, value in terms.items():
                 sums[name] = sums.get(name, torch.zeros(())) + value.detach().cpu()
             now = time.monotonic()
+            self.seconds = before + now - began
             if report is not None and (self.step % every == 0 or self.step == config.steps):
                 score = validate(self.model) if validate and self.step % (10 * every) == 0 else None
                 means = {name: float(value) / every for name, value in sums.items()}

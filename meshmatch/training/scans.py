@@ -11,7 +11,11 @@ from meshmatch.training.poses import DEGREE, rotation_from_vector
 
 @dataclass(frozen=True)
 class ScanConfig:
-    """How rough the simulated scans are. Lengths in units of sqrt(surface area)."""
+    """How rough the simulated scans are. Lengths in units of sqrt(surface area).
+
+    ``upright``: scans stand in the category's own axes, centred, turned about the vertical only (the paper);
+    otherwise roughly in the core frame, where an aligner puts them.
+    """
 
     points: int = 2048
     noise: float = 0.012
@@ -20,6 +24,7 @@ class ScanConfig:
     density: float = 0.6
     bumps: float = 0.004
     scale: float = 0.04
+    upright: bool = False
 
 
 def surface_area(verts: torch.Tensor, faces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -64,6 +69,12 @@ def small_rotations(B: int, generator: torch.Generator) -> torch.Tensor:
     """Mostly a few degrees, sometimes tens: what an aligner gets wrong."""
     size = torch.where(torch.rand(B, 1, generator=generator) < 0.75, 6.0, 18.0) * DEGREE
     return rotation_from_vector(size * torch.randn(B, 3, generator=generator))
+
+
+def yaw_rotations(B: int, generator: torch.Generator) -> torch.Tensor:
+    """Rotations (B, 3, 3) about the vertical axis y."""
+    angle = 2 * torch.pi * torch.rand(B, 1, generator=generator)
+    return rotation_from_vector(angle * torch.tensor([0.0, 1.0, 0.0]))
 
 
 def bump(verts: torch.Tensor, amplitude: float, generator: torch.Generator) -> torch.Tensor:

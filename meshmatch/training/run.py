@@ -1,0 +1,215 @@
+"""`meshmatch train`: from a template and shapes to a model folder that the registry accepts."""
+
+from __future__ import annotations
+
+import datetime
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import platformdirs
+import torch
+
+from meshmatch.errors import OptionError
+from meshmatch.models.card import ModelCard, write_card
+from meshmatch.models.checkpoint import save_weights
+from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig
+from meshmatch.templates.prepare import read_registered
+from meshmatch.templates.template import Template, load_template
+from meshmatch.training.datasets import Source, body_source, registered_source
+from meshmatch.training.human_template import restrict
+from meshmatch.training.loop import Progress, TrainConfig, Trainer
+from meshmatch.training.losses import LossConfig, LossPoints, distance
+from meshmatch.training.rig import RIG_VERSION, Rig, build_rig, load_rig, save_rig
+from meshmatch.training.scans import ScanConfig
+from meshmatch.training.setup import build_dataset, build_deformer, build_loss_points
+
+Preset = Literal["default", "paper"]
+CHECKPOINT = "last.safetensors"
+_VALIDATION_SEED = 999_983
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything a training run is a function of, besides its shapes."""
+
+    network: NetworkConfig
+    train: TrainConfig
+    scan: ScanConfig
+    kernel: Literal["smooth", "cubic"]
+
+
+def recipe(preset: Preset = "default") -> Recipe:
+    """The recipe of a preset.
+
+    ``paper``: point encoder, node decoder, squared loss with the paper's weights, its kernel, batch and rate,
+    3,000 clean points turned about the vertical axis. ``default``: what beat it (docs/results.md).
+    """
+    if preset == "paper":
+        return Recipe(
+            PAPER,
+            TrainConfig(steps=75_000, shapes=16, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=LossConfig()),
+            ScanConfig(points=3000, noise=0.0, holes=0.0, outliers=0.0, density=0.0, bumps=0.0, scale=0.0, upright=True),
+            "cubic",
+        )
+    if preset == "default":
+        loss = LossConfig(volume=2e-3, arap=2e-3, blend=1e-3, robust=True)
+        return Recipe(NetworkConfig(), TrainConfig(steps=13_000, decay=0.65, loss=loss), ScanConfig(), "smooth")
+    raise OptionError(f"no preset {preset!r}", "choose default or paper")
+
+
+def human_source(
+    template: Template, identities: int = 4096, seed: int = 0, progress: Callable[[int, int], None] | None = None
+) -> Source:
+    """Generated bodies on a human template's vertices; the rig is built once and cached."""
+    rig = cached_rig(identities, seed, progress)
+    # Template vertices are a subset of the body model's: the dense mesh says which.
+    from scipy.spatial import cKDTree
+
+    apart, keep = cKDTree(template.dense.verts).query(template.shape.verts)
+    if template.dense.verts.shape[0] != rig.rest.shape[1] or apart.max() > 1e-4:
+        raise OptionError(
+            f"template {template.name} is not made from the body model",
+            "train on a prepared folder (--shapes), or use a human template",
+        )
+    return body_source(restrict(rig, keep, np.array(template.shape.faces)))
+
+
+def cached_rig(identities: int, seed: int, progress: Callable[[int, int], None] | None = None) -> Rig:
+    """The body rig from the cache, or built into it (a minute or two, once)."""
+    path = Path(platformdirs.user_cache_dir("meshmatch")) / f"rig-v{RIG_VERSION}-{identities}-{seed}.safetensors"
+    if path.is_file():
+        return load_rig(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rig = build_rig(identities, seed, progress=progress)
+    save_rig(rig, path)
+    return rig
+
+
+def folder_source(folder: str | Path, template: Template) -> tuple[Source, int]:
+    """Registered shapes of a prepared folder, and how many there are."""
+    shapes = torch.from_numpy(read_registered(folder, template))
+    return registered_source(shapes), len(shapes)
+
+
+def train_model(
+    template: Template,
+    source: Source,
+    output: str | Path,
+    *,
+    recipe: Recipe,
+    name: str,
+    category: str = "human",
+    data: str = "",
+    licence: str = "",
+    resume: bool = True,
+    progress: Callable[[Progress], None] | None = None,
+) -> Path:
+    """Train, or go on training, and write a model folder.
+
+    ``output`` receives ``checkpoint/last.safetensors`` on the way and, at every stop, ``template.safetensors``,
+    ``weights.safetensors`` and last ``card.json``.
+
+    Returns
+    -------
+    Path
+        The model folder.
+    """
+    output = Path(output)
+    (output / "checkpoint").mkdir(parents=True, exist_ok=True)
+    checkpoint = output / "checkpoint" / CHECKPOINT
+    config = recipe.train
+    model = build_deformer(template, source, recipe.network, recipe.scan, recipe.kernel, config.seed)
+    points = build_loss_points(template, recipe.kernel)
+    dataset = build_dataset(
+        template, source, model, recipe.scan, config.shapes, config.scans_per_shape, config.seed, config.steps
+    )
+    trainer = Trainer(model, points, config)
+    if resume and checkpoint.is_file():
+        trainer.load(checkpoint)
+    held_out = replace(dataset, seed=_VALIDATION_SEED, shapes=32, scans_per_shape=1)[0]
+
+    def validate(model: Deformer) -> float:
+        return validation_error(model, held_out, points)
+
+    trainer.run(dataset, checkpoint, progress, validate)
+    if trainer.rank == 0:
+        score = validation_error(_averaged(trainer), held_out, points)
+        export(trainer, template, output, recipe, name, category, data, licence, score)
+    return output
+
+
+def _averaged(trainer: Trainer) -> Deformer:
+    trainer.model.load_state_dict(trainer.averaged_state())
+    return trainer.model
+
+
+@torch.no_grad()
+def validation_error(model: Deformer, batch, points: LossPoints) -> float:
+    """Mean distance (units of sqrt(area)) on held-out scans, learned corrections included."""
+    was = model.training
+    model.eval()
+    device = points.positions.device
+    error = float(distance(points.moved(model(batch.points.to(device))), batch.targets.to(device)))
+    model.train(was)
+    return error
+
+
+def export(
+    trainer: Trainer,
+    template: Template,
+    output: Path,
+    recipe: Recipe,
+    name: str,
+    category: str,
+    data: str,
+    licence: str,
+    score: float,
+    storage: str = "int8",
+) -> None:
+    """Write the averaged weights as a model folder; the card comes last."""
+    from meshmatch.templates.template import save_template
+
+    (output / "card.json").unlink(missing_ok=True)
+    save_template(template, output / "template.safetensors")
+    digest = save_weights(trainer.averaged_state(), output / "weights.safetensors", storage=storage)
+    card = ModelCard(
+        name=name,
+        category=category,
+        template=template.name,
+        template_hash=template.hash,
+        network=recipe.network.to_dict(),
+        field={"kernel": recipe.kernel, "radius": template.radius, "nodes": template.K},
+        data=data,
+        licence=licence,
+        recipe={"train": asdict(recipe.train), "scan": asdict(recipe.scan)},
+        seed=recipe.train.seed,
+        steps=trainer.step,
+        training_minutes=round(trainer.seconds / 60, 1),
+        metrics={"validation": {"distance": round(score, 5)}},
+        weights_sha256=digest,
+        created=datetime.date.today().isoformat(),
+        description="",
+    )
+    write_card(card, output / "card.json")
+
+
+def read_template(name: str | Path) -> Template:
+    """A template by file, or one of the built-in ones by name (human-T, human-A, human-I)."""
+    from meshmatch.templates.location import bundled_folder
+
+    path = Path(name)
+    if path.is_file():
+        return load_template(path)
+    inside = bundled_folder() / "human" / f"{name}.safetensors"
+    return load_template(inside if inside.is_file() else path)
+
+
+def copy_model(folder: Path, target: Path) -> None:
+    """Copy the three files of a model, the card last."""
+    target.mkdir(parents=True, exist_ok=True)
+    for file in ("template.safetensors", "weights.safetensors", "card.json"):
+        shutil.copy2(folder / file, target / file)

@@ -1,0 +1,128 @@
+"""Moving least squares: a slow textbook oracle, finite differences in float64, and the laws."""
+
+import numpy as np
+import pytest
+import torch
+
+from meshmatch.errors import TemplateError
+from meshmatch.fields.energies import arap_energy, determinant, volume_energy
+from meshmatch.fields.mls import build_field, kernel_weights
+
+KERNELS = ("smooth", "cubic")
+
+
+def weight(x, q, r, kernel):
+    d = np.linalg.norm(x - q)
+    if d > r:
+        return 0.0
+    return (1 - d / r) ** 3 if kernel == "cubic" else (1 - d**2 / r**2) ** 3
+
+
+def textbook_phi(x, nodes, r, kernel):
+    """Phi_i = p(x)^T M^-1 w_i p(q_i), written as the formula reads, in the global basis."""
+
+    def p(y):
+        return np.array([1.0, *y])
+
+    M = sum(weight(x, q, r, kernel) * np.outer(p(q), p(q)) for q in nodes)
+    left = p(x) @ np.linalg.inv(M)
+    return np.array([left @ (weight(x, q, r, kernel) * p(q)) for q in nodes])
+
+
+def textbook_gradient(x, nodes, r, kernel, h=1e-6):
+    rows = []
+    for k in range(3):
+        e = np.zeros(3)
+        e[k] = h
+        rows.append((textbook_phi(x + e, nodes, r, kernel) - textbook_phi(x - e, nodes, r, kernel)) / (2 * h))
+    return np.array(rows)
+
+
+@pytest.fixture
+def cloud():
+    rng = np.random.default_rng(0)
+    return rng.uniform(-0.6, 0.6, (12, 3)), rng.uniform(-1, 1, (150, 3))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_shape_functions_and_gradient_equal_the_textbook(cloud, kernel):
+    points, nodes = cloud
+    field = build_field(points, nodes, 0.7, kernel)
+    phi = field.phi.to_dense().numpy()
+    gradient = field.gradient.to_dense().numpy().reshape(len(points), 3, -1)
+    for n, x in enumerate(points):
+        assert np.allclose(phi[n], textbook_phi(x, nodes, 0.7, kernel), atol=1e-5)
+        assert np.allclose(gradient[n], textbook_gradient(x, nodes, 0.7, kernel), atol=2e-4)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_laws(cloud, kernel):
+    points, nodes = cloud
+    field = build_field(points, nodes, 0.7, kernel)
+    phi = field.phi.to_dense().double().numpy()
+    assert np.allclose(phi.sum(1), 1, atol=1e-5)
+    assert np.allclose(phi @ nodes, points, atol=1e-5)
+    assert (phi[np.linalg.norm(points[:, None] - nodes, axis=2) > 0.7] == 0).all()
+    assert torch.equal(field.displacement(torch.zeros(2, len(nodes), 3)), torch.zeros(2, len(points), 3))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_an_affine_motion_of_the_nodes_is_affine_everywhere(cloud, kernel):
+    points, nodes = cloud
+    field = build_field(points, nodes, 0.7, kernel)
+    A = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.3], [0.0, 0.1, 1.2]])
+    vectors = torch.from_numpy(nodes @ (A - np.eye(3)).T + 0.5).float()[None]
+    assert np.allclose(field.displacement(vectors)[0].numpy(), points @ (A - np.eye(3)).T + 0.5, atol=1e-5)
+    assert np.allclose(field.deformation_gradient(vectors)[0].numpy(), A, atol=1e-4)
+
+
+def test_a_rigid_motion_has_no_energy_and_a_stretch_has(cloud):
+    points, nodes = cloud
+    field = build_field(points, nodes, 0.7)
+    angle = 0.7
+    R = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    rigid = field.deformation_gradient(torch.from_numpy(nodes @ (R - np.eye(3)).T + 0.1).float()[None])
+    assert volume_energy(rigid).max() < 1e-7
+    assert arap_energy(rigid).max() < 1e-3
+    double = field.deformation_gradient(torch.from_numpy(nodes).float()[None])  # x -> 2 x
+    assert torch.allclose(volume_energy(double), torch.tensor(49.0), rtol=1e-3)  # (8 - 1)^2
+    assert torch.allclose(arap_energy(double), torch.tensor(27.0).sqrt(), rtol=1e-3)  # |4 I - I|
+
+
+def test_determinant_and_arap_equal_the_plain_formulas():
+    F = torch.randn(50, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.allclose(determinant(F), torch.linalg.det(F))
+    plain = torch.linalg.matrix_norm(F.transpose(1, 2) @ F - torch.eye(3, dtype=F.dtype))
+    assert torch.allclose(arap_energy(F), plain, atol=1e-6)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_kernel_slope_is_the_derivative(kernel):
+    d = torch.linspace(0.01, 0.99, 30, dtype=torch.float64)
+    r = torch.ones_like(d)
+    value, slope = kernel_weights(d, r, kernel)
+    h = 1e-6
+    numeric = (kernel_weights(d + h, r, kernel)[0] - kernel_weights(d - h, r, kernel)[0]) / (2 * h)
+    assert torch.allclose(slope * d, numeric, atol=1e-6)
+    assert kernel_weights(torch.tensor([1.5]), torch.ones(1), kernel)[0] == 0
+    assert kernel_weights(torch.zeros(1), torch.ones(1), "cubic")[1] == 0
+
+
+def test_far_from_the_origin_float32_holds():
+    rng = np.random.default_rng(1)
+    points, nodes = rng.uniform(-0.5, 0.5, (20, 3)), rng.uniform(-1, 1, (150, 3))
+    near = build_field(points, nodes, 0.7).phi.to_dense()
+    far = build_field(points + 1000, nodes + 1000, 0.7).phi.to_dense()
+    assert torch.allclose(near, far, atol=1e-5)
+
+
+def test_a_point_out_of_reach_is_named():
+    nodes = np.random.default_rng(0).uniform(-1, 1, (100, 3))
+    with pytest.raises(TemplateError, match="points 1"):
+        build_field(np.array([[0.0, 0, 0], [9.0, 0, 0]]), nodes, 0.8)
+
+
+def test_coplanar_nodes_are_not_enough():
+    flat = np.random.default_rng(0).uniform(-1, 1, (100, 3)) * [1, 1, 0]
+    with pytest.raises(TemplateError, match="non-coplanar"):
+        build_field(np.zeros((1, 3)), flat, 0.8)
