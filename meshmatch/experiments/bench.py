@@ -85,7 +85,7 @@ _work: _Work | None = None
 
 
 def _begin(work: _Work) -> None:
-    global _work  # noqa: PLW0603  (the one way to keep something in a worker process)
+    global _work
     set_threads(work.threads)
     _work = work
 

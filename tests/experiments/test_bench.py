@@ -35,9 +35,12 @@ def test_every_shape_is_fitted_once(small: Path, kept: Path, monkeypatch: pytest
     found = run_set(bench, Oracle(), pairs=bench.pairs, cache=kept)
     assert sorted(fitted) == sorted(bench.shapes)
     record = found.as_dict()
-    assert record["mean_cm"] == 0 and record["complete"] and not record["failed"]
+    assert record["mean_cm"] == 0
+    assert record["complete"]
+    assert not record["failed"]
     assert set(record["groups"]) == {"same subject", "cross subject"}
-    assert len(found.map_seconds) == 6 and set(found.fit_seconds) == set(bench.shapes)
+    assert len(found.map_seconds) == 6
+    assert set(found.fit_seconds) == set(bench.shapes)
 
 
 def test_two_processes_find_the_same(small: Path, kept: Path) -> None:
@@ -54,7 +57,8 @@ def test_a_shape_that_cannot_be_fitted_costs_its_pairs(small: Path, kept: Path) 
     bench = load_set("shrec19", small)
     found = run_set(bench, Oracle(refuses="2"), pairs=bench.pairs, cache=kept)
     record = found.as_dict()
-    assert record["pairs"] == 3 and record["complete"]
+    assert record["pairs"] == 3
+    assert record["complete"]
     assert record["failed"] == [["1", "2", "2 cannot be fitted"], ["10", "2", "2 cannot be fitted"]]
     assert record["flips"] == pytest.approx(2 / 3, abs=1e-4)
     assert record["fits"]["2"] == ["failed", "2 cannot be fitted"]
@@ -107,11 +111,13 @@ def test_the_command(
         main(["--data", str(small), "--cache", str(kept), "--maps", str(saved), "--sets", "faust,scape"]) == 0
     )
     again = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    assert again["sets"]["faust"]["mean_cm"] == 0 and list(again["sets"]) == ["faust", "scape"]
+    assert again["sets"]["faust"]["mean_cm"] == 0
+    assert list(again["sets"]) == ["faust", "scape"]
     # A part says that it is one.
     assert main([*words, "--limit-pairs", "2", "--sets", "faust"]) == 0
     text = capsys.readouterr().out
-    assert "2 of 6" in text and not json.loads(text.strip().splitlines()[-1])["sets"]["faust"]["complete"]
+    assert "2 of 6" in text
+    assert not json.loads(text.strip().splitlines()[-1])["sets"]["faust"]["complete"]
 
 
 def test_the_command_speaks_of_the_users_mistakes(

@@ -60,7 +60,8 @@ def test_right_maps_have_no_error(small: Path, kept: Path, name: str) -> None:
     bench = load_set(name, small)
     scores = evaluate_set(bench, {pair: truth(*pair) for pair in bench.pairs}, cache=kept)
     record = scores.as_dict()
-    assert record["pairs"] == len(bench.pairs) and record["complete"]
+    assert record["pairs"] == len(bench.pairs)
+    assert record["complete"]
     assert record["points_per_pair"] == BODY.V
     assert record["mean_cm"] == record["share_over_15cm"] == record["flips"] == record["worst"][0][2] == 0
 
@@ -83,7 +84,8 @@ def test_errors_are_those_of_the_plain_way(small: Path, kept: Path, name: str) -
         total.append(expected.mean_cm)
     assert scores.joined.mean_cm == pytest.approx(np.mean(total), rel=1e-3)
     assert scores.as_dict()["median_pair_cm"] == pytest.approx(np.median(total), rel=1e-3)
-    assert scores.flips == 1.0 and scores.joined.mean_cm > 40
+    assert scores.flips == 1.0
+    assert scores.joined.mean_cm > 40
     worst = scores.as_dict()["worst"][0]
     assert worst[2] == pytest.approx(max(total), abs=0.1)
 
@@ -95,7 +97,8 @@ def test_one_pair_of_three_is_wrong(small: Path, kept: Path) -> None:
     scores = evaluate_set(bench, maps, cache=kept)
     assert scores.flips == pytest.approx(1 / 3)
     assert next(iter(scores.means_cm)) == ("1", "10")
-    assert scores.joined.median == 0 and scores.joined.mean > 0.1
+    assert scores.joined.median == 0
+    assert scores.joined.mean > 0.1
 
 
 def test_groups_share_the_pairs(small: Path, kept: Path) -> None:
@@ -104,8 +107,10 @@ def test_groups_share_the_pairs(small: Path, kept: Path) -> None:
     maps["tr_reg_000", "tr_reg_001"] = np.zeros(BODY.V, dtype=int)
     cross, same = evaluate_set(bench, maps, cache=kept).groups()
     assert (cross.group, len(cross.errors), cross.joined.mean) == ("cross subject", 4, 0)
-    assert (same.group, len(same.errors)) == ("same subject", 2) and same.flips == 0.5
-    assert same.expected == 2 and cross.as_dict()["complete"]
+    assert (same.group, len(same.errors)) == ("same subject", 2)
+    assert same.flips == 0.5
+    assert same.expected == 2
+    assert cross.as_dict()["complete"]
 
 
 def test_nothing_is_left_out_in_silence(small: Path, kept: Path) -> None:
@@ -114,7 +119,8 @@ def test_nothing_is_left_out_in_silence(small: Path, kept: Path) -> None:
     with pytest.raises(InputError, match=r"1 maps are missing, the first 10 -> 2"):
         evaluate_set(bench, maps, cache=kept)
     part = evaluate_set(bench, maps, cache=kept, pairs=bench.pairs[:2])
-    assert not part.as_dict()["complete"] and part.expected == 3
+    assert not part.as_dict()["complete"]
+    assert part.expected == 3
     with pytest.raises(InputError, match="has no pair 2 -> 1"):
         evaluate_set(bench, maps, cache=kept, pairs=[("2", "1")])
     with pytest.raises(InputError, match="nothing to evaluate"):
@@ -132,14 +138,16 @@ def test_distances_are_computed_once(small: Path, tmp_path: Path, monkeypatch: p
     first = TruthDistances(shape, landmarks, tmp_path)
     index = np.array([5, 8, 1, 70])
     (errors,) = first.errors([index])
-    assert errors[0] == errors[3] == 0 and (errors[1:3] > 0).all()
+    assert errors[0] == errors[3] == 0
+    assert (errors[1:3] > 0).all()
     assert np.load(first.path).shape == (3, shape.V)
     monkeypatch.setattr(distances, "GeodesicDistances", None)  # would fail if it were asked again
     monkeypatch.setattr(distances, "READ_BYTES", 1)  # one row at a time
     again = TruthDistances(bench.shape("mesh000"), landmarks, tmp_path)
     assert np.array_equal(again.errors([index])[0], errors)
     one, other = again.errors([index, index[::-1]])
-    assert np.array_equal(one, errors) and not np.array_equal(other, errors)
+    assert np.array_equal(one, errors)
+    assert not np.array_equal(other, errors)
     # Another shape, or other landmarks, are other distances.
     paths = {
         first.path,
@@ -170,7 +178,9 @@ def test_the_table(small: Path, kept: Path, capsys: pytest.CaptureFixture[str]) 
     scores: SetScores = evaluate_set(bench, {p: truth(*p) for p in pairs}, cache=kept, pairs=pairs)
     print_table([scores])
     text = capsys.readouterr().out
-    assert "3 of 6" in text and "same subject" in text and "1 of 4" in text
+    assert "3 of 6" in text
+    assert "same subject" in text
+    assert "1 of 4" in text
     assert "Not all pairs were measured" in text
     assert "Dijkstra" in text
 

@@ -82,10 +82,14 @@ def test_evaluate_map() -> None:
     shape = bumpy_sphere(10, 12, "ball")
     truth = np.arange(shape.V)
     record = evaluate_map(VertexMap.identity(shape), shape, shape, target_points=truth).as_dict()
-    assert record["mean_cm"] == 0 and record["share_over_threshold"] == 0 and record["distortion"] == 0
-    assert record["points"] == shape.V and record["coverage_vertices"] == 1
+    assert record["mean_cm"] == 0
+    assert record["share_over_threshold"] == 0
+    assert record["distortion"] == 0
+    assert record["points"] == shape.V
+    assert record["coverage_vertices"] == 1
     blind = evaluate_map(VertexMap.identity(shape), shape, shape)
-    assert blind.errors is None and "mean_cm" not in blind.as_dict()
+    assert blind.errors is None
+    assert "mean_cm" not in blind.as_dict()
     cloud = Shape(shape.verts, np.zeros((0, 3), int), "dots")
     assert evaluate_map(VertexMap.identity(cloud), cloud, cloud).distortion is None
     with pytest.raises(InputError, match="does not fit"):
@@ -107,7 +111,8 @@ def test_the_curve_is_a_picture_of_the_errors(tmp_path: Path) -> None:
     assert good.shape == (600, 900, 3)
     blue = [(p[:, :, 2] - p[:, :, 0] > 100) for p in (good, bad)]
     # Columns at the axis' right end: the good curve runs along the top, the bad one has not got there.
-    assert blue[0][20:40, 700:860].any() and not blue[1][20:40, 700:860].any()
+    assert blue[0][20:40, 700:860].any()
+    assert not blue[1][20:40, 700:860].any()
 
 
 def test_curve_refusals(tmp_path: Path) -> None:

@@ -70,7 +70,8 @@ def test_the_same_map_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
 def test_npy_is_what_the_documents_say(tmp_path: Path) -> None:
     save_map(tmp_path / "map.NPY", random_map(A, B, 1))
     index = np.load(tmp_path / "map.NPY")
-    assert index.dtype == np.int64 and index.shape == (A.V,)
+    assert index.dtype == np.int64
+    assert index.shape == (A.V,)
 
 
 def test_mat_counts_from_one_too(tmp_path: Path) -> None:

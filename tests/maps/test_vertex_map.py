@@ -42,10 +42,12 @@ def test_between_knows_both_shapes() -> None:
 def test_a_bare_list_is_a_map_with_unknowns() -> None:
     m = VertexMap("a", "b", np.array([2, 0, 1], dtype=np.int32))
     assert m.index.dtype == np.int64
-    assert m.target_vertices == -1 and m.source_vertices == 3
+    assert m.target_vertices == -1
+    assert m.source_vertices == 3
     assert m.face.tolist() == [-1] * 3
     assert m.barycentric.tolist() == [[1, 0, 0]] * 3
-    assert m.confidence.dtype == np.float32 and m.confidence.tolist() == [1] * 3
+    assert m.confidence.dtype == np.float32
+    assert m.confidence.tolist() == [1] * 3
     assert m.verdict == "unknown"
 
 
@@ -149,7 +151,8 @@ def test_maps_that_do_not_meet_are_not_joined() -> None:
     ab = random_map(A, B, 1)
     with pytest.raises(InputError, match="cannot join a -> b with c -> d") as caught:
         ab.compose(random_map(C, D, 2))
-    assert "16 vertices" in caught.value.message and f"{C.V} vertices" in caught.value.message
+    assert "16 vertices" in caught.value.message
+    assert f"{C.V} vertices" in caught.value.message
     assert caught.value.hint == "the first must end where the second starts"
     with pytest.raises(InputError) as caught:
         ab.compose(random_map(C, B, 2))

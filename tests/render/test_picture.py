@@ -52,15 +52,18 @@ def test_a_shape_fills_its_panel_and_nothing_else(tmp_path: Path) -> None:
     for unit in (1e-3, 1.0, 1e5):
         seen = something(draw(tmp_path, (box((0.5 * unit, unit, 0.2 * unit), (9e3 * unit, 0, 0)), None)))
         rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-        assert rows[0] == pytest.approx(4, abs=1) and rows[-1] == pytest.approx(91, abs=1)
-        assert columns[0] == pytest.approx(26, abs=1) and columns[-1] == pytest.approx(69, abs=1)
+        assert rows[0] == pytest.approx(4, abs=1)
+        assert rows[-1] == pytest.approx(91, abs=1)
+        assert columns[0] == pytest.approx(26, abs=1)
+        assert columns[-1] == pytest.approx(69, abs=1)
         assert seen[rows[0] + 1 : rows[-1], columns[0] + 1 : columns[-1]].all()
 
 
 def test_a_wide_shape_is_limited_by_the_width(tmp_path: Path) -> None:
     seen = something(draw(tmp_path, (box((3, 1, 1)), None), up="y", size=(120, 60)))
     columns = np.flatnonzero(seen.any(axis=0))
-    assert columns[0] == pytest.approx(5, abs=1) and columns[-1] == pytest.approx(114, abs=1)
+    assert columns[0] == pytest.approx(5, abs=1)
+    assert columns[-1] == pytest.approx(114, abs=1)
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z", "+z", "Z"])
@@ -71,7 +74,8 @@ def test_up_is_up(tmp_path: Path, up: str) -> None:
     above, below = picture[20, 48], picture[76, 48]
     if up.startswith("-"):
         above, below = below, above
-    assert above[0] > above[2] + 60 and below[2] > below[0] + 60
+    assert above[0] > above[2] + 60
+    assert below[2] > below[0] + 60
 
 
 @pytest.mark.parametrize("front", ["x", "-x", "z", "-z"])
@@ -85,7 +89,8 @@ def test_front_is_to_the_viewer_and_left_stays_left(tmp_path: Path, front: str) 
     assert np.linalg.det(rotation) == pytest.approx(1)  # no mirror
     right = (shape.verts @ rotation[0] > 0)[:, None]
     picture = draw(tmp_path, (shape, np.where(right, RED, BLUE)), up="y", front=front)
-    assert picture[48, 70, 0] > picture[48, 70, 2] + 60 and picture[48, 25, 2] > picture[48, 25, 0] + 60
+    assert picture[48, 70, 0] > picture[48, 70, 2] + 60
+    assert picture[48, 25, 2] > picture[48, 25, 0] + 60
 
 
 def test_up_and_front_are_guessed_from_the_extents(tmp_path: Path) -> None:
@@ -120,7 +125,8 @@ def test_what_is_nearer_hides_what_is_behind(tmp_path: Path) -> None:
     both = Shape(np.concatenate([a.verts, b.verts]), np.concatenate([a.faces, b.faces + 8]))
     colors = np.repeat([RED, BLUE], 8, axis=0)
     picture = draw(tmp_path, (both, colors), up="y", front="z")
-    assert picture[48, 48, 0] > 100 > picture[48, 48, 2] and picture[10, 85, 2] > 100 > picture[10, 85, 0]
+    assert picture[48, 48, 0] > 100 > picture[48, 48, 2]
+    assert picture[10, 85, 2] > 100 > picture[10, 85, 0]
     picture = draw(tmp_path, (both, colors), up="y", front="-z")
     assert picture[48, 48, 2] > 100 > picture[48, 48, 0]
 
@@ -130,7 +136,8 @@ def test_colors_are_interpolated_and_alpha_ignored(tmp_path: Path) -> None:
     colors = np.where((shape.verts[:, 1] > 0)[:, None], [0.9, 0.9, 0.9], [0.1, 0.1, 0.1])
     picture = draw(tmp_path, (shape, colors), up="y", front="z")
     column = picture[10:86, 48, 0]
-    assert (np.diff(column) <= 2).all() and column[0] - column[-1] > 100
+    assert (np.diff(column) <= 2).all()
+    assert column[0] - column[-1] > 100
     rgba = np.concatenate([colors, np.zeros((8, 1))], axis=1)
     assert np.array_equal(draw(tmp_path, (shape, rgba), up="y", front="z"), picture)
     assert np.array_equal(
@@ -144,7 +151,8 @@ def test_edges_are_antialiased(tmp_path: Path) -> None:
     soft = draw(tmp_path, (triangle, None), front="z", samples=3)
     body = int(np.median(soft[something(soft)][:, 0]))
     between = [((p[:, :, 0] > body + 15) & (p[:, :, 0] < 240)).sum() for p in (inside, soft)]
-    assert between[0] == 0 and between[1] > 60
+    assert between[0] == 0
+    assert between[1] > 60
 
 
 def test_a_hollow_is_darker_than_a_hill(tmp_path: Path) -> None:
@@ -204,12 +212,15 @@ def test_panels_stand_side_by_side_with_their_captions(tmp_path: Path) -> None:
     assert bare.shape == (64, 160, 3)
     assert np.array_equal(bare[:, :80], bare[:, 80:])
     named = draw(tmp_path, (shape, None), Panel(shape, label="hidden"), size=(80, 64), labels=["a", ""])
-    assert named.shape[0] > 64 and np.array_equal(named[:64], bare)
+    assert named.shape[0] > 64
+    assert np.array_equal(named[:64], bare)
     strip = something(named[64:])
-    assert strip[:, :80].any() and not strip[:, 80:].any()
+    assert strip[:, :80].any()
+    assert not strip[:, 80:].any()
     long = draw(tmp_path, Panel(shape, label="a caption that is much too long for it"), size=(200, 160))
     columns = np.flatnonzero(something(long[160:]).any(axis=0))
-    assert columns[0] >= 2 and columns[-1] <= 197
+    assert columns[0] >= 2
+    assert columns[-1] <= 197
 
 
 def test_the_same_picture_twice(tmp_path: Path) -> None:
@@ -243,7 +254,9 @@ def test_refusals(tmp_path: Path) -> None:
 def test_position_colors_span_the_extent_and_follow_a_rotation() -> None:
     shape = box((1, 2, 3), (7, 8, 9))
     colors = position_colors(shape)
-    assert colors.shape == (8, 3) and colors.min() >= 0 and colors.max() <= 1
+    assert colors.shape == (8, 3)
+    assert colors.min() >= 0
+    assert colors.max() <= 1
     assert np.array_equal(np.unique(colors, axis=0), np.unique(colors[::-1], axis=0))
     assert len(np.unique(colors, axis=0)) == 8
     turned = position_colors(shape, np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]]))
