@@ -1,0 +1,256 @@
+"""What a model is, in words and numbers: a strict JSON card beside its weights.
+
+Standard library alone, so that models can be listed without loading anything heavy.
+"""
+
+import json
+import math
+import re
+from dataclasses import asdict, dataclass, fields
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NoReturn
+
+from meshmatch.errors import ModelError
+from meshmatch.outputs import replace_on_success
+
+SCHEMA = 1
+MOST_BYTES = 1_000_000
+"""A larger file is no card."""
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
+_HASH = re.compile(r"[0-9a-f]{16}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_FIELD_KEYS = {"kernel": str, "radius": float, "nodes": int}
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """Everything about a model but its weights. Valid once built; its dictionaries are plain JSON values.
+
+    Parameters
+    ----------
+    name : str
+        Small letters, digits and ``. _ -``, at most 64; the folder of an installed model has this name.
+    category : str
+        What it was trained on, such as "human".
+    template, template_hash : str
+        Name and hash of the template that the weights belong to.
+    network : dict
+        Sizes and choices of the network.
+    field : dict
+        Of the deformation field: ``kernel`` (str), ``radius`` (sqrt-area units), ``nodes`` (K).
+    data, licence : str
+        What it was trained on, and under which terms the weights may be used.
+    recipe : dict
+        All settings of the training run.
+    seed, steps : int
+    training_minutes : float
+    metrics : dict
+        For each evaluation set a dict of numbers, or of dicts of numbers by refinement ("none", "nodes").
+    weights_sha256 : str
+        Of the weights file, 64 hex digits.
+    created : str
+        ISO date.
+    description : str
+        A sentence for people; may be empty.
+    schema : int
+        Version of this list.
+
+    Raises
+    ------
+    ModelError
+        A value of the wrong kind, or out of its range.
+    """
+
+    name: str
+    category: str
+    template: str
+    template_hash: str
+    network: dict[str, Any]
+    field: dict[str, Any]
+    data: str
+    licence: str
+    recipe: dict[str, Any]
+    seed: int
+    steps: int
+    training_minutes: float
+    metrics: dict[str, Any]
+    weights_sha256: str
+    created: str
+    description: str = ""
+    schema: int = SCHEMA
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = _plain(getattr(self, item.name), item.name)
+            if item.type is float and type(value) is int:
+                value = float(value)
+            kind = dict if item.type not in (str, int, float) else item.type
+            if type(value) is not kind:
+                _refuse(f"{item.name} must be {_KINDS[kind]}, not {_shown(value)}")
+            object.__setattr__(self, item.name, value)
+        if self.schema != SCHEMA:
+            newer = self.schema > SCHEMA
+            raise ModelError(
+                f"the model card has schema {self.schema}, not {SCHEMA}",
+                "it needs a newer meshmatch: update it" if newer else "train or fetch the model again",
+            )
+        check_name(self.name)
+        if not _HASH.fullmatch(self.template_hash):
+            _refuse(f"template_hash must be 16 hex digits, not {_shown(self.template_hash)}")
+        if not _SHA256.fullmatch(self.weights_sha256):
+            _refuse(f"weights_sha256 must be 64 hex digits, not {_shown(self.weights_sha256)}")
+        if self.steps < 0 or self.training_minutes < 0:
+            _refuse("steps and training_minutes must be 0 or more")
+        try:
+            datetime.fromisoformat(self.created)
+        except ValueError:
+            _refuse(f"created must be an ISO date such as 2026-01-31, not {_shown(self.created)}")
+        self._check_field()
+        _check_metrics(self.metrics)
+
+    def _check_field(self) -> None:
+        if self.field.keys() != _FIELD_KEYS.keys():
+            _refuse(f"field must have {', '.join(_FIELD_KEYS)}, not {', '.join(self.field) or 'nothing'}")
+        for key, kind in _FIELD_KEYS.items():
+            value = self.field[key]
+            if type(value) is not kind and not (kind is float and type(value) is int):
+                _refuse(f"field.{key} must be {_KINDS[kind]}, not {_shown(value)}")
+        if not self.field["radius"] > 0 or self.field["nodes"] < 4:
+            _refuse("field needs a positive radius and at least 4 nodes")
+
+
+_KINDS: dict[Any, str] = {str: "text", int: "a whole number", float: "a number", dict: "an object"}
+
+
+def check_name(name: str) -> str:
+    """The name, if it can be one; `ModelError` otherwise. It can then be used as the name of a folder."""
+    if not _NAME.fullmatch(name):
+        raise ModelError(
+            f"{name[:80]!r} cannot be the name of a model",
+            "use small letters, digits, '.', '_' and '-', beginning with a letter or digit, at most 64",
+        )
+    return name
+
+
+def read_card(path: str | Path) -> ModelCard:
+    """Read a card.
+
+    Raises
+    ------
+    ModelError
+        The file is missing, too large, no JSON object, of another schema, or has missing, unknown, repeated
+        or wrong entries.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise ModelError(
+            f"{path.parent} holds no model: cannot read {path.name}",
+            "a model is a folder with card.json, weights.safetensors and template.safetensors",
+        ) from error
+    if len(data) > MOST_BYTES:
+        raise ModelError(f"{path} is larger than {MOST_BYTES // 1000} kB: this is no model card")
+    try:
+        return card_from_json(data.decode("utf-8"))
+    except UnicodeDecodeError as error:
+        raise ModelError(f"{path} is no model card: it is not text", "is the file damaged?") from error
+    except ModelError as error:
+        raise ModelError(f"{path}: {error.message}", error.hint) from error
+
+
+def card_from_json(text: str) -> ModelCard:
+    """The card that a text holds; `ModelError` if it holds none."""
+    try:
+        found = json.loads(text, object_pairs_hook=unique_keys, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
+        raise ModelError(f"this is no JSON: {reason}", "is the file damaged?") from error
+    if not isinstance(found, dict):
+        _refuse("a card must be a JSON object")
+    if type(found.get("schema")) is int and found["schema"] > SCHEMA:
+        # before its keys are judged, which a newer version is free to change
+        raise ModelError(
+            f"the model card has schema {found['schema']}, not {SCHEMA}",
+            "it needs a newer meshmatch: update it",
+        )
+    known = [item.name for item in fields(ModelCard)]
+    unknown = sorted(set(found) - set(known))
+    missing = [name for name in known if name not in found]
+    if unknown:
+        _refuse(f"unknown entries: {', '.join(_shown(name) for name in unknown[:5])}")
+    if missing:
+        _refuse(f"missing entries: {', '.join(missing)}")
+    return ModelCard(**found)
+
+
+def card_to_json(card: ModelCard) -> str:
+    """The text of a card: keys in the order of `ModelCard`, the schema first."""
+    values = asdict(card)
+    ordered = {"schema": values.pop("schema"), **values}
+    return json.dumps(ordered, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def write_card(card: ModelCard, path: str | Path) -> None:
+    """Write a card, whole or not at all. Write it last: a folder without one is no model.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    with replace_on_success(path) as temporary:
+        temporary.write_text(card_to_json(card), encoding="utf-8")
+
+
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of a JSON text (`object_pairs_hook`); ValueError if a key occurs twice."""
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a key occurs twice")
+    return found
+
+
+def _check_metrics(metrics: dict[str, Any]) -> None:
+    for name, values in metrics.items():
+        if not isinstance(values, dict):
+            _refuse(f"metrics.{name} must be an object of numbers, not {_shown(values)}")
+        for key, value in values.items():
+            numbers = value.values() if isinstance(value, dict) else (value,)
+            if any(type(number) not in (int, float) for number in numbers):
+                _refuse(f"metrics.{name}.{key} must be a number or an object of numbers")
+
+
+def _plain(value: Any, where: str, depth: int = 0) -> Any:
+    """The value as JSON has it: tuples become lists; what JSON does not have is refused."""
+    if depth > 20:
+        _refuse(f"{where} is nested too deeply")
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            _refuse(f"{where} must be finite, not {value}")
+        return value
+    if isinstance(value, dict):
+        if not all(isinstance(key, str) for key in value):
+            _refuse(f"{where} has a key that is not text")
+        return {key: _plain(inner, f"{where}.{key}", depth + 1) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner, where, depth + 1) for inner in value]
+    _refuse(f"{where} cannot hold {_shown(value)}")
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _refuse(problem: str) -> NoReturn:
+    raise ModelError(f"the model card is wrong: {problem}", "is the file damaged, or from another version?")

@@ -1,0 +1,154 @@
+"""Weights to a compact safetensors file and back, strictly.
+
+Only the matrices of linear layers (``*.weight``, two or more axes) are kept compactly: they are nearly all of a model. As
+``int8`` a matrix has one float32 scale a row beside it, ``name.scale``: q = round(w / scale), scale = max |w| / 127; the
+error is at most half a scale. As ``float16`` it is at most 2^-11 of each value. Biases, norms and buffers (nodes, basis
+points, shape functions, running variances) stay float32: they are small, and their laws must hold exactly.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from meshmatch.errors import ModelError, OptionError
+from meshmatch.models.tensor_file import check_tensor_file
+from meshmatch.outputs import replace_on_success
+
+Storage = Literal["float32", "float16", "int8"]
+STORAGES: tuple[Storage, ...] = ("float32", "float16", "int8")
+
+SCALE = ".scale"
+_KEY = "meshmatch"
+_FORMAT = "weights 1"
+_SHORT_ROW = 64  # of a matrix with fewer columns the scales would weigh as much as they save
+
+
+def save_weights(state: Mapping[str, torch.Tensor], path: str | Path, *, storage: str = "float16") -> str:
+    """Write a state dict and return the sha256 of the file (64 hex digits). The same state gives the same file.
+
+    Parameters
+    ----------
+    state
+        Tensors by name.
+    storage : {"float32", "float16", "int8"}
+        "int8" quantises the matrices of linear layers with at least 64 columns; other weights become float16.
+
+    Raises
+    ------
+    ModelError
+        A tensor is not finite.
+    OptionError
+        There is no such storage.
+    OutputError
+        The file cannot be written.
+    """
+    if storage not in STORAGES:
+        raise OptionError(f"no storage {storage!r}", f"choose one of {', '.join(STORAGES)}")
+    arrays: dict[str, torch.Tensor] = {}
+    for name in sorted(state):
+        tensor = state[name].detach().cpu()
+        if tensor.is_floating_point():
+            if not tensor.isfinite().all():
+                raise ModelError(
+                    f"weight {name} is not finite", "the training diverged: use an earlier checkpoint"
+                )
+            tensor = tensor.float()
+        if name.endswith(SCALE) and name.removesuffix(SCALE) in state:
+            raise ModelError(f"{name} is reserved for the scale of {name.removesuffix(SCALE)}")
+        if storage == "float32" or not (
+            name.endswith("weight") and tensor.is_floating_point() and tensor.ndim > 1
+        ):
+            arrays[name] = tensor.contiguous().clone()  # a clone: safetensors refuses shared memory
+        elif storage == "int8" and tensor.ndim == 2 and tensor.shape[1] >= _SHORT_ROW:
+            arrays[name], arrays[name + SCALE] = _quantised(tensor)
+        else:
+            half = tensor.half().contiguous()
+            arrays[name] = half if half.isfinite().all() else tensor.contiguous().clone()
+    with replace_on_success(path) as temporary:
+        save_file(arrays, temporary, {_KEY: _FORMAT})
+        with temporary.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
+    """Read what `save_weights` wrote: float32 where it was floating.
+
+    Parameters
+    ----------
+    expected
+        Shape of every tensor that must be there; no other may be.
+
+    Raises
+    ------
+    ModelError
+        The file is missing or damaged, or its tensors are not those expected.
+    """
+    path = Path(path)
+    held = check_tensor_file(path)
+    scales = {
+        name for name in held if name.endswith(SCALE) and held.get(name.removesuffix(SCALE)) is not None
+    }
+    names = held.keys() - scales
+    missing, unexpected = sorted(expected.keys() - names), sorted(names - expected.keys())
+    if missing or unexpected:
+        told = [
+            f"{what}: {_some(which)}"
+            for what, which in (("missing", missing), ("unexpected", unexpected))
+            if which
+        ]
+        raise _mismatch(path, "; ".join(told))
+    for name, shape in expected.items():
+        if held[name].shape != tuple(shape):
+            raise _mismatch(path, f"{name} has shape {held[name].shape}, not {tuple(shape)}")
+        if name + SCALE in scales:
+            scale = held[name + SCALE]
+            if (
+                held[name].dtype != "I8"
+                or scale.dtype != "F32"
+                or scale.shape != tuple(shape[:1])
+                or len(shape) != 2
+            ):
+                raise _mismatch(path, f"the scale of {name} does not fit it")
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            if (file.metadata() or {}).get(_KEY) != _FORMAT:
+                raise _mismatch(path, "it is not a weights file of meshmatch")
+            arrays = {name: file.get_tensor(name) for name in held}
+    except (SafetensorError, OSError) as error:
+        raise ModelError(f"{path} is damaged", "fetch or make it again") from error
+    found: dict[str, torch.Tensor] = {}
+    for name in expected:
+        tensor = arrays[name]
+        if name + SCALE in scales:
+            tensor = tensor.float() * arrays[name + SCALE][:, None]
+        elif tensor.is_floating_point():
+            tensor = tensor.float()
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            raise _mismatch(path, f"{name} is not finite")
+        found[name] = tensor
+    return found
+
+
+def _quantised(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """(R, C) float32 -> (R, C) int8, (R,) float32."""
+    scale = matrix.abs().amax(dim=1) / 127.0
+    scale = torch.where(scale > 0, scale, torch.ones_like(scale))  # a row of zeros stays one
+    return (matrix / scale[:, None]).round().clamp(-127, 127).to(torch.int8), scale
+
+
+def _some(names: list[str]) -> str:
+    rest = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return ", ".join(names[:4]) + rest
+
+
+def _mismatch(path: Path, reason: str) -> ModelError:
+    return ModelError(
+        f"{path} does not fit its model card: {reason}", "the card and the weights are of different models"
+    )
