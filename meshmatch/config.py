@@ -9,7 +9,8 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS
 def set_threads(count: int) -> None:
     """Use `count` threads in everything that computes.
 
-    Libraries that are not loaded yet read the environment when they are; torch is told directly if it is loaded.
+    Libraries that are not loaded yet read the environment when they are; torch is told directly if it is
+    loaded.
 
     Raises
     ------

@@ -1,6 +1,7 @@
 """The one error family: what is wrong in a line, and a hint what to do about it.
 
-Everything that the user's data or choices can cause is a `MeshmatchError`; anything else is a bug and keeps its traceback.
+Everything that the user's data or choices can cause is a `MeshmatchError`; anything else is a bug and keeps
+its traceback.
 """
 
 

@@ -37,10 +37,10 @@ def flat_faces(verts: Floats, faces: Ints, cross: Floats, diagonal: float) -> ND
 
 
 def double_faces(faces: Ints) -> NDArray[np.bool_]:
-    """True for faces to drop: all but the first of the same three corners, and the first too if the two are a flap.
+    """True for faces to drop: all but the first of the same three corners, and both of a flap.
 
-    Two that face opposite ways cancel. On a surface that goes on around them they are a fold of no volume, and without
-    both it is closed as before; in a sheet that is double all over, one of each is the surface.
+    Two that face opposite ways cancel. On a surface that goes on around them they are a fold of no volume,
+    and without both it is closed as before; in a sheet that is double all over, one of each is the surface.
     """
     a, b, c = np.ascontiguousarray(faces.T)
     low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)

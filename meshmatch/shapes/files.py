@@ -1,7 +1,8 @@
 """Shapes from files and to files: one function each way, the format by suffix.
 
 Every vertex that the file lists stays, in the file's order, because a map has to answer for each of them:
-nothing is merged, split or dropped here (see `meshmatch.shapes.repair` for that). Polygons become fans of triangles.
+nothing is merged, split or dropped here (see `meshmatch.shapes.repair` for that). Polygons become fans of
+triangles.
 """
 
 from collections.abc import Callable
@@ -40,9 +41,10 @@ SUFFIXES = tuple(_READERS)
 def load_shape(path: str | Path) -> Shape:
     """Read a mesh or a point cloud as it is: all vertices, in file order, in the file's frame and unit.
 
-    A vertex whose position is not a number is kept in its place and marked in `Shape.invalid`; its `verts` row is then
-    the centroid of the others. The scene of a glb or gltf is one shape: its meshes one after the other, each where the
-    scene puts it. An stl has no shared vertices: every corner of every triangle is a vertex, 3 F of them.
+    A vertex whose position is not a number is kept in its place and marked in `Shape.invalid`; its `verts`
+    row is then the centroid of the others. The scene of a glb or gltf is one shape: its meshes one after the
+    other, each where the scene puts it. An stl has no shared vertices: every corner of every triangle is a
+    vertex, 3 F of them.
 
     Raises
     ------
@@ -74,9 +76,9 @@ def load_shape(path: str | Path) -> Shape:
 def save_shape(path: str | Path, shape: Shape) -> None:
     """Write a shape, in the format that the suffix names. The file appears whole or not at all.
 
-    ply, obj, off, xyz and npy keep every bit of the positions; stl and glb hold 32-bit floats, and stl no shared vertices.
-    Colours go into ply, obj, off and glb. An invalid vertex is written as nan where the format allows (all but stl and
-    glb, which take its stand-in).
+    ply, obj, off, xyz and npy keep every bit of the positions; stl and glb hold 32-bit floats, and stl no
+    shared vertices. Colours go into ply, obj, off and glb. An invalid vertex is written as nan where the
+    format allows (all but stl and glb, which take its stand-in).
 
     Raises
     ------

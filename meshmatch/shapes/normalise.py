@@ -42,5 +42,5 @@ def unit_sphere_frame(shape: Shape) -> Frame:
 
 
 def _centroid(shape: Shape) -> Floats:
-    """(3,) area-weighted centroid; around a mesh vertex lies a third of each of its faces, so this is exact."""
+    """(3,) area-weighted centroid; exact for a mesh: around a vertex lies a third of each of its faces."""
     return np.asarray(shape.vertex_areas @ shape.verts / shape.vertex_areas.sum())

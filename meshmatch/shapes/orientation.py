@@ -67,8 +67,9 @@ def agreeing_flips(
 def turn_faces(verts: Floats, faces: Ints, cross: Floats, edges: Edges) -> tuple[Ints, int]:
     """Faces turned so that neighbours agree and the shape is not inside out, and how many were turned.
 
-    A part whose faces disagreed is turned outwards by the sign of its volume; if they agreed everywhere, the shape is
-    turned as a whole, and only if its volume is clearly negative. An edge of more than two faces joins nothing.
+    A part whose faces disagreed is turned outwards by the sign of its volume; if they agreed everywhere, the
+    shape is turned as a whole, and only if its volume is clearly negative. An edge of more than two faces
+    joins nothing.
 
     Parameters
     ----------

@@ -42,14 +42,15 @@ def find_parts(verts: Floats, faces: Ints, cross: Floats) -> Parts:
     part = face_parts(faces, len(verts))
     if part.max() == 0:
         return Parts(np.zeros(len(faces), bool), 0, 1, 0, 0.0)
-    areas = np.bincount(part, weights=0.5 * np.sqrt(squared_lengths(cross)))
+    face_areas = 0.5 * np.sqrt(squared_lengths(cross))
+    areas = np.bincount(part, weights=face_areas)
     largest = int(areas.argmax())
     small = areas < STRAY_SHARE * areas[largest]
     big = np.flatnonzero(~small)
     # the body grows from the largest part by all big parts that are near
     body = np.array([largest])
     while len(body) < len(big):
-        gap, diagonal = _gaps(verts, faces, part, body, np.setdiff1d(big, body))
+        gap, diagonal = _gaps(verts, faces, face_areas, part, body, np.setdiff1d(big, body))
         near = np.setdiff1d(big[gap[big] <= _FAR * diagonal], body)
         if len(near) == 0:
             break
@@ -57,29 +58,34 @@ def find_parts(verts: Floats, faces: Ints, cross: Floats) -> Parts:
     far = np.setdiff1d(big, body)
     stray = small.copy()
     if areas[small].sum() > 0.1 * areas.sum():
-        gap, diagonal = _gaps(verts, faces, part, big, np.flatnonzero(small))
+        gap, diagonal = _gaps(verts, faces, face_areas, part, big, np.flatnonzero(small))
         stray &= gap > _NEAR * diagonal
     share = float(areas[far].sum() / areas.sum())
     return Parts(stray[part], int(stray.sum()), len(areas) - int(stray.sum()), len(far), share)
 
 
-def _gaps(verts: Floats, faces: Ints, part: Ints, body: Ints, others: Ints) -> tuple[Floats, float]:
-    """Distance (parts,) of each of the `others` to the parts in `body`, 0 for the rest; and the body's diagonal."""
+def _gaps(
+    verts: Floats, faces: Ints, face_areas: Floats, part: Ints, body: Ints, others: Ints
+) -> tuple[Floats, float]:
+    """Distance (parts,) of each of the `others` to the parts in `body`, else 0; and the body's diagonal."""
     from scipy.spatial import cKDTree
 
     count = int(part.max()) + 1
     theirs, ours = np.isin(np.arange(count), others), np.isin(np.arange(count), body)
-    anchor = _corners(faces[ours[part]], len(verts))
-    diagonal = float(np.linalg.norm(np.ptp(verts[anchor], axis=0)))
+    chosen, anchor = theirs[part], faces[ours[part]]
+    diagonal = float(np.linalg.norm(np.ptp(verts[_corners(anchor, len(verts))], axis=0)))
     gap = np.zeros(count)
     if len(others):
-        chosen = theirs[part]
+        # points on the body's faces, because its vertices may be far apart
+        rng = np.random.default_rng(0)
+        total = np.cumsum(face_areas[ours[part]])
+        face = np.searchsorted(total, rng.random(20_000) * total[-1]).clip(max=len(anchor) - 1)
+        points = np.einsum("pk,pki->pi", rng.dirichlet(np.ones(3), len(face)), verts[anchor[face]])
         corners = _corners(faces[chosen], len(verts))
         of_vertex = np.zeros(len(verts), np.int64)
         of_vertex[faces[chosen]] = part[chosen, None]
-        distance = cKDTree(verts[anchor[:: max(len(anchor) // 20_000, 1)]]).query(verts[corners])[0]
         gap[others] = np.inf
-        np.minimum.at(gap, of_vertex[corners], distance)
+        np.minimum.at(gap, of_vertex[corners], cKDTree(points).query(verts[corners])[0])
     return gap, diagonal
 
 

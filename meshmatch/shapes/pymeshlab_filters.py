@@ -1,6 +1,7 @@
-"""The one door to pymeshlab, which is under the GPL and optional: nothing on the main path comes through here.
+"""The one door to pymeshlab, which is under the GPL and optional: nothing on the main path comes here.
 
-Its filters sit in plugins. Without Debian's libopengl0 some of them are silently missing; without libgl1 the import fails.
+Its filters sit in plugins. Without Debian's libopengl0 some of them are silently missing; without libgl1 the
+import fails.
 """
 
 from typing import Any
@@ -43,7 +44,7 @@ def collapse_edges(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Int
 
 
 def remesh(shape: Shape, edge: float, iterations: int = 5) -> Shape:
-    """The same surface with other, even triangles: for tests and training, not for matching. Slow (15 s for 100k faces).
+    """The same surface with other, even triangles, for tests and training. Slow: 15 s for 100,000 faces.
 
     Parameters
     ----------

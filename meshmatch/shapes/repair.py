@@ -26,9 +26,9 @@ class Repaired:
     shape : Shape
         All its vertices are valid and, in a mesh, used by a face.
     original_to_repaired : (V_original,) int64
-        The repaired vertex that stands for each original one: itself, its twin at the same position, or if it was
-        dropped the nearest one. The nearest to a vertex without a position is a valid corner of one of its faces,
-        or if there is none the nearest in the file's order.
+        The repaired vertex that stands for each original one: itself, its twin at the same position, or if it
+        was dropped the nearest one. The nearest to a vertex without a position is a valid corner of one of
+        its faces, or if there is none the nearest in the file's order.
     kept_vertex : (V,) int64
         The original vertex that each repaired one is; increasing.
     notes : tuple of str
@@ -50,7 +50,7 @@ class Repaired:
     far_parts: int = 0
 
     def original_face(self, face: Ints, weights: Floats) -> tuple[Ints, Floats]:
-        """Repaired faces (N,) and weights of their corners (N, 3) in the numbering and corner order of the original."""
+        """Repaired faces (N,) and weights (N, 3) of their corners, numbered and ordered as in the original."""
         theirs = self.kept_face[face]
         corners = self.original_to_repaired[self.original.faces[theirs]]  # N 3
         same = corners[:, :, None] == self.shape.faces[face][:, None, :]  # N original repaired
@@ -60,13 +60,15 @@ class Repaired:
 def repair(shape: Shape) -> Repaired:
     """Drop what is broken, merge what is double, and say so.
 
-    In this order: vertices without a position and the faces that touch them; vertices at exactly the same position
-    are merged if they lie on an open edge (texture seams of obj and glTF files, every corner of an stl; two layers
-    that merely touch stay apart); faces without area; faces that occur twice (both of them, where they are a flap of
-    no volume on a closed surface); stray parts (see `meshmatch.shapes.parts.STRAY_SHARE`; unless together they are more than a tenth of the surface: then the shape
-    is made of small parts, and only those far from the rest are stray); vertices that no face uses. Then faces are
-    turned so that neighbours agree and the shape is not inside out. Open and non-manifold edges are counted, not mended.
-    Of a cloud: points without a position, double ones, and strays far from all others.
+    In this order: vertices without a position and the faces that touch them; vertices at exactly the same
+    position are merged if they lie on an open edge (texture seams of obj and glTF files, every corner of an
+    stl; two layers that merely touch stay apart); faces without area; faces that occur twice (both of them,
+    where they are a flap of no volume on a closed surface); stray parts (see
+    `meshmatch.shapes.parts.STRAY_SHARE`; unless together they are more than a tenth of the surface: then the
+    shape is made of small parts, and only those far from the rest are stray); vertices that no face uses.
+    Then faces are turned so that neighbours agree and the shape is not inside out. Open and non-manifold
+    edges are counted, not mended. Of a cloud: points without a position, double ones, and strays far from all
+    others.
 
     Raises
     ------
@@ -173,7 +175,7 @@ def _result(
 
 
 def _valid_neighbour(shape: Shape, valid: NDArray[np.bool_]) -> Ints:
-    """(V,) itself for a valid vertex; for others a valid corner of one of their faces, or the nearest in file order."""
+    """(V,) itself if valid; else a valid corner of one of its faces, or the nearest in file order."""
     places = np.flatnonzero(valid)
     every = np.arange(shape.V)
     after = np.searchsorted(places, every).clip(max=len(places) - 1)

@@ -72,7 +72,8 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
 def farthest_points(points: Floats, K: int, start: int = 0) -> Ints:
     """Indices (K,) of points that are each as far as possible from all before them, beginning with `start`.
 
-    Takes K passes over the points. With fewer distinct points than `K` the last ones repeat positions, never indices.
+    Takes K passes over the points. With fewer distinct points than `K` the last ones repeat positions, never
+    indices.
 
     Raises
     ------
@@ -100,12 +101,12 @@ def farthest_points(points: Floats, K: int, start: int = 0) -> Ints:
 
 
 def _draw_points(areas: Floats, P: int, rng: np.random.Generator) -> Ints:
-    """Indices (P,) drawn by weight: without repetition first (Efraimidis and Spirakis 2006), the rest with."""
+    """Indices (P,) drawn by weight, first without repetition (Efraimidis and Spirakis 2006), then with."""
     possible = np.flatnonzero(areas)
     with np.errstate(divide="ignore"):
         keys = np.log(rng.random(len(possible))) / areas[possible]
     once = possible[np.argsort(keys, kind="stable")[::-1][:P]]
-    if P <= len(once):
+    if len(once) >= P:
         return once.astype(np.int64)
     total = np.cumsum(areas[possible])
     again = np.searchsorted(total, rng.random(P - len(once)) * total[-1], side="right")

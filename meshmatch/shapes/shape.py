@@ -29,8 +29,9 @@ class Shape:
     colors : (V, 4) float64, optional
         Red, green, blue, alpha in 0..1.
     invalid : (V,) bool, optional
-        True for a vertex whose position in the file was not a number. Such a vertex keeps its place in the order
-        (the map answers for it too) but its `verts` row is only a stand-in, and faces that touch it have no area.
+        True for a vertex whose position in the file was not a number. Such a vertex keeps its place in the
+        order (the map answers for it too) but its `verts` row is only a stand-in, and faces that touch it
+        have no area.
 
     Raises
     ------
@@ -231,7 +232,7 @@ class Frame:
         return (np.asarray(vectors, np.float64) * self.scale) @ self.rotation
 
     def compose(self, outer: "Frame") -> "Frame":
-        """The frame that does this one first, then `outer`: ``compose(o).apply(x) = o.apply(self.apply(x))``."""
+        """This frame first, then `outer`: ``self.compose(outer).apply(x) = outer.apply(self.apply(x))``."""
         return Frame(self.scale * outer.scale, outer.rotation @ self.rotation, self.undo(outer.center))
 
 

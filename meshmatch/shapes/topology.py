@@ -55,7 +55,8 @@ class Edges:
     Parameters
     ----------
     ordered : (3 F,) int64
-        Twice the number of each edge of each face, plus 1 if the face runs from the smaller vertex to the larger.
+        Twice the number of each edge of each face, plus 1 if the face runs from the smaller vertex to the
+        larger.
     begins, sizes : (E,) int64
         Where each edge begins in `ordered`, and how many faces it has.
     """
@@ -101,7 +102,7 @@ def open_edges(faces: Ints) -> Ints:
 
 
 def edge_keys(faces: Ints, V: int) -> Ints:
-    """(3 F,) one number for each edge of each face, the same both ways; F of the edges 0-1, then 1-2, then 2-0."""
+    """(3 F,) a number for each edge of each face, the same both ways: F of the edges 0-1, then 1-2, 2-0."""
     columns = np.ascontiguousarray(faces.T)
     start, end = columns.ravel(), columns[[1, 2, 0]].ravel()
     return np.asarray(np.minimum(start, end) * V + np.maximum(start, end))

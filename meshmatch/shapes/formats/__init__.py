@@ -1,7 +1,8 @@
 """One module per file format: bytes to plain arrays, and a `Shape` to bytes.
 
-The readers are our own because the map must answer for every vertex that the file lists: libraries merge, split and
-reorder vertices on the way in (texture seams), and some allocate whatever a damaged header asks for.
+The readers are our own because the map must answer for every vertex that the file lists: libraries merge,
+split and reorder vertices on the way in (texture seams), and some allocate whatever a damaged header asks
+for.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from meshmatch.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Raw:
-    """What a file says, unchecked: verts (V, 3) float64 (maybe NaN), faces (F, 3) int64, colors (V, 4) in 0..1 or None."""
+    """What a file says, unchecked: positions (V, 3), maybe NaN; faces (F, 3), colours (V, 4) in 0..1."""
 
     verts: NDArray[np.float64]
     faces: NDArray[np.int64]
@@ -30,7 +31,7 @@ def damaged(name: str, what: str) -> InputError:
 
 
 def fan(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Triangles (F, 3) of polygons: `corners` one polygon after the other, `sizes` (polygons,) corners of each.
+    """Triangles (F, 3) of polygons: `corners` one polygon after the other, `sizes` how many each has.
 
     A polygon a b c d ... becomes a b c, a c d, ...; one of fewer than 3 corners becomes nothing.
     """

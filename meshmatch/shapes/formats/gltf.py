@@ -1,7 +1,8 @@
 """glTF 2.0, binary (glb) and text (gltf): the triangles and points of a scene, where the scene puts them.
 
-Specification: Khronos glTF 2.0. A skinned mesh stands as its joints stand in the file (sections 3.7.3 and 5.28), so
-that it fits whatever hangs from the same joints. Animations, morph targets and materials are ignored.
+Specification: Khronos glTF 2.0. A skinned mesh stands as its joints stand in the file (sections 3.7.3 and
+5.28), so that it fits whatever hangs from the same joints. Animations, morph targets and materials are
+ignored.
 """
 
 import base64
@@ -25,7 +26,7 @@ _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
 
 
 def read(path: Path, data: bytes) -> Raw:
-    """All triangles and points of the scene, primitive after primitive, in the order in which its tree is walked."""
+    """All triangles and points of the scene, one primitive after the other, parents before children."""
     try:
         return _Document(path, data).scene()
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""Wavefront OBJ: positions and faces. Texture and normal indices of a corner are ignored, so seams split nothing."""
+"""Wavefront OBJ: positions and faces. Texture and normal indices are ignored, so seams split nothing."""
 
 import re
 from pathlib import Path

@@ -31,7 +31,7 @@ def read(path: Path, data: bytes) -> Raw:
         raise damaged(name, "the header does not say how many vertices and faces there are")
     V, F = int(head.group(1)), int(head.group(2))
     body = body[head.end() :]
-    if V + F > len(body):  # a row takes two bytes and more
+    if len(body) < V + F:  # a row takes two bytes and more
         raise damaged(name, f"it promises {V} vertices and {F} faces, but is only {len(data)} bytes long")
     counts = words_per_line(body)
     if len(counts) < V + F:

@@ -55,7 +55,7 @@ def words_per_line(text: bytes) -> NDArray[np.int64]:
 
 
 def lines_of(text: bytes, *words: bytes) -> list[tuple[bytes, NDArray[np.int64]]]:
-    """For each of the given first words: its lines without that word, one after the other, and which lines they are.
+    """For each of the given first words: its lines without that word, and which lines of the text they are.
 
     Spaces in front of the word are allowed.
     """
@@ -91,7 +91,7 @@ def without_slashes(text: bytes) -> bytes:
 def columns(
     values: NDArray[np.float64], counts: NDArray[np.int64], first: int, last: int
 ) -> NDArray[np.float64]:
-    """Columns `first` to `last` (excluded) of lines of unequal length, given the flat values and words per line."""
+    """Columns `first` to `last` (excluded) of lines of unequal length: flat values, and words per line."""
     if len(counts) and (counts == counts[0]).all():
         return values.reshape(len(counts), -1)[:, first:last]
     starts = np.cumsum(counts) - counts

@@ -1,0 +1,150 @@
+"""Decimation: near the target, near the surface, closed where it was closed, for any input."""
+
+import builtins
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes import decimate as module
+from meshmatch.shapes import pymeshlab_filters
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.topology import edges_of, is_watertight
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1750.0])
+@pytest.mark.parametrize("quality", ["fast", "pymeshlab"])
+def test_closed_mesh_stays_closed_and_near(
+    make_sphere: Callable[[int], Shape], scale: float, quality: str
+) -> None:
+    if quality == "pymeshlab" and pymeshlab_filters.missing_filters():
+        pytest.skip(pymeshlab_filters.missing_filters())
+    ball = make_sphere(4)
+    shape = Shape(ball.verts * scale + 5 * scale, ball.faces, "ball")
+    small = decimate(shape, 600, quality)
+    assert abs(small.F - 600) <= 6
+    assert is_watertight(small.faces)
+    assert small.V - 3 * small.F // 2 + small.F == 2  # Euler: still a sphere
+    radius = np.linalg.norm(small.verts / scale - 5, axis=1)
+    np.testing.assert_allclose(radius, 1.0, atol=0.02)
+    assert small.area == pytest.approx(shape.area, rel=0.02)
+    assert (np.einsum("vi,vi->v", small.vertex_normals, small.verts / scale - 5) > 0).all()
+    assert small.name == "ball"
+
+
+def test_small_enough_is_returned_as_it_is(cube: Shape) -> None:
+    assert decimate(cube, 12) is cube
+    assert decimate(cube, 5000) is cube
+
+
+def test_open_and_non_manifold_and_unused_are_survived(torus: Shape) -> None:
+    fin = np.stack([np.arange(0, 300), np.arange(1, 301), np.arange(700, 1000)], axis=1)
+    verts = np.vstack([torus.verts, [[9, 9, 9]]])
+    shape = Shape(verts, np.vstack([torus.faces[:-400], fin]))
+    small = decimate(shape, 800)
+    assert small.F < 1000
+    assert np.abs(small.verts).max() < 2  # the unused vertex is gone
+    assert (np.diff(np.sort(small.faces, axis=1), axis=1) > 0).all()
+
+
+def test_colours_come_from_the_nearest_vertex(make_sphere: Callable[[int], Shape]) -> None:
+    ball = make_sphere(3)
+    colors = np.random.default_rng(0).random((ball.V, 4))
+    small = decimate(Shape(ball.verts, ball.faces, colors=colors), 300)
+    np.testing.assert_array_equal(small.colors, colors[cKDTree(ball.verts).query(small.verts)[1]])
+
+
+def test_open_result_for_a_closed_mesh_is_tried_again(sphere: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
+    import fast_simplification
+
+    real, asked = fast_simplification.simplify, []
+
+    def leaky(points: np.ndarray, faces: np.ndarray, target_count: int, agg: float):
+        asked.append(agg)
+        verts, small = real(points, faces, target_count=target_count, agg=agg)
+        return verts, small[len(asked) < 2 :]  # the first try has a hole
+
+    monkeypatch.setattr(fast_simplification, "simplify", leaky)
+    assert is_watertight(decimate(sphere, 300).faces)
+    assert len(asked) == 2
+
+
+def test_best_of_bad_results_is_used(sphere: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
+    import fast_simplification
+
+    real, lost = fast_simplification.simplify, iter([9, 2, 5, 7])
+
+    def leaky(points: np.ndarray, faces: np.ndarray, target_count: int, agg: float):
+        verts, small = real(points, faces, target_count=target_count, agg=agg)
+        return verts, small[2 * next(lost) :]
+
+    monkeypatch.setattr(fast_simplification, "simplify", leaky)
+    small = decimate(sphere, 300)
+    assert abs(small.F - 296) < 4
+
+
+def test_first_choice_is_gentle() -> None:
+    assert module._AGGRESSIVENESS[0] == 3.0
+
+
+def test_target_is_reached_where_the_gentle_way_stops_short(sphere: Shape) -> None:
+    small = decimate(sphere, 60)
+    assert small.F <= 62
+    assert is_watertight(small.faces)
+
+
+def test_choices_that_do_not_exist(sphere: Shape) -> None:
+    with pytest.raises(OptionError, match="unknown quality 'best'") as caught:
+        decimate(sphere, 100, "best")
+    assert "fast or pymeshlab" in caught.value.hint
+    with pytest.raises(OptionError, match="cannot decimate to 3 faces"):
+        decimate(sphere, 3)
+    with pytest.raises(InputError, match="point cloud"):
+        decimate(Shape(sphere.verts, []), 100)
+
+
+def test_lost_filters_are_named(sphere: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
+    pymeshlab = pytest.importorskip("pymeshlab")
+    monkeypatch.setattr(pymeshlab, "MeshSet", type("MeshSet", (), {}))
+    with pytest.raises(OptionError, match="lost its filter meshing_decimation") as caught:
+        decimate(sphere, 100, "pymeshlab")
+    assert "libopengl0" in caught.value.hint
+    assert "libopengl0" in pymeshlab_filters.missing_filters()
+
+
+@pytest.mark.parametrize(
+    ("error", "hint"),
+    [
+        (ModuleNotFoundError("No module named 'pymeshlab'"), "pip install pymeshlab"),
+        (ImportError("libGL.so.1: cannot open shared object file"), "apt-get install libgl1"),
+    ],
+)
+def test_missing_pymeshlab_is_explained(
+    sphere: Shape, monkeypatch: pytest.MonkeyPatch, error: ImportError, hint: str
+) -> None:
+    real = builtins.__import__
+
+    def refuse(name: str, *rest: object, **more: object) -> object:
+        if name == "pymeshlab":
+            raise error
+        return real(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(OptionError) as caught:
+        decimate(sphere, 100, "pymeshlab")
+    assert hint in caught.value.hint
+    assert decimate(sphere, 100).F <= 102  # the default way does not need it
+
+
+def test_remeshing_gives_even_triangles(torus: Shape) -> None:
+    if pymeshlab_filters.missing_filters():
+        pytest.skip(pymeshlab_filters.missing_filters())
+    other = pymeshlab_filters.remesh(torus, 0.12)
+    assert other.area == pytest.approx(torus.area, rel=0.03)
+    assert edges_of(other.faces).counts == (0, 0)
+    edges = other.verts[other.faces] - other.verts[np.roll(other.faces, -1, axis=1)]
+    assert np.median(np.linalg.norm(edges, axis=2)) == pytest.approx(0.12, rel=0.2)
+    assert len(cKDTree(torus.verts).query_ball_point(other.verts, 1e-9).nonzero()[0]) < other.V / 2
