@@ -1,0 +1,45 @@
+"""The tree of verbs."""
+
+import typer
+
+from meshmatch import __version__
+from meshmatch.cli.evaluate import evaluate
+from meshmatch.cli.info import info
+from meshmatch.cli.match import match, register
+from meshmatch.cli.models import models
+from meshmatch.cli.prepare import prepare
+from meshmatch.cli.train import train
+
+app = typer.Typer(
+    name="meshmatch",
+    help="Dense matching of non-rigid 3D shapes: two meshes in, a vertex map out.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,  # plain text: it comes at once, and docs/cli.md shows it as it is
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"meshmatch {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version and leave."
+    ),
+) -> None:
+    """Dense matching of non-rigid 3D shapes: two meshes in, a vertex map out.
+
+    Exit status: 0 done, 1 the data or a choice is wrong (one line says what), 2 the command line is wrong.
+    Words go to stderr, data to stdout. MESHMATCH_DEBUG=1 shows the traceback of every error.
+    """
+
+
+for verb in (match, register, evaluate, info, prepare, train):
+    app.command()(verb)
+app.add_typer(models, name="models")

@@ -1,0 +1,116 @@
+"""``meshmatch models``: the trained models that are at hand."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from meshmatch.cli import options
+from meshmatch.cli.voice import Voice, print_json, print_rows
+
+models = typer.Typer(
+    help="List, show, add, remove and verify trained models.", no_args_is_help=True, rich_markup_mode=None
+)
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="The model's name.")]
+
+
+@models.command("list")
+def list_all(json: options.Json = False) -> None:
+    """List built-in models and your own."""
+    from meshmatch.models.registry import list_models
+
+    entries = list_models()
+    if json:
+        record = [
+            {
+                "name": entry.name,
+                "built_in": entry.built_in,
+                "folder": str(entry.folder),
+                "category": entry.card.category if entry.card else None,
+                "created": entry.card.created if entry.card else None,
+                "licence": entry.card.licence if entry.card else None,
+                "problem": entry.problem,
+            }
+            for entry in entries
+        ]
+        print_json({"models": record})
+        return
+    rows = [("NAME", "CATEGORY", "CREATED", "FROM", "LICENCE")]
+    for entry in entries:
+        where = "package" if entry.built_in else "own"
+        if entry.card is None:
+            rows.append((entry.name, "", "", where, "damaged"))
+        else:
+            rows.append((entry.name, entry.card.category, entry.card.created, where, entry.card.licence))
+    print_rows(rows)
+    for entry in entries:
+        if entry.problem:
+            Voice().warn(f"model {entry.name}: {entry.problem}")
+
+
+@models.command()
+def show(name: Name) -> None:
+    """Show a model's card as JSON.
+
+    It names template, data, licence, recipe, time, errors and hashes.
+    """
+    from meshmatch.models.card import card_to_json
+    from meshmatch.models.registry import CARD, locate_model
+    from meshmatch.models.registry import read_card as read
+
+    typer.echo(card_to_json(read(locate_model(name) / CARD)), nl=False)
+
+
+@models.command()
+def add(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="A model folder, such as `meshmatch train` writes.")
+    ],
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace your own model of the same name.")
+    ] = False,
+) -> None:
+    """Copy a model into your registry.
+
+    It is checked first, and gets the name on its card.
+    """
+    from meshmatch.models.registry import add_model
+
+    entry = add_model(folder, replace=replace)
+    Voice().say(f"added model {entry.name} to {entry.folder.parent}")
+
+
+@models.command()
+def remove(name: Name) -> None:
+    """Remove one of your own models."""
+    from meshmatch.models.registry import remove_model
+
+    remove_model(name)
+    Voice().say(f"removed model {name}")
+
+
+@models.command()
+def verify(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="Models to check; all if none is named.")
+    ] = None,
+) -> None:
+    """Check that models are whole and unchanged."""
+    from meshmatch.errors import ModelError
+    from meshmatch.models.registry import list_models, verify_model
+
+    wrong: list[ModelError] = []
+    for name in names or [entry.name for entry in list_models()]:
+        try:
+            card = verify_model(name)
+        except ModelError as error:
+            wrong.append(error)
+            Voice().trouble(name, error.message, error.hint)
+        else:
+            typer.echo(f"{name}: ok, sha256 {card.weights_sha256}")
+    if wrong:
+        count = len(wrong)
+        raise ModelError(
+            f"{count} {'model is' if count == 1 else 'models are'} damaged", "see the lines above"
+        )

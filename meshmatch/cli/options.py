@@ -1,0 +1,32 @@
+"""Arguments and options that several verbs share, described once."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+Refine = Literal["none", "latent", "nodes"]
+Polish = Literal["auto", "on", "off"]
+
+Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="The shape whose every vertex is matched.")]
+Target = Annotated[Path, typer.Argument(metavar="TARGET", help="The shape that it is matched to.")]
+Model = Annotated[
+    str,
+    typer.Option(metavar="NAME", help="A model by name (see `meshmatch models list`) or by its folder."),
+]
+RefineOption = Annotated[
+    Refine,
+    typer.Option(
+        help="How the fit is refined: Gauss-Newton on the nodes, the search over codes, or the network alone."
+    ),
+]
+Up = Annotated[Axis | None, typer.Option(help="The file's axis that points up. Searched for if not given.")]
+Front = Annotated[
+    Axis | None, typer.Option(help="The file's axis that the shape faces. Searched for if not given.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Chooses the samples. The same seed gives the same result.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Write nothing and exit with 1 if a fit is poor.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+Threads = Annotated[int, typer.Option(min=1, help="How many threads to use.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary; warnings stay.")]

@@ -1,0 +1,143 @@
+"""``meshmatch prepare``."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from meshmatch.cli import options
+from meshmatch.cli.voice import Voice, print_json
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from meshmatch.shapes.repair import Repaired
+
+
+def prepare(
+    shapes: Annotated[
+        Path, typer.Argument(metavar="SHAPES", help="A folder of shapes, or the one shape of a template.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where everything goes; made if needed.")
+    ],
+    template: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="The shape that becomes the template; the folder's first if not given."
+        ),
+    ] = None,
+    strategy: Annotated[
+        Literal["parts", "spectral", "geodesic", "uniform"],
+        typer.Option(
+            help="Which nodes are refused: those between two parts (needs --labels), between two spectral "
+            "clusters, near two points far apart along the surface, or none."
+        ),
+    ] = "geodesic",
+    labels: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="The part of every vertex of a single shape, a number a line, from 0."
+        ),
+    ] = None,
+    nodes: Annotated[int, typer.Option(min=4, help="How many control nodes.")] = 320,
+    radius: Annotated[
+        float, typer.Option(min=1e-6, help="Support radius of a node, in units of sqrt(surface area).")
+    ] = 0.13,
+    faces: Annotated[int, typer.Option(min=100, help="Triangles of the low resolution.")] = 10_000,
+    seed: options.Seed = 0,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Make a template, and shapes to learn from.
+
+    A folder's shapes are checked, normalised and decimated. If all share the template's vertices and triangles they
+    are registered: `meshmatch train --shapes FOLDER` learns from them. Writes template.safetensors, a picture of the
+    nodes (nodes.png) and, from a folder, shapes.safetensors, normalised/ and prepared.json.
+    """
+    from meshmatch.errors import OptionError, OutputError
+    from meshmatch.render.picture import Panel, render_shapes
+    from meshmatch.shapes.files import load_shape
+    from meshmatch.shapes.repair import repair
+    from meshmatch.templates.nodes import NodeConfig
+    from meshmatch.templates.prepare import low_resolution, make_template, prepare_folder
+    from meshmatch.templates.template import save_template
+
+    voice = Voice(quiet)
+    config = NodeConfig(strategy=strategy, K=nodes, radius=radius, seed=seed)
+    if (strategy == "parts") != (labels is not None):
+        raise OptionError(
+            "--strategy parts and --labels belong together", "give both, or choose another strategy"
+        )
+    if shapes.is_dir() and labels is not None:
+        raise OptionError("--labels are of one shape, not of a folder", "name the shape itself")
+    if not shapes.is_dir() and template is not None:
+        raise OptionError("--template goes with a folder of shapes", "one shape is its own template")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the folder {output}: {error.strerror}", "choose another with -o"
+        ) from error
+    if shapes.is_dir():
+        with voice.progress() as report:
+            made = prepare_folder(
+                shapes,
+                output,
+                config,
+                template=template,
+                faces=faces,
+                progress=lambda done, total: report("checked", shapes.name, done / total),
+            )
+        bundle, names, registered, notes = made.template, made.names, len(made.shapes), made.notes
+    else:
+        from meshmatch.maps.pairs import load_points
+
+        clean = repair(load_shape(shapes))
+        parts = None if labels is None else _repaired_labels(load_points(labels), clean, labels)
+        bundle = make_template(
+            clean.shape,
+            shapes.stem,
+            config,
+            labels=parts,
+            source=shapes.name,
+            low=low_resolution(clean.shape, faces),
+        )
+        save_template(bundle, output / "template.safetensors")
+        names, registered, notes = (shapes.name,), 0, clean.notes
+    picture = output / "nodes.png"
+    render_shapes(
+        [Panel(bundle.shape, label=f"{bundle.name}: {bundle.K} nodes", points=bundle.nodes)], picture
+    )
+    for note in notes:
+        voice.say(note)
+    voice.say(
+        f"wrote {output}: a template of {bundle.shape.V} vertices and {bundle.K} nodes"
+        + (f", {registered} registered shapes" if registered else "")
+        + f"; look at {picture}"
+    )
+    if json:
+        print_json(
+            {
+                "output": str(output),
+                "template": bundle.name,
+                "template_hash": bundle.hash,
+                "vertices": bundle.shape.V,
+                "nodes": bundle.K,
+                "shapes": list(names),
+                "registered": registered,
+                "notes": list(notes),
+            }
+        )
+
+
+def _repaired_labels(labels: "np.ndarray", clean: "Repaired", file: Path) -> "np.ndarray":
+    """Labels of the file's vertices (V_original,) as labels of the repaired ones (V,)."""
+    from meshmatch.errors import InputError
+
+    if len(labels) != clean.original.V:
+        raise InputError(
+            f"{file.name} has {len(labels)} labels, but {clean.original.name} has {clean.original.V} vertices",
+            "one label a line, for every vertex of the file",
+        )
+    return labels[clean.kept_vertex]

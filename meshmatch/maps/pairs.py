@@ -1,0 +1,85 @@
+"""Known points: pairs of vertices of two shapes (landmarks, a partial truth), and lists of vertices of one.
+
+Text files hold one pair, or one vertex, a line: numbers apart by spaces, tabs, commas or semicolons; ``#`` begins a
+comment; a first line of words is taken for a header. ``.npy`` files hold the same as an integer array. Vertices are
+counted from 0, in the order of the shape's file.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.errors import InputError
+
+_PAIRS = "one pair a line: a vertex of the source, then a vertex of the target, counted from 0"
+_POINTS = "one vertex a line, counted from 0"
+
+
+def load_pairs(path: str | Path) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Read pairs: vertices of the source (N,), and the same N points on the target (N,).
+
+    Raises
+    ------
+    InputError
+        The file is missing or empty, or is not a table of two columns of vertices.
+    """
+    table = _table(Path(path), 2, _PAIRS)
+    return table[:, 0].copy(), table[:, 1].copy()
+
+
+def load_points(path: str | Path) -> NDArray[np.int64]:
+    """Read a list of vertices (N,) of one shape.
+
+    Raises
+    ------
+    InputError
+        The file is missing or empty, or is not a list of vertices.
+    """
+    return _table(Path(path), 1, _POINTS)[:, 0].copy()
+
+
+def _table(path: Path, columns: int, hint: str) -> NDArray[np.int64]:
+    if not path.is_file():
+        raise InputError(f"there is no file {path}", hint)
+    try:
+        rows = _from_npy(path) if path.suffix.lower() == ".npy" else _from_text(path)
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(f"{path.name} is not a list of vertices: {error}", hint) from error
+    if rows.ndim == 1 and columns == 1:
+        rows = rows[:, None]
+    if rows.size == 0:
+        raise InputError(f"{path.name} holds no vertex", hint)
+    if rows.ndim != 2 or rows.shape[1] != columns:
+        shape = " x ".join(str(n) for n in rows.shape)
+        raise InputError(f"{path.name} has {shape} numbers, not {columns} a line", hint)
+    if rows.min() < 0:
+        raise InputError(f"{path.name} names vertex {int(rows.min())}", hint)
+    return rows
+
+
+def _from_npy(path: Path) -> NDArray[np.int64]:
+    array = np.load(path, allow_pickle=False)
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iu":
+        raise ValueError("its numbers are not whole")
+    return array.astype(np.int64)
+
+
+def _from_text(path: Path) -> NDArray[np.int64]:
+    rows: list[list[int]] = []
+    words_allowed = True
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
+        cells = line.partition("#")[0].replace(",", " ").replace(";", " ").split()
+        if not cells:
+            continue
+        try:
+            rows.append([int(cell) for cell in cells])
+        except ValueError:
+            if not words_allowed:
+                raise ValueError(f"line {number} is {line.strip()[:40]!r}") from None
+        words_allowed = False
+        if rows and len(rows[-1]) != len(rows[0]):
+            raise ValueError(f"line {number} has {len(rows[-1])} numbers, the first has {len(rows[0])}")
+    return np.array(rows, np.int64)
