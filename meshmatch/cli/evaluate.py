@@ -72,7 +72,7 @@ def evaluate(
         limit = 20.0 if unit == "cm" else 25.0
         draw_curves({found.source or source.stem: result.errors}, curve, limit, unit=unit)
     for reason in found.reasons:
-        Voice().warn(reason)
+        Voice().say(f"note: {reason}")
     if json:
         print_json(dict(result.as_dict(threshold)))
     else:

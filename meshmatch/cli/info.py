@@ -29,8 +29,8 @@ def info(
         return
     rows = []
     for key, value in record.items():
-        values = value if isinstance(value, list) and key == "repair" else [value]
-        shown = [_shown(item) for item in values] or ["nothing to do"]
+        values = value if key in ("repair", "reasons") else [value]  # a line each
+        shown = [_shown(item) for item in values] or ["nothing to do" if key == "repair" else "none"]
         rows += [(key if n == 0 else "", text) for n, text in enumerate(shown)]
     print_rows([(key.replace("_", " "), text) for key, text in rows])
 

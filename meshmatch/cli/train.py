@@ -82,10 +82,12 @@ def train(
 
     label = check_name(name or output.resolve().name)
     chosen = run.recipe(preset)
-    changes = {"steps": steps, "bf16": bf16, "workers": workers}
+    preset_train = chosen.train
     settings = replace(
-        chosen.train,
-        **{key: value for key, value in changes.items() if value is not None},
+        preset_train,
+        steps=preset_train.steps if steps is None else steps,
+        bf16=preset_train.bf16 if bf16 is None else bf16,
+        workers=preset_train.workers if workers is None else workers,
         minutes=minutes,
         threads=threads,
         seed=seed,

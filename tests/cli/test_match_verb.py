@@ -1,0 +1,292 @@
+"""`match` and `register` hand everything on, and write all or nothing."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from meshmatch import pipeline
+from meshmatch.errors import InputError
+from meshmatch.fitting.fit import Fit
+from meshmatch.maps.files import load_map
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.shape import Frame, Shape
+from tests.cli.conftest import Run
+
+FACES = np.array([[0, 1, 2], [0, 2, 3]])
+CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+
+
+def fit(shape: Shape, verdict: str = "good", reasons: tuple[str, ...] = ()) -> Fit:
+    return Fit(
+        template_hash="0" * 16,
+        frame=Frame(2.0, np.eye(3), np.array([10.0, 0, 0])),
+        points=CORNERS,
+        vectors=np.zeros((4, 3)),
+        faces=FACES,
+        residual=0.0123,
+        vertex_distance=np.zeros(shape.V),
+        verdict=verdict,
+        reasons=reasons,
+        up="+y",
+        front="-z",
+        seconds=1.25,
+        seed=0,
+    )
+
+
+class Recorder:
+    """Stands for the pipeline: remembers how it was called, and answers at once."""
+
+    def __init__(self) -> None:
+        self.called: dict[str, Any] = {}
+        self.verdict = "good"
+        self.reasons: tuple[str, ...] = ()
+
+    def match(self, source: Path, target: Path, **options: Any) -> pipeline.MatchResult:
+        self.called = {"source": source, "target": target} | options
+        options["progress"]("orientation", "a.ply", 0.5)
+        a, b = load_shape(source), load_shape(target)
+        found = VertexMap.between(a, b, np.arange(a.V) % b.V, verdict=self.verdict, reasons=self.reasons)
+        return pipeline.MatchResult(found, fit(a), fit(b), 2.5, ("a.ply: 3 faces dropped",))
+
+    def register(self, shape: Shape, **options: Any) -> Fit:
+        self.called = {"shape": shape} | options
+        options["progress"]("orientation", "a.ply", 0.5)
+        return fit(shape, self.verdict, self.reasons)
+
+
+@pytest.fixture
+def stub(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    recorder = Recorder()
+    monkeypatch.setattr(pipeline, "match", recorder.match)
+    monkeypatch.setattr(pipeline, "register", recorder.register)
+    return recorder
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".csv", ".txt", ".mat", ".json"])
+def test_match_writes_the_map(run: Run, two: tuple[Path, Path], stub: Recorder, suffix: str) -> None:
+    output = two[0].with_name(f"map{suffix}")
+    answer = run("match", *two, "-o", output)
+    assert answer.status == 0
+    assert answer.out == ""
+    found = load_map(output, load_shape(two[0]), load_shape(two[1]))
+    assert found.index.tolist() == [i % 1600 for i in range(642)]
+    assert sorted(path.name for path in output.parent.iterdir()) == sorted(["a.ply", "b.ply", output.name])
+
+
+def test_match_says_what_it_did(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+    said = run("match", *two, "-o", two[0].with_name("map.npy")).err
+    for words in (
+        "3 faces dropped",
+        "a.ply: good fit, up +y, front -z",
+        "for each of the 642 vertices of a.ply its vertex of b.ply (2.5 s)",
+    ):
+        assert words in said
+
+
+DEFAULTS = {
+    "model": "human",
+    "refine": "nodes",
+    "polish": "auto",
+    "seed": 0,
+    "up": None,
+    "front": None,
+    "landmarks": None,
+    "workers": 2,
+}
+
+
+def test_match_defaults(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+    run("match", *two, "-o", two[0].with_name("map.npy"))
+    called = dict(stub.called)
+    del called["progress"]
+    assert called == DEFAULTS | {"source": two[0], "target": two[1]}
+
+
+OPTIONS = [
+    (["--model", "mine"], "model", "mine"),
+    *[(["--refine", value], "refine", value) for value in ("none", "latent", "nodes")],
+    *[(["--polish", value], "polish", value) for value in ("auto", "on", "off")],
+    *[(["--up", value], "up", value) for value in ("x", "y", "z", "-x", "-y", "-z")],
+    *[(["--front", value], "front", value) for value in ("x", "y", "z", "-x", "-y", "-z")],
+    (["--seed", "7"], "seed", 7),
+]
+
+
+@pytest.mark.parametrize(("words", "name", "value"), [*OPTIONS, (["--threads", "1"], "workers", 1)])
+def test_match_hands_options_on(
+    run: Run, two: tuple[Path, Path], stub: Recorder, words: list[str], name: str, value: object
+) -> None:
+    assert run("match", *two, "-o", two[0].with_name("map.npy"), *words).status == 0
+    called = {key: stub.called[key] for key in DEFAULTS}
+    assert called == DEFAULTS | {name: value}
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--refine", "much"],
+        ["--polish", "maybe"],
+        ["--up", "w"],
+        ["--front", "forward"],
+        ["--seed", "-1"],
+        ["--threads", "0"],
+    ],
+)
+def test_match_refuses_values_that_do_not_exist(
+    run: Run, two: tuple[Path, Path], stub: Recorder, words: list[str]
+) -> None:
+    output = two[0].with_name("map.npy")
+    assert run("match", *two, "-o", output, *words).status == 2
+    assert not output.exists()
+
+
+def test_match_reads_landmarks(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+    file = two[0].with_name("pairs.txt")
+    file.write_text("source target\n0 10\n5 11  # the nose\n")
+    run("match", *two, "-o", two[0].with_name("map.npy"), "--landmarks", file)
+    assert [list(side) for side in stub.called["landmarks"]] == [[0, 5], [10, 11]]
+
+
+def test_match_json_is_one_line_of_data(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+    stub.verdict, stub.reasons = "fair", ("a hand is far",)
+    output = two[0].with_name("map.npy")
+    answer = run("match", *two, "-o", output, "--json", "--refine", "latent", "--seed", "3")
+    assert answer.out.count("\n") == 1
+    record = json.loads(answer.out)
+    assert record["output"] == str(output)
+    assert (record["source"], record["target"]) == ("a.ply", "b.ply")
+    assert (record["source_vertices"], record["target_vertices"]) == (642, 1600)
+    assert (record["verdict"], record["reasons"]) == ("fair", ["a hand is far"])
+    assert (record["refine"], record["seed"], record["model"]) == ("latent", 3, "human")
+    assert record["seconds"] == 2.5
+    assert record["notes"] == ["a.ply: 3 faces dropped"]
+    assert [each["shape"] for each in record["fits"]] == ["a.ply", "b.ply"]
+    assert record["fits"][0]["residual"] == 0.0123
+
+
+def test_quiet_is_silent(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+    answer = run("match", *two, "-o", two[0].with_name("map.npy"), "--quiet")
+    assert (answer.status, answer.out, answer.err) == (0, "", "")
+
+
+def test_a_poor_fit_warns_even_when_quiet(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+    stub.verdict, stub.reasons = "poor", ("an arm is missing",)
+    output = two[0].with_name("map.npy")
+    answer = run("match", *two, "-o", output, "-q")
+    assert answer.status == 0
+    assert answer.err == "warning: the fit is poor: an arm is missing\n"
+    assert output.exists()
+
+
+@pytest.mark.parametrize(("verb", "output"), [("match", "map.npy"), ("register", "fitted.ply")])
+def test_strict_makes_a_poor_fit_an_error(
+    run: Run, two: tuple[Path, Path], stub: Recorder, verb: str, output: str
+) -> None:
+    stub.verdict, stub.reasons = "poor", ("an arm is missing",)
+    words = [*two][: 2 if verb == "match" else 1]
+    answer = run(verb, *words, "-o", two[0].with_name(output), "--strict")
+    assert answer.status == 1
+    assert "an arm is missing" in answer.err
+    assert sorted(path.name for path in two[0].parent.iterdir()) == ["a.ply", "b.ply"]
+
+
+@pytest.mark.parametrize(("verb", "output"), [("match", "map.npy"), ("register", "fitted.ply")])
+@pytest.mark.parametrize("verdict", ["good", "fair"])
+def test_strict_lets_other_fits_pass(
+    run: Run, two: tuple[Path, Path], stub: Recorder, verb: str, output: str, verdict: str
+) -> None:
+    stub.verdict, stub.reasons = verdict, ("so so",)
+    words = [*two][: 2 if verb == "match" else 1]
+    answer = run(verb, *words, "-o", two[0].with_name(output), "--strict")
+    assert answer.status == 0
+    assert ("note: so so" in answer.err) == (verdict == "fair")
+    assert two[0].with_name(output).exists()
+
+
+@pytest.mark.parametrize("verb", ["match", "register"])
+@pytest.mark.parametrize(
+    ("output", "words"),
+    [("out.bad", "suffix"), ("nowhere/out{}", "no folder"), ("", "folder")],
+    ids=["suffix", "missing folder", "a folder"],
+)
+def test_an_output_that_cannot_be_is_told_before_the_work(
+    run: Run, two: tuple[Path, Path], stub: Recorder, verb: str, output: str, words: str
+) -> None:
+    suffix = ".npy" if verb == "match" else ".ply"
+    path = two[0].parent / output.format(suffix)
+    if not output:
+        path = two[0].parent / f"folder{suffix}"
+        path.mkdir()
+    answer = run(verb, *[*two][: 2 if verb == "match" else 1], "-o", path)
+    assert answer.status == 1
+    assert "error: " in answer.err
+    assert stub.called == {}
+
+
+@pytest.mark.parametrize("error", [InputError("a bad file"), KeyboardInterrupt()])
+def test_a_failure_leaves_what_was_there(
+    run: Run, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def failing(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(pipeline, "match", failing)
+    output = two[0].with_name("map.npy")
+    output.write_bytes(b"old")
+    assert run("match", *two, "-o", output).status == (1 if isinstance(error, InputError) else 130)
+    assert output.read_bytes() == b"old"
+    assert len(list(output.parent.iterdir())) == 3
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl", ".glb"])
+def test_register_writes_the_template_in_the_frame_of_the_file(
+    run: Run, two: tuple[Path, Path], stub: Recorder, suffix: str
+) -> None:
+    output = two[0].with_name(f"fitted{suffix}")
+    answer = run("register", two[0], "-o", output)
+    assert answer.status == 0
+    assert answer.out == ""
+    fitted = load_shape(output)
+    wanted = 2.0 * CORNERS + [10.0, 0, 0]
+    assert np.allclose(fitted.verts[fitted.faces], wanted[FACES])
+    assert "good fit, up +y, front -z" in answer.err
+
+
+@pytest.mark.parametrize(("words", "name", "value"), [item for item in OPTIONS if item[1] != "polish"])
+def test_register_hands_options_on(
+    run: Run, two: tuple[Path, Path], stub: Recorder, words: list[str], name: str, value: object
+) -> None:
+    assert run("register", two[0], "-o", two[0].with_name("fitted.ply"), *words).status == 0
+    defaults = {key: DEFAULTS[key] for key in ("model", "refine", "seed", "up", "front")}
+    assert {key: stub.called[key] for key in defaults} == defaults | {name: value}
+    assert stub.called["shape"].V == 642
+
+
+def test_register_json(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+    answer = run("register", two[0], "-o", two[0].with_name("fitted.ply"), "--json", "--quiet")
+    record = json.loads(answer.out)
+    assert answer.err == ""
+    assert (record["shape"], record["verdict"], record["up"]) == ("a.ply", "good", "+y")
+    assert record["output"] == str(two[0].with_name("fitted.ply"))
+
+
+@pytest.mark.parametrize("verb", ["match", "register"])
+def test_threads_are_set(
+    run: Run, two: tuple[Path, Path], stub: Recorder, monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr("meshmatch.config.set_threads", asked.append)
+    words = (
+        (*two, "-o", two[0].with_name("map.npy"))
+        if verb == "match"
+        else (two[0], "-o", two[0].with_name("f.ply"))
+    )
+    run(verb, *words, "--threads", "4")
+    # match runs its two fits side by side, one thread each, and spends the rest on the map
+    assert asked == ([1] if verb == "match" else [4])
+    assert verb == "register" or stub.called["workers"] == 4
