@@ -2,13 +2,29 @@
 
 from pathlib import Path
 
+from meshmatch.errors import TemplateError
+
 
 def bundled_folder() -> Path:
     """The folder of bundled data: ``meshmatch/_templates`` of an installed wheel, ``templates/`` beside a checkout.
 
     It holds ``human/`` (template bundles), ``models/NAME/`` (trained models) and ``samples/`` (two shapes to try).
-    The wheel's own copy wins, so that an installed package never reads a stranger's ``templates/``.
+    The wheel's own copy wins, and of a checkout only one with its ``pyproject.toml``, so that an installed package
+    never reads a stranger's ``templates/``.
+
+    Raises
+    ------
+    TemplateError
+        There is neither.
     """
     package = Path(__file__).resolve().parents[1]
     installed = package / "_templates"
-    return installed if installed.is_dir() else package.parent / "templates"
+    if installed.is_dir():
+        return installed
+    checkout = package.parent
+    if (checkout / "pyproject.toml").is_file() and (checkout / "templates").is_dir():
+        return checkout / "templates"
+    raise TemplateError(
+        f"the templates and models that come with meshmatch are neither in {installed} nor in {checkout / 'templates'}",
+        "the installation is incomplete: install meshmatch again",
+    )
