@@ -187,7 +187,11 @@ def test_light_modules_load_nothing_heavy(module: str) -> None:
 
 
 def test_help_loads_nothing_heavy() -> None:
-    statement = "import contextlib, io\nfrom meshmatch.cli import main\nwith contextlib.redirect_stdout(io.StringIO()): main(['--help'])"
+    statement = (
+        "import contextlib, io\n"
+        "from meshmatch.cli import main\n"
+        "with contextlib.redirect_stdout(io.StringIO()): main(['--help'])"
+    )
     assert loaded_by(statement) & {*HEAVY, "numpy", "rich"} == set()
 
 

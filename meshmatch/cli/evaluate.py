@@ -49,8 +49,9 @@ def evaluate(
 ) -> None:
     """Measure how good a map is.
 
-    Where the truth is known: errors. Always: coverage, and between meshes distortion. Errors are geodesic distances on TARGET over the square root of its area, times 100; and in centimetres
-    with TARGET scaled to 1.9 square metres, the skin of a person.
+    Coverage always, distortion between meshes, and errors where the truth is known: geodesic distances on
+    TARGET, over the square root of its area and times 100; and in centimetres with TARGET scaled to 1.9
+    square metres, the skin of a person.
     """
     import numpy as np
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from meshmatch.cli import options
+from meshmatch.cli.folders import make_folder
 from meshmatch.cli.voice import Voice, print_json
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def prepare(
     are registered: `meshmatch train --shapes FOLDER` learns from them. Writes template.safetensors, a picture of the
     nodes (nodes.png) and, from a folder, shapes.safetensors, normalised/ and prepared.json.
     """
-    from meshmatch.errors import OptionError, OutputError
+    from meshmatch.errors import OptionError
     from meshmatch.render.picture import Panel, render_shapes
     from meshmatch.shapes.files import load_shape
     from meshmatch.shapes.repair import repair
@@ -73,12 +74,7 @@ def prepare(
         raise OptionError("--labels are of one shape, not of a folder", "name the shape itself")
     if not shapes.is_dir() and template is not None:
         raise OptionError("--template goes with a folder of shapes", "one shape is its own template")
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot make the folder {output}: {error.strerror}", "choose another with -o"
-        ) from error
+    make_folder(output)
     if shapes.is_dir():
         with voice.progress() as report:
             made = prepare_folder(

@@ -1,5 +1,6 @@
 """``meshmatch train``."""
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from meshmatch.cli import options
+from meshmatch.cli.folders import make_folder
 from meshmatch.cli.voice import Voice, print_json
 
 if TYPE_CHECKING:
@@ -71,12 +73,15 @@ def train(
 ) -> None:
     """Train a model.
 
-    The result is a folder that --model and `meshmatch models add` accept. The same command goes on from the checkpoint, exactly, after a stop or a kill. On several GPUs:
+    The result is a folder that --model and `meshmatch models add` accept. After a stop or a kill the same
+    command goes on from the checkpoint, exactly. On several GPUs:
     `torchrun --nproc-per-node N -m meshmatch train ...`.
     """
     from meshmatch.config import set_threads
 
     set_threads(threads)
+    first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
+    make_folder(output)
     from meshmatch.models.card import check_name
     from meshmatch.training import run
 
@@ -93,7 +98,7 @@ def train(
         seed=seed,
     )
     chosen = replace(chosen, train=settings)
-    voice = Voice(quiet)
+    voice = Voice(quiet or not first)
     if shapes is not None:
         made = run.read_template(shapes / "template.safetensors")
         source, count = run.folder_source(shapes, made)
@@ -126,7 +131,7 @@ def train(
     voice.say(
         f"wrote model {label} to {folder}; use it with --model {folder}, or add it: meshmatch models add {folder}"
     )
-    if json:
+    if json and first:
         from meshmatch.models.registry import CARD, read_card
 
         card = read_card(folder / CARD)

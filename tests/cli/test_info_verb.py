@@ -1,0 +1,81 @@
+"""`info` says what a file holds, and writes nothing."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.maps.files import save_map
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
+from tests.cli.conftest import Run
+
+
+def record(run: Run, file: Path) -> dict[str, object]:
+    answer = run("info", file, "--json")
+    assert answer.status == 0
+    assert answer.out.count("\n") == 1
+    found: dict[str, object] = json.loads(answer.out)
+    return found
+
+
+def test_a_mesh(run: Run, two: tuple[Path, Path]) -> None:
+    found = record(run, two[0])
+    assert (found["kind"], found["vertices"], found["faces"]) == ("mesh", 642, 1280)
+    assert found["size"] == pytest.approx([2.0, 2.0, 2.0], abs=0.1)
+    assert found["watertight"] is True
+    assert found["repair"] == []
+    assert found["hash"] == load_shape(two[0]).hash
+
+
+def test_a_mesh_that_needs_repair(run: Run, tmp_path: Path, sphere: Shape) -> None:
+    faces = np.concatenate([sphere.faces[1:], sphere.faces[-1:], [[0, 0, 1]]])
+    save_shape(tmp_path / "bad.ply", Shape(sphere.verts, faces))
+    before = (tmp_path / "bad.ply").read_bytes()
+    found = record(run, tmp_path / "bad.ply")
+    assert found["watertight"] is False
+    assert found["faces"] == 1281
+    assert found["repaired_faces"] == 1279
+    assert len(found["repair"]) >= 2  # type: ignore[arg-type]
+    assert (tmp_path / "bad.ply").read_bytes() == before
+    shown = run("info", tmp_path / "bad.ply").out
+    assert all(note in shown for note in found["repair"])  # type: ignore[attr-defined]
+
+
+def test_nothing_to_repair_is_said(run: Run, two: tuple[Path, Path]) -> None:
+    assert "nothing to do" in run("info", two[0]).out
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".xyz", ".ply"])
+def test_a_cloud(run: Run, tmp_path: Path, sphere: Shape, suffix: str) -> None:
+    save_shape(tmp_path / f"cloud{suffix}", Shape(sphere.verts, np.empty((0, 3), int)))
+    found = record(run, tmp_path / f"cloud{suffix}")
+    assert (found["kind"], found["vertices"], found["faces"]) == ("point cloud", 642, 0)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".csv", ".txt", ".mat", ".json"])
+def test_a_map(run: Run, tmp_path: Path, sphere: Shape, suffix: str) -> None:
+    save_map(tmp_path / f"map{suffix}", VertexMap.identity(sphere))
+    found = record(run, tmp_path / f"map{suffix}")
+    assert (found["kind"], found["source_vertices"]) == ("map", 642)
+    assert found["target_vertices"] == (642 if suffix in (".npz", ".mat", ".json") else None)
+    assert "index[i]" in str(found["direction"])
+    assert ("unknown" in run("info", tmp_path / f"map{suffix}").out) == (suffix in (".npy", ".csv", ".txt"))
+
+
+def test_a_template(run: Run) -> None:
+    found = record(run, bundled_folder() / "human" / "human-T.safetensors")
+    assert (found["kind"], found["name"], found["pose"]) == ("template", "human-T", "T")
+    assert "head" in found["parts"]  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("name", ["empty.ply", "empty.npy", "empty.safetensors", "empty.npz", "what.docx"])
+def test_a_file_that_is_none_of_these_is_an_error(run: Run, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"")
+    answer = run("info", tmp_path / name)
+    assert answer.status == 1
+    assert answer.out == ""
+    assert name in answer.err
