@@ -1,9 +1,10 @@
 """Weights to a compact safetensors file and back, strictly.
 
-Only the matrices of linear layers (``*.weight``, two or more axes) are kept compactly: they are nearly all of a model. As
-``int8`` a matrix has one float32 scale a row beside it, ``name.scale``: q = round(w / scale), scale = max |w| / 127; the
-error is at most half a scale. As ``float16`` it is at most 2^-11 of each value. Biases, norms and buffers (nodes, basis
-points, shape functions, running variances) stay float32: they are small, and their laws must hold exactly.
+Only the matrices of linear layers (``*.weight``, two or more axes) are kept compactly: they are nearly all of
+a model. As ``int8`` a matrix has one float32 scale a row beside it, ``name.scale``: q = round(w / scale),
+scale = max |w| / 127; the error is at most half a scale. As ``float16`` it is at most 2^-11 of each value.
+Biases, norms and buffers (nodes, basis points, shape functions, running variances) stay float32: they are
+small, and their laws must hold exactly.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from meshmatch.errors import ModelError, OptionError
-from meshmatch.models.tensor_file import check_tensor_file
+from meshmatch.models.tensor_file import TensorInfo, check_tensor_file
 from meshmatch.outputs import replace_on_success
 
 Storage = Literal["float32", "float16", "int8"]
@@ -31,7 +32,7 @@ _SHORT_ROW = 64  # of a matrix with fewer columns the scales would weigh as much
 
 
 def save_weights(state: Mapping[str, torch.Tensor], path: str | Path, *, storage: str = "float16") -> str:
-    """Write a state dict and return the sha256 of the file (64 hex digits). The same state gives the same file.
+    """Write a state dict and return the sha256 of the file (64 hex digits). Same state, same file.
 
     Parameters
     ----------
@@ -92,30 +93,7 @@ def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> d
     """
     path = Path(path)
     held = check_tensor_file(path)
-    scales = {
-        name for name in held if name.endswith(SCALE) and held.get(name.removesuffix(SCALE)) is not None
-    }
-    names = held.keys() - scales
-    missing, unexpected = sorted(expected.keys() - names), sorted(names - expected.keys())
-    if missing or unexpected:
-        told = [
-            f"{what}: {_some(which)}"
-            for what, which in (("missing", missing), ("unexpected", unexpected))
-            if which
-        ]
-        raise _mismatch(path, "; ".join(told))
-    for name, shape in expected.items():
-        if held[name].shape != tuple(shape):
-            raise _mismatch(path, f"{name} has shape {held[name].shape}, not {tuple(shape)}")
-        if name + SCALE in scales:
-            scale = held[name + SCALE]
-            if (
-                held[name].dtype != "I8"
-                or scale.dtype != "F32"
-                or scale.shape != tuple(shape[:1])
-                or len(shape) != 2
-            ):
-                raise _mismatch(path, f"the scale of {name} does not fit it")
+    _check(path, held, expected)
     try:
         with safe_open(str(path), framework="pt") as file:
             if (file.metadata() or {}).get(_KEY) != _FORMAT:
@@ -126,7 +104,7 @@ def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> d
     found: dict[str, torch.Tensor] = {}
     for name in expected:
         tensor = arrays[name]
-        if name + SCALE in scales:
+        if tensor.dtype == torch.int8:
             tensor = tensor.float() * arrays[name + SCALE][:, None]
         elif tensor.is_floating_point():
             tensor = tensor.float()
@@ -134,6 +112,24 @@ def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> d
             raise _mismatch(path, f"{name} is not finite")
         found[name] = tensor
     return found
+
+
+def _check(path: Path, held: Mapping[str, TensorInfo], expected: Mapping[str, tuple[int, ...]]) -> None:
+    """Refuse a file whose names, shapes or scales are not those of the expected tensors."""
+    scales = {name for name in held if name.endswith(SCALE) and name.removesuffix(SCALE) in held}
+    names = held.keys() - scales
+    missing, unexpected = sorted(expected.keys() - names), sorted(names - expected.keys())
+    if missing:
+        raise _mismatch(path, f"missing {_some(missing)}")
+    if unexpected:
+        raise _mismatch(path, f"unexpected {_some(unexpected)}")
+    for name, shape in expected.items():
+        if held[name].shape != tuple(shape):
+            raise _mismatch(path, f"{name} has shape {held[name].shape}, not {tuple(shape)}")
+        scaled = name + SCALE in scales
+        fits = scaled and len(shape) == 2 and held[name + SCALE] == TensorInfo("F32", (shape[0],))
+        if (held[name].dtype == "I8" or scaled) and not (held[name].dtype == "I8" and fits):
+            raise _mismatch(path, f"the scale of {name} is missing or does not fit it")
 
 
 def _quantised(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

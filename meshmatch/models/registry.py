@@ -1,7 +1,7 @@
 """Models by name: those that ship with the package, and the user's own.
 
-A model is a folder with ``card.json`` (written last), ``weights.safetensors`` and ``template.safetensors``. Nothing here
-loads a network: listing models is cheap.
+A model is a folder with ``card.json`` (written last), ``weights.safetensors`` and ``template.safetensors``.
+Nothing here loads a network: listing models is cheap.
 """
 
 import hashlib
@@ -50,7 +50,7 @@ def built_in_folder() -> Path:
 
 
 def user_folder() -> Path:
-    """Where the user's own models are; may not exist yet. The environment variable MESHMATCH_HOME moves it."""
+    """Where the user's own models are; may not exist yet. The variable MESHMATCH_HOME moves it."""
     home = os.environ.get(HOME_VARIABLE)
     if home:
         return Path(home).expanduser() / "models"
@@ -155,13 +155,14 @@ def verify_model(name: str | Path) -> ModelCard:
         template = load_template(folder / TEMPLATE)
     except MeshmatchError as error:
         raise ModelError(f"model {card.name}: {error.message}", "fetch or add the model again") from error
-    if template.hash != card.template_hash or template.K != card.field["nodes"]:
+    if template.hash != card.template_hash or card.field["nodes"] != template.K:
         raise ModelError(
             f"model {card.name} was trained with another template "
             f"({card.template_hash}, {card.field['nodes']} nodes; here {template.hash}, {template.K} nodes)",
             "fetch or add the model again",
         )
-    if folder.parent in (built_in_folder(), user_folder()) and folder.name != card.name:
+    registered = folder.parent in (built_in_folder(), user_folder()) and not folder.name.startswith(".")
+    if registered and folder.name != card.name:
         raise ModelError(
             f"the folder {folder.name} holds a model called {card.name}",
             "remove it, and add it again from its source",

@@ -31,8 +31,8 @@ class TensorInfo:
 def check_tensor_file(path: str | Path) -> dict[str, TensorInfo]:
     """The tensors of a safetensors file, if its header is honest.
 
-    The header has at most 1 MB and the file 1 GB; every tensor's bytes are those of its kind and shape; header and
-    tensors together are the whole file, with no gap and no overlap. Nothing but the header is read.
+    The header has at most 1 MB and the file 1 GB; every tensor's bytes are those of its kind and shape;
+    header and tensors together are the whole file, with no gap and no overlap. Only the header is read.
 
     Raises
     ------

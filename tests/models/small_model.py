@@ -1,0 +1,60 @@
+"""A model folder with a few numbers in it: everything of a model but a network that works."""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import save_file
+
+from meshmatch.models.card import ModelCard, write_card
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.template import Template, save_template
+
+
+def small_card(**changes: Any) -> ModelCard:
+    """A card that is right in every entry."""
+    card = ModelCard(
+        name="blob",
+        category="blobs",
+        template="ball",
+        template_hash="0123456789abcdef",
+        network={"width": 8, "layers": [1, 2], "note": None, "rate": 0.5, "deep": {"a": True}},
+        field={"kernel": "smooth", "radius": 0.5, "nodes": 6},
+        data="nothing",
+        licence="CC0-1.0",
+        recipe={"steps": 3},
+        seed=1,
+        steps=3,
+        training_minutes=0.25,
+        metrics={
+            "validation": {"distance": 0.5},
+            "scape": {"none": {"mean_cm": 4.0}, "nodes": {"mean_cm": 2}},
+        },
+        weights_sha256="ab" * 32,
+        created="2026-01-31",
+        description="Größe: none",
+    )
+    return replace(card, **changes)
+
+
+def small_template() -> Template:
+    """An octahedron with a node at every corner."""
+    verts = np.concatenate([np.eye(3), -np.eye(3)]) * 0.4
+    faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+    ball = Shape(verts, faces, "ball")
+    return Template("ball", ball, ball, verts.copy(), 0.5, np.zeros(6, np.int64), ("all",), np.arange(6))
+
+
+def write_model(folder: Path, **changes: Any) -> ModelCard:
+    """Write a model that `verify_model` accepts; `changes` are made to its card."""
+    folder.mkdir(parents=True, exist_ok=True)
+    template = small_template()
+    save_template(template, folder / "template.safetensors")
+    weights = folder / "weights.safetensors"
+    save_file({"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.ones(4, np.float16)}, weights)
+    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+    card = small_card(**{"template_hash": template.hash, "weights_sha256": digest} | changes)
+    write_card(card, folder / "card.json")
+    return card
