@@ -1,0 +1,142 @@
+"""`prepare` makes a template of one shape, and of a folder shapes to learn from."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.prepare import read_registered
+from meshmatch.templates.template import load_template
+from tests.cli.conftest import Answer, Run
+
+# A sphere of area 1 has a radius of 0.28: a few nodes with a wide reach support it.
+FEW = ("--nodes", "60", "--radius", "0.3")
+
+
+def made(answer: Answer) -> dict[str, object]:
+    assert answer.status == 0, answer.err
+    record: dict[str, object] = json.loads(answer.out)
+    return record
+
+
+@pytest.fixture
+def folder(tmp_path: Path, sphere: Shape) -> Path:
+    """Three registered shapes: a sphere, stretched in three ways."""
+    shapes = tmp_path / "eggs"
+    shapes.mkdir()
+    for n in range(3):
+        save_shape(shapes / f"egg{n}.ply", Shape(sphere.verts * [1, 1 + 0.2 * n, 1], sphere.faces))
+    return shapes
+
+
+@pytest.mark.parametrize("strategy", ["spectral", "geodesic", "uniform"])
+def test_one_shape_becomes_a_template(
+    run: Run, two: tuple[Path, Path], tmp_path: Path, strategy: str
+) -> None:
+    record = made(run("prepare", two[0], "-o", tmp_path / "out", "--strategy", strategy, *FEW, "--json"))
+    template = load_template(tmp_path / "out" / "template.safetensors")
+    assert record["template_hash"] == template.hash
+    assert record["nodes"] == template.K >= 60
+    assert (record["vertices"], template.radius) == (642, 0.3)
+    with Image.open(tmp_path / "out" / "nodes.png") as picture:
+        assert min(picture.size) > 100
+
+
+def test_parts_need_labels_and_use_them(
+    run: Run, two: tuple[Path, Path], sphere: Shape, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "labels.npy", (sphere.verts[:, 2] > 0).astype(int))
+    words = ("prepare", two[0], "-o", tmp_path / "out", "--strategy", "parts", *FEW)
+    assert run(*words).status == 1
+    made(run(*words, "--labels", tmp_path / "labels.npy", "--json"))
+    assert set(load_template(tmp_path / "out" / "template.safetensors").labels) == {0, 1}
+    np.save(tmp_path / "labels.npy", np.zeros(5, int))
+    answer = run(*words, "--labels", tmp_path / "labels.npy")
+    assert answer.status == 1
+    assert "5 labels" in answer.err
+
+
+def test_a_folder_of_registered_shapes(run: Run, folder: Path, tmp_path: Path) -> None:
+    record = made(run("prepare", folder, "-o", tmp_path / "out", *FEW, "--json"))
+    assert record["registered"] == 3
+    assert record["shapes"] == ["egg0.ply", "egg1.ply", "egg2.ply"]
+    template = load_template(tmp_path / "out" / "template.safetensors")
+    assert read_registered(tmp_path / "out", template).shape == (3, 642, 3)
+    assert len(list((tmp_path / "out" / "normalised").iterdir())) == 3
+
+
+def test_shapes_that_are_not_registered_are_prepared_all_the_same(
+    run: Run, folder: Path, torus: Shape, tmp_path: Path
+) -> None:
+    save_shape(folder / "other.ply", torus)
+    (folder / "broken.ply").write_bytes(b"ply\n")
+    answer = run("prepare", folder, "-o", tmp_path / "out", *FEW, "--json")
+    record = made(answer)
+    assert record["registered"] == 0
+    assert any("broken.ply" in note for note in record["notes"])  # type: ignore[attr-defined]
+    assert "broken.ply" in answer.err
+
+
+def test_the_template_of_a_folder_can_be_chosen(run: Run, folder: Path, tmp_path: Path) -> None:
+    hashes = [
+        made(run("prepare", folder, "-o", tmp_path / f"out{n}", *FEW, "--json", *words))["template_hash"]
+        for n, words in enumerate(
+            [(), ("--template", folder / "egg0.ply"), ("--template", folder / "egg2.ply")]
+        )
+    ]
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_options_of_the_nodes_reach_them(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
+    def hash_with(*words: str) -> object:
+        return made(run("prepare", two[0], "-o", tmp_path / "out", *FEW, "--json", *words))["template_hash"]
+
+    first = hash_with()
+    assert hash_with() == first
+    assert hash_with("--seed", "1") != first
+    assert hash_with("--nodes", "70") != first
+    assert hash_with("--radius", "0.35") != first
+    assert hash_with("--faces", "600") != first
+    assert load_template(tmp_path / "out" / "template.safetensors").shape.F <= 600
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["nothing.ply"], "nothing.ply"),
+        (["a.ply", "--radius", "0.01"], "vert"),
+        (["a.ply", "--template", "b.ply"], "folder"),
+        ([".", "--labels", "l.txt", "--strategy", "parts"], "one shape"),
+        (["empty"], "no shapes"),
+    ],
+)
+def test_what_cannot_be_is_told(
+    run: Run,
+    two: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    told: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("empty").mkdir()
+    answer = run("prepare", *words, "-o", "out")
+    assert answer.status == 1
+    assert told in answer.err
+    assert not Path("out/template.safetensors").exists()
+
+
+def test_an_output_folder_that_cannot_be(run: Run, two: tuple[Path, Path]) -> None:
+    for verb in (("prepare", two[0]), ("train",)):
+        answer = run(*verb, "-o", two[1])
+        assert answer.status == 1
+        assert "cannot make the folder" in answer.err
+
+
+def test_quiet(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
+    answer = run("prepare", two[0], "-o", tmp_path / "out", *FEW, "--quiet")
+    assert (answer.status, answer.out, answer.err) == (0, "", "")

