@@ -1,12 +1,15 @@
 """`prepare` makes a template of one shape, and of a folder shapes to learn from."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from meshmatch.render import picture
+from meshmatch.render.picture import Panel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.prepare import read_registered
@@ -15,6 +18,14 @@ from tests.cli.conftest import Answer, Run
 
 # A sphere of area 1 has a radius of 0.28: a few nodes with a wide reach support it.
 FEW = ("--nodes", "60", "--radius", "0.3")
+
+
+@pytest.fixture(autouse=True)
+def pictures(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Sequence[Panel], Path]]:
+    """What was to be drawn; one test alone waits for a real picture."""
+    asked: list[tuple[Sequence[Panel], Path]] = []
+    monkeypatch.setattr(picture, "render_shapes", lambda panels, path: asked.append((panels, path)))
+    return asked
 
 
 def made(answer: Answer) -> dict[str, object]:
@@ -35,15 +46,29 @@ def folder(tmp_path: Path, sphere: Shape) -> Path:
 
 @pytest.mark.parametrize("strategy", ["spectral", "geodesic", "uniform"])
 def test_one_shape_becomes_a_template(
-    run: Run, two: tuple[Path, Path], tmp_path: Path, strategy: str
+    run: Run,
+    two: tuple[Path, Path],
+    tmp_path: Path,
+    strategy: str,
+    pictures: list[tuple[Sequence[Panel], Path]],
 ) -> None:
     record = made(run("prepare", two[0], "-o", tmp_path / "out", "--strategy", strategy, *FEW, "--json"))
     template = load_template(tmp_path / "out" / "template.safetensors")
     assert record["template_hash"] == template.hash
     assert record["nodes"] == template.K >= 60
     assert (record["vertices"], template.radius) == (642, 0.3)
-    with Image.open(tmp_path / "out" / "nodes.png") as picture:
-        assert min(picture.size) > 100
+    [([panel], path)] = pictures
+    assert path == tmp_path / "out" / "nodes.png"
+    assert np.array_equal(panel.points, template.nodes)
+
+
+def test_the_nodes_are_drawn(
+    run: Run, two: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
+    made(run("prepare", two[0], "-o", tmp_path / "out", *FEW, "--json"))
+    with Image.open(tmp_path / "out" / "nodes.png") as drawn:
+        assert min(drawn.size) > 100
 
 
 def test_parts_need_labels_and_use_them(

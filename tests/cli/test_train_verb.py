@@ -103,8 +103,9 @@ def test_identities(run: Run, stub: Recorder, tmp_path: Path) -> None:
 
 
 def test_a_prepared_folder_brings_template_and_category(
-    run: Run, stub: Recorder, tmp_path: Path, two: tuple[Path, Path]
+    run: Run, stub: Recorder, tmp_path: Path, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("meshmatch.render.picture.render_shapes", lambda panels, path: None)
     for name in ("eggs/one.ply", "eggs/two.ply"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(two[0].read_bytes())
