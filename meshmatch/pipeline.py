@@ -48,7 +48,6 @@ def match(
     *,
     model: str | Path = "human",
     refine: Refine = "nodes",
-    polish: str = "auto",
     seed: int = 0,
     up: str | None = None,
     front: str | None = None,
@@ -102,8 +101,10 @@ def match(
         fits = list(pool.map(one, (0, 1)))
     if landmarks is not None:
         fits = _honour(loaded, clean, fits, landmarks, config)
-    found = build_map(clean[0], fits[0], clean[1], fits[1], polish=polish, workers=workers)
-    notes = tuple(f"{shape.name}: {note}" for shape, part in zip(shapes, clean, strict=True) for note in part.notes)
+    found = build_map(clean[0], fits[0], clean[1], fits[1], workers=workers)
+    notes = tuple(
+        f"{shape.name}: {note}" for shape, part in zip(shapes, clean, strict=True) for note in part.notes
+    )
     return MatchResult(found, fits[0], fits[1], time.monotonic() - began, notes)
 
 
@@ -128,18 +129,16 @@ def register(
     return lay_template(read_model(model), usable(shape).shape, config, None, tell)
 
 
-def fit_shape(
-    shape: Shape, *, model: str | Path = "human", refine: Refine = "nodes", seed: int = 0
-) -> Fit:
+def fit_shape(shape: Shape, *, model: str | Path = "human", refine: Refine = "nodes", seed: int = 0) -> Fit:
     """`register` for shapes that are loaded already."""
     return register(shape, model=model, refine=refine, seed=seed)
 
 
 def map_between(
-    source: Shape, source_fit: Fit, target: Shape, target_fit: Fit, *, polish: str = "auto", workers: int = 1
+    source: Shape, source_fit: Fit, target: Shape, target_fit: Fit, *, workers: int = 1
 ) -> VertexMap:
     """The map between two shapes that were fitted with the same model."""
-    return build_map(usable(source), source_fit, usable(target), target_fit, polish=polish, workers=workers)
+    return build_map(usable(source), source_fit, usable(target), target_fit, workers=workers)
 
 
 @lru_cache(maxsize=2)
@@ -168,7 +167,8 @@ def usable(shape: Shape) -> Repaired:
         raise InputError(f"{shape.name} has only {fixed.V} points", f"at least {MINIMUM_POINTS} are needed")
     if not fixed.is_cloud and fixed.F < MINIMUM_FACES:
         raise InputError(
-            f"{shape.name} has only {fixed.F} usable triangles", f"at least {MINIMUM_FACES} are needed to see a shape"
+            f"{shape.name} has only {fixed.F} usable triangles",
+            f"at least {MINIMUM_FACES} are needed to see a shape",
         )
     if not fixed.area > 0:
         raise InputError(f"{shape.name} has no surface area", "are all its points the same, or on a line?")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from meshmatch.cli import options
+from meshmatch.cli.claims import check_png, claimed
 from meshmatch.cli.voice import Voice, print_json, print_rows
 
 if TYPE_CHECKING:
@@ -65,13 +66,15 @@ def evaluate(
         raise OptionError("--truth and --points both give the truth", "choose one of them")
     if curve is not None and truth is None and points is None:
         raise OptionError("a curve of errors needs the truth", "give it with --truth or --points")
-    shapes = load_shape(source), load_shape(target)
-    found = load_map(map_file, *shapes)
-    known = _known(truth, points, shapes[0])
-    result = evaluate_map(found, *shapes, *known, rng=np.random.default_rng(seed))
-    if curve is not None and result.errors is not None:
-        limit = 20.0 if unit == "cm" else 25.0
-        draw_curves({found.source or source.stem: result.errors}, curve, limit, unit=unit)
+    check_png(curve)
+    with claimed(curve) as drawing:  # a picture that cannot be written is told before the geodesics
+        shapes = load_shape(source), load_shape(target)
+        found = load_map(map_file, *shapes)
+        known = _known(truth, points, shapes[0])
+        result = evaluate_map(found, *shapes, *known, rng=np.random.default_rng(seed))
+        if drawing is not None and result.errors is not None:
+            limit = 20.0 if unit == "cm" else 25.0
+            draw_curves({found.source or source.stem: result.errors}, drawing, limit, unit=unit)
     for reason in found.reasons:
         Voice().say(f"note: {reason}")
     if json:

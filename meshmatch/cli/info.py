@@ -56,8 +56,9 @@ def _is_list(file: Path) -> bool:
 
 def _shape(file: Path) -> Record:
     from meshmatch.shapes.files import load_shape
+    from meshmatch.shapes.guesses import long_axis, person_unit
     from meshmatch.shapes.repair import repair
-    from meshmatch.shapes.topology import is_watertight
+    from meshmatch.shapes.topology import edges_of, face_parts
 
     shape = load_shape(file)
     record: Record = {
@@ -70,8 +71,15 @@ def _shape(file: Path) -> Record:
         "colors": shape.colors is not None,
     }
     if not shape.is_cloud:
-        record["watertight"] = is_watertight(shape.faces)
+        border, crowded = edges_of(shape.faces).counts
+        record["watertight"] = border == crowded == 0
+        record["open_edges"] = border
+        record["non_manifold_edges"] = crowded
     clean = repair(shape)
+    if not shape.is_cloud:  # of the repaired mesh: the seams of texture and the corners of an stl are joined
+        record["parts"] = int(face_parts(clean.shape.faces, clean.shape.V).max()) + 1
+    record["longest_along"] = long_axis(clean.shape)
+    record["unit_if_a_person"] = person_unit(clean.shape)
     record["repair"] = list(clean.notes)
     record["repaired_vertices"] = clean.shape.V
     record["repaired_faces"] = clean.shape.F

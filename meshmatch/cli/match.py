@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from meshmatch.cli import options
+from meshmatch.cli.claims import check_apart, check_png, claimed
 from meshmatch.cli.voice import Voice, print_json
 
 if TYPE_CHECKING:
@@ -36,10 +37,10 @@ def match(
             help="Known pairs to honour: a source vertex and a target vertex a line, counted from 0.",
         ),
     ] = None,
-    polish: Annotated[
-        options.Polish,
-        typer.Option(help="Polish the map along both surfaces: where it helps, always, never."),
-    ] = "auto",
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="PNG", help="Draw both shapes, matched places in one colour."),
+    ] = None,
     seed: options.Seed = 0,
     strict: options.Strict = False,
     json: options.Json = False,
@@ -57,36 +58,51 @@ def match(
     from meshmatch.errors import PoorFit
     from meshmatch.maps.files import check_suffix, save_map
     from meshmatch.maps.pairs import load_pairs
+    from meshmatch.models.registry import locate_model
     from meshmatch.outputs import replace_on_success
+    from meshmatch.shapes.files import load_shape
 
     check_suffix(output)
+    check_png(picture)
+    check_apart([output, picture], [source, target, landmarks])
     voice = Voice(quiet)
-    with replace_on_success(output) as temporary:  # a folder that cannot be written is told at once
-        pairs = None if landmarks is None else load_pairs(landmarks)
-        from meshmatch import pipeline
+    # Outputs that cannot be written, a mistyped model and broken files are told before the long work.
+    with claimed(picture) as drawing:
+        with replace_on_success(output) as temporary:
+            locate_model(model)
+            shapes = load_shape(source), load_shape(target)
+            pairs = None if landmarks is None else load_pairs(landmarks)
+            from meshmatch import pipeline
 
-        with voice.progress() as report:
-            result = pipeline.match(
-                source,
-                target,
-                model=model,
-                refine=refine,
-                polish=polish,
-                seed=seed,
-                up=up,
-                front=front,
-                landmarks=pairs,
-                workers=threads,
-                progress=report,
-            )
-        found = result.map
-        if strict and found.verdict == "poor":
-            raise PoorFit(f"poor fit, nothing was written: {_why(found.reasons)}", _HINT)
-        save_map(temporary, found)
-    _tell_match(voice, result, output)
+            with voice.progress() as report:
+                result = pipeline.match(
+                    *shapes,
+                    model=model,
+                    refine=refine,
+                    seed=seed,
+                    up=up,
+                    front=front,
+                    landmarks=pairs,
+                    workers=threads,
+                    progress=report,
+                )
+            found = result.map
+            if strict and found.verdict == "poor":
+                raise PoorFit(f"poor fit, nothing was written: {_why(found.reasons)}", _HINT)
+            save_map(temporary, found)
+        if drawing is not None:
+            from meshmatch.render.matched import render_match
+
+            rotations = result.source_fit.frame.rotation, result.target_fit.frame.rotation
+            render_match(*shapes, found, drawing, rotations=rotations)
+    names = _apart(source, target)
+    _tell_match(voice, result, names, output)
+    if picture is not None:
+        voice.say(f"drew {picture}: matched places have one colour")
     if json:
-        choices = {"model": model, "refine": refine, "polish": polish, "seed": seed}
-        print_json(_match_record(result, output) | choices)
+        choices = {"model": model, "refine": refine, "seed": seed}
+        files = {"output": str(output), "picture": None if picture is None else str(picture)}
+        print_json(files | _match_record(result, names) | choices)
 
 
 def register(
@@ -104,6 +120,9 @@ def register(
     refine: options.RefineOption = "nodes",
     up: options.Up = None,
     front: options.Front = None,
+    dense: Annotated[
+        bool, typer.Option("--dense", help="Write the template in its full resolution.")
+    ] = False,
     seed: options.Seed = 0,
     strict: options.Strict = False,
     json: options.Json = False,
@@ -120,13 +139,16 @@ def register(
     import numpy as np
 
     from meshmatch.errors import PoorFit
+    from meshmatch.models.registry import locate_model
     from meshmatch.outputs import replace_on_success
     from meshmatch.shapes.files import load_shape, save_shape
     from meshmatch.shapes.shape import Shape
 
+    check_apart([output], [shape])
     voice = Voice(quiet)
     with replace_on_success(output) as temporary:
         save_shape(temporary, Shape(np.eye(3), np.array([[0, 1, 2]])))  # a suffix that cannot be is told now
+        locate_model(model)
         loaded = load_shape(shape)
         from meshmatch import pipeline
 
@@ -136,27 +158,39 @@ def register(
             )
         if strict and fit.verdict == "poor":
             raise PoorFit(f"poor fit, nothing was written: {_why(fit.reasons)}", _HINT)
-        save_shape(temporary, Shape(fit.points_in_file, fit.faces, output.stem))
+        fitted = Shape(fit.points_in_file, fit.faces, output.stem)
+        if dense:
+            from meshmatch.fitting.dense import dense_shape
+
+            fitted = dense_shape(pipeline.read_model(model).template, fit)
+        save_shape(temporary, fitted)
     voice.say(f"laid the template of {model} on {loaded.name}: {_fit_words(fit)}")
     _warn(voice, fit.verdict, fit.reasons)
-    voice.say(f"wrote {output} ({fit.seconds:.1f} s)")
+    voice.say(f"wrote {output}: {fitted.V} vertices, {fitted.F} faces ({fit.seconds:.1f} s)")
     if json:
-        print_json({"output": str(output), "model": model, "refine": refine} | _fit_record(loaded.name, fit))
+        size = {"vertices": fitted.V, "faces": fitted.F}
+        choices = {"model": model, "refine": refine, "dense": dense}
+        print_json({"output": str(output)} | size | choices | _fit_record(loaded.name, fit))
 
 
 _HINT = "is it the model's category? try --up and --front, --landmarks, or leave out --strict to look at it"
 
 
-def _tell_match(voice: Voice, result: "MatchResult", output: Path) -> None:
+def _apart(source: Path, target: Path) -> tuple[str, str]:
+    """Names to show: those of the files, with their folders where they are the same."""
+    return (source.name, target.name) if source.name != target.name else (str(source), str(target))
+
+
+def _tell_match(voice: Voice, result: "MatchResult", names: tuple[str, str], output: Path) -> None:
     found = result.map
     for note in result.notes:
         voice.say(note)
-    for name, fit in ((found.source, result.source_fit), (found.target, result.target_fit)):
+    for name, fit in zip(names, (result.source_fit, result.target_fit), strict=True):
         voice.say(f"{name}: {_fit_words(fit)}")
     _warn(voice, found.verdict, found.reasons)
     voice.say(
-        f"wrote {output}: for each of the {found.source_vertices} vertices of {found.source} "
-        f"its vertex of {found.target} ({result.seconds:.1f} s)"
+        f"wrote {output}: for each of the {found.source_vertices} vertices of {names[0]} "
+        f"its vertex of {names[1]} ({result.seconds:.1f} s)"
     )
 
 
@@ -189,12 +223,14 @@ def _fit_record(name: str, fit: "Fit") -> dict[str, Any]:
     }
 
 
-def _match_record(result: "MatchResult", output: Path) -> dict[str, Any]:
+def _match_record(result: "MatchResult", names: tuple[str, str]) -> dict[str, Any]:
+    from meshmatch.maps.vertex_map import DIRECTION
+
     found = result.map
     return {
-        "output": str(output),
-        "source": found.source,
-        "target": found.target,
+        "source": names[0],
+        "target": names[1],
+        "direction": DIRECTION,
         "source_vertices": found.source_vertices,
         "target_vertices": found.target_vertices,
         "verdict": found.verdict,
@@ -202,8 +238,8 @@ def _match_record(result: "MatchResult", output: Path) -> dict[str, Any]:
         "confidence_mean": float(found.confidence.mean()),
         "notes": list(result.notes),
         "fits": [
-            _fit_record(found.source, result.source_fit),
-            _fit_record(found.target, result.target_fit),
+            _fit_record(name, fit)
+            for name, fit in zip(names, (result.source_fit, result.target_fit), strict=True)
         ],
         "seconds": round(result.seconds, 3),
     }

@@ -70,6 +70,7 @@ def add(
     replace: Annotated[
         bool, typer.Option("--replace", help="Replace your own model of the same name.")
     ] = False,
+    json: options.Json = False,
 ) -> None:
     """Copy a model into your registry.
 
@@ -79,15 +80,19 @@ def add(
 
     entry = add_model(folder, replace=replace)
     Voice().say(f"added model {entry.name} to {entry.folder.parent}")
+    if json:
+        print_json({"added": entry.name, "folder": str(entry.folder)})
 
 
 @models.command()
-def remove(name: Name) -> None:
+def remove(name: Name, json: options.Json = False) -> None:
     """Remove one of your own models."""
     from meshmatch.models.registry import remove_model
 
     remove_model(name)
     Voice().say(f"removed model {name}")
+    if json:
+        print_json({"removed": name})
 
 
 @models.command()
@@ -95,22 +100,27 @@ def verify(
     names: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME]...", help="Models to check; all if none is named.")
     ] = None,
+    json: options.Json = False,
 ) -> None:
     """Check that models are whole and unchanged."""
     from meshmatch.errors import ModelError
     from meshmatch.models.registry import list_models, verify_model
 
-    wrong: list[ModelError] = []
+    checked: list[dict[str, str | None]] = []
     for name in names or [entry.name for entry in list_models()]:
         try:
             card = verify_model(name)
         except ModelError as error:
-            wrong.append(error)
+            checked.append({"name": name, "sha256": None, "problem": error.message})
             Voice().trouble(name, error.message, error.hint)
         else:
-            typer.echo(f"{name}: ok, sha256 {card.weights_sha256}")
+            checked.append({"name": name, "sha256": card.weights_sha256, "problem": ""})
+            if not json:
+                typer.echo(f"{name}: ok, sha256 {card.weights_sha256}")
+    if json:
+        print_json({"models": checked})
+    wrong = sum(model["sha256"] is None for model in checked)
     if wrong:
-        count = len(wrong)
         raise ModelError(
-            f"{count} {'model is' if count == 1 else 'models are'} damaged", "see the lines above"
+            f"{wrong} {'model is' if wrong == 1 else 'models are'} damaged", "see the lines above"
         )

@@ -7,7 +7,6 @@ import typer
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Refine = Literal["none", "latent", "nodes"]
-Polish = Literal["auto", "on", "off"]
 
 Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="The shape whose every vertex is matched.")]
 Target = Annotated[Path, typer.Argument(metavar="TARGET", help="The shape that it is matched to.")]

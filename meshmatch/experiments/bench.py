@@ -55,7 +55,6 @@ class PipelineMatcher:
 
     model: str = "human"
     refine: Literal["none", "latent", "nodes"] = "nodes"
-    polish: str = "auto"
     seed: int = 0
 
     def fit(self, shape: Shape) -> Any:
@@ -68,7 +67,7 @@ class PipelineMatcher:
         """Build the map from two fits."""
         from meshmatch.pipeline import map_between
 
-        return map_between(source, source_fit, target, target_fit, polish=self.polish)
+        return map_between(source, source_fit, target, target_fit)
 
 
 @dataclass(frozen=True)
@@ -232,7 +231,6 @@ def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--sets", default=",".join(SET_NAMES), help="some of %(default)s")
     parser.add_argument("--model", default="human")
     parser.add_argument("--refine", default="nodes", choices=("none", "latent", "nodes"))
-    parser.add_argument("--polish", default="auto")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--limit-pairs", type=int, metavar="N", help="N pairs of each set, evenly spread")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
@@ -266,7 +264,7 @@ def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
     started = time.perf_counter()
     cache = options.cache or default_folder()
     benches = [load_set(name, options.data) for name in options.sets.split(",")]
-    matcher = PipelineMatcher(options.model, options.refine, options.polish, options.seed)
+    matcher = PipelineMatcher(options.model, options.refine, options.seed)
     runs: list[SetRun] = []
     for bench in benches:
         pairs = chosen_pairs(bench, options.limit_pairs)

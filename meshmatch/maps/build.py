@@ -17,7 +17,11 @@ _ORDER = {"good": 0, "fair": 1, "poor": 2}
 
 
 def build_map(
-    source: Repaired, source_fit: Fit, target: Repaired, target_fit: Fit, polish: str = "auto", workers: int = 1
+    source: Repaired,
+    source_fit: Fit,
+    target: Repaired,
+    target_fit: Fit,
+    workers: int = 1,
 ) -> VertexMap:
     """Carry every source vertex through the template to the target.
 
@@ -66,7 +70,9 @@ def carry(
 ) -> tuple[Footpoints, np.ndarray]:
     """Where on the target every source vertex lands, and a confidence in 0..1."""
     points, normals = in_core_frame(source, source_fit)
-    template = Surface(source_fit.points, source_fit.faces, vertex_normals(source_fit.points, source_fit.faces))
+    template = Surface(
+        source_fit.points, source_fit.faces, vertex_normals(source_fit.points, source_fit.faces)
+    )
     foot = template.query(points, normals, workers)
     corners = source_fit.faces[foot.face]
     moved = np.einsum("nk,nkd->nd", foot.barycentric, target_fit.points[corners])

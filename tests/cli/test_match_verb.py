@@ -1,19 +1,25 @@
 """`match` and `register` hand everything on, and write all or nothing."""
 
 import json
+import signal
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from meshmatch import pipeline
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, OutputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.templates.location import bundled_folder
+from meshmatch.templates.template import Template
 from tests.cli.conftest import Run
 
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -46,10 +52,9 @@ class Recorder:
         self.verdict = "good"
         self.reasons: tuple[str, ...] = ()
 
-    def match(self, source: Path, target: Path, **options: Any) -> pipeline.MatchResult:
-        self.called = {"source": source, "target": target} | options
+    def match(self, a: Shape, b: Shape, **options: Any) -> pipeline.MatchResult:
+        self.called = {"source": a.name, "target": b.name} | options
         options["progress"]("orientation", "a.ply", 0.5)
-        a, b = load_shape(source), load_shape(target)
         found = VertexMap.between(a, b, np.arange(a.V) % b.V, verdict=self.verdict, reasons=self.reasons)
         return pipeline.MatchResult(found, fit(a), fit(b), 2.5, ("a.ply: 3 faces dropped",))
 
@@ -91,7 +96,6 @@ def test_match_says_what_it_did(run: Run, two: tuple[Path, Path], stub: Recorder
 DEFAULTS = {
     "model": "human",
     "refine": "nodes",
-    "polish": "auto",
     "seed": 0,
     "up": None,
     "front": None,
@@ -104,13 +108,11 @@ def test_match_defaults(run: Run, two: tuple[Path, Path], stub: Recorder) -> Non
     run("match", *two, "-o", two[0].with_name("map.npy"))
     called = dict(stub.called)
     del called["progress"]
-    assert called == DEFAULTS | {"source": two[0], "target": two[1]}
+    assert called == DEFAULTS | {"source": "a.ply", "target": "b.ply"}
 
 
 OPTIONS = [
-    (["--model", "mine"], "model", "mine"),
     *[(["--refine", value], "refine", value) for value in ("none", "latent", "nodes")],
-    *[(["--polish", value], "polish", value) for value in ("auto", "on", "off")],
     *[(["--up", value], "up", value) for value in ("x", "y", "z", "-x", "-y", "-z")],
     *[(["--front", value], "front", value) for value in ("x", "y", "z", "-x", "-y", "-z")],
     (["--seed", "7"], "seed", 7),
@@ -130,7 +132,6 @@ def test_match_hands_options_on(
     "words",
     [
         ["--refine", "much"],
-        ["--polish", "maybe"],
         ["--up", "w"],
         ["--front", "forward"],
         ["--seed", "-1"],
@@ -243,6 +244,96 @@ def test_a_failure_leaves_what_was_there(
     assert len(list(output.parent.iterdir())) == 3
 
 
+@pytest.mark.parametrize(("verb", "output"), [("match", "map.npy"), ("register", "fitted.ply")])
+def test_a_model_is_named_or_shown(
+    run: Run, two: tuple[Path, Path], stub: Recorder, verb: str, output: str
+) -> None:
+    words = (verb, *[*two][: 2 if verb == "match" else 1], "-o", two[0].with_name(output))
+    folder = bundled_folder() / "models" / "human"
+    assert run(*words, "--model", folder).status == 0
+    assert stub.called["model"] == str(folder)
+    stub.called = {}
+    answer = run(*words, "--model", "humna")
+    assert answer.status == 1
+    assert "did you mean human?" in answer.err
+    assert stub.called == {}
+
+
+def test_match_draws_a_picture(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+    picture, output = two[0].with_name("both.png"), two[0].with_name("map.npy")
+    answer = run("match", *two, "-o", output, "--picture", picture, "--json")
+    assert answer.status == 0
+    assert f"drew {picture}" in answer.err
+    assert json.loads(answer.out)["picture"] == str(picture)
+    with Image.open(picture) as image:
+        pixels = np.asarray(image)
+        assert image.size[0] > 1.3 * image.size[1]  # side by side
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 1000  # and in colours
+    assert output.exists()
+
+
+def test_a_picture_that_fails_costs_no_map(
+    run: Run, two: tuple[Path, Path], stub: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object, **__: object) -> None:
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr("meshmatch.render.matched.render_match", failing)
+    output = two[0].with_name("map.npy")
+    assert run("match", *two, "-o", output, "--picture", two[0].with_name("both.png")).status == 1
+    assert sorted(path.name for path in two[0].parent.iterdir()) == ["a.ply", "b.ply", "map.npy"]
+
+
+@pytest.mark.parametrize("name", ["both.jpg", "nowhere/both.png", "map.npy", "a.png"])
+def test_a_picture_that_cannot_be_is_told_before_the_work(
+    run: Run, two: tuple[Path, Path], stub: Recorder, name: str
+) -> None:
+    two[0].with_name("a.png").mkdir()
+    words = ("-o", two[0].with_name("map.npy"), "--picture", two[0].parent / name)
+    answer = run("match", *two, *words)
+    assert answer.status == 1
+    assert Path(name).name in answer.err
+    assert stub.called == {}
+    assert not two[0].with_name("map.npy").exists()
+
+
+def test_an_input_is_never_overwritten(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+    cloud = two[0].with_name("cloud.npy")
+    np.save(cloud, np.eye(3))
+    before = cloud.read_bytes(), two[0].read_bytes()
+    indirect = cloud.parent / ".." / cloud.parent.name / cloud.name
+    for words in (("match", cloud, two[1], "-o", indirect), ("register", two[0], "-o", two[0])):
+        answer = run(*words)
+        assert answer.status == 1
+        assert "is an input of this command" in answer.err
+    assert stub.called == {}
+    assert (cloud.read_bytes(), two[0].read_bytes()) == before
+
+
+def test_files_of_one_name_are_told_apart(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+    other = two[0].parent / "other" / "a.ply"
+    other.parent.mkdir()
+    other.write_bytes(two[1].read_bytes())
+    answer = run("match", two[0], other, "-o", two[0].with_name("map.npy"), "--json")
+    assert f"of {two[0]} its vertex of {other}" in answer.err
+    record = json.loads(answer.out)
+    assert (record["source"], record["target"]) == (str(two[0]), str(other))
+
+
+def test_a_real_ctrl_c_in_the_long_work(
+    run: Run, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("the signal was swallowed")
+
+    monkeypatch.setattr(pipeline, "match", slow)
+    answer = run("match", *two, "-o", two[0].with_name("map.npy"), "--picture", two[0].with_name("p.png"))
+    assert answer.status == 130
+    assert answer.err.splitlines() == ["interrupted: nothing was written"]
+    assert sorted(path.name for path in two[0].parent.iterdir()) == ["a.ply", "b.ply"]
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl", ".glb"])
 def test_register_writes_the_template_in_the_frame_of_the_file(
     run: Run, two: tuple[Path, Path], stub: Recorder, suffix: str
@@ -257,7 +348,7 @@ def test_register_writes_the_template_in_the_frame_of_the_file(
     assert "good fit, up +y, front -z" in answer.err
 
 
-@pytest.mark.parametrize(("words", "name", "value"), [item for item in OPTIONS if item[1] != "polish"])
+@pytest.mark.parametrize(("words", "name", "value"), OPTIONS)
 def test_register_hands_options_on(
     run: Run, two: tuple[Path, Path], stub: Recorder, words: list[str], name: str, value: object
 ) -> None:
@@ -273,6 +364,34 @@ def test_register_json(run: Run, two: tuple[Path, Path], stub: Recorder) -> None
     assert answer.err == ""
     assert (record["shape"], record["verdict"], record["up"]) == ("a.ply", "good", "+y")
     assert record["output"] == str(two[0].with_name("fitted.ply"))
+
+
+def test_register_in_full_resolution(
+    run: Run, two: tuple[Path, Path], stub: Recorder, sphere: Shape, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A translation of all nodes moves the dense template by as much, then out of the core frame."""
+    nodes = sphere.verts[:42]
+    template = Template(
+        "ball", Shape(CORNERS, FACES), sphere, nodes, 1.2, np.zeros(4, int), ("all",), np.arange(4)
+    )
+    moved = replace(fit(sphere), template_hash=template.hash, vectors=np.tile([0.0, 0.0, 5.0], (42, 1)))
+    monkeypatch.setattr(pipeline, "register", lambda *_, **__: moved)
+    monkeypatch.setattr(pipeline, "read_model", lambda name: SimpleNamespace(template=template))
+    output = two[0].with_name("fitted.ply")
+    answer = run("register", two[0], "-o", output, "--dense", "--json")
+    assert (answer.status, json.loads(answer.out)["vertices"]) == (0, 642)
+    fitted = load_shape(output)
+    assert np.allclose(fitted.verts, 2.0 * (sphere.verts + [0, 0, 5]) + [10, 0, 0], atol=1e-5)
+    assert np.array_equal(fitted.faces, sphere.faces)
+
+
+def test_full_resolution_needs_the_template_of_the_fit(
+    run: Run, two: tuple[Path, Path], stub: Recorder
+) -> None:
+    answer = run("register", two[0], "-o", two[0].with_name("fitted.ply"), "--dense")
+    assert answer.status == 1
+    assert "another template" in answer.err
+    assert not two[0].with_name("fitted.ply").exists()
 
 
 @pytest.mark.parametrize("verb", ["match", "register"])

@@ -101,7 +101,7 @@ def test_the_command(
         "faust": 6,
     }
     assert all(part["mean_cm"] == 0 for part in record["sets"].values())
-    assert record["maps"] == {"model": "human", "refine": "none", "polish": "auto", "seed": 3}
+    assert record["maps"] == {"model": "human", "refine": "none", "seed": 3}
     assert record["threads"] == record["jobs"] == 1
     assert {"date", "commit", "machine", "geodesic", "seconds"} <= set(record)
     assert "shrec19" in "".join(lines[:-1])
