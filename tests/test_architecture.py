@@ -171,6 +171,22 @@ def test_no_drawer_without_a_name() -> None:
     assert names & FORBIDDEN_NAMES == set()
 
 
+def long_modules(folder: Path, most: int = 320) -> list[str]:
+    """Modules of more than `most` lines: each is asking to be two."""
+    lines = {path: path.read_text(encoding="utf-8").count("\n") for path in folder.rglob("*.py")}
+    return [f"{path.relative_to(folder)}: {count} lines" for path, count in lines.items() if count > most]
+
+
+def test_no_module_is_too_long() -> None:
+    assert long_modules(PACKAGE) == []
+
+
+def test_the_rule_sees_a_module_that_is_too_long(tmp_path: Path) -> None:
+    (tmp_path / "fine.py").write_text("a = 1\n" * 320)
+    (tmp_path / "long.py").write_text("a = 1\n" * 321)
+    assert long_modules(tmp_path) == ["long.py: 321 lines"]
+
+
 def loaded_by(statement: str) -> set[str]:
     """Top-level modules that a fresh interpreter has loaded after a statement."""
     code = f"{statement}\nimport sys\nprint('\\n'.join({{name.split('.')[0] for name in sys.modules}}))"
