@@ -173,7 +173,9 @@ def _assemble(at, of, phi, gradient, P, K) -> Field:
     return Field(values, slopes)
 
 
-def _csr(start: torch.Tensor, column: torch.Tensor, values: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+def _csr(
+    start: torch.Tensor, column: torch.Tensor, values: torch.Tensor, size: tuple[int, int]
+) -> torch.Tensor:
     with warnings.catch_warnings():
         # Torch announces its CSR layout as beta at the first use: nothing a user could act on.
         warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")

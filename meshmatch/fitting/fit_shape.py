@@ -16,7 +16,14 @@ from meshmatch.fitting.fit import FAIR_RESIDUAL, GOOD_RESIDUAL, Fit, axis_name
 from meshmatch.fitting.latent import LatentRefineConfig, refine_code
 from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
-from meshmatch.fitting.orientation import Hypothesis, axis_vector, forced_frames, propose, standing_grid, with_flips
+from meshmatch.fitting.orientation import (
+    Hypothesis,
+    axis_vector,
+    forced_frames,
+    propose,
+    standing_grid,
+    with_flips,
+)
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -127,7 +134,9 @@ def fit_shape(
     )
 
 
-def _lay(model: TrainedModel, system: NodeSystem, scan: Scan, guess: Hypothesis | Candidate, rng, **how) -> Candidate:
+def _lay(
+    model: TrainedModel, system: NodeSystem, scan: Scan, guess: Hypothesis | Candidate, rng, **how
+) -> Candidate:
     return lay_on(model.network, system, model.template.core, scan, guess.rotation, guess.centre, rng, **how)
 
 
@@ -143,7 +152,9 @@ def _hypotheses(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypo
     if model.network.aligner is None:
         voted = standing_grid(scan.points.mean(0))
     else:
-        voted = with_flips(propose(model.network, scan.points[:2048], config.copies, config.hypotheses, config.seed))
+        voted = with_flips(
+            propose(model.network, scan.points[:2048], config.copies, config.hypotheses, config.seed)
+        )
     if config.up is None and config.front is None:
         return voted
     up = axis_vector(config.up) if config.up else None
@@ -153,7 +164,8 @@ def _hypotheses(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypo
     obeying = [
         guess
         for guess in voted
-        if (up is None or guess.rotation[:, 1] @ up > 0.5) and (front is None or guess.rotation[:, 2] @ front > 0.5)
+        if (up is None or guess.rotation[:, 1] @ up > 0.5)
+        and (front is None or guess.rotation[:, 2] @ front > 0.5)
     ]
     return obeying or forced_frames(up, front)
 

@@ -17,6 +17,7 @@ def template_vertices(template: Template, fits: list[Fit], places: list[np.ndarr
     """
     verts = template.shape.verts
     answers = [
-        verts[cKDTree(fit.points).query(fit.frame.apply(place))[1]] for fit, place in zip(fits, places, strict=True)
+        verts[cKDTree(fit.points).query(fit.frame.apply(place))[1]]
+        for fit, place in zip(fits, places, strict=True)
     ]
     return cKDTree(verts).query(np.mean(answers, axis=0))[1].astype(np.int64)

@@ -52,7 +52,9 @@ def two_way_residual(
 
 
 @torch.inference_mode()
-def predict(model: Deformer, scan: Scan, draws: int, rng: np.random.Generator, points: int = 2048) -> np.ndarray:
+def predict(
+    model: Deformer, scan: Scan, draws: int, rng: np.random.Generator, points: int = 2048
+) -> np.ndarray:
     """Mean prediction over several draws of points: node vectors (K, 3) for a scan in its core frame."""
     count = min(points, len(scan.points))
     chosen = np.stack([rng.choice(len(scan.points), count, replace=False) for _ in range(draws)])

@@ -114,7 +114,9 @@ def pair_terms(
 def _accumulate(at, point, normal, weight, share, V) -> tuple[np.ndarray, np.ndarray]:
     """Sum w (n n^T + share I) and its product with the point, per template vertex."""
     x, y, z = normal.T
-    entries = np.stack([x * x + share, x * y, x * z, y * y + share, y * z, z * z + share], 1) * weight[:, None]
+    entries = (
+        np.stack([x * x + share, x * y, x * z, y * y + share, y * z, z * z + share], 1) * weight[:, None]
+    )
     along = (normal * point).sum(1, keepdims=True)
     pull = weight[:, None] * (normal * along + share * point)
     weights = np.stack([np.bincount(at, entries[:, k], V) for k in range(6)], 1)

@@ -88,7 +88,9 @@ _FLIPS = Rotation.from_rotvec(
 def with_flips(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
     """Every hypothesis and its flips; front and back of a body look alike to a vote, not to a fit."""
     return [
-        Hypothesis(guess.rotation @ flip, guess.centre, guess.votes) for flip in _FLIPS for guess in hypotheses
+        Hypothesis(guess.rotation @ flip, guess.centre, guess.votes)
+        for flip in _FLIPS
+        for guess in hypotheses
     ]
 
 

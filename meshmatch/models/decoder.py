@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import nn
 
@@ -35,7 +37,7 @@ class NodeDecoder(nn.Module):
         self.from_node = nn.Linear(3, width, bias=False)
         sizes = [width, width // 2, width // 4]
         layers: list[nn.Module] = [nn.BatchNorm1d(width), nn.ReLU()]
-        for a, b in zip(sizes[:-1], sizes[1:], strict=True):
+        for a, b in pairwise(sizes):
             layers += [nn.Linear(a, b), nn.BatchNorm1d(b), nn.ReLU()]
         layers.append(nn.Linear(sizes[-1], 3))
         self.network = nn.Sequential(*layers)

@@ -90,16 +90,16 @@ class Deformer(nn.Module):
         self.register_buffer("anchors", anchors)
         self.register_buffer("anchor_phi", anchor_phi)
         if config.encoder == "basis":
-            self.encoder: nn.Module = BasisEncoder(basis, config.width, config.depth, config.code)
+            self.encoder: BasisEncoder | PointEncoder = BasisEncoder(
+                basis, config.width, config.depth, config.code
+            )
         else:
             self.encoder = PointEncoder(config.code)
         if config.decoder == "flat":
-            self.decoder: nn.Module = FlatDecoder(config.code, config.width, 1, K)
+            self.decoder: FlatDecoder | NodeDecoder = FlatDecoder(config.code, config.width, 1, K)
         else:
             self.decoder = NodeDecoder(config.code, nodes, config.width)
-        self.aligner = (
-            BasisEncoder(align_basis, config.align_width, 2, 9) if config.align_basis else None
-        )
+        self.aligner = BasisEncoder(align_basis, config.align_width, 2, 9) if config.align_basis else None
         self.corrector = residual_mlp(A * 10, config.correct_width, 1, 3 * K) if config.corrections else None
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import nn
@@ -42,7 +43,7 @@ class PointEncoder(nn.Module):
         self.register_buffer("frequencies", torch.logspace(-1, 2, frequencies, base=2.0))
         sizes = [6 * frequencies, latent // 8, latent // 4, latent // 2, latent]
         layers: list[nn.Module] = []
-        for i, (a, b) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        for i, (a, b) in enumerate(pairwise(sizes)):
             layers += [nn.Conv1d(a, b, 1), nn.BatchNorm1d(b)]
             layers += [nn.ReLU()] if i < len(sizes) - 2 else []
         self.points = nn.Sequential(*layers)

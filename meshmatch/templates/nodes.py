@@ -85,7 +85,9 @@ def _complete(shape: Shape, config: NodeConfig, nodes: np.ndarray, candidates: n
         bad = poorly_supported(shape.verts, nodes, config.radius)
         if not len(bad):
             return nodes
-        extra = candidates[cKDTree(candidates).query(shape.verts[bad], k=min(40, len(candidates)))[1].reshape(-1)]
+        extra = candidates[
+            cKDTree(candidates).query(shape.verts[bad], k=min(40, len(candidates)))[1].reshape(-1)
+        ]
         spread = farthest_points(np.concatenate([nodes, extra]), min(len(nodes) + 8, len(nodes) + len(extra)))
         fresh = spread[spread >= len(nodes)] - len(nodes)
         if not len(fresh):
@@ -108,7 +110,9 @@ def _allowed(shape, config, labels, candidates, own, rng) -> np.ndarray:
         return _geodesic_allowed(shape, touched, own)
     if config.strategy == "parts":
         if labels is None:
-            raise OptionError("node strategy 'parts' needs part labels", "use --strategy spectral or geodesic")
+            raise OptionError(
+                "node strategy 'parts' needs part labels", "use --strategy spectral or geodesic"
+            )
         parts = labels
     else:
         parts = spectral_clusters(shape, config.clusters, rng)
@@ -147,7 +151,9 @@ def _geodesic_allowed(shape: Shape, touched: list, own: np.ndarray) -> np.ndarra
     return np.array([np.isfinite(distance[place[i], hits]).all() for i, hits in enumerate(touched)])
 
 
-def spectral_clusters(shape: Shape, clusters: int, rng: np.random.Generator, functions: int = 12) -> np.ndarray:
+def spectral_clusters(
+    shape: Shape, clusters: int, rng: np.random.Generator, functions: int = 12
+) -> np.ndarray:
     """k-means on the global point signature (Rustamov 2007): labels (V,) from Laplace-Beltrami eigenvectors."""
     stiffness, mass = robust_laplacian.mesh_laplacian(shape.verts, shape.faces)
     count = min(functions + 1, shape.V - 2)

@@ -95,7 +95,9 @@ def make_template(
     small = Shape(frame.apply(small.verts), faces, name)
     parts = np.zeros(shape.V, np.int64) if labels is None else np.asarray(labels, np.int64)
     if parts.shape != (shape.V,) or parts.min() < 0:
-        raise TemplateError(f"{len(parts)} labels for {shape.V} vertices of {shape.name}", "one label a vertex, from 0")
+        raise TemplateError(
+            f"{len(parts)} labels for {shape.V} vertices of {shape.name}", "one label a vertex, from 0"
+        )
     names = tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1))
     in_core = np.ones(shape.V, bool) if core is None else np.isin(np.arange(shape.V), core)
     return Template(
@@ -151,22 +153,37 @@ def prepare_folder(
         fixed = clean.shape
         small = fixed if fixed.is_cloud or fixed.F <= faces else decimate(fixed, faces)
         frame = sqrt_area_frame(small)
-        save_shape(output / "normalised" / f"{path.stem}.ply", Shape(frame.apply(small.verts), small.faces, path.stem))
+        save_shape(
+            output / "normalised" / f"{path.stem}.ply",
+            Shape(frame.apply(small.verts), small.faces, path.stem),
+        )
         if progress is not None:
             progress(number + 1, len(files))
     if not shapes:
         raise InputError(f"no shape in {folder} could be used", notes[0])
     first = load_shape(template) if template is not None else shapes[0]
-    made = make_template(first, folder.name, config, source=f"{first.name} of {folder.name}", low=low_resolution(first, faces))
+    made = make_template(
+        first, folder.name, config, source=f"{first.name} of {folder.name}", low=low_resolution(first, faces)
+    )
     same = [s for s in shapes if s.V == first.V and np.array_equal(s.faces, first.faces)]
     keep = low_resolution(first, faces)[0]
     registered = len(same) == len(shapes) and len(shapes) > 1
-    stack = np.stack([s.verts[keep] for s in same]).astype(np.float32) if registered else np.zeros((0, len(keep), 3), np.float32)
+    stack = (
+        np.stack([s.verts[keep] for s in same]).astype(np.float32)
+        if registered
+        else np.zeros((0, len(keep), 3), np.float32)
+    )
     save_template(made, output / "template.safetensors")
     with replace_on_success(output / "shapes.safetensors") as temporary:
         save_file({"verts": stack}, temporary)
     names = tuple(s.name for s in shapes)
-    words = {"names": names, "registered": registered, "notes": notes, "template": made.hash, "config": asdict(config)}
+    words = {
+        "names": names,
+        "registered": registered,
+        "notes": notes,
+        "template": made.hash,
+        "config": asdict(config),
+    }
     with replace_on_success(output / "prepared.json") as temporary:
         Path(temporary).write_text(json.dumps(words, indent=1))
     return Prepared(made, stack, names, tuple(notes))
@@ -185,7 +202,9 @@ def read_registered(folder: str | Path, template: Template) -> np.ndarray:
         words = json.loads((folder / "prepared.json").read_text())
         shapes = load_file(folder / "shapes.safetensors")["verts"]
     except (OSError, ValueError, KeyError, SafetensorError) as error:
-        raise InputError(f"{folder} is not a prepared folder", "run `meshmatch prepare FOLDER -o OUT` first") from error
+        raise InputError(
+            f"{folder} is not a prepared folder", "run `meshmatch prepare FOLDER -o OUT` first"
+        ) from error
     if words.get("template") != template.hash:
         raise InputError(f"{folder} was prepared for another template", "prepare it again")
     if not len(shapes):

@@ -106,7 +106,9 @@ def save_template(template: Template, path: str | Path) -> None:
     }
     with replace_on_success(path) as temporary:
         save_file(
-            {name: np.ascontiguousarray(a) for name, a in arrays.items()}, temporary, {"template": json.dumps(words)}
+            {name: np.ascontiguousarray(a) for name, a in arrays.items()},
+            temporary,
+            {"template": json.dumps(words)},
         )
 
 
@@ -128,13 +130,19 @@ def load_template(path: str | Path) -> Template:
                 raise KeyError("arrays")
             arrays = {name: file.get_tensor(name) for name in _ARRAYS}
     except (SafetensorError, KeyError, ValueError, OSError) as error:
-        raise TemplateError(f"{path.name} is not a template bundle", "make one with `meshmatch prepare`") from error
+        raise TemplateError(
+            f"{path.name} is not a template bundle", "make one with `meshmatch prepare`"
+        ) from error
     if words.get("schema") != SCHEMA:
-        raise TemplateError(f"{path.name} has template schema {words.get('schema')}, not {SCHEMA}", "update meshmatch")
+        raise TemplateError(
+            f"{path.name} has template schema {words.get('schema')}, not {SCHEMA}", "update meshmatch"
+        )
     template = Template(
         name=words["name"],
         shape=Shape(arrays["verts"].astype(np.float64), arrays["faces"].astype(np.int64), words["name"]),
-        dense=Shape(arrays["dense_verts"].astype(np.float64), arrays["dense_faces"].astype(np.int64), words["name"]),
+        dense=Shape(
+            arrays["dense_verts"].astype(np.float64), arrays["dense_faces"].astype(np.int64), words["name"]
+        ),
         nodes=arrays["nodes"].astype(np.float64),
         radius=float(words["radius"]),
         labels=arrays["labels"].astype(np.int64),
@@ -145,5 +153,7 @@ def load_template(path: str | Path) -> Template:
         licence=words["licence"],
     )
     if template.hash != words["hash"]:
-        raise TemplateError(f"{path.name} is damaged: its content does not match its hash", "make or fetch it again")
+        raise TemplateError(
+            f"{path.name} is damaged: its content does not match its hash", "make or fetch it again"
+        )
     return template

@@ -22,7 +22,6 @@ def draw_identities(rig: Rig, B: int, generator: torch.Generator) -> tuple[torch
 
 def skin(rig: Rig, rest: torch.Tensor, world: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
     """Linear blend skinning: posed vertices (B, V, 3)."""
-    B, J = world.shape[:2]
     transforms = torch.cat([world.flatten(2), offset], -1)  # B J 12
     blended = torch.einsum("vj,bjk->bvk", rig.weights, transforms)
     return (blended[..., :9].unflatten(-1, (3, 3)) @ rest[..., None])[..., 0] + blended[..., 9:]

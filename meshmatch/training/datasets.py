@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
-from meshmatch.models.encoder import BasisEncoder
+from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.training.bodies import sample_bodies
 from meshmatch.training.rig import Rig
 from meshmatch.training.scans import (
@@ -53,7 +53,7 @@ class Batch:
     align_centre: torch.Tensor | None = None
 
     def to(self, device: torch.device) -> Batch:
-        return Batch(*(None if v is None else v.to(device) for v in vars(self).values()))
+        return replace(self, **{n: v.to(device) for n, v in vars(self).items() if v is not None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class BatchDataset(torch.utils.data.Dataset):
     template_core: torch.Tensor
     core: torch.Tensor
     loss_points: torch.Tensor
-    encoder: torch.nn.Module
+    encoder: BasisEncoder | PointEncoder
     aligner: BasisEncoder | None
     scan: ScanConfig
     shapes: int = 32
@@ -120,6 +120,4 @@ class BatchDataset(torch.utils.data.Dataset):
         anywhere = random_rotations(B, generator)
         turned = (points - middle) @ anywhere.transpose(1, 2)
         centre = (anywhere @ (t - middle[:, 0])[..., None])[..., 0]
-        return Batch(
-            in_core, targets, features, self.aligner.features(turned), anywhere @ R, centre
-        )
+        return Batch(in_core, targets, features, self.aligner.features(turned), anywhere @ R, centre)

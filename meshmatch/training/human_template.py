@@ -79,4 +79,6 @@ def human_template(rig: Rig, pose: str, config: NodeConfig, low: tuple[np.ndarra
 def restrict(rig: Rig, keep: np.ndarray, faces: np.ndarray) -> Rig:
     """The same bodies on the low-resolution mesh."""
     chosen = torch.from_numpy(keep)
-    return Rig(rig.rest[:, chosen], rig.heads, rig.weights[chosen], rig.parents, rig.names, torch.from_numpy(faces))
+    return Rig(
+        rig.rest[:, chosen], rig.heads, rig.weights[chosen], rig.parents, rig.names, torch.from_numpy(faces)
+    )

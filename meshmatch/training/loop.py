@@ -84,7 +84,11 @@ class Trainer:
         self.average = {n: p.detach().clone() for n, p in model.named_parameters()}
         self.buffers = {n: b for n, b in model.named_buffers() if n.endswith(("running_mean", "running_var"))}
         self.optimiser = torch.optim.AdamW(
-            model.parameters(), lr=config.rate, betas=(0.9, 0.99), weight_decay=config.weight_decay, fused=True
+            model.parameters(),
+            lr=config.rate,
+            betas=(0.9, 0.99),
+            weight_decay=config.weight_decay,
+            fused=True,
         )
         self.step = 0
         self.seconds = 0.0
@@ -106,7 +110,7 @@ class Trainer:
         with safe_open(str(path), framework="pt") as file:
             self.step = int(file.metadata()["step"])
             self.seconds = float(file.metadata().get("seconds", 0.0))
-            arrays = {n: file.get_tensor(n) for n in file.keys()}
+            arrays = {n: file.get_tensor(n) for n in file.keys()}  # noqa: SIM118 (it is no dictionary)
         self.model.load_state_dict(_part(arrays, "model."))
         for n, tensor in _part(arrays, "average.").items():
             self.average[n].copy_(tensor)
@@ -161,7 +165,11 @@ class Trainer:
             if report is not None and (self.step % every == 0 or self.step == config.steps):
                 score = validate(self.model) if validate and self.step % (10 * every) == 0 else None
                 means = {name: float(value) / every for name, value in sums.items()}
-                report(Progress(self.step, config.steps, learning_rate(self.step, config), now - began, means, score))
+                report(
+                    Progress(
+                        self.step, config.steps, learning_rate(self.step, config), now - began, means, score
+                    )
+                )
                 sums = {}
             if checkpoint is not None and now - saved > 60 * config.checkpoint_minutes:
                 self.save(checkpoint)

@@ -88,7 +88,9 @@ def losses(
             current = current.detach()
         terms["correct"] = config.correct * torch.stack(steps).sum()
         errors["error_corrected"] = steps[-2].detach()
-    if model.aligner is not None and batch.align_features is not None:
+    if model.aligner is not None:
+        assert batch.align_features is not None and batch.align_rotation is not None
+        assert batch.align_centre is not None
         R, t = model.align(batch.align_features)
         turn = (R - batch.align_rotation).square().sum((1, 2)).clamp_min(1e-12).sqrt().mean()
         terms["align"] = config.align * (turn + 3 * distance(t, batch.align_centre))

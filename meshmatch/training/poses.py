@@ -189,9 +189,7 @@ def sample_pose(rig: Rig, heads: torch.Tensor, generator: torch.Generator) -> to
     draw = _Draw(B, generator)
     vectors = torch.zeros(B, J, 3)
     joint = rig.joint
-    family = torch.multinomial(
-        torch.tensor([0.34, 0.24, 0.14, 0.08, 0.1, 0.1]), B, True, generator=generator
-    )
+    family = torch.multinomial(torch.tensor([0.34, 0.24, 0.14, 0.08, 0.1, 0.1]), B, True, generator=generator)
     left, right = _draw_limbs(draw, family), _draw_limbs(draw, family)
     same_arms = torch.rand(B, generator=generator) < 0.3
     same_legs = torch.rand(B, generator=generator) < 0.35
@@ -271,9 +269,7 @@ def still_pose(rig: Rig, heads: torch.Tensor, arms: float, legs: float) -> torch
 
 def _pose_arm(vectors, extra, rig, heads, side, suffix, limbs, draw) -> None:
     joint = rig.joint
-    upper, elbow, wrist = (
-        heads[:, joint(name + suffix)] for name in ("upperarm01", "lowerarm01", "wrist")
-    )
+    upper, elbow, wrist = (heads[:, joint(name + suffix)] for name in ("upperarm01", "lowerarm01", "wrist"))
     rest_arm, rest_fore = _unit(elbow - upper), _unit(wrist - elbow)
     elevation, azimuth = limbs.arm_elevation * DEGREE, limbs.arm_azimuth * DEGREE
     target = torch.stack(
@@ -297,18 +293,14 @@ def _pose_arm(vectors, extra, rig, heads, side, suffix, limbs, draw) -> None:
     vectors[:, joint("upperarm02" + suffix)] = 0.5 * twist
     hinge = torch.linalg.cross(rest_arm, rest_fore)
     rest_flexion = torch.asin(hinge.norm(dim=-1).clamp(max=1.0))
-    vectors[:, joint("lowerarm01" + suffix)] = (
-        _unit(hinge) * (limbs.elbow * DEGREE - rest_flexion)[:, None]
-    )
+    vectors[:, joint("lowerarm01" + suffix)] = _unit(hinge) * (limbs.elbow * DEGREE - rest_flexion)[:, None]
     vectors[:, joint("lowerarm02" + suffix)] = side * limbs.pronation[:, None] * DEGREE * rest_fore
     vectors[:, joint("wrist" + suffix)] = draw.normal3(16)
 
 
 def _pose_leg(vectors, extra, rig, heads, side, suffix, limbs, draw) -> None:
     joint = rig.joint
-    hip, knee, ankle = (
-        heads[:, joint(name + suffix)] for name in ("upperleg01", "lowerleg01", "foot")
-    )
+    hip, knee, ankle = (heads[:, joint(name + suffix)] for name in ("upperleg01", "lowerleg01", "foot"))
     rest_thigh, rest_shin = _unit(knee - hip), _unit(ankle - knee)
     flexion, spread = limbs.hip_flexion * DEGREE, limbs.hip_abduction * DEGREE
     target = torch.stack(

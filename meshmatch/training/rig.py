@@ -92,7 +92,9 @@ def _sample_local_changes(labels: list[str], B: int, rng: np.random.Generator) -
     return changes
 
 
-def build_rig(identities: int = 4096, seed: int = 0, vertices: np.ndarray | None = None, progress=None) -> Rig:
+def build_rig(
+    identities: int = 4096, seed: int = 0, vertices: np.ndarray | None = None, progress=None
+) -> Rig:
     """Sample identities from anny's phenotype space.
 
     Parameters
@@ -164,7 +166,7 @@ def save_rig(rig: Rig, path: str | Path) -> None:
 def load_rig(path: str | Path) -> Rig:
     """Read a rig written by :func:`save_rig`."""
     with safe_open(os.fspath(path), framework="pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
         names = tuple(file.metadata()["names"].split("\n"))
     parents = tuple(int(parent) for parent in tensors.pop("parents"))
     return Rig(parents=parents, names=names, **tensors)

@@ -51,18 +51,34 @@ def recipe(preset: Preset = "default") -> Recipe:
     if preset == "paper":
         return Recipe(
             PAPER,
-            TrainConfig(steps=75_000, shapes=16, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=LossConfig()),
-            ScanConfig(points=3000, noise=0.0, holes=0.0, outliers=0.0, density=0.0, bumps=0.0, scale=0.0, upright=True),
+            TrainConfig(
+                steps=75_000, shapes=16, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=LossConfig()
+            ),
+            ScanConfig(
+                points=3000,
+                noise=0.0,
+                holes=0.0,
+                outliers=0.0,
+                density=0.0,
+                bumps=0.0,
+                scale=0.0,
+                upright=True,
+            ),
             "cubic",
         )
     if preset == "default":
         loss = LossConfig(volume=2e-3, arap=2e-3, blend=1e-3, robust=True)
-        return Recipe(NetworkConfig(), TrainConfig(steps=13_000, decay=0.65, loss=loss), ScanConfig(), "smooth")
+        return Recipe(
+            NetworkConfig(), TrainConfig(steps=13_000, decay=0.65, loss=loss), ScanConfig(), "smooth"
+        )
     raise OptionError(f"no preset {preset!r}", "choose default or paper")
 
 
 def human_source(
-    template: Template, identities: int = 4096, seed: int = 0, progress: Callable[[int, int], None] | None = None
+    template: Template,
+    identities: int = 4096,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Source:
     """Generated bodies on a human template's vertices; the rig is built once and cached."""
     rig = cached_rig(identities, seed, progress)
@@ -80,7 +96,9 @@ def human_source(
 
 def cached_rig(identities: int, seed: int, progress: Callable[[int, int], None] | None = None) -> Rig:
     """The body rig from the cache, or built into it (a minute or two, once)."""
-    path = Path(platformdirs.user_cache_dir("meshmatch")) / f"rig-v{RIG_VERSION}-{identities}-{seed}.safetensors"
+    path = (
+        Path(platformdirs.user_cache_dir("meshmatch")) / f"rig-v{RIG_VERSION}-{identities}-{seed}.safetensors"
+    )
     if path.is_file():
         return load_rig(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -89,7 +89,11 @@ def bump(verts: torch.Tensor, amplitude: float, generator: torch.Generator) -> t
 
 
 def sample_scan(
-    verts: torch.Tensor, areas: torch.Tensor, faces: torch.Tensor, config: ScanConfig, generator: torch.Generator
+    verts: torch.Tensor,
+    areas: torch.Tensor,
+    faces: torch.Tensor,
+    config: ScanConfig,
+    generator: torch.Generator,
 ) -> torch.Tensor:
     """Points (B, P, 3) on the surface, with uneven density, holes, noise and outliers."""
     B, P = len(verts), config.points
