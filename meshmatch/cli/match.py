@@ -62,6 +62,7 @@ def match(
     from meshmatch.outputs import replace_on_success
     from meshmatch.shapes.files import load_shape
 
+    options.check_axes(up, front)
     check_suffix(output)
     check_png(picture)
     check_apart([output, picture], [source, target, landmarks])
@@ -144,6 +145,7 @@ def register(
     from meshmatch.shapes.files import load_shape, save_shape
     from meshmatch.shapes.shape import Shape
 
+    options.check_axes(up, front)
     check_apart([output], [shape])
     voice = Voice(quiet)
     with replace_on_success(output) as temporary:

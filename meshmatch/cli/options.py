@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from meshmatch.errors import OptionError
+
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Refine = Literal["none", "latent", "nodes"]
 
@@ -29,3 +31,9 @@ Strict = Annotated[bool, typer.Option("--strict", help="Write nothing and exit w
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 Threads = Annotated[int, typer.Option(min=1, help="How many threads to use.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary; warnings stay.")]
+
+
+def check_axes(up: Axis | None, front: Axis | None) -> None:
+    """Refuse up and front along one axis (`OptionError`)."""
+    if up is not None and front is not None and up[-1] == front[-1]:
+        raise OptionError(f"up ({up}) and front ({front}) lie along one axis", "choose two different axes")

@@ -144,3 +144,17 @@ def test_a_map_of_other_shapes_is_refused(
     answer = run("evaluate", files[0], tmp_path / "t.ply", files[2])
     assert answer.status == 1
     assert "642" in answer.err
+
+
+@pytest.mark.parametrize("name", ["curve.jpg", "nowhere/curve.png"])
+def test_a_curve_that_cannot_be_is_told_before_the_work(
+    run: Run, files: tuple[Path, ...], tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def work(*_: object, **__: object) -> None:
+        pytest.fail("it began")
+
+    monkeypatch.setattr("meshmatch.maps.evaluate.evaluate_map", work)
+    truth = write_truth(tmp_path, "pairs")
+    answer = run("evaluate", *files, *truth, "--curve", tmp_path / name)
+    assert answer.status == 1
+    assert "error: " in answer.err

@@ -45,6 +45,44 @@ def test_a_mesh_that_needs_repair(run: Run, tmp_path: Path, sphere: Shape) -> No
     assert all(note in shown for note in found["repair"])  # type: ignore[attr-defined]
 
 
+def test_parts_holes_axis_and_unit(run: Run, tmp_path: Path, sphere: Shape) -> None:
+    tall = sphere.verts * [20, 30, 88]  # as long as a person in centimetres, along z
+    twice = np.concatenate([tall, tall + np.array([45.0, 0, 0])])
+    faces = np.concatenate([sphere.faces[1:], sphere.faces + 642])
+    save_shape(tmp_path / "two.ply", Shape(twice, faces))
+    found = record(run, tmp_path / "two.ply")
+    assert (found["parts"], found["open_edges"], found["non_manifold_edges"]) == (2, 3, 0)
+    assert found["watertight"] is False
+    assert found["longest_along"] == "z"
+    assert found["unit_if_a_person"] == "centimetres"
+    save_shape(tmp_path / "ball.ply", sphere)
+    round_one = record(run, tmp_path / "ball.ply")
+    assert (round_one["parts"], round_one["open_edges"], round_one["watertight"]) == (1, 0, True)
+    assert round_one["longest_along"] is None
+    shown = run("info", tmp_path / "ball.ply").out
+    assert "longest along" in shown
+    assert "unknown" in shown
+
+
+@pytest.mark.parametrize(
+    ("length", "unit"),
+    [
+        (1.75, "metres"),
+        (175, "centimetres"),
+        (1750, "millimetres"),
+        (69, "inches"),
+        (5.7, "feet"),
+        (12, None),
+    ],
+)
+def test_unit_of_a_person(run: Run, tmp_path: Path, sphere: Shape, length: float, unit: str | None) -> None:
+    save_shape(
+        tmp_path / "a.ply", Shape(sphere.verts * [0.1 * length, 0.5 * length, 0.1 * length], sphere.faces)
+    )
+    found = record(run, tmp_path / "a.ply")
+    assert (found["longest_along"], found["unit_if_a_person"]) == ("y", unit)
+
+
 def test_nothing_to_repair_is_said(run: Run, two: tuple[Path, Path]) -> None:
     assert "nothing to do" in run("info", two[0]).out
 

@@ -381,7 +381,9 @@ def test_register_in_full_resolution(
     answer = run("register", two[0], "-o", output, "--dense", "--json")
     assert (answer.status, json.loads(answer.out)["vertices"]) == (0, 642)
     fitted = load_shape(output)
-    assert np.allclose(fitted.verts, 2.0 * (sphere.verts + [0, 0, 5]) + [10, 0, 0], atol=1e-5)
+    assert np.allclose(
+        fitted.verts, 2.0 * (sphere.verts + np.array([0, 0, 5])) + np.array([10, 0, 0]), atol=1e-5
+    )
     assert np.array_equal(fitted.faces, sphere.faces)
 
 

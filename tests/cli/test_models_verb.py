@@ -107,3 +107,17 @@ def test_list_shows_a_damaged_model_and_why(run: Run, home: Path) -> None:
 def test_what_is_no_model_is_not_added(run: Run, tmp_path: Path) -> None:
     assert run("models", "add", tmp_path).status == 1
     assert run("models", "add", tmp_path / "nowhere").status == 1
+
+
+def test_json_of_every_verb(run: Run, mine: Path, home: Path) -> None:
+    added = json.loads(run("models", "add", mine, "--json").out)
+    assert added == {"added": "mine", "folder": str(home / "models" / "mine")}
+    (home / "models" / "mine" / "weights.safetensors").write_bytes(b"")
+    answer = run("models", "verify", "--json")
+    assert answer.status == 1
+    checked = {model["name"]: model for model in json.loads(answer.out)["models"]}
+    assert checked["human"]["problem"] == ""
+    assert len(checked["human"]["sha256"]) == 64
+    assert checked["mine"]["sha256"] is None
+    assert "too short" in checked["mine"]["problem"]
+    assert json.loads(run("models", "remove", "mine", "--json").out) == {"removed": "mine"}

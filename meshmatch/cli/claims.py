@@ -1,0 +1,37 @@
+"""Output files, claimed before the work begins."""
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from meshmatch.errors import OptionError
+from meshmatch.outputs import replace_on_success
+
+
+@contextmanager
+def claimed(path: Path | None) -> Iterator[Path | None]:
+    """`replace_on_success` for an output that may not be wanted."""
+    if path is None:
+        yield None
+        return
+    with replace_on_success(path) as temporary:
+        yield temporary
+
+
+def check_apart(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
+    """Refuse an output that would replace an input, or another output (`OptionError`)."""
+    taken = {path.resolve(): "is an input of this command" for path in inputs if path is not None}
+    for path in outputs:
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            raise OptionError(
+                f"cannot write {path}: it {taken[path.resolve()]}", "choose another name for the output"
+            )
+        taken[path.resolve()] = "is an output of this command already"
+
+
+def check_png(path: Path | None) -> None:
+    """Refuse a picture that is no PNG (`OptionError`)."""
+    if path is not None and path.suffix.lower() != ".png":
+        raise OptionError(f"{path.name}: a picture is a PNG", "end the name in .png")

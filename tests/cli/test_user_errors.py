@@ -1,0 +1,236 @@
+"""What users get wrong: one line that says what, a hint, status 1, nothing half-written.
+
+Everything here fails before the first fit, which is made to fail the test if it begins.
+"""
+
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch import pipeline
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
+from tests.cli.conftest import Answer, Run
+
+
+@pytest.fixture(autouse=True)
+def no_fit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def begun(*_: object, **__: object) -> None:
+        raise AssertionError("a fit began")
+
+    monkeypatch.setattr(pipeline, "lay_template", begun)
+    monkeypatch.setenv("MESHMATCH_HOME", str(tmp_path.parent / f"{tmp_path.name}-home"))
+
+
+def write_text(path: Path, text: str) -> None:
+    path.write_text(text)
+
+
+def truncated_ply(path: Path) -> None:
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 100\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    path.write_bytes(head.encode() + struct.pack("<30f", *range(30)))
+
+
+def all_nan(path: Path) -> None:
+    write_text(path, "v nan nan nan\n" * 3 + "f 1 2 3\n")
+
+
+def nan_cloud(path: Path) -> None:
+    np.save(path, np.full((500, 3), np.nan))
+
+
+def one_triangle(path: Path) -> None:
+    save_shape(path, Shape(np.eye(3), np.array([[0, 1, 2]]), "one"))
+
+
+def flat_faces(path: Path) -> None:
+    save_shape(path, Shape(np.eye(3), np.array([[0, 1, 1], [2, 2, 2]]), "flat"))
+
+
+def few_points(path: Path) -> None:
+    np.save(path, np.random.default_rng(0).normal(size=(20, 3)))
+
+
+def far_apart(path: Path) -> None:
+    n = 30
+    u, v = np.meshgrid(np.linspace(0.1, 3.0, n), np.arange(n) * 2 * np.pi / n, indexing="ij")
+    ball = np.stack([np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)], -1).reshape(-1, 3)
+    grid = np.arange(n * n).reshape(n, n)
+    a, b = grid[:-1], grid[1:]
+    c, d = np.roll(b, -1, 1), np.roll(a, -1, 1)
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    both = np.concatenate([ball, ball + np.array([50.0, 0, 0])])
+    save_shape(path, Shape(both, np.concatenate([faces, faces + n * n]), "both"))
+
+
+# name of the file, how it is made (None: not at all), a word of the message that names the trouble
+BAD_FILES = {
+    "missing": ("bad.ply", None, "there is no file"),
+    "0 bytes": ("bad.ply", lambda path: path.write_bytes(b""), "0 bytes"),
+    "not a mesh": ("bad.ply", lambda path: write_text(path, "Dear Sir or Madam,\n"), "is not a ply file"),
+    "a picture called obj": (
+        "bad.obj",
+        lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0"),
+        "is not an obj file",
+    ),
+    "unknown kind": ("bad.docx", lambda path: write_text(path, "x"), "unknown kind"),
+    "no suffix": ("bad", lambda path: write_text(path, "x"), "no suffix"),
+    "truncated ply": ("bad.ply", truncated_ply, "fewer vertex rows than the 100"),
+    "truncated glb": ("bad.glb", lambda path: path.write_bytes(b"glTF\2\0\0\0\xff\0\0\0"), "is only 12"),
+    "no vertices": ("bad.off", lambda path: write_text(path, "OFF\n0 0 0\n"), "no vertices"),
+    "face of a missing vertex": (
+        "bad.obj",
+        lambda path: write_text(path, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
+        "names vertex 9",
+    ),
+    "all NaN": ("bad.obj", all_nan, "NaN"),
+    "a cloud of NaN": ("bad.npy", nan_cloud, "NaN"),
+    "one triangle": ("bad.ply", one_triangle, "only 1 usable triangle"),
+    "no face with area": ("bad.ply", flat_faces, "no face with any area"),
+    "few points": ("bad.npy", few_points, "only 20 points"),
+    "two components far apart": ("bad.ply", far_apart, "2 large parts far apart"),
+    "a folder": ("bad.ply", lambda path: path.mkdir(), "is a folder"),
+    "a map for a cloud": ("bad.npy", lambda path: np.save(path, np.arange(9)), "bad.npy"),
+}
+
+
+def check(answer: Answer, told: str, folder: Path, before: list[str]) -> None:
+    lines = answer.err.splitlines()
+    assert answer.status == 1, answer.err
+    assert answer.out == ""
+    assert lines[0].startswith("error: ")
+    assert told in lines[0]
+    assert lines[1].startswith("hint: ")
+    assert len(lines) == 2
+    assert sorted(os.listdir(folder)) == before
+
+
+@pytest.mark.parametrize("side", ["source", "target", "register"])
+@pytest.mark.parametrize("kind", BAD_FILES)
+def test_bad_files(run: Run, two: tuple[Path, Path], tmp_path: Path, kind: str, side: str) -> None:
+    name, make, told = BAD_FILES[kind]
+    bad = tmp_path / name
+    if make is not None:
+        make(bad)
+    before = sorted(os.listdir(tmp_path))
+    words = {
+        "source": ("match", bad, two[1], "-o", tmp_path / "map.npy"),
+        "target": ("match", two[0], bad, "-o", tmp_path / "map.npy"),
+        "register": ("register", bad, "-o", tmp_path / "fitted.obj"),
+    }[side]
+    check(run(*words), told, tmp_path, before)
+
+
+def test_a_few_bad_vertices_are_no_error(
+    run: Run, two: tuple[Path, Path], tmp_path: Path, sphere: Shape
+) -> None:
+    """A NaN vertex and a stray triangle are repaired: the work goes on to the fit."""
+    verts = np.concatenate([sphere.verts, 9.0 + np.eye(3) / 1000, np.zeros((1, 3))])
+    faces = np.concatenate([sphere.faces, [[642, 643, 644]]])
+    bad = np.arange(646) == 645
+    save_shape(tmp_path / "nan.ply", Shape(verts, faces, "nan", None, bad))
+    assert load_shape(tmp_path / "nan.ply").invalid is not None
+    with pytest.raises(AssertionError, match="a fit began"):
+        run("register", tmp_path / "nan.ply", "-o", tmp_path / "fitted.ply")
+
+
+def test_a_mistyped_file_is_guessed(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "dancer.ply").write_bytes(two[0].read_bytes())
+    answer = run("match", tmp_path / "dancre.ply", two[1], "-o", tmp_path / "map.npy")
+    assert f"did you mean {tmp_path / 'dancer.ply'}?" in answer.err
+
+
+@pytest.mark.parametrize("name", ["humna", "../human", "Human", "", "human/", "/no/such/folder"])
+@pytest.mark.parametrize("verb", ["match", "register"])
+def test_models_that_do_not_exist(
+    run: Run, two: tuple[Path, Path], tmp_path: Path, name: str, verb: str
+) -> None:
+    before = sorted(os.listdir(tmp_path))
+    output = tmp_path / ("map.npy" if verb == "match" else "fitted.ply")
+    answer = run(verb, *two[: 2 if verb == "match" else 1], "-o", output, "--model", name)
+    check(answer, "model", tmp_path, before)
+    if name == "humna":
+        assert "did you mean human?" in answer.err
+
+
+def test_a_damaged_model(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
+    model = tmp_path / "model"
+    model.mkdir()
+    for file in (bundled_folder() / "models" / "human").iterdir():
+        (model / file.name).write_bytes(file.read_bytes())
+    weights = model / "weights.safetensors"
+    data = bytearray(weights.read_bytes())
+    data[-1] ^= 1
+    weights.write_bytes(data)
+    before = sorted(os.listdir(tmp_path))
+    answer = run("match", *two, "-o", tmp_path / "map.npy", "--model", model)
+    check(answer, "are not those of its card", tmp_path, before)
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
+    closed = tmp_path / "closed"
+    closed.mkdir(mode=0o500)
+    answer = run("match", *two, "-o", closed / "map.npy")
+    assert answer.status == 1
+    assert f"cannot write {closed / 'map.npy'}" in answer.err
+
+
+def test_a_folder_that_refuses_files(
+    run: Run, two: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As above, for every user: the system says no when the file is made."""
+
+    def refused(self: Path, *_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    before = sorted(os.listdir(tmp_path))
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "touch", refused)
+        answer = run("match", *two, "-o", tmp_path / "map.npy")
+    check(answer, "Permission denied", tmp_path, before)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "holds no vertex"),
+        ("nose\n", "pairs.txt"),
+        ("1 2 3\n", "pairs.txt"),
+        ("0 -1\n", "-1"),
+        ("1.5 2\n", "pairs.txt"),
+    ],
+)
+def test_landmarks_that_are_none(
+    run: Run, two: tuple[Path, Path], tmp_path: Path, text: str, told: str
+) -> None:
+    (tmp_path / "pairs.txt").write_text(text)
+    before = sorted(os.listdir(tmp_path))
+    answer = run("match", *two, "-o", tmp_path / "map.npy", "--landmarks", tmp_path / "pairs.txt")
+    check(answer, told, tmp_path, before)
+
+
+def test_both_axes_the_same(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
+    before = sorted(os.listdir(tmp_path))
+    for words in (
+        ("match", *two, "-o", tmp_path / "map.npy"),
+        ("register", two[0], "-o", tmp_path / "f.ply"),
+    ):
+        answer = run(*words, "--up", "y", "--front", "-y")
+        check(answer, "lie along one axis", tmp_path, before)
+
+
+def test_a_truth_on_a_cloud_needs_faces(run: Run, tmp_path: Path, sphere: Shape) -> None:
+    np.save(tmp_path / "cloud.npy", sphere.verts)
+    save_shape(tmp_path / "ball.ply", sphere)
+    np.savetxt(tmp_path / "map.txt", np.arange(642), fmt="%d")
+    before = sorted(os.listdir(tmp_path))
+    words = (tmp_path / "map.txt", tmp_path / "ball.ply", tmp_path / "cloud.npy")
+    answer = run("evaluate", *words, "--truth", tmp_path / "map.txt")
+    check(answer, "cloud", tmp_path, before)
