@@ -44,6 +44,14 @@ def test_output_appears_whole(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["map.npy"]
 
 
+def test_output_is_replaced_not_rewritten(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("old")
+    with (tmp_path / "a.txt").open() as reader:
+        with replace_on_success(tmp_path / "a.txt") as temporary:
+            temporary.write_text("new")
+        assert reader.read() == "old"  # whoever was reading reads on
+
+
 @pytest.mark.parametrize("stop", [ValueError, KeyboardInterrupt])
 def test_failed_output_leaves_the_old_one(tmp_path: Path, stop: type[BaseException]) -> None:
     (tmp_path / "a.txt").write_text("old")

@@ -50,7 +50,7 @@ class Repaired:
     far_parts: int = 0
 
     def original_face(self, face: Ints, weights: Floats) -> tuple[Ints, Floats]:
-        """Repaired faces (N,) and weights (N, 3) of their corners, numbered and ordered as in the original."""
+        """Repaired faces (N,) and weights (N, 3) of their corners, numbered and ordered as originally."""
         theirs = self.kept_face[face]
         corners = self.original_to_repaired[self.original.faces[theirs]]  # N 3
         same = corners[:, :, None] == self.shape.faces[face][:, None, :]  # N original repaired

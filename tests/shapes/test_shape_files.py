@@ -44,6 +44,10 @@ end_header
 """
 
 
+XYZ = "".join(f"property float {axis}\n" for axis in "xyz")
+HUGE = "ply\nformat {} 1.0\nelement vertex {}\n" + XYZ + "end_header\n"
+
+
 def test_ply_text_with_a_polygon(tmp_path: Path) -> None:
     rows = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n.5 .5 1\n4 0 1 2 3\n3 0 1 4\n"
     check(load(tmp_path, "a.ply", PLY_HEADER.format(format="ascii") + rows))
@@ -93,6 +97,26 @@ end_header
     np.testing.assert_allclose(shape.colors[:, 0], 1.0)
     np.testing.assert_allclose(shape.colors[:, 1], np.arange(5) / 255)
     np.testing.assert_allclose(shape.colors[:, 2:], [[0.2, 1.0]] * 5)
+
+
+def test_ply_big_endian_with_wide_counts_and_unequal_lists(tmp_path: Path) -> None:
+    header = PLY_HEADER.format(format="binary_big_endian").replace("list uchar", "list ushort")
+    body = struct.pack(">15f", *CORNERS.ravel()) + struct.pack(">H4iH3i", 4, 0, 1, 2, 3, 3, 0, 1, 4)
+    check(load(tmp_path, "a.ply", header.encode() + body))
+    windows = header.replace("\n", "\r\n").encode()
+    check(load(tmp_path, "b.ply", windows + body))
+
+
+def test_ply_colours_of_two_bytes(tmp_path: Path) -> None:
+    channels = "".join(f"property ushort {c}\n" for c in ("red", "green", "blue"))
+    head = HUGE.format("binary_little_endian", 1).replace("end_header\n", channels + "end_header\n")
+    shape = load(tmp_path, "a.ply", head.encode() + struct.pack("<3f3H", 1, 2, 3, 65535, 13107, 0))
+    np.testing.assert_allclose(shape.colors, [[1, 0.2, 0, 1]])
+
+
+def test_ply_colours_are_rounded_not_cut(tmp_path: Path, cube: Shape) -> None:
+    save_shape(tmp_path / "a.ply", Shape(cube.verts, cube.faces, colors=np.full((8, 4), 0.999)))
+    np.testing.assert_array_equal(load_shape(tmp_path / "a.ply").colors, 1.0)
 
 
 def test_ply_text_with_lists_of_unequal_length_among_the_vertices(tmp_path: Path) -> None:
@@ -153,6 +177,7 @@ def test_obj(tmp_path: Path, quad: str, triangle: str) -> None:
     check(load(tmp_path, "a.obj", text))
     check(load(tmp_path, "b.obj", text.replace("\n", "\r\n")))
     check(load(tmp_path, "c.obj", text.rstrip("\n")))
+    check(load(tmp_path, "d.obj", text.replace("  v", "\tv")))
 
 
 def test_obj_counts_back_from_where_the_face_stands(tmp_path: Path) -> None:
@@ -195,7 +220,9 @@ def test_stl_has_three_vertices_a_triangle(tmp_path: Path) -> None:
         corners = "".join(f"vertex {x} {y} {z}\n" for x, y, z in (a, b, c))
         text += f"facet normal 0 0 0\nouter loop\n{corners}endloop\nendfacet\n"
         binary += struct.pack("<12fH", 0, 0, 0, *a, *b, *c, 0)
-    for shape in (load(tmp_path, "a.stl", text + "endsolid x\n"), load(tmp_path, "b.stl", binary)):
+    named = binary.replace(b"says the header", b"a facet, header")
+    for k, content in enumerate((text.encode() + b"endsolid x\n", binary, named)):
+        shape = load(tmp_path, f"{k}.stl", content)
         np.testing.assert_array_equal(shape.verts, triangles.reshape(-1, 3))
         np.testing.assert_array_equal(shape.faces, np.arange(9).reshape(3, 3))
 
@@ -442,8 +469,6 @@ def test_writing_to_where_it_cannot_go(tmp_path: Path, cube: Shape) -> None:
 
 # --- bad files
 
-XYZ = "".join(f"property float {axis}\n" for axis in "xyz")
-HUGE = "ply\nformat {} 1.0\nelement vertex {}\n" + XYZ + "end_header\n"
 FIVE = PLY_HEADER.format(format="ascii").encode() + b"0 0 0\n" * 5
 BINARY = PLY_HEADER.format(format="binary_little_endian").encode() + bytes(60)
 
@@ -483,6 +508,7 @@ BINARY = PLY_HEADER.format(format="binary_little_endian").encode() + bytes(60)
         ("a.off", b"OFF BINARY\n", "binary"),
         ("a.stl", b"x".ljust(80) + struct.pack("<I", 10**9) + bytes(50), "promises 1000000000 triangles"),
         ("a.stl", b"solid x\nfacet normal 0 0 0\nouter loop\nvertex 0 0 0\n", "middle of a triangle"),
+        ("a.stl", b"solid x\nfacet normal 0 0 0\nouter loop\n" + b"vertex 0 0 1\n" * 3, "middle of a triangle"),
         ("a.stl", b"x".ljust(84, b"\0"), "no vertices"),
         ("a.glb", b"glTF" + struct.pack("<III4s", 2, 10**9, 10**9, b"JSON"), "should be"),
         ("a.xyz", b"# nothing\n", "no points"),
@@ -540,8 +566,12 @@ def test_npy_of_something_else(tmp_path: Path, array: np.ndarray, words: str) ->
 def test_npy_header_that_claims_a_billion_points(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros((100, 3)))
     data = (tmp_path / "a.npy").read_bytes()
+    tracemalloc.start()
     with pytest.raises(InputError, match="not a whole npy file"):
         load(tmp_path, "b.npy", data.replace(b"(100, 3)", b"(999999999, 3)").replace(b"      \n", b"\n", 1))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5e6
     with pytest.raises(InputError, match="not a whole npy file"):
         load(tmp_path, "c.npy", data[:-1])
 
