@@ -106,7 +106,7 @@ def test_a_call_that_the_program_would_refuse_is_noticed() -> None:
         parse(call)
     with pytest.raises(TyperException, match="'w' is not one of"):
         parse(["match", "a.ply", "b.ply", "-o", "m.npy", "--up", "w"])
-    with pytest.raises(TyperException, match="Missing argument"):
+    with pytest.raises(TyperException, match="Missing parameter: name"):
         parse(["models", "show"])
     with pytest.raises(AssertionError, match="no verb mach"):
         parse(["mach", "a.ply"])
