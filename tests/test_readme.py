@@ -100,6 +100,11 @@ def test_every_call_on_a_page_is_one_that_the_program_accepts(page: Path) -> Non
         parse(words)
 
 
+def test_every_verb_is_shown_on_some_page() -> None:
+    shown = {words[0] for page in PAGES for words in calls(page.read_text(encoding="utf-8"))}
+    assert shown == set(get_command(app).commands)
+
+
 def test_a_call_that_the_program_would_refuse_is_noticed() -> None:
     (call,) = calls("```bash\nmeshmatch match a.ply b.ply \\\n  -o m.npy --colour red  # no\n```\n")
     with pytest.raises(TyperException, match="--colour"):
