@@ -9,8 +9,8 @@ import numpy as np
 from meshmatch.shapes.shape import Frame
 
 # Mean two-way residual (units of sqrt(area)) up to which a fit is called good, and fair.
-GOOD_RESIDUAL = 0.020
-FAIR_RESIDUAL = 0.027
+GOOD_RESIDUAL = 0.0285
+FAIR_RESIDUAL = 0.031
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import FAIR_RESIDUAL, GOOD_RESIDUAL, Fit, axis_name
 from meshmatch.fitting.latent import LatentRefineConfig, refine_code
-from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual
+from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual, variants
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
 from meshmatch.fitting.orientation import (
     Hypothesis,
@@ -44,8 +44,9 @@ class FitConfig:
     """How hard to look and how to refine.
 
     samples : points drawn on the surface, of which coarse_samples see every orientation; hypotheses : voted
-    orientations, each tried with its flips; finalists : of which this many are refined before the better one is
-    kept; copies : turned copies that vote on the orientation.
+    orientations, each tried with its flips; laid : of which this many are laid on with care; variants : readings
+    of the best from frames tilted by ``tilt`` degrees; finalists : readings that get ``screening`` node steps
+    before the best one gets them all; copies : turned copies that vote on the orientation.
     """
 
     refine: Refine = "nodes"
@@ -56,7 +57,11 @@ class FitConfig:
     coarse_samples: int = 2048
     copies: int = 48
     hypotheses: int = 2
-    finalists: int = 2
+    laid: int = 3
+    variants: int = 12
+    tilt: float = 15.0
+    finalists: int = 4
+    screening: int = 4
     nodes: NodeRefineConfig = field(default_factory=NodeRefineConfig)
     latent: LatentRefineConfig = field(default_factory=LatentRefineConfig)
 
@@ -109,8 +114,10 @@ def fit_shape(
         rough.append(_lay(model, system, coarse, guess, rng, rounds=1, draws=1, stride=1))
         tell("orientation", 0.7 * (number + 1) / len(guesses))
     rough.sort(key=lambda candidate: candidate.residual)
-    candidates = [_lay(model, system, scan, guess, rng) for guess in rough[: config.finalists + 1]]
+    candidates = [_lay(model, system, scan, guess, rng) for guess in rough[: config.laid]]
     candidates.sort(key=lambda candidate: candidate.residual)
+    if config.refine == "nodes":
+        candidates = _readings(model, system, scan, coarse, candidates, config, rng)
     tell("orientation", 1.0)
     best = _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell)
     core_frame = frame.compose(Frame(1.0, best.rotation.T, best.centre))
@@ -132,6 +139,18 @@ def fit_shape(
         seconds=time.monotonic() - began,
         seed=config.seed,
     )
+
+
+def _readings(model, system, scan, coarse, candidates, config, rng) -> list[Candidate]:
+    """The candidates and tilted readings of the best one, best first on the coarse scan."""
+    best = candidates[0]
+    here, near = (part.turned(best.rotation, best.centre) for part in (scan, coarse))
+    pool = variants(model.network, system, here, near, best, rng, config.variants, config.tilt)
+    for other in candidates:
+        there = coarse.turned(other.rotation, other.centre)
+        residual = two_way_residual(system, there, other.vectors, 1)
+        pool.append(Candidate(other.rotation, other.centre, other.vectors, residual))
+    return sorted(pool, key=lambda candidate: candidate.residual)
 
 
 def _lay(
@@ -173,25 +192,33 @@ def _hypotheses(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypo
 def _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell) -> Candidate:
     if config.refine == "none":
         return candidates[0]
-    refined = []
-    finalists = candidates[: config.finalists] if config.refine == "nodes" else candidates[:1]
-    for number, candidate in enumerate(finalists):
+    if config.refine == "latent":
+        best = candidates[0]
+        local = scan.turned(best.rotation, best.centre)
+        vectors = refine_code(
+            model.network, model.template, local, config.latent, rng, lambda k, n: tell("refinement", k / n)
+        )
+        return Candidate(best.rotation, best.centre, vectors, two_way_residual(system, local, vectors))
+
+    def fitted(candidate: Candidate, nodes: NodeRefineConfig, report=None) -> Candidate:
         local = scan.turned(candidate.rotation, candidate.centre)
+        fixed = None
+        if landmarks is not None:
+            fixed = (landmarks[0], (frame.apply(landmarks[1]) - candidate.centre) @ candidate.rotation)
+        vectors = refine_nodes(system, local, candidate.vectors, nodes, fixed, progress=report)
+        return Candidate(
+            candidate.rotation, candidate.centre, vectors, two_way_residual(system, local, vectors)
+        )
 
-        def report(done: int, total: int, number: int = number) -> None:
-            tell("refinement", (number + done / total) / len(finalists))
-
-        if config.refine == "latent":
-            vectors = refine_code(model.network, model.template, local, config.latent, rng, report)
-        else:
-            fixed = None
-            if landmarks is not None:
-                positions = (frame.apply(landmarks[1]) - candidate.centre) @ candidate.rotation
-                fixed = (landmarks[0], positions)
-            vectors = refine_nodes(system, local, candidate.vectors, config.nodes, fixed, progress=report)
-        residual = two_way_residual(system, local, vectors)
-        refined.append(Candidate(candidate.rotation, candidate.centre, vectors, residual))
-    return min(refined, key=lambda candidate: candidate.residual)
+    # A few steps tell which reading the surface agrees with; the prior of the full run stays the network's.
+    screen = replace(config.nodes, steps=config.screening)
+    finalists = candidates[: config.finalists]
+    scores = []
+    for number, candidate in enumerate(finalists):
+        scores.append(fitted(candidate, screen).residual)
+        tell("refinement", 0.6 * (number + 1) / len(finalists))
+    chosen = finalists[int(np.argmin(scores))]
+    return fitted(chosen, config.nodes, lambda k, n: tell("refinement", 0.6 + 0.4 * k / n))
 
 
 def _vertex_distance(verts: np.ndarray, points: np.ndarray) -> np.ndarray:

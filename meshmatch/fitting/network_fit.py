@@ -7,10 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.scan import Scan, with_normals
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.models.deformer import Deformer
+
+
+_VARIANT_POINTS = (700, 1400)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,3 +89,34 @@ def lay_on(
             R, t = rigid_motion(system.verts[core], system.moved(vectors)[core])
             rotation, centre = rotation @ R, rotation @ t + centre
     return Candidate(rotation, centre, vectors, two_way_residual(system, local, vectors, stride))
+
+
+@torch.inference_mode()
+def variants(
+    model: Deformer,
+    system: NodeSystem,
+    scan: Scan,
+    coarse: Scan,
+    candidate: Candidate,
+    rng: np.random.Generator,
+    count: int,
+    degrees: float,
+) -> list[Candidate]:
+    """Other readings of a hard pose: predictions from randomly tilted core frames, turned back.
+
+    Where a limb could be one or the other, tilts and thinner samples tip the network either way, and the residual on the
+    ``coarse`` scan (core frame, like ``scan``) tells which reading is right.
+    """
+    tilts = Rotation.from_rotvec(np.radians(degrees) * rng.standard_normal((count, 3))).as_matrix()
+    nodes = model.nodes.double().numpy()
+    back = []
+    for number, tilt in enumerate(tilts):
+        size = min(_VARIANT_POINTS[number % len(_VARIANT_POINTS)], len(scan.points))
+        cloud = scan.points[rng.choice(len(scan.points), size, replace=False)] @ tilt.T
+        vectors = model(torch.from_numpy(cloud).float()[None])[0].double().numpy()
+        # A node at q moves to Q^T (q + u'), so its vector in the untilted frame is that minus q.
+        back.append((nodes + vectors) @ tilt - nodes)
+    return [
+        Candidate(candidate.rotation, candidate.centre, u, two_way_residual(system, coarse, u, 1))
+        for u in back
+    ]
