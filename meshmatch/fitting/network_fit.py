@@ -13,7 +13,6 @@ from meshmatch.fitting.scan import Scan, with_normals
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.models.deformer import Deformer
 
-
 _VARIANT_POINTS = (700, 1400)
 
 
