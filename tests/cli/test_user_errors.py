@@ -143,6 +143,7 @@ def test_a_few_bad_vertices_are_no_error(
 def test_a_mistyped_file_is_guessed(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "dancer.ply").write_bytes(two[0].read_bytes())
     answer = run("match", tmp_path / "dancre.ply", two[1], "-o", tmp_path / "map.npy")
+    assert answer.status == 1
     assert f"did you mean {tmp_path / 'dancer.ply'}?" in answer.err
 
 
