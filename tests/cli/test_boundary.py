@@ -74,6 +74,15 @@ def test_ctrl_c_is_one_line_and_130(run: Run, monkeypatch: pytest.MonkeyPatch) -
     assert answer.err.splitlines() == ["interrupted: nothing was written"]
 
 
+def test_ctrl_c_before_the_verb_is_the_same(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def loading(arguments: object) -> int:
+        raise KeyboardInterrupt  # while Python still imports
+
+    monkeypatch.setattr("meshmatch.cli.boundary._run", loading)
+    answer = run("info", "a.ply")
+    assert (answer.status, answer.err) == (130, "interrupted: nothing was written\n")
+
+
 def test_a_bug_keeps_its_traceback(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     fail(ZeroDivisionError("a bug"), monkeypatch)
     with pytest.raises(ZeroDivisionError):

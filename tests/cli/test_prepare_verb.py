@@ -85,6 +85,18 @@ def test_parts_need_labels_and_use_them(
     assert "5 labels" in answer.err
 
 
+def test_labels_follow_their_vertices_through_repair(run: Run, sphere: Shape, tmp_path: Path) -> None:
+    verts = np.concatenate([[[0.0, 0.0, 0.5]], sphere.verts])  # a vertex that no face uses comes first
+    save_shape(tmp_path / "a.ply", Shape(verts, sphere.faces + 1))
+    np.save(tmp_path / "labels.npy", np.concatenate([[0], (sphere.verts[:, 2] > 0).astype(int)]))
+    words = ("--strategy", "parts", "--labels", tmp_path / "labels.npy")
+    made(run("prepare", tmp_path / "a.ply", "-o", tmp_path / "out", *words, *FEW, "--json"))
+    template = load_template(tmp_path / "out" / "template.safetensors")
+    height = template.shape.verts[:, 2]
+    clear = np.abs(height) > 1e-9  # not on the equator, where rounding decides
+    assert np.array_equal(template.labels[clear], height[clear] > 0)
+
+
 def test_a_folder_of_registered_shapes(run: Run, folder: Path, tmp_path: Path) -> None:
     record = made(run("prepare", folder, "-o", tmp_path / "out", *FEW, "--json"))
     assert record["registered"] == 3
