@@ -1,0 +1,104 @@
+"""The whole road with the model that ships: two shapes in, a map out."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import meshmatch
+from meshmatch.errors import InputError, ModelError, OptionError
+from meshmatch.pipeline import match, register
+from meshmatch.shapes.shape import Shape
+
+SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
+
+
+@pytest.fixture(scope="module")
+def dancer() -> Shape:
+    return meshmatch.load_shape(SAMPLES / "dancer.ply")
+
+
+@pytest.fixture(scope="module")
+def both(dancer: Shape):
+    return match(dancer, meshmatch.load_shape(SAMPLES / "climber.ply"))
+
+
+def turned(shape: Shape) -> Shape:
+    """z up, facing elsewhere, in inches, somewhere else; twisted so that no axis survives."""
+    a, b = 0.9, 2.4
+    Z = np.array([[np.cos(b), -np.sin(b), 0], [np.sin(b), np.cos(b), 0], [0, 0, 1]])
+    X = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    return Shape(shape.verts @ (Z @ X).T / 2.54 + [300, -20, 5], shape.faces, "turned")
+
+
+def test_the_samples_match_well(both) -> None:
+    assert both.map.verdict != "poor"
+    assert both.map.source_vertices == len(both.map.index)
+    assert len(np.unique(both.map.index)) > 0.4 * both.map.target_vertices
+    assert (both.source_fit.up, both.target_fit.up) == ("+y", "+z")
+
+
+def test_the_same_seed_gives_the_same_map(dancer: Shape, both) -> None:
+    again = match(dancer, meshmatch.load_shape(SAMPLES / "climber.ply"))
+    assert np.array_equal(again.map.index, both.map.index)
+    assert np.array_equal(again.map.barycentric, both.map.barycentric)
+    assert np.array_equal(again.map.confidence, both.map.confidence)
+
+
+def test_a_turned_and_scaled_copy_maps_to_itself(dancer: Shape) -> None:
+    found = match(dancer, turned(dancer)).map.index
+    apart = np.linalg.norm(dancer.verts[found] - dancer.verts, axis=1)  # centimetres
+    assert apart.mean() < 1.5
+    assert (apart > 15).mean() < 0.005
+
+
+def test_a_wrong_axis_is_obeyed_and_judged(dancer: Shape) -> None:
+    upside_down = register(dancer, up="-y")
+    right = register(dancer, up="y")
+    assert upside_down.up != "+y" or upside_down.residual > right.residual
+    assert right.up == "+y"
+    assert upside_down.residual > right.residual
+
+
+def test_landmarks_are_honoured(dancer: Shape, both) -> None:
+    climber = meshmatch.load_shape(SAMPLES / "climber.ply")
+    source = np.array([100, 900])
+    wanted = both.map.index[source]
+    found = match(dancer, climber, landmarks=(source, wanted)).map.index[source]
+    height = np.ptp(climber.verts, axis=0).max()
+    assert np.linalg.norm(climber.verts[found] - climber.verts[wanted], axis=1).max() < 0.02 * height
+
+
+@pytest.mark.parametrize(
+    ("choice", "error"),
+    [
+        ({"model": "humann"}, ModelError),
+        ({"refine": "lots"}, OptionError),
+        ({"up": "w"}, OptionError),
+        ({"up": "y", "front": "-y"}, OptionError),
+        ({"landmarks": (np.array([10**6]), np.array([0]))}, OptionError),
+        ({"landmarks": (np.array([0, 1]), np.array([0]))}, OptionError),
+    ],
+)
+def test_choices_that_do_not_exist(dancer: Shape, choice: dict, error: type) -> None:
+    with pytest.raises(error) as caught:
+        match(dancer, dancer, **choice)
+    assert caught.value.hint
+
+
+def test_shapes_that_cannot_be_fitted(cube: Shape, dancer: Shape) -> None:
+    with pytest.raises(InputError, match="12 usable triangles"):
+        match(cube, dancer)
+    apart = Shape(
+        np.concatenate([dancer.verts, dancer.verts + 1e4]),
+        np.concatenate([dancer.faces, dancer.faces + dancer.V]),
+        "two",
+    )
+    with pytest.raises(InputError, match="far apart"):
+        register(apart)
+
+
+def test_what_is_no_body_is_called_poor(torus: Shape) -> None:
+    fit = register(torus)
+    assert fit.verdict == "poor"
+    assert fit.reasons
