@@ -139,6 +139,14 @@ def test_strays(monkeypatch: pytest.MonkeyPatch, largest: int) -> None:
     assert not stray_points(points[:10]).any()
 
 
+def test_loose_point_of_a_dense_patch_is_no_stray() -> None:
+    """It is far for its neighbours, who are crowded, but not for the cloud."""
+    x, y = np.meshgrid(np.arange(30.0), np.arange(30.0))
+    grid = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    patch = grid[:100] * 0.02 + [100, 0, 0]
+    assert not stray_points(np.vstack([grid, patch, [[100.3, 0.5, 0]]])).any()
+
+
 def test_flips_against_the_slow_way() -> None:
     """On random graphs without contradictions the flips make every pair agree; parts are the graph's."""
     rng = np.random.default_rng(0)

@@ -83,6 +83,12 @@ def test_sliver_without_height_is_dropped_at_any_scale(cube: Shape, scale: float
     assert done.shape.F == 13  # the thin one that has some height stays
 
 
+def test_tiny_face_of_good_shape_is_kept(cube: Shape) -> None:
+    tiny = cube.verts[0] + [[1e-7, 0, 0], [0, -1e-7, 0]]
+    shape = Shape(np.vstack([cube.verts, tiny]), np.vstack([cube.faces, [[0, 8, 9]]]))
+    assert repair(shape).shape.F == 13
+
+
 def test_seams_are_merged_and_every_copy_answered(tmp_path: Path, torus: Shape) -> None:
     save_shape(tmp_path / "t.stl", torus)
     soup = load_shape(tmp_path / "t.stl")
@@ -193,10 +199,49 @@ def test_inner_wall_keeps_facing_inward(sphere: Shape) -> None:
     np.testing.assert_array_equal(repair(hollow).shape.faces, hollow.faces)
 
 
-def test_flat_sheet_is_never_inside_out() -> None:
-    verts = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
-    for faces in ([[0, 1, 2], [0, 2, 3]], [[2, 1, 0], [3, 2, 0]]):
-        np.testing.assert_array_equal(repair(Shape(verts, faces)).shape.faces, faces)
+def test_inner_wall_stays_when_the_outer_one_is_mended(sphere: Shape) -> None:
+    hollow = join(sphere, Shape(sphere.verts * 0.8, sphere.faces[:, ::-1]))
+    faces = hollow.faces.copy()
+    faces[5] = faces[5][::-1]
+    np.testing.assert_array_equal(repair(Shape(hollow.verts, faces)).shape.faces, hollow.faces)
+
+
+def test_part_that_is_mostly_turned_ends_outward_beside_a_bigger_one(sphere: Shape) -> None:
+    both = join(sphere, move(sphere, [2, 0, 0], 0.8))
+    faces = both.faces.copy()
+    faces[sphere.F + 50 :] = faces[sphere.F + 50 :][:, ::-1]
+    np.testing.assert_allclose(repair(Shape(both.verts, faces)).shape.face_normals, both.face_normals)
+
+
+def sheet(n: int = 12, bump: float = 0.0) -> Shape:
+    x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n))
+    z = bump * np.random.default_rng(0).normal(size=x.shape)
+    a = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (q.ravel() for q in (a[:-1, :-1], a[:-1, 1:], a[1:, 1:], a[1:, :-1]))
+    faces = np.vstack([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return Shape(np.stack([x, y, z], axis=-1).reshape(-1, 3), faces)
+
+
+@pytest.mark.parametrize("bump", [0.0, 1e-3])
+def test_sheet_is_never_inside_out(bump: float) -> None:
+    flat = sheet(bump=bump)
+    for faces in (flat.faces, flat.faces[:, ::-1]):
+        np.testing.assert_array_equal(repair(Shape(flat.verts, faces)).shape.faces, faces)
+
+
+@pytest.mark.parametrize("wrong", [[0], [7], [0, 1, 2]])
+def test_few_faces_of_a_sheet_are_turned_not_the_many(wrong: list[int]) -> None:
+    faces = sheet().faces.copy()
+    faces[wrong] = faces[wrong][:, ::-1]
+    done = repair(Shape(sheet().verts, faces))
+    np.testing.assert_allclose(done.shape.face_normals, sheet().face_normals)
+
+
+@pytest.mark.parametrize("shift", [-100.0, 0.0, 100.0])
+def test_open_cup_keeps_its_sides_wherever_it_stands(sphere: Shape, shift: float) -> None:
+    cup = sphere.faces[sphere.verts[sphere.faces].mean(axis=1)[:, 2] > 0]
+    done = repair(Shape(sphere.verts + np.array([0, 0, shift]), cup))
+    np.testing.assert_allclose(done.shape.face_normals, Shape(sphere.verts, cup).face_normals, atol=1e-9)
 
 
 def test_moebius_band_is_survived() -> None:
@@ -238,6 +283,13 @@ def test_invalid_vertices_are_dropped_and_answered_by_a_neighbour(sphere: Shape)
     assert (
         done.kept_vertex[done.original_to_repaired[sphere.V]] == sphere.V - 1
     )  # nearest in the file's order
+
+
+def test_invalid_vertex_without_a_face_is_answered_in_file_order(cube: Shape) -> None:
+    verts = np.insert(cube.verts, [3, 3, 3], 0.0, axis=0)  # numbers 3, 4 and 5
+    invalid = np.isin(np.arange(11), [3, 4, 5])
+    done = repair(Shape(verts, cube.faces + 3 * (cube.faces >= 3), invalid=invalid))
+    np.testing.assert_array_equal(done.kept_vertex[done.original_to_repaired[[3, 5]]], [2, 6])
 
 
 def test_nothing_left_is_an_input_error() -> None:
