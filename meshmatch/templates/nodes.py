@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 import robust_laplacian
-from scipy.cluster.vq import kmeans2
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import eigsh
@@ -32,7 +31,13 @@ _GEODESIC_SHARE = 0.2
 class NodeConfig:
     """How nodes are chosen. Lengths in units of sqrt(surface area).
 
-    radius 0.13 is the paper's 0.2 in the unit sphere for a standing body.
+    radius 0.13 is the paper's 0.2 in the unit sphere for a standing body. Candidates lie up to ``depth`` below the
+    surface; ``spectral`` begins with so many ``clusters``.
+
+    Raises
+    ------
+    OptionError
+        Unknown strategy, fewer than 4 nodes, or a length or count that is not positive.
     """
 
     strategy: Strategy = "parts"
@@ -41,6 +46,18 @@ class NodeConfig:
     depth: float = 0.03
     clusters: int = 24
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.strategy not in STRATEGIES:
+            raise OptionError(f"no node strategy {self.strategy!r}", f"choose one of {', '.join(STRATEGIES)}")
+        if self.K < 4:
+            raise OptionError(f"{self.K} nodes are too few", "moving least squares needs at least 4")
+        if not 0 < self.radius < np.inf:
+            raise OptionError(f"a node radius must be positive, not {self.radius:g}", "0.13 suits a body")
+        if not 0 <= self.depth < np.inf:
+            raise OptionError(f"a depth of candidates must be 0 or more, not {self.depth:g}")
+        if self.clusters < 1:
+            raise OptionError(f"at least one cluster is needed, not {self.clusters}")
 
 
 def choose_nodes(shape: Shape, config: NodeConfig, labels: np.ndarray | None = None) -> np.ndarray:
@@ -61,22 +78,51 @@ def choose_nodes(shape: Shape, config: NodeConfig, labels: np.ndarray | None = N
     Raises
     ------
     OptionError
-        Unknown strategy, or ``parts`` without labels.
+        Strategy ``parts`` without labels.
     TemplateError
         If some vertices cannot be supported; the message names them.
     """
-    if config.strategy not in STRATEGIES:
-        raise OptionError(f"no node strategy {config.strategy!r}", f"choose one of {', '.join(STRATEGIES)}")
+    if config.strategy == "parts" and labels is None and not shape.is_cloud:
+        raise OptionError("node strategy 'parts' needs part labels", "use --strategy spectral or geodesic")
     rng = np.random.default_rng(config.seed)
     samples = sample_surface(shape, 30 * config.K, rng)
     inwards = samples.normals * rng.uniform(0, config.depth, (len(samples.points), 1))
     candidates = samples.points - inwards
-    own = shape.faces[samples.face, samples.barycentric.argmax(1)] if shape.F else None
-    allowed = _allowed(shape, config, labels, candidates, own, rng)
-    candidates = candidates[allowed] if allowed.any() else candidates
-    chosen = farthest_points(candidates, min(config.K, len(candidates)))
-    nodes = candidates[chosen]
+    if config.strategy == "uniform" or shape.is_cloud:
+        return _spread(shape, config, candidates)
+    own = shape.faces[samples.face, samples.barycentric.argmax(1)]
+    touched = cKDTree(shape.verts).query_ball_point(candidates, config.radius)
+    if config.strategy == "spectral":
+        return _spectral_nodes(shape, config, candidates, own, touched)
+    if config.strategy == "geodesic":
+        allowed = _geodesic_allowed(shape, touched, own)
+    else:
+        assert labels is not None
+        allowed = _parts_allowed(shape, labels, touched, own)
+    return _spread(shape, config, candidates[allowed] if allowed.any() else candidates)
+
+
+def _spread(shape: Shape, config: NodeConfig, candidates: np.ndarray) -> np.ndarray:
+    """Farthest points of the candidates, and what some vertices then still lack."""
+    nodes = candidates[farthest_points(candidates, min(config.K, len(candidates)))]
     return _complete(shape, config, nodes, candidates)
+
+
+def _spectral_nodes(shape: Shape, config: NodeConfig, candidates: np.ndarray, own, touched) -> np.ndarray:
+    """Nodes that respect spectral clusters.
+
+    Clusters narrower than the radius (fingers, ears) leave no candidate near them: then a coarser clustering is tried.
+    """
+    clusters = config.clusters
+    while True:
+        parts = spectral_clusters(shape, clusters, np.random.default_rng(config.seed))
+        allowed = _parts_allowed(shape, parts, touched, own)
+        try:
+            return _spread(shape, config, candidates[allowed] if allowed.any() else candidates)
+        except TemplateError:
+            if clusters <= 2:
+                raise
+        clusters = clusters * 4 // 5
 
 
 def _complete(shape: Shape, config: NodeConfig, nodes: np.ndarray, candidates: np.ndarray) -> np.ndarray:
@@ -101,21 +147,8 @@ def _complete(shape: Shape, config: NodeConfig, nodes: np.ndarray, candidates: n
     )
 
 
-def _allowed(shape, config, labels, candidates, own, rng) -> np.ndarray:
-    """Mask of the candidates that the rejection rule keeps."""
-    if config.strategy == "uniform" or shape.is_cloud:
-        return np.ones(len(candidates), bool)
-    touched = cKDTree(shape.verts).query_ball_point(candidates, config.radius)
-    if config.strategy == "geodesic":
-        return _geodesic_allowed(shape, touched, own)
-    if config.strategy == "parts":
-        if labels is None:
-            raise OptionError(
-                "node strategy 'parts' needs part labels", "use --strategy spectral or geodesic"
-            )
-        parts = labels
-    else:
-        parts = spectral_clusters(shape, config.clusters, rng)
+def _parts_allowed(shape: Shape, parts: np.ndarray, touched: list, own: np.ndarray) -> np.ndarray:
+    """Drop candidates that touch a part which does not border on their own."""
     neighbours = _part_neighbours(shape, parts)
     home = parts[own]
     return np.array([neighbours[home[i], np.unique(parts[hits])].all() for i, hits in enumerate(touched)])
@@ -154,13 +187,25 @@ def _geodesic_allowed(shape: Shape, touched: list, own: np.ndarray) -> np.ndarra
 def spectral_clusters(
     shape: Shape, clusters: int, rng: np.random.Generator, functions: int = 12
 ) -> np.ndarray:
-    """k-means on the global point signature (Rustamov 2007): labels (V,) from Laplace-Beltrami eigenvectors."""
+    """k-means on the global point signature (Rustamov 2007) of Laplace-Beltrami eigenvectors.
+
+    Returns
+    -------
+    int64 array (V,)
+        Labels from 0, at most ``clusters`` of them, none without a vertex.
+    """
     stiffness, mass = robust_laplacian.mesh_laplacian(shape.verts, shape.faces)
     count = min(functions + 1, shape.V - 2)
-    values, vectors = eigsh(stiffness, count, mass, sigma=-1e-8, v0=np.ones(shape.V))
+    # Not a constant start: that is an eigenvector already, and the search would go on from a random one.
+    values, vectors = eigsh(stiffness, count, mass, sigma=-1e-8, v0=rng.standard_normal(shape.V))
     signature = vectors[:, 1:] / np.sqrt(np.maximum(values[1:], 1e-9))
-    start = signature[farthest_points_any(signature, clusters)]
-    return kmeans2(signature, start, minit="matrix", missing="warn")[1].astype(np.int64)
+    centres = signature[farthest_points_any(signature, clusters)]
+    for _ in range(20):
+        label = cKDTree(centres).query(signature)[1]
+        for axis in range(signature.shape[1]):
+            total = np.bincount(label, signature[:, axis], len(centres))
+            centres[:, axis] = total / np.maximum(np.bincount(label, minlength=len(centres)), 1)
+    return np.unique(cKDTree(centres).query(signature)[1], return_inverse=True)[1].astype(np.int64)
 
 
 def farthest_points_any(points: np.ndarray, K: int) -> np.ndarray:

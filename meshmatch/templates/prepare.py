@@ -12,12 +12,12 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 from scipy.spatial import cKDTree
 
-from meshmatch.errors import InputError, MeshmatchError, TemplateError
+from meshmatch.errors import InputError, MeshmatchError, OutputError, TemplateError
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
 from meshmatch.shapes.normalise import sqrt_area_frame
-from meshmatch.shapes.repair import repair
+from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.nodes import NodeConfig, choose_nodes
 from meshmatch.templates.template import Template, save_template
@@ -29,7 +29,7 @@ LOW_FACES = 10_000
 class Prepared:
     """A folder made ready: the template, and the shapes that share its connectivity (or none).
 
-    shapes : float32 array (N, V, 3), template vertices on every shape, its own frame and unit;
+    shapes : float32 array (N, V, 3), template vertices on every shape, its own axes and unit, centred;
     empty if the folder's meshes are not registered. names : their files. notes : what was found and done.
     """
 
@@ -94,10 +94,12 @@ def make_template(
     frame = sqrt_area_frame(small)
     small = Shape(frame.apply(small.verts), faces, name)
     parts = np.zeros(shape.V, np.int64) if labels is None else np.asarray(labels, np.int64)
-    if parts.shape != (shape.V,) or parts.min() < 0:
+    if parts.shape != (shape.V,):
         raise TemplateError(
             f"{len(parts)} labels for {shape.V} vertices of {shape.name}", "one label a vertex, from 0"
         )
+    if parts.min() < 0:
+        raise TemplateError(f"{shape.name} has a label below 0: {parts.min()}", "count parts from 0")
     names = tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1))
     in_core = np.ones(shape.V, bool) if core is None else np.isin(np.arange(shape.V), core)
     return Template(
@@ -127,66 +129,96 @@ def prepare_folder(
     """Check, normalise and decimate every shape of a folder and lay a template for them.
 
     Writes ``template.safetensors``, ``shapes.safetensors`` (registered shapes), ``normalised/NAME.ply`` and, last,
-    ``prepared.json``. Shapes are registered if all have the template file's vertex count and triangles.
+    ``prepared.json``. The template is made from the template file, else from the first mesh, after repair. Shapes
+    are registered if all have that file's vertex count and triangles.
 
     Raises
     ------
     InputError
         No usable shape in the folder; files that cannot be read are named in the notes instead.
+    OutputError
+        The output folder cannot be written.
     """
     folder, output = Path(folder), Path(output)
     files = sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES)
     if not files:
         raise InputError(f"no shapes in {folder}", f"files that end in {', '.join(SUFFIXES)} are read")
-    shapes: list[Shape] = []
+    _make_folder(output / "normalised")
+    found: list[Repaired] = []
     notes: list[str] = []
-    (output / "normalised").mkdir(parents=True, exist_ok=True)
+    stems = [path.stem for path in files]
     for number, path in enumerate(files):
         try:
-            shape = load_shape(path)
-            clean = repair(shape)
+            clean = repair(load_shape(path))
+            normal = _normalised(clean.shape, faces)
         except MeshmatchError as error:
             notes.append(f"{path.name} left out: {error.message}")
-            continue
-        notes += [f"{path.name}: {note}" for note in clean.notes]
-        shapes.append(shape)
-        fixed = clean.shape
-        small = fixed if fixed.is_cloud or fixed.F <= faces else decimate(fixed, faces)
-        frame = sqrt_area_frame(small)
-        save_shape(
-            output / "normalised" / f"{path.stem}.ply",
-            Shape(frame.apply(small.verts), small.faces, path.stem),
-        )
+        else:
+            notes += [f"{path.name}: {note}" for note in clean.notes]
+            found.append(clean)
+            name = path.stem if stems.count(path.stem) == 1 else path.name
+            save_shape(output / "normalised" / f"{name}.ply", normal)
         if progress is not None:
             progress(number + 1, len(files))
-    if not shapes:
+    if not found:
         raise InputError(f"no shape in {folder} could be used", notes[0])
-    first = load_shape(template) if template is not None else shapes[0]
-    made = make_template(
-        first, folder.name, config, source=f"{first.name} of {folder.name}", low=low_resolution(first, faces)
-    )
-    same = [s for s in shapes if s.V == first.V and np.array_equal(s.faces, first.faces)]
-    keep = low_resolution(first, faces)[0]
-    registered = len(same) == len(shapes) and len(shapes) > 1
-    stack = (
-        np.stack([s.verts[keep] for s in same]).astype(np.float32)
-        if registered
-        else np.zeros((0, len(keep), 3), np.float32)
-    )
+    if template is not None:
+        first = repair(load_shape(template))
+    else:
+        first = next((clean for clean in found if not clean.shape.is_cloud), found[0])
+    low = low_resolution(first.shape, faces)
+    name = folder.resolve().name
+    made = make_template(first.shape, name, config, source=f"{first.original.name} of {folder.name}", low=low)
+    stack = _registered(first, found, first.kept_vertex[low[0]], notes)
     save_template(made, output / "template.safetensors")
     with replace_on_success(output / "shapes.safetensors") as temporary:
         save_file({"verts": stack}, temporary)
-    names = tuple(s.name for s in shapes)
+    names = tuple(clean.original.name for clean in found)
     words = {
         "names": names,
-        "registered": registered,
+        "registered": len(stack) > 0,
         "notes": notes,
         "template": made.hash,
         "config": asdict(config),
     }
     with replace_on_success(output / "prepared.json") as temporary:
-        Path(temporary).write_text(json.dumps(words, indent=1))
+        Path(temporary).write_text(json.dumps(words, indent=1), encoding="utf-8")
     return Prepared(made, stack, names, tuple(notes))
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the folder {folder}: {error.strerror}", "choose another folder"
+        ) from error
+
+
+def _normalised(shape: Shape, faces: int) -> Shape:
+    """A shape of at most so many faces with area 1, centred."""
+    small = shape if shape.is_cloud or shape.F <= faces else decimate(shape, faces)
+    return Shape(sqrt_area_frame(small).apply(small.verts), small.faces, small.name)
+
+
+def _registered(first: Repaired, found: list[Repaired], vertices: np.ndarray, notes: list[str]) -> np.ndarray:
+    """Vertices (N, V, 3) of the shapes that share the first one's connectivity; N = 0 unless all of them do."""
+    like = first.original
+    same = all(
+        clean.original.V == like.V and np.array_equal(clean.original.faces, like.faces) for clean in found
+    )
+    whole = []
+    for clean in found if same and not like.is_cloud else ():
+        invalid = clean.original.invalid
+        if invalid is None or not invalid[vertices].any():
+            whole.append(clean.original.verts[vertices])
+        else:
+            notes.append(f"{clean.original.name}: not among the registered shapes, vertices lack a position")
+    if len(whole) < 2:
+        return np.zeros((0, len(vertices), 3), np.float32)
+    chosen = np.stack(whole)
+    # Centred before the numbers become short: a scan in a surveyor's coordinates would lose its digits.
+    return (chosen - chosen.mean(1, keepdims=True)).astype(np.float32)
 
 
 def read_registered(folder: str | Path, template: Template) -> np.ndarray:

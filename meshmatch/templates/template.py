@@ -12,7 +12,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from meshmatch.errors import TemplateError
+from meshmatch.errors import InputError, TemplateError
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.shape import Shape
 
@@ -126,7 +126,7 @@ def load_template(path: str | Path) -> Template:
     try:
         with safe_open(str(path), framework="np") as file:
             words = json.loads((file.metadata() or {})["template"])
-            if set(file.keys()) != set(_ARRAYS):
+            if set(file.keys()) != set(_ARRAYS) or not isinstance(words, dict):
                 raise KeyError("arrays")
             arrays = {name: file.get_tensor(name) for name in _ARRAYS}
     except (SafetensorError, KeyError, ValueError, OSError) as error:
@@ -137,12 +137,23 @@ def load_template(path: str | Path) -> Template:
         raise TemplateError(
             f"{path.name} has template schema {words.get('schema')}, not {SCHEMA}", "update meshmatch"
         )
-    template = Template(
-        name=words["name"],
-        shape=Shape(arrays["verts"].astype(np.float64), arrays["faces"].astype(np.int64), words["name"]),
-        dense=Shape(
-            arrays["dense_verts"].astype(np.float64), arrays["dense_faces"].astype(np.int64), words["name"]
-        ),
+    try:
+        template = _template(words, arrays)
+    except (KeyError, TypeError, ValueError, IndexError, InputError) as error:
+        raise TemplateError(f"{path.name} is not a template bundle: {error}", "make it again") from error
+    if template.hash != words.get("hash"):
+        raise TemplateError(
+            f"{path.name} is damaged: its content does not match its hash", "make or fetch it again"
+        )
+    return template
+
+
+def _template(words: dict, arrays: dict[str, np.ndarray]) -> Template:
+    name = str(words["name"])
+    return Template(
+        name=name,
+        shape=Shape(arrays["verts"].astype(np.float64), arrays["faces"].astype(np.int64), name),
+        dense=Shape(arrays["dense_verts"].astype(np.float64), arrays["dense_faces"].astype(np.int64), name),
         nodes=arrays["nodes"].astype(np.float64),
         radius=float(words["radius"]),
         labels=arrays["labels"].astype(np.int64),
@@ -152,8 +163,3 @@ def load_template(path: str | Path) -> Template:
         source=words["source"],
         licence=words["licence"],
     )
-    if template.hash != words["hash"]:
-        raise TemplateError(
-            f"{path.name} is damaged: its content does not match its hash", "make or fetch it again"
-        )
-    return template

@@ -1,0 +1,219 @@
+"""Control nodes: whatever the strategy, every vertex has four non-coplanar ones in reach, or an error names it."""
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import OptionError, TemplateError
+from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
+from meshmatch.templates.nodes import (
+    STRATEGIES,
+    NodeConfig,
+    Strategy,
+    choose_nodes,
+    edge_graph,
+    farthest_points_any,
+    spectral_clusters,
+)
+from meshmatch.templates.support import poorly_supported, support_pairs
+from meshmatch.templates.template import Template, load_template
+
+
+def unit_area(shape: Shape) -> Shape:
+    return Shape(sqrt_area_frame(shape).apply(shape.verts), shape.faces, shape.name)
+
+
+@pytest.fixture(scope="module")
+def ring(torus: Shape) -> Shape:
+    return unit_area(torus)
+
+
+@pytest.fixture(scope="module")
+def human() -> Template:
+    return load_template(bundled_folder() / "human" / "human-T.safetensors")
+
+
+def badly_held(verts: np.ndarray, nodes: np.ndarray, radius: float) -> list[int]:
+    """The slow way: vertices whose nodes in reach do not span space."""
+    bad = []
+    for number, vertex in enumerate(verts):
+        near = nodes[np.linalg.norm(nodes - vertex, axis=1) <= radius]
+        if len(near) < 4 or np.linalg.matrix_rank(near - near[0], tol=1e-4) < 3:
+            bad.append(number)
+    return bad
+
+
+def test_pairs_are_those_within_the_radius_by_hand() -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
+    nodes = np.array([[0.5, 0, 0], [0, 1, 0]])
+    row, column = support_pairs(points, nodes, np.array([0.5, 1.2]))
+    assert row.tolist() == [0, 0, 1]
+    assert column.tolist() == [0, 1, 0]
+    assert support_pairs(points + 100, nodes, np.array([0.5, 1.2]))[0].shape == (0,)
+
+
+def test_support_by_hand() -> None:
+    corners = np.concatenate([np.zeros((1, 3)), np.eye(3)]) * 0.5
+    inside, outside = np.full(3, 0.1), np.full(3, 9.0)
+    assert poorly_supported(np.stack([inside, outside]), corners, 1.0).tolist() == [1]
+    flat = corners * [1, 1, 0] + [[0, 0, 0], [0, 0, 0], [0, 0, 0], [0.3, 0.3, 0]]
+    assert poorly_supported(inside[None], flat, 1.0).tolist() == [0]  # four, but coplanar
+    assert poorly_supported(inside[None], corners[:3], 1.0).tolist() == [0]  # three
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_every_vertex_of_a_ring_is_held(strategy: Strategy, ring: Shape) -> None:
+    angle = np.arctan2(ring.verts[:, 1], ring.verts[:, 0])
+    labels = ((angle + np.pi) / (2 * np.pi) * 8).astype(int) % 8
+    config = NodeConfig(strategy=strategy, K=120, radius=0.2, clusters=8)
+    nodes = choose_nodes(ring, config, labels)
+    assert len(nodes) >= 120
+    assert badly_held(ring.verts, nodes, 0.2) == []
+    assert np.array_equal(nodes, choose_nodes(ring, config, labels))
+    other = NodeConfig(strategy=strategy, K=120, radius=0.2, clusters=8, seed=1)
+    assert not np.array_equal(nodes[:120], choose_nodes(ring, other, labels)[:120])
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_every_vertex_of_the_human_template_is_held(strategy: Strategy, human: Template) -> None:
+    nodes = choose_nodes(human.shape, NodeConfig(strategy=strategy), human.labels)
+    assert len(nodes) >= 320
+    assert badly_held(human.shape.verts, nodes, 0.13) == []
+    if strategy == "parts":  # the recipe of the template that ships
+        assert np.allclose(nodes, human.nodes, atol=1e-9)
+
+
+def test_nodes_lie_in_the_volume_near_the_surface(ring: Shape) -> None:
+    nodes = choose_nodes(ring, NodeConfig(strategy="uniform", K=100, radius=0.2, depth=0.02))
+    scale = np.sqrt((2 * np.pi) ** 2 * 1.0 * 0.4)  # of a torus of area 4 pi^2 R r
+    around = np.hypot(nodes[:, 0], nodes[:, 1]) * scale - 1
+    tube = np.hypot(around, nodes[:, 2] * scale)
+    assert tube.max() < 0.401  # never outside
+    assert tube.min() > 0.4 - 0.02 * scale - 0.01
+
+
+def two_plates(gap: float) -> Shape:
+    """A folded strip: two plates, close in space, joined along one far edge. Area about 1."""
+    n, m = 30, 12
+    s = np.linspace(0, 2, n)  # along the strip; the fold is at 1
+    x = np.where(s < 1, s, 2 - s) * 0.9
+    z = np.clip((s - 0.95) / 0.1, 0, 1) * gap
+    verts = np.stack([np.repeat(x, m), np.tile(np.linspace(0, 0.55, m), n), np.repeat(z, m)], 1)
+    a = np.arange(n * m).reshape(n, m)
+    corners = (a[:-1, :-1], a[1:, :-1], a[1:, 1:], a[:-1, 1:])
+    p, q, r, t = (c.reshape(-1) for c in corners)
+    return Shape(verts, np.concatenate([np.stack([p, r, q], 1), np.stack([p, t, r], 1)]), "fold")
+
+
+def test_geodesic_rejection_keeps_a_node_off_the_other_plate() -> None:
+    fold = two_plates(0.2)
+    far = fold.verts[:, 0] < 0.4
+    below, above = far & (fold.verts[:, 2] < 0.01), far & (fold.verts[:, 2] > 0.19)
+
+    def touching_both(strategy: Strategy) -> int:
+        """Nodes that reach both plates far from the fold."""
+        nodes = choose_nodes(fold, NodeConfig(strategy=strategy, K=60, radius=0.18, depth=0.08))
+        assert badly_held(fold.verts, nodes, 0.18) == []
+        reach = np.linalg.norm(fold.verts - nodes[:, None], axis=2) <= 0.18
+        return int((reach[:, below].any(1) & reach[:, above].any(1)).sum())
+
+    assert touching_both("uniform") > 10
+    assert touching_both("geodesic") == 0
+
+
+def test_a_rejection_that_leaves_nothing_names_the_vertices() -> None:
+    with pytest.raises(TemplateError, match="vertices"):
+        choose_nodes(two_plates(0.1), NodeConfig(strategy="geodesic", K=60, radius=0.2, depth=0.0))
+
+
+def test_parts_keep_a_node_off_a_part_that_does_not_border(ring: Shape) -> None:
+    """Eight sectors of the ring; a node reaches its own and their neighbours alone."""
+    angle = np.arctan2(ring.verts[:, 1], ring.verts[:, 0])
+    labels = ((angle + np.pi) / (2 * np.pi) * 12).astype(int) % 12
+
+    def furthest(strategy: Strategy) -> int:
+        nodes = choose_nodes(ring, NodeConfig(strategy=strategy, K=120, radius=0.2, depth=0.01), labels)
+        reach = np.linalg.norm(ring.verts - nodes[:, None], axis=2) <= 0.2
+        touched = [np.unique(labels[row]) for row in reach]
+        return max(len(parts) for parts in touched)
+
+    assert furthest("uniform") > 3
+    assert furthest("parts") == 3
+
+
+def test_an_edge_graph_by_hand() -> None:
+    triangle = Shape(np.array([[0.0, 0, 0], [3, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]]))
+    assert np.allclose(edge_graph(triangle).toarray(), [[0, 3, 4], [3, 0, 5], [4, 5, 0]])
+
+
+def test_spectral_clusters_tell_two_parts_apart(sphere: Shape) -> None:
+    two = Shape(
+        np.concatenate([sphere.verts, sphere.verts + 5]),
+        np.concatenate([sphere.faces, sphere.faces + sphere.V]),
+    )
+    labels = spectral_clusters(two, 2, np.random.default_rng(0))
+    assert set(labels[: sphere.V]) != set(labels[sphere.V :])
+    assert len(set(labels)) == 2
+
+
+def test_spectral_clusters_are_all_used_and_connected_pieces(ring: Shape) -> None:
+    labels = spectral_clusters(ring, 9, np.random.default_rng(0))
+    assert labels.shape == (ring.V,)
+    assert set(labels) == set(range(9))
+    # around a ring the first functions are waves of the angle: a cluster spans a sector
+    angle = np.exp(1j * np.arctan2(ring.verts[:, 1], ring.verts[:, 0]))
+    spread = [1 - abs(angle[labels == part].mean()) for part in range(9)]
+    assert max(spread) < 0.3
+
+
+def test_farthest_points_in_any_dimension_by_hand() -> None:
+    points = np.array([[0.0] * 5, [1.0] * 5, [10.0] * 5, [4.0] * 5])
+    assert farthest_points_any(points, 3).tolist() == [0, 2, 3]
+    assert farthest_points_any(points, 9).tolist()[:4] == [0, 2, 3, 1]
+
+
+def test_vertices_out_of_reach_are_named(ring: Shape) -> None:
+    with pytest.raises(
+        TemplateError, match=r"\d+ vertices have fewer than four .* \(vertices \d+, "
+    ) as caught:
+        choose_nodes(ring, NodeConfig(strategy="uniform", K=20, radius=0.02))
+    assert "radius" in caught.value.hint
+    named = [int(word) for word in caught.value.message.split("(vertices ")[1].split(", ")[:5]]
+    assert all(0 <= vertex < ring.V for vertex in named)
+
+
+def test_missing_vertices_are_completed(ring: Shape) -> None:
+    """Far fewer nodes than are needed: more are added where vertices lack them, and only then."""
+    nodes = choose_nodes(ring, NodeConfig(strategy="uniform", K=40, radius=0.2))
+    assert 40 < len(nodes) < 200
+    assert badly_held(ring.verts, nodes, 0.2) == []
+    assert len(choose_nodes(ring, NodeConfig(strategy="uniform", K=200, radius=0.3))) == 200
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"strategy": "psychic"}, "no node strategy 'psychic'"),
+        ({"K": 3}, "3 nodes are too few"),
+        ({"radius": 0.0}, "must be positive, not 0"),
+        ({"radius": -1.0}, "must be positive"),
+        ({"radius": float("nan")}, "must be positive"),
+        ({"radius": float("inf")}, "must be positive"),
+        ({"depth": -0.1}, "0 or more"),
+        ({"clusters": 0}, "at least one cluster"),
+    ],
+)
+def test_impossible_choices_are_refused(values: dict, told: str) -> None:
+    with pytest.raises(OptionError, match=told):
+        NodeConfig(**values)
+
+
+def test_parts_without_labels_are_refused(ring: Shape) -> None:
+    with pytest.raises(OptionError, match="needs part labels") as caught:
+        choose_nodes(ring, NodeConfig(strategy="parts", K=100, radius=0.2))
+    assert "spectral" in caught.value.hint
+
+
+def test_the_bundled_folder_is_there() -> None:
+    assert (bundled_folder() / "samples").is_dir()

@@ -1,0 +1,173 @@
+"""A folder made ready: what is registered, what is left out and why, and what lies on the disk afterwards."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from meshmatch.errors import InputError, OutputError
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.prepare import prepare_folder, read_registered
+from meshmatch.templates.template import load_template
+
+FEW = NodeConfig(strategy="uniform", K=60, radius=0.3)
+FAR = np.array([1e6, -3e5, 2e4])  # a surveyor's coordinates
+
+
+def egg(sphere: Shape, n: int) -> np.ndarray:
+    return sphere.verts * [1, 1 + 0.2 * n, 1]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, sphere: Shape) -> Path:
+    """Three registered shapes far from the origin."""
+    shapes = tmp_path / "eggs"
+    shapes.mkdir()
+    for n in range(3):
+        save_shape(shapes / f"egg{n}.obj", Shape(egg(sphere, n) + FAR, sphere.faces))
+    return shapes
+
+
+def test_registered_shapes_keep_their_correspondence(folder: Path, sphere: Shape, tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    made = prepare_folder(folder, tmp_path / "out", FEW, faces=600, progress=lambda *now: seen.append(now))
+    template = load_template(tmp_path / "out" / "template.safetensors")
+    assert template.hash == made.template.hash
+    assert template.name == "eggs"
+    assert template.shape.F <= 612
+    stack = read_registered(tmp_path / "out", template)
+    assert np.array_equal(stack, made.shapes)
+    assert (stack.shape, stack.dtype) == ((3, template.shape.V, 3), np.float32)
+    # each row is the same vertex on every shape; which one, the template's own positions tell
+    rest = template.shape.verts / template.shape.verts.std() * sphere.verts.std()
+    vertex = np.linalg.norm(rest[:, None] - sphere.verts, axis=2).argmin(1)
+    for n in range(3):
+        wanted = egg(sphere, n)[vertex]
+        assert np.allclose(stack[n], wanted - wanted.mean(0), atol=2e-5)  # not lost at a million metres
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert made.names == ("egg0.obj", "egg1.obj", "egg2.obj")
+    words = json.loads((tmp_path / "out" / "prepared.json").read_text())
+    assert words["registered"] is True
+    assert words["template"] == template.hash
+    assert words["config"]["K"] == 60
+
+
+def test_normalised_shapes_have_area_one_and_few_faces(folder: Path, tmp_path: Path) -> None:
+    prepare_folder(folder, tmp_path / "out", FEW, faces=600)
+    files = sorted((tmp_path / "out" / "normalised").iterdir())
+    assert [file.name for file in files] == ["egg0.ply", "egg1.ply", "egg2.ply"]
+    for file in files:
+        shape = load_shape(file)
+        assert shape.area == pytest.approx(1, rel=1e-5)
+        assert shape.F <= 612
+        assert np.abs((shape.face_areas[:, None] * shape.verts[shape.faces].mean(1)).sum(0)).max() < 1e-5
+
+
+def test_files_of_one_stem_do_not_overwrite_each_other(folder: Path, torus: Shape, tmp_path: Path) -> None:
+    save_shape(folder / "egg0.ply", torus)
+    prepare_folder(folder, tmp_path / "out", FEW)
+    files = sorted(file.name for file in (tmp_path / "out" / "normalised").iterdir())
+    assert files == ["egg0.obj.ply", "egg0.ply.ply", "egg1.ply", "egg2.ply"]
+
+
+def test_shapes_of_another_connectivity_are_not_registered(
+    folder: Path, sphere: Shape, tmp_path: Path
+) -> None:
+    save_shape(folder / "odd.ply", Shape(egg(sphere, 1), sphere.faces[:, [1, 2, 0]]))
+    made = prepare_folder(folder, tmp_path / "out", FEW)
+    assert made.shapes.shape == (0, 642, 3)
+    assert len(made.names) == 4
+    with pytest.raises(InputError, match="do not share one connectivity") as caught:
+        read_registered(tmp_path / "out", made.template)
+    assert "registered" in caught.value.hint
+
+
+def test_what_cannot_be_read_is_noted_and_left_out(folder: Path, tmp_path: Path, sphere: Shape) -> None:
+    (folder / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\n")
+    (folder / "empty.off").touch()
+    (folder / "notes.txt").write_text("not a shape")
+    np.save(folder / "point.npy", np.zeros((300, 3)))  # has no area
+    save_shape(folder / "dirty.obj", Shape(np.concatenate([sphere.verts, FAR[None]]), sphere.faces))
+    made = prepare_folder(folder, tmp_path / "out", FEW)
+    notes = "\n".join(made.notes)
+    for name in ("broken.ply left out", "empty.off left out", "point.npy left out", "dirty.obj: 1 vertex"):
+        assert name in notes
+    assert len(made.names) == 4
+
+
+def test_a_template_is_made_after_repair(tmp_path: Path, sphere: Shape, torus: Shape) -> None:
+    """Every corner of an STL is a vertex of its own; a registered folder may carry vertices that no face uses."""
+    shapes = tmp_path / "soup"
+    shapes.mkdir()
+    save_shape(shapes / "ball.stl", sphere)
+    made = prepare_folder(shapes, tmp_path / "out", FEW)
+    assert made.template.shape.V == 642
+    loose = tmp_path / "loose"
+    loose.mkdir()
+    for n in range(2):
+        verts = np.concatenate([FAR[None], egg(sphere, n)])
+        save_shape(loose / f"egg{n}.off", Shape(verts, sphere.faces + 1))
+    made = prepare_folder(loose, tmp_path / "out2", FEW)
+    assert made.shapes.shape == (2, 642, 3)
+    assert np.allclose(made.shapes[1], egg(sphere, 1) - egg(sphere, 1).mean(0), atol=1e-5)
+
+
+def test_a_registered_shape_with_lost_positions_is_left_out(folder: Path, tmp_path: Path) -> None:
+    text = (folder / "egg2.obj").read_text().splitlines()
+    text[[line.startswith("v ") for line in text].index(True)] = "v nan nan nan"
+    (folder / "egg2.obj").write_text("\n".join(text))
+    made = prepare_folder(folder, tmp_path / "out", FEW)
+    assert len(made.shapes) == 2
+    assert any("egg2.obj: not among the registered" in note for note in made.notes)
+
+
+def test_clouds_need_a_template_of_another_file(folder: Path, tmp_path: Path, sphere: Shape) -> None:
+    np.save(folder / "a_cloud.npy", sphere.verts)
+    made = prepare_folder(folder, tmp_path / "out", FEW)
+    assert made.template.shape.F == 1280  # of the first mesh
+    assert len(made.shapes) == 0
+    clouds = tmp_path / "clouds"
+    clouds.mkdir()
+    np.save(clouds / "a.npy", sphere.verts)
+    with pytest.raises(InputError, match="has no faces"):
+        prepare_folder(clouds, tmp_path / "out2", FEW)
+    made = prepare_folder(clouds, tmp_path / "out2", FEW, template=folder / "egg0.obj")
+    assert made.template.shape.F == 1280
+    assert made.names == ("a.npy",)
+
+
+def test_no_usable_shape_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    with pytest.raises(InputError, match="no shapes in") as caught:
+        prepare_folder(tmp_path / "in", tmp_path / "out", FEW)
+    assert ".ply" in caught.value.hint
+    (tmp_path / "in" / "x.ply").touch()
+    with pytest.raises(InputError, match="could be used") as caught:
+        prepare_folder(tmp_path / "in", tmp_path / "out", FEW)
+    assert "x.ply left out" in caught.value.hint
+    with pytest.raises(InputError, match="no shapes in"):
+        prepare_folder(tmp_path / "nowhere", tmp_path / "out", FEW)
+
+
+def test_an_output_that_cannot_be_made_is_told(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(OutputError, match="cannot make the folder"):
+        prepare_folder(folder, tmp_path / "taken", FEW)
+
+
+def test_a_folder_of_another_template_or_none_is_refused(folder: Path, tmp_path: Path) -> None:
+    made = prepare_folder(folder, tmp_path / "out", FEW)
+    other = prepare_folder(folder, tmp_path / "other", NodeConfig(strategy="uniform", K=61, radius=0.3))
+    with pytest.raises(InputError, match="prepared for another template"):
+        read_registered(tmp_path / "out", other.template)
+    with pytest.raises(InputError, match="not a prepared folder") as caught:
+        read_registered(tmp_path, made.template)
+    assert "meshmatch prepare" in caught.value.hint
+    (tmp_path / "out" / "shapes.safetensors").write_bytes(b"?")
+    with pytest.raises(InputError, match="not a prepared folder"):
+        read_registered(tmp_path / "out", made.template)
+    assert load_file(tmp_path / "other" / "shapes.safetensors")["verts"].shape[0] == 3

@@ -1,0 +1,183 @@
+"""The template bundle: what is written comes back, and a damaged one is refused."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from meshmatch.errors import InputError, TemplateError
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.prepare import low_resolution, make_template
+from meshmatch.templates.template import Template, load_template, save_template
+
+FEW = NodeConfig(strategy="uniform", K=60, radius=0.3)
+
+
+@pytest.fixture(scope="module")
+def ball(sphere: Shape) -> Template:
+    labels = (sphere.verts[:, 1] > 0).astype(int)
+    core = np.flatnonzero(sphere.verts[:, 1] < 0)
+    return make_template(
+        Shape(sphere.verts * 70 + 9, sphere.faces, "ball.obj"),
+        "ball",
+        FEW,
+        labels=labels,
+        label_names=("south", "north"),
+        core=core,
+        pose="none",
+        source="arithmetic",
+        licence="CC0-1.0",
+        low=low_resolution(sphere, 500),
+    )
+
+
+def test_a_template_stands_in_its_own_frame(ball: Template) -> None:
+    assert ball.shape.area == pytest.approx(1)
+    corners = ball.shape.verts[ball.shape.faces].mean(1)
+    assert np.allclose((ball.shape.face_areas[:, None] * corners).sum(0), 0, atol=1e-12)
+    # the dense mesh lies on the same surface, in the same frame
+    assert np.linalg.norm(ball.dense.verts, axis=1).std() < 1e-3
+    assert ball.dense.V == 642
+    assert ball.shape.F <= 500
+
+
+def test_labels_and_core_follow_their_vertices(ball: Template, sphere: Shape) -> None:
+    height = sphere.verts[low_resolution(sphere, 500)[0], 1]
+    assert np.array_equal(ball.labels, height > 0)
+    assert np.array_equal(ball.core, np.flatnonzero(height < 0))
+    assert 0 < len(ball.core) < ball.shape.V
+
+
+def test_low_resolution_keeps_a_subset_of_the_vertices(sphere: Shape) -> None:
+    keep, faces = low_resolution(sphere, 300)
+    assert len(keep) < sphere.V
+    assert np.array_equal(keep, np.unique(keep))
+    assert len(faces) <= 306  # the target and 2 %
+    assert np.array_equal(np.unique(faces), np.arange(len(keep)))
+    a, b, c = faces.T
+    assert ((a != b) & (b != c) & (c != a)).all()
+    small = Shape(sphere.verts[keep], faces)
+    assert small.area == pytest.approx(4 * np.pi, rel=0.05)  # still the sphere
+    assert (np.einsum("fi,fi->f", small.face_normals, small.verts[faces].mean(1)) > 0.9).mean() > 0.98
+    same, all_faces = low_resolution(sphere, 5000)
+    assert np.array_equal(same, np.arange(sphere.V))
+    assert np.array_equal(all_faces, sphere.faces)
+
+
+def test_written_bundle_comes_back(ball: Template, tmp_path: Path) -> None:
+    save_template(ball, tmp_path / "ball.safetensors")
+    found = load_template(tmp_path / "ball.safetensors")
+    assert found.hash == ball.hash
+    for name in ("name", "radius", "label_names", "pose", "source", "licence", "K"):
+        assert getattr(found, name) == getattr(ball, name), name
+    for name in ("nodes", "labels", "core"):
+        assert np.array_equal(getattr(found, name), getattr(ball, name)), name
+    assert np.array_equal(found.shape.verts, ball.shape.verts)
+    assert np.array_equal(found.shape.faces, ball.shape.faces)
+    assert np.array_equal(found.dense.faces, ball.dense.faces)
+    assert np.allclose(found.dense.verts, ball.dense.verts, atol=1e-7)
+
+
+def test_the_hash_is_of_what_a_model_depends_on(ball: Template) -> None:
+    shape = ball.shape
+    moved = Shape(shape.verts + 1e-9, shape.faces, shape.name)
+    turned = Shape(shape.verts, shape.faces[:, [1, 2, 0]], shape.name)
+    others = [
+        replace(ball, shape=moved),
+        replace(ball, shape=turned),
+        replace(ball, nodes=ball.nodes + 1e-9),
+        replace(ball, radius=0.31),
+        replace(ball, core=ball.core[1:]),
+    ]
+    assert len({ball.hash, *(other.hash for other in others)}) == 6
+    assert replace(ball, name="other", licence="none", label_names=("a", "b")).hash == ball.hash
+
+
+def _nan(array: np.ndarray) -> np.ndarray:
+    array = array.copy()
+    array[0] = np.nan
+    return array
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda t: {"nodes": t.nodes[:, :2]}, "nodes"),
+        (lambda t: {"nodes": _nan(t.nodes)}, "nodes"),
+        (lambda t: {"labels": t.labels[1:]}, "one label per vertex"),
+        (lambda t: {"labels": t.labels - 1}, "one label per vertex"),
+        (lambda t: {"label_names": ("only",)}, "a label has no name"),
+        (lambda t: {"core": t.core[:2]}, "core"),
+        (lambda t: {"core": t.core + t.shape.V}, "core"),
+        (lambda t: {"radius": 0.0}, "radius"),
+        (lambda t: {"radius": float("nan")}, "radius"),
+    ],
+)
+def test_an_impossible_template_is_refused(ball: Template, change, told: str) -> None:
+    with pytest.raises(TemplateError, match=told):
+        replace(ball, **change(ball))
+
+
+def rewrite(path: Path, arrays: dict | None = None, words: dict | None = None, drop: str = "") -> None:
+    """Damage a bundle, its container kept whole."""
+    from safetensors import safe_open
+
+    with safe_open(str(path), framework="np") as file:
+        header = json.loads(file.metadata()["template"])
+    held = load_file(path) | (arrays or {})
+    header |= words or {}
+    header.pop(drop, None)
+    held.pop(drop, None)
+    save_file(held, path, {"template": json.dumps(header)})
+
+
+@pytest.mark.parametrize(
+    ("how", "told"),
+    [
+        ({"words": {"schema": 2}}, "schema 2, not 1"),
+        ({"words": {"hash": "0" * 16}}, "does not match its hash"),
+        ({"words": {"radius": 0.4}}, "does not match its hash"),
+        ({"words": {"radius": "wide"}}, "not a template bundle"),
+        ({"drop": "radius"}, "not a template bundle"),
+        ({"drop": "name"}, "not a template bundle"),
+        ({"drop": "hash"}, "does not match its hash"),
+        ({"drop": "nodes"}, "not a template bundle"),
+        ({"arrays": {"extra": np.zeros(3)}}, "not a template bundle"),
+        ({"arrays": {"faces": np.full((4, 3), 99_999, np.int32)}}, "not a template bundle"),
+        ({"arrays": {"verts": np.full((600, 3), np.nan)}}, "not a template bundle"),
+        ({"arrays": {"nodes": np.zeros((60, 3))}}, "does not match its hash"),
+    ],
+)
+def test_a_damaged_bundle_is_refused(ball: Template, tmp_path: Path, how: dict, told: str) -> None:
+    path = tmp_path / "ball.safetensors"
+    save_template(ball, path)
+    rewrite(path, **how)
+    with pytest.raises(TemplateError, match=told) as caught:
+        load_template(path)
+    assert caught.value.hint
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\n", b"\xff" * 40])
+def test_what_is_no_bundle_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(TemplateError, match="not a template bundle"):
+        load_template(path)
+    save_file({"a": np.zeros(3)}, path, {"template": "[1]"})
+    with pytest.raises(TemplateError, match="not a template bundle"):
+        load_template(path)
+    with pytest.raises(TemplateError, match="no template bundle at"):
+        load_template(tmp_path / "none.safetensors")
+
+
+def test_a_cloud_is_no_template_and_labels_must_fit(sphere: Shape) -> None:
+    with pytest.raises(InputError, match="no faces"):
+        make_template(Shape(sphere.verts, np.empty((0, 3), int), "dots"), "dots", FEW)
+    with pytest.raises(TemplateError, match="5 labels for 642"):
+        make_template(sphere, "ball", FEW, labels=np.zeros(5, int))
+    with pytest.raises(TemplateError, match="a label below 0"):
+        make_template(sphere, "ball", FEW, labels=np.full(642, -1))
