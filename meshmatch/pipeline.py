@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -88,17 +89,24 @@ def match(
     clean = [usable(shape) for shape in shapes]
     config = FitConfig(refine=refine, seed=seed, up=up, front=front)
     set_threads(1 if workers > 1 else workers)
+    stop = threading.Event()
     names = _apart(shapes[0].name, shapes[1].name)
 
     def one(number: int) -> Fit:
         def tell(what: str, share: float) -> None:
+            if stop.is_set():
+                raise CancelledError
             if progress is not None:
                 progress(what, names[number], share)
 
         return lay_template(loaded, clean[number].shape, config, None, tell)
 
     with ThreadPoolExecutor(max(1, min(2, workers))) as pool:
-        fits = list(pool.map(one, (0, 1)))
+        try:
+            fits = list(pool.map(one, (0, 1)))
+        except BaseException:
+            stop.set()  # Ctrl-C, or one fit failed: the other one ends at its next word
+            raise
     if landmarks is not None:
         fits = _honour(loaded, clean, fits, landmarks, config)
     found = build_map(clean[0], fits[0], clean[1], fits[1], workers=workers)

@@ -27,6 +27,8 @@ class Fit:
         Template vertices (low resolution) on the shape, core frame.
     vectors : float64 array (K, 3)
         Node vectors, core frame.
+    resting : float64 array (V, 3)
+        The same vertices on the resting template, template frame.
     faces : int64 array (F, 3)
         The template's triangles.
     residual : float
@@ -46,6 +48,7 @@ class Fit:
     frame: Frame
     points: np.ndarray
     vectors: np.ndarray
+    resting: np.ndarray
     faces: np.ndarray
     residual: float
     vertex_distance: np.ndarray

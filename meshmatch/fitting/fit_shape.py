@@ -129,6 +129,7 @@ def fit_shape(
         frame=core_frame,
         points=points,
         vectors=best.vectors,
+        resting=system.verts,
         faces=system.faces,
         residual=best.residual,
         vertex_distance=distance,

@@ -6,6 +6,7 @@ import numpy as np
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
+from meshmatch.maps.place import at_footpoints, in_core_frame, place, unit, vertex_normals
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.repair import Repaired
@@ -26,7 +27,8 @@ def build_map(
     """Carry every source vertex through the template to the target.
 
     Source vertex -> closest point of the template as fitted to the source -> the same point of the template as
-    fitted to the target -> closest point of the target; neighbours must face the same way.
+    fitted to the target -> closest point of the target. Closest points must face the same way, and belong to the
+    same place of the template where two sheets touch (see `place`).
 
     Parameters
     ----------
@@ -69,19 +71,14 @@ def carry(
     source: Shape, source_fit: Fit, target: Shape, target_fit: Fit, workers: int = 1
 ) -> tuple[Footpoints, np.ndarray]:
     """Where on the target every source vertex lands, and a confidence in 0..1."""
-    points, normals = in_core_frame(source, source_fit)
-    template = Surface(
-        source_fit.points, source_fit.faces, vertex_normals(source_fit.points, source_fit.faces)
-    )
-    foot = template.query(points, normals, workers)
-    corners = source_fit.faces[foot.face]
-    moved = np.einsum("nk,nkd->nd", foot.barycentric, target_fit.points[corners])
-    target_normals = vertex_normals(target_fit.points, target_fit.faces)
-    facing = _unit(np.einsum("nk,nkd->nd", foot.barycentric, target_normals[corners]))
+    foot, belongs = place(source, source_fit, workers)
+    moved = at_footpoints(foot, source_fit.faces, target_fit.points)
+    facing = unit(at_footpoints(foot, source_fit.faces, vertex_normals(target_fit.points, target_fit.faces)))
+    there, there_normals = in_core_frame(target, target_fit)
     if target.is_cloud:
         facing = np.zeros_like(facing)
-    there, there_normals = in_core_frame(target, target_fit)
-    landed = Surface(there, target.faces, there_normals).query(moved, facing, workers)
+    surface = Surface(there, target.faces, there_normals, place(target, target_fit, workers)[1])
+    landed = surface.query(moved, facing, workers, belongs)
     confidence = np.exp(-np.square(foot.distance / _FIT_SCALE) - np.square(landed.distance / _FIT_SCALE))
     return landed, confidence
 
@@ -98,24 +95,3 @@ def _original_faces(target: Repaired, landed: Footpoints) -> tuple[np.ndarray, n
     if target.shape.is_cloud:
         return landed.face, landed.barycentric
     return target.original_face(landed.face, landed.barycentric)
-
-
-def in_core_frame(shape: Shape, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) and unit normals (V, 3) of a shape where its fit lives; zero normals for a cloud."""
-    if shape.is_cloud:
-        return fit.frame.apply(shape.verts), np.zeros_like(shape.verts)
-    return fit.frame.apply(shape.verts), shape.vertex_normals @ fit.frame.rotation.T
-
-
-def vertex_normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted unit vertex normals (V, 3)."""
-    a, b, c = (verts[faces[:, k]] for k in range(3))
-    face_vectors = np.cross(b - a, c - a)
-    summed = np.stack(
-        [np.bincount(faces.reshape(-1), np.repeat(face_vectors[:, k], 3), len(verts)) for k in range(3)], 1
-    )
-    return _unit(summed)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-20)

@@ -10,6 +10,8 @@ from scipy.spatial import cKDTree
 
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area).
 NORMAL_WEIGHT = 0.15
+# How much a distance on the resting template counts beside one in space.
+RESTING_WEIGHT = 0.2
 _CHUNK = 100_000
 
 
@@ -31,17 +33,24 @@ class Surface:
     verts : (V, 3)
     faces : (F, 3), F = 0 for a cloud
     normals : (V, 3) unit normals, zeros where unknown
+    resting : (V, 3), optional
+        Where on the resting template each vertex belongs. Queries that know the same then find the right one of
+        two sheets that touch, such as a hand on a thigh.
     """
 
-    def __init__(self, verts: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> None:
-        self.verts, self.faces, self.normals = verts, faces, normals
+    def __init__(
+        self, verts: np.ndarray, faces: np.ndarray, normals: np.ndarray, resting: np.ndarray | None = None
+    ) -> None:
+        self.verts, self.faces = verts, faces
         used = np.unique(faces) if len(faces) else np.arange(len(verts))
         self._used = used
-        self._tree = cKDTree(np.concatenate([verts[used], NORMAL_WEIGHT * normals[used]], 1))
+        self._tree = cKDTree(_features(verts, normals, resting)[used])
         self._start, self._around = _faces_around(faces, len(verts))
 
-    def query(self, points: np.ndarray, normals: np.ndarray, workers: int = 1) -> Footpoints:
-        """Closest points to (N, 3) points with normals (N, 3)."""
+    def query(
+        self, points: np.ndarray, normals: np.ndarray, workers: int = 1, resting: np.ndarray | None = None
+    ) -> Footpoints:
+        """Closest points to (N, 3) points with normals (N, 3); ``resting`` (N, 3) if the surface has it."""
         N = len(points)
         vertex = np.empty(N, np.int64)
         face = np.full(N, -1, np.int64)
@@ -49,7 +58,7 @@ class Surface:
         distance = np.empty(N)
         for low in range(0, N, _CHUNK):
             part = slice(low, min(low + _CHUNK, N))
-            sought = np.concatenate([points[part], NORMAL_WEIGHT * normals[part]], 1)
+            sought = _features(points[part], normals[part], None if resting is None else resting[part])
             vertex[part] = self._used[self._tree.query(sought, workers=workers)[1]]
             if len(self.faces):
                 face[part], weights[part], distance[part] = self._on_faces(points[part], vertex[part])
@@ -70,6 +79,11 @@ class Surface:
         order = np.lexsort((squared, query))
         best = order[np.searchsorted(query[order], np.arange(len(points)))]
         return face[best], weights[best], np.sqrt(squared[best])
+
+
+def _features(points: np.ndarray, normals: np.ndarray, resting: np.ndarray | None) -> np.ndarray:
+    parts = [points, NORMAL_WEIGHT * normals]
+    return np.concatenate(parts if resting is None else [*parts, RESTING_WEIGHT * resting], 1)
 
 
 def _faces_around(faces: np.ndarray, V: int) -> tuple[np.ndarray, np.ndarray]:

@@ -20,6 +20,12 @@ from meshmatch.models.layers import residual_mlp
 from meshmatch.models.neighbours import two_way_offsets
 
 
+_LARGEST = {
+    "code": 4096, "width": 8192, "depth": 64, "basis": 8192,
+    "align_basis": 8192, "align_width": 8192, "corrections": 64, "correct_width": 8192,
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class NetworkConfig:
     """Sizes and choices of a deformer; saved in the model card."""
@@ -34,6 +40,15 @@ class NetworkConfig:
     align_width: int = 512
     corrections: int = 3
     correct_width: int = 640
+
+    def __post_init__(self) -> None:
+        # A card may come from anywhere: bound what building the network allocates.
+        if self.encoder not in ("basis", "point") or self.decoder not in ("flat", "node"):
+            raise ModelError(f"no network of {self.encoder!r} and {self.decoder!r}", "update meshmatch")
+        for name, most in _LARGEST.items():
+            value = getattr(self, name)
+            if type(value) is not int or not 0 <= value <= most:
+                raise ModelError(f"network option {name} must be an integer from 0 to {most}, not {value!r}")
 
     @staticmethod
     def from_dict(values: dict) -> NetworkConfig:

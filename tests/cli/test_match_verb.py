@@ -32,6 +32,7 @@ def fit(shape: Shape, verdict: str = "good", reasons: tuple[str, ...] = ()) -> F
         frame=Frame(2.0, np.eye(3), np.array([10.0, 0, 0])),
         points=CORNERS,
         vectors=np.zeros((4, 3)),
+        resting=CORNERS,
         faces=FACES,
         residual=0.0123,
         vertex_distance=np.zeros(shape.V),

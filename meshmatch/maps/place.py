@@ -1,0 +1,112 @@
+"""Where on the template every vertex of a shape belongs, told apart where two sheets touch."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from meshmatch.fitting.fit import Fit
+from meshmatch.maps.surface import Footpoints, Surface
+from meshmatch.shapes.shape import Shape
+
+# An edge is torn where its ends belong this much further apart on the resting template (units of sqrt(area))
+# than they are, stretched by this factor.
+_TEAR, _STRETCH = 0.06, 3.0
+# A piece between tears is believed if it has this share of the surface.
+_BELIEVED = 0.02
+_ROUNDS, _FILL_STEPS = 2, 60
+
+
+@lru_cache(maxsize=4)
+def place(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndarray]:
+    """Points of the template as fitted for every vertex, and the same on the resting template (V, 3).
+
+    The closest point in space jumps to another limb where two of them touch. Neighbours on the shape that
+    belong far apart on the template reveal it: small pieces cut out by such tears ask again, knowing where
+    their surroundings belong.
+    """
+    points, normals = in_core_frame(shape, fit)
+    template_normals = vertex_normals(fit.points, fit.faces)
+    foot = Surface(fit.points, fit.faces, template_normals).query(points, normals, workers)
+    resting = at_footpoints(foot, fit.faces, fit.resting)
+    if shape.is_cloud:
+        return foot, resting
+    knowing = Surface(fit.points, fit.faces, template_normals, fit.resting)
+    edges = np.unique(np.sort(shape.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    area = np.bincount(shape.faces.reshape(-1), np.repeat(shape.face_areas, 3), shape.V)
+    for _ in range(_ROUNDS):
+        doubted = _doubted(edges, length, resting, area)
+        if not doubted.any():
+            break
+        around = _fill(edges, resting, doubted)
+        ask = np.flatnonzero(doubted & np.isfinite(around).all(1))
+        if not len(ask):
+            break
+        again = knowing.query(points[ask], normals[ask], workers, around[ask])
+        resting[ask] = at_footpoints(again, fit.faces, fit.resting)
+        for name in ("vertex", "face", "barycentric", "distance"):
+            getattr(foot, name)[ask] = getattr(again, name)
+    return foot, resting
+
+
+def _doubted(edges: np.ndarray, length: np.ndarray, resting: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """(V,) True on small pieces between tears."""
+    V = len(resting)
+    jump = np.linalg.norm(resting[edges[:, 0]] - resting[edges[:, 1]], axis=1)
+    whole = jump < _TEAR + _STRETCH * length
+    if whole.all():
+        return np.zeros(V, bool)
+    kept = edges[whole]
+    graph = csr_matrix((np.ones(len(kept)), (kept[:, 0], kept[:, 1])), (V, V))
+    piece = connected_components(graph, directed=False)[1]
+    return (np.bincount(piece, area) < _BELIEVED * area.sum())[piece]
+
+
+def _fill(edges: np.ndarray, resting: np.ndarray, doubted: np.ndarray) -> np.ndarray:
+    """Resting positions with the doubted ones replaced by the average of their surroundings; NaN out of reach."""
+    V = len(resting)
+    ones = np.ones(len(edges))
+    graph = csr_matrix((ones, (edges[:, 0], edges[:, 1])), (V, V))
+    graph = (graph + graph.T).tocsr()
+    rows = np.flatnonzero(doubted)
+    part = graph[rows]
+    filled = np.where(doubted[:, None], 0.0, resting)
+    known = (~doubted).astype(float)
+    for _ in range(_FILL_STEPS):
+        weight = part @ known
+        total = part @ (known[:, None] * filled)
+        filled[rows] = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], filled[rows])
+        known[rows] = weight > 0
+    filled[rows[known[rows] == 0]] = np.nan
+    return filled
+
+
+def at_footpoints(foot: Footpoints, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (V, D) of the vertices at footpoints: (N, D)."""
+    return np.einsum("nk,nkd->nd", foot.barycentric, values[faces[foot.face]])
+
+
+def in_core_frame(shape: Shape, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and unit normals (V, 3) of a shape where its fit lives; zero normals for a cloud."""
+    if shape.is_cloud:
+        return fit.frame.apply(shape.verts), np.zeros_like(shape.verts)
+    return fit.frame.apply(shape.verts), shape.vertex_normals @ fit.frame.rotation.T
+
+
+def vertex_normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area-weighted unit vertex normals (V, 3)."""
+    a, b, c = (verts[faces[:, k]] for k in range(3))
+    face_vectors = np.cross(b - a, c - a)
+    summed = np.stack(
+        [np.bincount(faces.reshape(-1), np.repeat(face_vectors[:, k], 3), len(verts)) for k in range(3)], 1
+    )
+    return unit(summed)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Rows scaled to length one; zeros stay zeros."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-20)
