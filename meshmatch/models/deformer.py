@@ -19,7 +19,6 @@ from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.models.layers import residual_mlp
 from meshmatch.models.neighbours import two_way_offsets
 
-
 _LARGEST = {
     "code": 4096, "width": 8192, "depth": 64, "basis": 8192,
     "align_basis": 8192, "align_width": 8192, "corrections": 64, "correct_width": 8192,
