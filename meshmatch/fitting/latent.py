@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -29,6 +30,36 @@ class LatentRefineConfig:
     points: int = 3000
 
 
+class PaperEnergy:
+    """The paper's energy of node vectors: Chamfer distance to points drawn from a scan, volume, rigidity.
+
+    Parameters
+    ----------
+    scan : Scan
+        In the core frame; ``config.points`` of its points are drawn.
+    """
+
+    def __init__(
+        self, template: Template, scan: Scan, config: LatentRefineConfig, rng: np.random.Generator
+    ) -> None:
+        self.config = config
+        chosen = rng.choice(len(scan.points), min(config.points, len(scan.points)), replace=False)
+        self.points = torch.from_numpy(scan.points[chosen]).float()
+        self._tree = cKDTree(scan.points[chosen])
+        self._template = _on_template(template, min(config.points, template.shape.V))
+
+    def __call__(self, vectors: torch.Tensor) -> torch.Tensor:
+        """Energy (a scalar tensor) of node vectors (1, K, 3) in the core frame."""
+        verts, phi, slopes = self._template
+        moved = verts + phi(vectors[0])
+        F = slopes(vectors[0]).unflatten(0, (-1, 3)).transpose(1, 2) + torch.eye(3)
+        return (
+            self.config.chamfer * _chamfer(moved, self.points, self._tree)
+            + self.config.volume * volume_energy(F).mean()
+            + self.config.arap * arap_energy(F).mean()
+        )
+
+
 def refine_code(
     model: Deformer,
     template: Template,
@@ -36,42 +67,64 @@ def refine_code(
     config: LatentRefineConfig,
     rng: np.random.Generator,
     progress: Callable[[int, int], None] | None = None,
+    start: np.ndarray | None = None,
 ) -> np.ndarray:
     """Node vectors (K, 3) of the code that fits a scan (core frame) best.
 
-    The learned corrections of the first code, where the model has them, stay as a constant offset.
     The best code seen is returned, so the energy never ends higher than it began.
+
+    Parameters
+    ----------
+    start : (K, 3), optional
+        Node vectors to start from, by default the network's own answer. What the encoder's code does not say
+        of them (the learned corrections, where the model has them) stays as a constant offset.
     """
-    chosen = rng.choice(len(scan.points), min(config.points, len(scan.points)), replace=False)
-    points = torch.from_numpy(scan.points[chosen]).float()
-    tree = cKDTree(scan.points[chosen])
-    at = farthest_points(template.shape.verts, min(config.points, template.shape.V))
-    verts = torch.from_numpy(template.shape.verts[at]).float()
-    field = build_field(template.shape.verts[at], template.nodes, template.radius)
+    energy_of = PaperEnergy(template, scan, config, rng)
     with torch.no_grad():
-        code = model.encoder(model.encoder.features(points[None]))
-        offset = model(points[None]) - model.decoder(code)
+        code = model.encoder(model.encoder.features(energy_of.points[None]))
+        first = model(energy_of.points[None]) if start is None else torch.from_numpy(start).float()[None]
+        offset = first - model.decoder(code)
     code = code.detach().clone().requires_grad_(True)
     optimiser = torch.optim.Adam([code], lr=config.rate)
     best, best_vectors = np.inf, None
     for step in range(config.steps):
         vectors = model.decoder(code) + offset
-        moved = verts + field.displacement(vectors)[0]
-        F = field.deformation_gradient(vectors)
-        energy = (
-            config.chamfer * _chamfer(moved, points, tree)
-            + config.volume * volume_energy(F).mean()
-            + config.arap * arap_energy(F).mean()
-        )
-        if float(energy) < best:
-            best, best_vectors = float(energy), vectors.detach()[0]
-        optimiser.zero_grad()
-        energy.backward()
+        energy = energy_of(vectors)
+        if float(energy.detach()) < best:
+            best, best_vectors = float(energy.detach()), vectors.detach()[0]
+        # Of the code alone: the gradients of the decoder's weights would cost more than all the rest.
+        (code.grad,) = torch.autograd.grad(energy, code)
         optimiser.step()
         if progress is not None and (step % 20 == 0 or step == config.steps - 1):
             progress(step + 1, config.steps)
     assert best_vectors is not None
     return best_vectors.double().numpy()
+
+
+class _Product(torch.autograd.Function):
+    """A sparse matrix times a dense one whose gradient uses a kept transpose: torch would sort a new one each time."""
+
+    @staticmethod
+    def forward(ctx, dense, matrix, transpose):
+        ctx.transpose = transpose
+        return matrix @ dense
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return ctx.transpose @ gradient, None, None
+
+
+@lru_cache(maxsize=4)
+def _on_template(template: Template, P: int):
+    """Template points (P, 3), and functions from node vectors (K, 3) to displacements (P, 3) and slopes (3 P, 3)."""
+    at = farthest_points(template.shape.verts, P)
+    field = build_field(template.shape.verts[at], template.nodes, template.radius)
+
+    def applied(matrix: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
+        transpose = matrix.t().to_sparse_csr()
+        return lambda vectors: _Product.apply(vectors, matrix, transpose)
+
+    return torch.from_numpy(template.shape.verts[at]).float(), applied(field.phi), applied(field.gradient)
 
 
 def _chamfer(moved: torch.Tensor, points: torch.Tensor, tree: cKDTree) -> torch.Tensor:
