@@ -22,16 +22,16 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.markup import escape
 
 from meshmatch.config import set_threads
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.distances import default_folder
 from meshmatch.experiments.protocols import SET_NAMES, BenchSet, Pair, load_set
-from meshmatch.experiments.report import circumstances, print_table
+from meshmatch.experiments.report import circumstances, explain, print_table
 from meshmatch.experiments.scores import SetScores, evaluate_set
 from meshmatch.maps.curve import draw_curves
 from meshmatch.maps.files import load_map, save_map
+from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
@@ -249,9 +249,7 @@ def main(words: Sequence[str] | None = None) -> int:
     try:
         run(options, console)
     except MeshmatchError as error:
-        console.print(f"[red]error:[/] {escape(error.message)}", highlight=False)
-        if error.hint:
-            console.print(f"[dim]hint:[/] {escape(error.hint)}", highlight=False)
+        explain(error)
         return 1
     return 0
 
@@ -290,6 +288,7 @@ def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
     record = {
         "benchmark": "development half",
         **circumstances(options.threads, options.jobs),
+        "geodesic": GEODESIC,
         "maps": str(options.maps) if options.maps else vars(matcher),
         "seconds": round(time.perf_counter() - started, 1),
         "sets": {each.scores.bench.name: each.as_dict() for each in runs},

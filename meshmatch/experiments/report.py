@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
+from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.scores import SetScores
 from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.geodesics import GEODESIC
@@ -21,8 +23,7 @@ from meshmatch.maps.geodesics import GEODESIC
 
 def print_table(sets: Sequence[SetScores], worst: int = 5, console: Console | None = None) -> None:
     """Print a row for each set, and one for each kind of pair in it; then each set's worst pairs."""
-    # A pipe has no width of its own, and rich would fold the table to 80 columns.
-    console = console or Console(width=None if os.isatty(1) else 120, highlight=False)
+    console = console or wide_console()
     table = Table(title=f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})", title_justify="left")
     table.add_column("set")
     columns = ("pairs", "mean", "median", "median pair", f"over {LOST_CM:g} cm", "flips", "worst pair")
@@ -51,6 +52,19 @@ def print_table(sets: Sequence[SetScores], worst: int = 5, console: Console | No
         console.print("[yellow]Not all pairs were measured: these means are not the benchmark's.[/]")
 
 
+def wide_console() -> Console:
+    """Stdout for a table: a pipe has no width of its own, and rich would fold the table to 80 columns."""
+    return Console(width=None if os.isatty(1) else 120, highlight=False)
+
+
+def explain(error: MeshmatchError) -> None:
+    """Say on stderr what stopped a benchmark."""
+    console = Console(stderr=True)
+    console.print(f"[red]error:[/] {escape(error.message)}", highlight=False)
+    if error.hint:
+        console.print(f"[dim]hint:[/] {escape(error.hint)}", highlight=False)
+
+
 def circumstances(threads: int, jobs: int) -> dict[str, Any]:
     """Date, commit, machine and threads, as every published number needs them."""
     return {
@@ -60,7 +74,6 @@ def circumstances(threads: int, jobs: int) -> dict[str, Any]:
         "python": platform.python_version(),
         "threads": threads,
         "jobs": jobs,
-        "geodesic": GEODESIC,
     }
 
 

@@ -32,6 +32,7 @@ def body_source(rig: Rig) -> Source:
 
 def registered_source(shapes: torch.Tensor) -> Source:
     """A fixed set of registered shapes (N, V, 3), drawn with replacement."""
+    shapes = shapes - shapes.mean(1, keepdim=True)
     return lambda count, generator: shapes[torch.randint(len(shapes), (count,), generator=generator)]
 
 

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from meshmatch.errors import ModelError, OptionError
 from meshmatch.models.deformer import Deformer
 from meshmatch.outputs import replace_on_success
 from meshmatch.training.datasets import BatchDataset
@@ -26,6 +27,11 @@ class TrainConfig:
 
     ``steps`` fixes the schedule: warm-up, a constant rate, then a cosine to zero over the last ``decay`` share.
     ``minutes`` only stops the run (with a checkpoint to go on from).
+
+    Raises
+    ------
+    OptionError
+        A count, a rate or a share that cannot be.
     """
 
     steps: int = 20_000
@@ -43,6 +49,15 @@ class TrainConfig:
     bf16: bool = False
     seed: int = 0
     loss: LossConfig = field(default_factory=LossConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "shapes", "scans_per_shape", "threads"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"{name} must be 1 or more, not {getattr(self, name)}")
+        if not (self.rate > 0 and 0 <= self.decay <= 1 and self.workers >= 0):
+            raise OptionError("a training needs a positive rate, a decay in 0..1 and workers of 0 or more")
+        if self.minutes is not None and not self.minutes > 0:
+            raise OptionError(f"minutes must be positive, not {self.minutes:g}")
 
 
 @dataclass(frozen=True)
@@ -63,7 +78,7 @@ def learning_rate(step: int, config: TrainConfig) -> float:
     fade = 1.0
     if step > start:
         fade = 0.5 * (1 + math.cos(math.pi * min(1.0, (step - start) / max(config.steps - start, 1))))
-    return config.rate * min(1.0, (step + 1) / config.warm_up) * fade
+    return config.rate * min(1.0, (step + 1) / max(config.warm_up, 1)) * fade
 
 
 class Trainer:
@@ -82,7 +97,6 @@ class Trainer:
         self.model = model.to(self.device)
         self.points = points.to(self.device)
         self.average = {n: p.detach().clone() for n, p in model.named_parameters()}
-        self.buffers = {n: b for n, b in model.named_buffers() if n.endswith(("running_mean", "running_var"))}
         self.optimiser = torch.optim.AdamW(
             model.parameters(),
             lr=config.rate,
@@ -106,12 +120,29 @@ class Trainer:
             save_file(arrays, temporary, {"step": str(self.step), "seconds": f"{self.seconds:.1f}"})
 
     def load(self, path: Path) -> None:
-        """Continue exactly where :meth:`save` was called."""
-        with safe_open(str(path), framework="pt") as file:
-            self.step = int(file.metadata()["step"])
-            self.seconds = float(file.metadata().get("seconds", 0.0))
-            arrays = {n: file.get_tensor(n) for n in file.keys()}  # noqa: SIM118 (it is no dictionary)
-        self.model.load_state_dict(_part(arrays, "model."))
+        """Continue exactly where :meth:`save` was called.
+
+        Raises
+        ------
+        ModelError
+            The file is no checkpoint, or is of another network or another template.
+        """
+        hint = "train into another folder, or start afresh"
+        try:
+            with safe_open(str(path), framework="pt") as file:
+                words = file.metadata() or {}
+                step, seconds = int(words["step"]), float(words.get("seconds", 0.0))
+                arrays = {n: file.get_tensor(n) for n in file.keys()}  # noqa: SIM118 (it is no dictionary)
+        except (SafetensorError, OSError, KeyError, ValueError) as error:
+            raise ModelError(f"{path} is no checkpoint of a training", hint) from error
+        weights = _part(arrays, "model.")
+        here = self.model.state_dict()
+        if {n: t.shape for n, t in weights.items()} != {n: t.shape for n, t in here.items()}:
+            raise ModelError(f"{path} is a checkpoint of another network", hint)
+        if not all(torch.equal(weights[n], here[n].cpu()) for n in ("nodes", "anchors")):
+            raise ModelError(f"{path} is a checkpoint for another template", hint)
+        self.step, self.seconds = step, seconds
+        self.model.load_state_dict(weights)
         for n, tensor in _part(arrays, "average.").items():
             self.average[n].copy_(tensor)
         state: dict[int, dict[str, torch.Tensor]] = {}
@@ -144,9 +175,14 @@ class Trainer:
         began = saved = time.monotonic()
         before = self.seconds
         sums: dict[str, torch.Tensor] = {}
+        summed = 0
         self.model.train()
         for batch in loader:
-            generator = torch.Generator().manual_seed(config.seed * 7919 + self.step * self.world + self.rank)
+            seed = config.seed * 7919 + self.step * self.world + self.rank
+            generator = torch.Generator().manual_seed(seed)
+            torch.manual_seed(
+                seed + 1
+            )  # dropout draws from the global stream: a resumed run must meet the same
             for group in self.optimiser.param_groups:
                 group["lr"] = learning_rate(self.step, config)
             with torch.autocast(self.device.type, torch.bfloat16, enabled=config.bf16):
@@ -160,21 +196,22 @@ class Trainer:
             self._update_average()
             for name, value in terms.items():
                 sums[name] = sums.get(name, torch.zeros(())) + value.detach().cpu()
+            summed += 1
             now = time.monotonic()
             self.seconds = before + now - began
             if report is not None and (self.step % every == 0 or self.step == config.steps):
                 score = validate(self.model) if validate and self.step % (10 * every) == 0 else None
-                means = {name: float(value) / every for name, value in sums.items()}
+                means = {name: float(value) / summed for name, value in sums.items()}
                 report(
                     Progress(
                         self.step, config.steps, learning_rate(self.step, config), now - began, means, score
                     )
                 )
-                sums = {}
+                sums, summed = {}, 0
             if checkpoint is not None and now - saved > 60 * config.checkpoint_minutes:
                 self.save(checkpoint)
                 saved = now
-            if config.minutes is not None and now - began > 60 * config.minutes:
+            if config.minutes is not None and self._any(now - began > 60 * config.minutes):
                 break
         if checkpoint is not None:
             self.save(checkpoint)
@@ -186,6 +223,14 @@ class Trainer:
                 if parameter.grad is not None:
                     dist.all_reduce(parameter.grad)
                     parameter.grad /= self.world
+
+    def _any(self, stop: bool) -> bool:
+        """Whether any process says so: one that stopped alone would leave the others waiting for its gradients."""
+        if self.world > 1:
+            said = torch.tensor(float(stop), device=self.device)
+            dist.all_reduce(said, dist.ReduceOp.MAX)
+            return bool(said)
+        return stop
 
     @torch.no_grad()
     def _update_average(self) -> None:

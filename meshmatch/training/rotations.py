@@ -23,8 +23,12 @@ def rotation_between(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Smallest rotation that takes unit vectors a (..., 3) to b (..., 3); returns a rotation vector."""
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)
-    angle = torch.atan2(sine, (a * b).sum(-1, keepdim=True))
-    return axis / sine.clamp_min(1e-9) * angle
+    cosine = (a * b).sum(-1, keepdim=True)
+    # Half a turn has no axis of its own: any that is perpendicular will do.
+    other = torch.nn.functional.one_hot(a.abs().argmin(-1), 3).to(a)
+    across = unit(torch.linalg.cross(a, other))
+    half = (sine < 1e-6) & (cosine < 0)
+    return torch.where(half, across * math.pi, axis / sine.clamp_min(1e-9) * torch.atan2(sine, cosine))
 
 
 def unit(vector: torch.Tensor) -> torch.Tensor:

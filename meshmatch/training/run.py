@@ -13,7 +13,7 @@ import numpy as np
 import platformdirs
 import torch
 
-from meshmatch.errors import OptionError
+from meshmatch.errors import OptionError, OutputError
 from meshmatch.models.card import ModelCard, write_card
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig
@@ -137,8 +137,13 @@ def train_model(
         The model folder.
     """
     output = Path(output)
-    (output / "checkpoint").mkdir(parents=True, exist_ok=True)
     checkpoint = output / "checkpoint" / CHECKPOINT
+    try:
+        checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the folder {checkpoint.parent}: {error.strerror}", "choose another folder"
+        ) from error
     config = recipe.train
     model = build_deformer(template, source, recipe.network, recipe.scan, recipe.kernel, config.seed)
     points = build_loss_points(template, recipe.kernel)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from meshmatch.errors import TemplateError
 from meshmatch.fields.mls import Kernel, build_field
 from meshmatch.models.deformer import Deformer, NetworkConfig
 from meshmatch.shapes.sampling import farthest_points
@@ -26,7 +27,18 @@ def fill_basis(points: torch.Tensor, M: int, generator: torch.Generator) -> torc
 
 
 def anchor_vertices(template: Template, A: int) -> np.ndarray:
-    """Template vertices (A,) where corrections look at the scan."""
+    """Template vertices (A,) where corrections look at the scan.
+
+    Raises
+    ------
+    TemplateError
+        The template has fewer vertices than that.
+    """
+    if template.shape.V < A:
+        raise TemplateError(
+            f"template {template.name} has {A} nodes but only {template.shape.V} vertices",
+            "prepare it with fewer nodes",
+        )
     return farthest_points(template.shape.verts, A)
 
 

@@ -1,0 +1,207 @@
+"""Time and memory of whole processes: ``python -m meshmatch.experiments.speed``.
+
+Each case is a command as a user types it, in a process of its own, from the interpreter's start to its end: nothing
+is warm but the disk's cache. Shown is the median of several runs after one that does not count: seconds on the
+clock, seconds of CPU (both cores together), and the largest memory that a run ever held. Bars are for two cores,
+and all processes are kept on two where the system allows that. The shapes are the two samples, split and decimated
+to the sizes that the cases ask for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+from meshmatch.errors import MeshmatchError
+from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.topology import edge_keys
+from meshmatch.templates.location import bundled_folder
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command and what it may cost.
+
+    Parameters
+    ----------
+    words : tuple of str
+        What follows ``python -m meshmatch``; a word ``NAME@V`` stands for the file of the sample NAME brought to at
+        least V vertices, ``@map`` for a file to write.
+    seconds, gigabytes : float
+        The bars; nothing is asked of memory where it is 0.
+    """
+
+    words: tuple[str, ...]
+    seconds: float
+    gigabytes: float = 0.0
+
+
+CASES = {
+    "help": Case(("--help",), 0.4),
+    "pair": Case(("match", "climber@10000", "dancer@10000", "-o", "@map"), 8.0, 1.5),
+    "million": Case(("match", "dancer@1000000", "climber@10000", "-o", "@map"), 30.0, 3.0),
+    "onto a million": Case(("match", "climber@10000", "dancer@1000000", "-o", "@map"), 30.0, 3.0),
+}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one process took: seconds on the clock, seconds of CPU, gigabytes at its largest."""
+
+    wall: float
+    cpu: float
+    gigabytes: float
+
+
+def cost_of(command: Sequence[str]) -> Cost:
+    """Run a command to its end and read what the kernel counted.
+
+    Raises
+    ------
+    MeshmatchError
+        It did not end with status 0; the message is its last line of stderr.
+    """
+    with tempfile.TemporaryFile() as told:
+        started = time.perf_counter()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=told)
+        _, status, usage = os.wait4(process.pid, 0)
+        wall = time.perf_counter() - started
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            told.seek(0)
+            lines = told.read().decode(errors="replace").strip().splitlines() or ["it said nothing"]
+            raise MeshmatchError(f"{' '.join(command)} ended with {process.returncode}: {lines[-1]}")
+    unit = 1.0 if sys.platform == "darwin" else 1024.0  # of ru_maxrss, in bytes
+    return Cost(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * unit / 1e9)
+
+
+def split(shape: Shape) -> Shape:
+    """Every triangle in four, through the middles of its edges."""
+    corners = shape.faces
+    keys, place = np.unique(edge_keys(corners, shape.V), return_inverse=True)
+    middles = 0.5 * (shape.verts[keys // shape.V] + shape.verts[keys % shape.V])
+    ab, bc, ca = shape.V + place.reshape(3, -1)
+    a, b, c = corners.T
+    parts = [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
+    faces = np.concatenate([np.stack(part, axis=1) for part in parts])
+    return Shape(np.concatenate([shape.verts, middles]), faces, shape.name)
+
+
+def sized(shape: Shape, V: int) -> Shape:
+    """A closed shape split until it has at least V vertices; a small one is then decimated to about V."""
+    while shape.V < V:
+        shape = split(shape)
+    return decimate(shape, 2 * V) if 1.1 * V < shape.V < 200_000 else shape
+
+
+def _write_shape(sample: str, V: int, path: Path) -> None:
+    save_shape(path, sized(load_shape(bundled_folder() / "samples" / f"{sample}.ply"), V))
+
+
+def shape_file(word: str, folder: Path) -> Path:
+    """The file of a ``NAME@V``, made once, by a process of its own: a child's memory is counted from its parent's."""
+    path = folder / f"{word.replace('@', '-')}.ply"
+    if not path.exists():
+        sample, V = word.split("@")
+        maker = multiprocessing.get_context("spawn").Process(target=_write_shape, args=(sample, int(V), path))
+        maker.start()
+        maker.join()
+        if maker.exitcode:
+            raise MeshmatchError(f"could not make {word}")
+    return path
+
+
+def measure(case: Case, runs: int, folder: Path) -> list[Cost]:
+    """Costs of `runs` runs after one that is not counted."""
+    command = [sys.executable, "-m", "meshmatch"]
+    for word in case.words:
+        made = str(folder / "map.npy") if word == "@map" else word
+        command.append(str(shape_file(word, folder)) if "@" in word[1:] else made)
+    return [cost_of(command) for _ in range(runs + 1)][1:]
+
+
+def keep_to_cores(count: int) -> int:
+    """Keep this process and its children on `count` cores; returns on how many they are."""
+    if not hasattr(os, "sched_setaffinity"):
+        return os.cpu_count() or 1
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
+    return len(os.sched_getaffinity(0))
+
+
+def _record(case: Case, costs: list[Cost]) -> dict[str, object]:
+    middle = Cost(
+        *(statistics.median(values) for values in zip(*(asdict(c).values() for c in costs), strict=True))
+    )
+    met = middle.wall <= case.seconds and (not case.gigabytes or middle.gigabytes <= case.gigabytes)
+    return {
+        **{name: round(value, 3) for name, value in asdict(middle).items()},
+        "bar_seconds": case.seconds,
+        "bar_gigabytes": case.gigabytes or None,
+        "met": met,
+        "runs": [[round(value, 3) for value in asdict(cost).values()] for cost in costs],
+    }
+
+
+def run(cases: Sequence[str], runs: int, cores: int) -> dict[str, object]:
+    """Measure cases by name; prints a table and a JSON line, whose record is returned too."""
+    kept = keep_to_cores(cores)
+    table = Table(title=f"Whole processes on {kept} cores, median of {runs} runs", title_justify="left")
+    for name in ("case", "seconds", "bar", "CPU s", "GB", "bar", "met"):
+        table.add_column(name, justify="left" if name == "case" else "right")
+    records: dict[str, object] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in cases:
+            case = CASES[name]
+            record = records[name] = _record(case, measure(case, runs, Path(folder)))
+            bar = f"{case.gigabytes:g}" if case.gigabytes else ""
+            numbers = (
+                f"{record['wall']:.2f}",
+                f"{case.seconds:g}",
+                f"{record['cpu']:.2f}",
+                f"{record['gigabytes']:.2f}",
+            )
+            table.add_row(name, *numbers, bar, "yes" if record["met"] else "NO")
+    wide_console().print(table)
+    whole = {"benchmark": "speed", **circumstances(threads=kept, jobs=1), "cases": records}
+    print(json.dumps(whole), flush=True)
+    return whole
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the benchmark; 0 when it ran, whatever it measured."""
+    parser = argparse.ArgumentParser("python -m meshmatch.experiments.speed", description=__doc__)
+    parser.add_argument("--cases", default=",".join(CASES), help="some of %(default)s")
+    parser.add_argument("--runs", type=int, default=5, help="counted runs of each case")
+    parser.add_argument("--cores", type=int, default=2, help="cores that all processes share")
+    options = parser.parse_args(words)
+    cases = options.cases.split(",")
+    if unknown := sorted(set(cases) - set(CASES)):
+        parser.error(f"no case {unknown[0]!r}; there are {', '.join(CASES)}")
+    if options.runs < 1 or options.cores < 1:
+        parser.error("--runs and --cores begin at 1")
+    try:
+        run(cases, options.runs, options.cores)
+    except MeshmatchError as error:
+        explain(error)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
