@@ -1,0 +1,195 @@
+"""From a folder of registered shapes to a model that loads, and on from there."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from meshmatch.errors import InputError, OptionError, OutputError, TemplateError
+from meshmatch.models.registry import verify_model
+from meshmatch.models.trained import load_model
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.prepare import prepare_folder
+from meshmatch.templates.template import Template, save_template
+from meshmatch.training import run
+from meshmatch.training.loop import Progress, TrainConfig
+from meshmatch.training.run import Recipe, copy_model, folder_source, read_template, recipe, train_model
+from meshmatch.training.scans import ScanConfig
+from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template
+from tests.training.stick import stick_figure
+
+SMALL = Recipe(
+    NETWORK, TrainConfig(steps=4, shapes=4, scans_per_shape=1, workers=0, warm_up=1), SCAN, "smooth"
+)
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of five registered eggs, prepared."""
+    root = tmp_path_factory.mktemp("eggs")
+    egg = egg_template().shape
+    rng = np.random.default_rng(0)
+    (root / "in").mkdir()
+    for n in range(5):
+        verts = egg.verts @ (np.eye(3) + 0.1 * rng.normal(size=(3, 3)))
+        save_shape(root / "in" / f"egg{n}.ply", Shape(verts, egg.faces))
+    prepare_folder(root / "in", root / "out", NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05))
+    return root / "out"
+
+
+def trained(prepared: Path, output: Path, chosen: Recipe = SMALL, **more) -> Path:
+    template = read_template(prepared / "template.safetensors")
+    source, count = folder_source(prepared, template)
+    assert count == 5
+    return train_model(
+        template,
+        source,
+        output,
+        recipe=chosen,
+        name="eggs",
+        category="eggs",
+        data="5 eggs",
+        licence="CC0-1.0",
+        **more,
+    )
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [SMALL, replace(SMALL, network=POINTS, scan=UPRIGHT, kernel="cubic")],
+    ids=["default", "paper"],
+)
+def test_a_folder_becomes_a_model(prepared: Path, tmp_path: Path, chosen: Recipe) -> None:
+    seen: list[Progress] = []
+    folder = trained(prepared, tmp_path / "model", chosen, progress=seen.append)
+    card = verify_model(folder)
+    assert (card.name, card.category, card.data, card.licence) == ("eggs", "eggs", "5 eggs", "CC0-1.0")
+    assert card.steps == 4
+    assert card.field == {"kernel": chosen.kernel, "radius": 0.45, "nodes": card.field["nodes"]}
+    assert card.recipe["train"]["shapes"] == 4
+    assert card.recipe["scan"]["points"] == 96
+    assert card.metrics["validation"]["distance"] > 0
+    assert seen[-1].step == 4
+    model = load_model(folder)
+    assert model.card == card
+    points = torch.randn(2, 50, 3, generator=torch.Generator().manual_seed(0)) * 0.2
+    assert model.network(points).shape == (2, model.template.K, 3)
+    assert not model.network.training
+
+
+def test_training_goes_on_from_the_checkpoint_unless_told_not_to(prepared: Path, tmp_path: Path) -> None:
+    whole = verify_model(trained(prepared, tmp_path / "whole"))
+    # the schedule is that of four steps; a folder whose run was stopped after two
+    stopped = tmp_path / "stopped"
+
+    def stop(now: Progress) -> None:
+        raise KeyboardInterrupt
+
+    half = replace(SMALL, train=replace(SMALL.train, checkpoint_minutes=0.0))
+    template = read_template(prepared / "template.safetensors")
+    source, _ = folder_source(prepared, template)
+    calls = iter(range(100))
+
+    def interrupted(count: int, generator: torch.Generator) -> torch.Tensor:
+        if next(calls) == 4:  # the basis and the held-out batch are drawn first, then the steps
+            raise KeyboardInterrupt
+        return source(count, generator)
+
+    with pytest.raises(KeyboardInterrupt):
+        train_model(template, interrupted, stopped, recipe=half, name="eggs")
+    assert (stopped / "checkpoint" / "last.safetensors").is_file()
+    assert not (stopped / "card.json").exists()  # no model yet
+    assert verify_model(trained(prepared, stopped)).weights_sha256 == whole.weights_sha256
+    again = verify_model(trained(prepared, stopped))  # nothing left to do: the same model
+    assert (again.weights_sha256, again.steps) == (whole.weights_sha256, 4)
+    longer = replace(SMALL, train=replace(SMALL.train, steps=6))
+    assert verify_model(trained(prepared, stopped, longer)).steps == 6
+    other = replace(SMALL, train=replace(SMALL.train, seed=1))
+    fresh = verify_model(trained(prepared, stopped, other, resume=False))
+    assert (fresh.steps, fresh.seed) == (4, 1)
+    assert fresh.weights_sha256 != whole.weights_sha256
+
+
+def test_an_output_that_cannot_be_made_is_told(prepared: Path, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(OutputError, match="cannot make the folder"):
+        trained(prepared, tmp_path / "taken")
+
+
+def test_the_presets_are_what_they_say() -> None:
+    paper, default = recipe("paper"), recipe("default")
+    assert recipe() == default
+    assert (paper.network.encoder, paper.network.decoder, paper.kernel) == ("point", "node", "cubic")
+    assert paper.network.align_basis == paper.network.corrections == 0
+    loss = paper.train.loss
+    assert (loss.reconstruction, loss.volume, loss.arap, loss.blend) == (1.0, 5e-3, 1e-2, 5e-3)
+    assert not loss.robust
+    assert (paper.train.shapes, paper.train.scans_per_shape, paper.train.rate) == (16, 1, 1e-3)
+    # 1,200 epochs of 1,000 shapes in batches of 16
+    assert paper.train.steps == 1_200_000 // 16
+    assert paper.scan == ScanConfig(3000, 0, 0, 0, 0, 0, 0, upright=True)
+    assert default.network.encoder == "basis"
+    assert default.scan.noise > 0
+    with pytest.raises(OptionError, match="no preset 'best'") as caught:
+        recipe("best")  # type: ignore[arg-type]
+    assert "paper" in caught.value.hint
+
+
+def test_templates_are_found_by_file_and_by_name(prepared: Path) -> None:
+    assert read_template("human-A").pose == "A"
+    assert read_template(prepared / "template.safetensors").K >= 36
+    with pytest.raises(TemplateError, match="human-Z"):
+        read_template("human-Z")
+    with pytest.raises(InputError, match="another template"):
+        folder_source(prepared, egg_template())
+
+
+def test_a_model_is_copied_whole(prepared: Path, tmp_path: Path) -> None:
+    folder = trained(prepared, tmp_path / "model", replace(SMALL, train=replace(SMALL.train, steps=1)))
+    copy_model(folder, tmp_path / "deep" / "copy")
+    assert verify_model(tmp_path / "deep" / "copy") == verify_model(folder)
+
+
+def test_bodies_need_a_template_of_the_body_model(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    rig = stick_figure()
+    monkeypatch.setattr(run, "cached_rig", lambda *_: rig)
+    with pytest.raises(OptionError, match="not made from the body model") as caught:
+        run.human_source(egg_template())
+    assert "--shapes" in caught.value.hint
+    dense = Shape(rig.rest[0].double().numpy(), rig.faces.numpy(), "stick")
+    keep = np.arange(0, dense.V, 2)
+    faces = np.stack([np.arange(len(keep) - 2) + k for k in range(3)], 1)
+    small = Shape(dense.verts[keep], faces)
+    half = Template("half", small, dense, np.eye(3), 1.0, np.zeros(len(keep), int), ("all",), np.arange(9))
+    drawn = run.human_source(half)(3, torch.Generator().manual_seed(0))
+    assert drawn.shape == (3, len(keep), 3)
+    wanted = run.body_source(rig)(3, torch.Generator().manual_seed(0))[:, keep]
+    assert torch.equal(drawn, wanted)
+
+
+def test_the_rig_is_built_once_and_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    built: list[int] = []
+
+    def build(identities: int, seed: int, progress=None):
+        built.append(identities)
+        return stick_figure(identities)
+
+    monkeypatch.setattr(run, "build_rig", build)
+    monkeypatch.setattr(run.platformdirs, "user_cache_dir", lambda name: str(tmp_path / "cache"))
+    first = run.cached_rig(3, 0)
+    second = run.cached_rig(3, 0)
+    assert built == [3]
+    assert torch.equal(first.heads, second.heads)
+    run.cached_rig(4, 0)
+    run.cached_rig(3, 1)
+    assert built == [3, 4, 3]
+
+
+def test_a_saved_template_is_read_by_file(tmp_path: Path) -> None:
+    egg = egg_template()
+    save_template(egg, tmp_path / "egg.safetensors")
+    assert read_template(tmp_path / "egg.safetensors").hash == egg.hash
