@@ -86,9 +86,6 @@ def test_training_goes_on_from_the_checkpoint_unless_told_not_to(prepared: Path,
     # the schedule is that of four steps; a folder whose run was stopped after two
     stopped = tmp_path / "stopped"
 
-    def stop(now: Progress) -> None:
-        raise KeyboardInterrupt
-
     half = replace(SMALL, train=replace(SMALL.train, checkpoint_minutes=0.0))
     template = read_template(prepared / "template.safetensors")
     source, _ = folder_source(prepared, template)

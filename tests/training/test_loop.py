@@ -1,0 +1,305 @@
+"""The loop: it learns, it stops in time, and a run that was stopped ends exactly where an unbroken one does."""
+
+import math
+import os
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from meshmatch.errors import ModelError, OptionError, OutputError
+from meshmatch.models.deformer import Deformer, NetworkConfig
+from meshmatch.templates.template import Template
+from meshmatch.training.datasets import Batch, BatchDataset
+from meshmatch.training.loop import Progress, TrainConfig, Trainer, config_dict, learning_rate
+from meshmatch.training.losses import LossConfig
+from meshmatch.training.scans import ScanConfig
+from tests.training.small import (
+    NETWORK,
+    POINTS,
+    SCAN,
+    UPRIGHT,
+    egg_template,
+    small_data,
+    small_network,
+    small_points,
+)
+
+CONFIG = TrainConfig(
+    steps=10, shapes=4, scans_per_shape=2, warm_up=3, decay=0.5, workers=0, loss=LossConfig(robust=True)
+)
+
+
+@pytest.fixture(scope="module")
+def egg() -> Template:
+    return egg_template()
+
+
+def trainer(
+    egg: Template, config: TrainConfig, network: NetworkConfig = NETWORK, scan: ScanConfig = SCAN
+) -> Trainer:
+    return Trainer(small_network(egg, network, scan), small_points(egg), config)
+
+
+def state(run: Trainer) -> dict[str, torch.Tensor]:
+    """All that the next step depends on."""
+    held = {f"model.{n}": t.clone() for n, t in run.model.state_dict().items()}
+    held |= {f"average.{n}": t.clone() for n, t in run.average.items()}
+    for index, moments in run.optimiser.state_dict()["state"].items():
+        held |= {f"optimiser.{index}.{n}": torch.as_tensor(t).clone() for n, t in moments.items()}
+    return held
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.parametrize(("network", "scan"), [(NETWORK, SCAN), (POINTS, UPRIGHT)], ids=["default", "paper"])
+def test_a_stopped_run_ends_where_an_unbroken_one_does(
+    egg: Template, tmp_path: Path, network: NetworkConfig, scan: ScanConfig
+) -> None:
+    """Bit for bit, dropout and batch norm of the paper's network included."""
+    whole = trainer(egg, CONFIG, network, scan)
+    whole.run(small_data(egg, whole.model, scan, length=10))
+
+    path = tmp_path / "last.safetensors"
+    first = trainer(egg, CONFIG, network, scan)
+
+    def stop(now: Progress) -> None:
+        if now.step == 4:
+            raise KeyboardInterrupt  # a kill
+
+    with pytest.raises(KeyboardInterrupt):
+        first.run(small_data(egg, first.model, scan, length=10), None, stop, every=1)
+    first.save(path)
+    torch.rand(17)  # another process has another global stream
+    second = trainer(egg, CONFIG, network, scan)
+    second.load(path)
+    assert second.step == 4
+    assert same(state(second), state(first))
+    second.run(small_data(egg, second.model, scan, length=10))
+    assert second.step == whole.step == 10
+    assert same(state(second), state(whole))
+    assert same(second.averaged_state(), whole.averaged_state())
+
+
+def test_a_seed_fixes_the_training(egg: Template) -> None:
+    def trained(seed: int) -> dict[str, torch.Tensor]:
+        run = trainer(egg, replace(CONFIG, steps=2, seed=seed))
+        run.run(small_data(egg, run.model, seed=seed, length=2))
+        return state(run)
+
+    first = trained(0)
+    assert same(first, trained(0))
+    assert not same(first, trained(1))
+
+
+def test_worker_processes_change_nothing(egg: Template) -> None:
+    def trained(workers: int) -> dict[str, torch.Tensor]:
+        run = trainer(egg, replace(CONFIG, steps=3, workers=workers))
+        run.run(small_data(egg, run.model, length=3))
+        return state(run)
+
+    assert same(trained(0), trained(1))
+
+
+@pytest.mark.parametrize("bf16", [False, True])
+def test_a_little_training_lowers_the_loss(egg: Template, bf16: bool) -> None:
+    config = replace(CONFIG, steps=80, rate=3e-3, bf16=bf16)
+    run = trainer(egg, config)
+    seen: list[Progress] = []
+    run.run(small_data(egg, run.model, length=80), None, seen.append, every=10)
+    first, last = seen[0].terms, seen[-1].terms
+    assert (
+        last["total"] < 0.95 * first["total"]
+    )  # mostly the aligner's, and an egg looks alike from many sides
+    assert last["error_code"] < 0.8 * first["error_code"]
+    assert last["error_corrected"] < 0.7 * first["error_corrected"]
+    assert [now.step for now in seen] == [10, 20, 30, 40, 50, 60, 70, 80]
+    assert not run.model.training
+
+
+def test_reports_are_means_over_what_they_cover(egg: Template) -> None:
+    def reports(every: int) -> list[Progress]:
+        run = trainer(egg, replace(CONFIG, steps=5))
+        seen: list[Progress] = []
+        run.run(small_data(egg, run.model, length=5), None, seen.append, every=every)
+        return seen
+
+    one, three = reports(1), reports(3)
+    assert [now.step for now in three] == [3, 5]
+    for now, covered in zip(three, (one[:3], one[3:]), strict=True):
+        for name, value in now.terms.items():
+            assert value == pytest.approx(
+                sum(other.terms[name] for other in covered) / len(covered), rel=1e-4
+            )
+
+
+def test_the_rate_by_hand() -> None:
+    config = TrainConfig(steps=100, rate=2.0, warm_up=4, decay=0.5)
+    rates = [learning_rate(step, config) for step in range(101)]
+    assert rates[:5] == [0.5, 1.0, 1.5, 2.0, 2.0]
+    assert rates[50] == 2.0
+    assert rates[75] == pytest.approx(1.0)
+    assert rates[60] == pytest.approx(2.0 * 0.5 * (1 + math.cos(math.pi * 0.2)))
+    assert rates[100] == pytest.approx(0.0)
+    assert learning_rate(99, replace(config, decay=0.0)) == 2.0
+    assert learning_rate(0, replace(config, warm_up=0)) == 2.0
+
+
+def test_minutes_stop_a_run_with_a_checkpoint_to_go_on_from(egg: Template, tmp_path: Path) -> None:
+    run = trainer(egg, replace(CONFIG, steps=100_000, minutes=0.2 / 60))
+    path = tmp_path / "last.safetensors"
+    began = time.monotonic()
+    run.run(small_data(egg, run.model, length=100_000), path)
+    assert 0 < run.step < 100_000
+    assert time.monotonic() - began < 60
+    other = trainer(egg, replace(CONFIG, steps=100_000))
+    other.load(path)
+    assert other.step == run.step
+    assert other.seconds == pytest.approx(run.seconds, abs=0.06)
+    assert other.seconds > 0
+
+
+def test_a_finished_run_has_nothing_left_to_do(egg: Template) -> None:
+    run = trainer(egg, CONFIG)
+    run.step = CONFIG.steps
+    before = state(run)
+    run.run(small_data(egg, run.model, length=10))
+    assert same(before, state(run))
+
+
+def test_the_average_follows_quickly_at_first(egg: Template) -> None:
+    run = trainer(egg, CONFIG)
+    name, parameter = next(iter(run.model.named_parameters()))
+    start = run.average[name].clone()
+    with torch.no_grad():
+        parameter += 1.0
+    run.step = 1
+    run._update_average()
+    assert torch.allclose(run.average[name], start + (1 - 2 / 11), atol=1e-6)  # keep = (1 + 1) / (10 + 1)
+    run.step = 10**9
+    run._update_average()
+    assert torch.allclose(run.average[name], start + 1 - (2 / 11) * 0.999, atol=1e-6)
+    averaged = run.averaged_state()
+    assert averaged.keys() == run.model.state_dict().keys()
+    assert torch.equal(averaged[name], run.average[name])
+    assert torch.equal(averaged["nodes"], run.model.nodes)
+
+
+def test_validation_is_asked_now_and_then(egg: Template) -> None:
+    run = trainer(egg, replace(CONFIG, steps=10))
+    seen: list[Progress] = []
+    asked: list[Deformer] = []
+
+    def validate(model: Deformer) -> float:
+        asked.append(model)
+        return 0.25
+
+    run.run(small_data(egg, run.model, length=10), None, seen.append, validate, every=1)
+    assert [now.validation for now in seen] == [None] * 9 + [0.25]
+    assert asked == [run.model]
+
+
+def test_a_checkpoint_that_does_not_fit_is_refused(egg: Template, tmp_path: Path) -> None:
+    path = tmp_path / "last.safetensors"
+    run = trainer(egg, CONFIG)
+    run.save(path)
+    before = state(run)
+    other = trainer(egg, CONFIG, replace(NETWORK, width=40))
+    with pytest.raises(ModelError, match="another network") as caught:
+        other.load(path)
+    assert caught.value.hint
+    held = load_file(path)
+    held["model.nodes"] = held["model.nodes"] + 1e-3
+    save_file(held, path, {"step": "4"})
+    with pytest.raises(ModelError, match="another template"):
+        run.load(path)
+    for content in (b"", b"\x00" * 100):
+        path.write_bytes(content)
+        with pytest.raises(ModelError, match="no checkpoint"):
+            run.load(path)
+    save_file(held, path)  # a safetensors file, but not of a trainer
+    with pytest.raises(ModelError, match="no checkpoint"):
+        run.load(path)
+    assert run.step == 0
+    assert same(before, state(run))  # untouched
+    with pytest.raises(OutputError):
+        run.save(tmp_path / "nowhere" / "last.safetensors")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"steps": 0},
+        {"shapes": 0},
+        {"scans_per_shape": 0},
+        {"threads": 0},
+        {"workers": -1},
+        {"rate": 0.0},
+        {"decay": 1.5},
+        {"minutes": 0.0},
+    ],
+)
+def test_impossible_settings_are_refused(values: dict) -> None:
+    with pytest.raises(OptionError):
+        TrainConfig(**values)
+
+
+def test_settings_become_plain_values() -> None:
+    values = config_dict(CONFIG)
+    assert values["loss"]["robust"] is True
+    assert values["steps"] == 10
+
+
+_TWO = replace(CONFIG, steps=4, minutes=60.0, loss=LossConfig(robust=True, blend=0.0))
+_ONE_OF_TWO = """
+import sys
+import torch.distributed as dist
+from safetensors.torch import save_file
+from tests.training.test_loop import _TWO, egg_template, small_data, trainer
+
+egg = egg_template()
+run = trainer(egg, _TWO)
+run.run(small_data(egg, run.model, length=8))
+save_file(run.averaged_state(), f"{sys.argv[1]}/rank{run.rank}.safetensors")
+dist.destroy_process_group()
+"""
+
+
+class Joined(torch.utils.data.Dataset):
+    """Item s is what two processes see at step s."""
+
+    def __init__(self, data: BatchDataset) -> None:
+        self.data = data
+
+    def __getitem__(self, step: int) -> Batch:
+        pair = zip(vars(self.data[2 * step]).values(), vars(self.data[2 * step + 1]).values(), strict=True)
+        return Batch(*(torch.cat(both) for both in pair))
+
+
+def test_two_processes_learn_as_one_that_sees_both_their_batches(egg: Template, tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    words = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "CUDA_VISIBLE_DEVICES": ""}
+    command = [sys.executable, "-c", _ONE_OF_TWO, str(tmp_path)]
+    root = Path(__file__).resolve().parents[2]
+    both = [subprocess.Popen(command, env=os.environ | words | {"RANK": rank}, cwd=root) for rank in "01"]
+    assert [process.wait(timeout=300) for process in both] == [0, 0]
+    ranks = [load_file(tmp_path / f"rank{rank}.safetensors") for rank in (0, 1)]
+    assert same(ranks[0], ranks[1])
+
+    alone = trainer(egg, _TWO)
+    fresh = alone.averaged_state()
+    alone.run(Joined(small_data(egg, alone.model, length=8)))  # type: ignore[arg-type]
+    found = alone.averaged_state()
+    for name, _ in alone.model.named_parameters():
+        learned = (found[name] - fresh[name]).abs().mean()
+        assert (found[name] - ranks[0][name]).abs().mean() <= 0.02 * learned + 1e-7, name
