@@ -17,7 +17,7 @@ def nearest(queries: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, 
         Nearest point minus query, in the unit of the input.
     """
     if queries.is_cuda:
-        index = torch.cdist(queries, points).argmin(-1)
+        index = every_pair(queries, points)
     else:
         found = [
             cKDTree(cloud, balanced_tree=False, compact_nodes=False).query(query)[1]
@@ -25,6 +25,11 @@ def nearest(queries: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, 
         ]
         index = torch.from_numpy(np.stack(found))
     return index, torch.gather(points, 1, index[..., None].expand(-1, -1, 3)) - queries
+
+
+def every_pair(queries: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """Index (B, Q) of the nearest point by comparing all of them: what suits a GPU."""
+    return torch.cdist(queries, points).argmin(-1)
 
 
 def two_way_offsets(anchors: torch.Tensor, points: torch.Tensor) -> torch.Tensor:

@@ -1,0 +1,277 @@
+"""The networks: what must not matter does not, and what goes in one by one comes out as in a batch."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from meshmatch.errors import ModelError
+from meshmatch.fields.mls import build_field
+from meshmatch.models.checkpoint import save_weights
+from meshmatch.models.decoder import FlatDecoder, NodeDecoder
+from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig, rotation_from_six
+from meshmatch.models.encoder import BasisEncoder, PointEncoder
+from meshmatch.models.layers import ResidualBlock, residual_mlp
+from meshmatch.models.neighbours import every_pair, nearest, two_way_offsets
+from meshmatch.models.registry import built_in_folder
+from meshmatch.models.trained import TrainedModel, blank_deformer, load_model
+from meshmatch.training.setup import build_deformer
+from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, bent_eggs, egg_template
+
+CONFIGS = pytest.mark.parametrize("config", [NETWORK, POINTS], ids=["basis", "point"])
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def clouds(B: int = 3, P: int = 60, seed: int = 0) -> torch.Tensor:
+    return 0.3 * torch.randn(B, P, 3, generator=seeded(seed))
+
+
+def network(config: NetworkConfig, seed: int = 0) -> Deformer:
+    """An egg's network whose last layers speak up: fresh ones hardly move anything."""
+    egg = egg_template()
+    scan = SCAN if config.encoder == "basis" else UPRIGHT
+    model = build_deformer(egg, bent_eggs(egg), config, scan, "smooth", seed)
+    generator = seeded(seed)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=generator)
+    return model.eval()
+
+
+@pytest.fixture(scope="module")
+def networks() -> dict[str, Deformer]:
+    return {config.encoder: network(config) for config in (NETWORK, POINTS)}
+
+
+@pytest.fixture(scope="module")
+def human() -> TrainedModel:
+    return load_model("human")
+
+
+# neighbours
+
+
+def test_nearest_points_by_hand() -> None:
+    points = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 5, 0]]])
+    queries = torch.tensor([[[0.9, 0, 0], [0, 3, 1]]])
+    index, offset = nearest(queries, points)
+    assert index.tolist() == [[1, 2]]
+    assert torch.allclose(offset, torch.tensor([[[0.1, 0, 0], [0, 2, -1]]]))
+
+
+def test_the_tree_and_every_pair_agree() -> None:
+    queries, points = clouds(4, 80, 1), clouds(4, 50, 2)
+    index, offset = nearest(queries, points)
+    assert torch.equal(index, every_pair(queries, points))
+    slow = (queries[:, :, None] - points[:, None]).norm(dim=-1).amin(-1)
+    assert torch.allclose(offset.norm(dim=-1), slow, atol=1e-6)
+
+
+def test_two_way_offsets_by_hand() -> None:
+    """Two anchors; three points see the first, none the second."""
+    anchors = torch.tensor([[[0.0, 0, 0], [0, 0, 9]]])
+    points = torch.tensor([[[1.0, 0, 0], [0, 2, 0], [0, 0, 3]]])
+    seen = two_way_offsets(anchors, points)[0]
+    assert torch.allclose(seen[0, :3], torch.tensor([1.0, 0, 0]))
+    assert torch.allclose(seen[0, 3:6], torch.tensor([1 / 3, 2 / 3, 1.0]))
+    assert float(seen[0, 6]) == pytest.approx(float(torch.tensor(3.0).log()), abs=1e-6)  # log(1 + 3 * 2/3)
+    assert torch.allclose(seen[1], torch.tensor([0.0, 0, -6, 0, 0, 0, 0]))
+
+
+def test_two_way_offsets_ignore_the_order_of_the_points() -> None:
+    anchors, points = clouds(2, 20, 1), clouds(2, 90, 2)
+    shuffled = points[:, torch.randperm(90, generator=seeded())]
+    assert torch.allclose(two_way_offsets(anchors, points), two_way_offsets(anchors, shuffled), atol=1e-6)
+
+
+# encoders and decoders
+
+
+@CONFIGS
+def test_the_encoder_ignores_the_order_of_the_points(networks: dict[str, Deformer], config) -> None:
+    encoder = networks[config.encoder].encoder
+    points = clouds()
+    shuffled = points[:, torch.randperm(60, generator=seeded())]
+    code = encoder(encoder.features(points))
+    assert code.shape == (3, 16)
+    assert torch.allclose(encoder(encoder.features(shuffled)), code, atol=1e-5)
+    assert (encoder(encoder.features(points + 0.1)) - code).abs().max() > 1e-3  # but not the points
+
+
+@CONFIGS
+def test_the_encoder_takes_any_number_of_points_and_repeated_ones(networks, config) -> None:
+    encoder = networks[config.encoder].encoder
+    points = clouds(2, 33)
+    code = encoder(encoder.features(points))
+    twice = torch.cat([points, points], 1)
+    assert torch.allclose(encoder(encoder.features(twice)), code, atol=1e-5)
+
+
+@CONFIGS
+def test_a_batch_of_one_equals_one_of_a_batch(networks: dict[str, Deformer], config) -> None:
+    model, points = networks[config.encoder], clouds()
+    together = model(points)
+    for n in range(3):
+        assert torch.allclose(model(points[n : n + 1])[0], together[n], atol=1e-5)
+    assert (together[0] - together[1]).abs().max() > 1e-3
+    assert together.shape == (3, model.K, 3)
+
+
+def test_the_positional_encoding_lies_on_a_sphere() -> None:
+    encoder = PointEncoder(8)
+    features = encoder.features(clouds())
+    assert features.shape == (3, 60, 6 * 21)
+    assert torch.allclose(features.norm(dim=-1), torch.ones(3, 60), atol=1e-5)
+    at_zero = encoder.features(torch.zeros(1, 1, 3))[0, 0] * 63**0.5
+    assert torch.allclose(at_zero.sort()[0], torch.tensor([0.0] * 63 + [1.0] * 63), atol=1e-6)
+    low, high = float(encoder.frequencies[0]), float(encoder.frequencies[-1])
+    assert (low, high) == pytest.approx((0.5, 4.0))
+
+
+def test_basis_features_are_offsets() -> None:
+    encoder = BasisEncoder(torch.tensor([[0.0, 0, 0], [1, 1, 1]]), 8, 1, 4)
+    points = torch.tensor([[[0.2, 0, 0], [1, 1, 1.4]]])
+    assert torch.allclose(encoder.features(points), torch.tensor([[[1.0, 0, 0], [0, 0, 2]]]), atol=1e-6)
+
+
+def test_the_node_decoder_is_one_mlp_over_nodes() -> None:
+    """[q_i, code] through one matrix is the same as the code's part, broadcast, plus the node's."""
+    torch.manual_seed(0)
+    nodes = clouds(1, 12)[0]
+    decoder = NodeDecoder(5, nodes, 16).eval()
+    code = torch.randn(3, 5, generator=seeded())
+    found = decoder(code)
+    assert found.shape == (3, 12, 3)
+    matrix = torch.cat([decoder.from_node.weight, decoder.from_code.weight], 1)
+    for b in range(3):
+        for k in range(12):
+            hidden = matrix @ torch.cat([nodes[k], code[b]]) + decoder.from_code.bias
+            one = 2 * torch.tanh(decoder.network(hidden[None]))[0]
+            assert torch.allclose(found[b, k], one, atol=1e-5)
+    shuffled = NodeDecoder(5, nodes.flip(0), 16).eval()
+    shuffled.load_state_dict(decoder.state_dict() | {"nodes": nodes.flip(0)})
+    assert torch.allclose(shuffled(code), found.flip(1), atol=1e-6)
+
+
+def test_the_flat_decoder_has_a_row_for_each_node() -> None:
+    assert FlatDecoder(5, 16, 1, 12)(torch.zeros(3, 5)).shape == (3, 12, 3)
+
+
+def test_a_fresh_residual_block_is_the_identity() -> None:
+    x = torch.randn(4, 8, generator=seeded())
+    assert torch.equal(ResidualBlock(8)(x), x)
+    torch.manual_seed(0)
+    assert residual_mlp(8, 64, 2, 30)(x).abs().max() < 0.2  # near zero: an untrained template stays at rest
+
+
+def test_predicted_rotations_are_rotations() -> None:
+    R = rotation_from_six(torch.randn(50, 6, generator=seeded()))
+    assert torch.allclose(R.transpose(1, 2) @ R, torch.eye(3).expand(50, 3, 3), atol=1e-5)
+    assert torch.allclose(torch.det(R), torch.ones(50), atol=1e-5)
+    hand = rotation_from_six(torch.tensor([[0.0, 2, 0, 1, 1, 0]]))[0]
+    assert torch.allclose(hand, torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]), atol=1e-6)
+
+
+# the whole
+
+
+def test_zero_nodes_move_nothing() -> None:
+    egg = egg_template()
+    field = build_field(egg.shape.verts, egg.nodes, egg.radius)
+    zero = torch.zeros(1, egg.K, 3)
+    assert torch.equal(field.displacement(zero), torch.zeros(1, 162, 3))
+    assert torch.equal(field.deformation_gradient(zero), torch.eye(3).expand(1, 162, 3, 3))
+
+
+def test_an_untrained_template_stays_nearly_at_rest() -> None:
+    egg = egg_template()
+    model = build_deformer(egg, bent_eggs(egg), NETWORK, SCAN, "smooth", 0).eval()
+    assert model(clouds()).abs().max() < 0.05
+
+
+def test_a_seed_fixes_the_network() -> None:
+    first, again, other = (network(NETWORK, seed).state_dict() for seed in (0, 0, 1))
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not torch.equal(first["encoder.basis"], other["encoder.basis"])
+
+
+def test_a_correction_is_relative_to_where_the_template_is(networks: dict[str, Deformer]) -> None:
+    model = networks["basis"]
+    vectors, points = 0.05 * torch.randn(2, model.K, 3, generator=seeded()), clouds(2)
+    step = model.correct(vectors, points) - vectors
+    assert torch.allclose(model.correct(vectors, points.flip(1)) - vectors, step, atol=1e-6)
+    assert (model.correct(vectors, points + 0.2) - vectors - step).abs().max() > 1e-3
+
+
+def test_the_aligner_answers_with_a_rigid_motion(networks: dict[str, Deformer]) -> None:
+    model = networks["basis"]
+    assert model.aligner is not None
+    R, t = model.align(model.aligner.features(clouds()))
+    assert (R.shape, t.shape) == ((3, 3, 3), (3, 3))
+    assert torch.allclose(torch.det(R), torch.ones(3), atol=1e-5)
+
+
+def test_what_a_config_leaves_out_is_not_there(networks: dict[str, Deformer]) -> None:
+    assert networks["point"].aligner is None
+    assert networks["point"].corrector is None
+    assert (PAPER.encoder, PAPER.decoder, PAPER.code) == ("point", "node", 512)
+
+
+@CONFIGS
+def test_saved_networks_come_back_bit_for_bit(networks, config, tmp_path: Path) -> None:
+    from meshmatch.models.checkpoint import load_weights
+
+    model = networks[config.encoder]
+    save_weights(model.state_dict(), tmp_path / "weights.safetensors", storage="float32")
+    found = blank_deformer(config, model.K)
+    expected = {name: tuple(value.shape) for name, value in found.state_dict().items()}
+    found.load_state_dict(load_weights(tmp_path / "weights.safetensors", expected))
+    points = clouds()
+    assert torch.equal(found.eval()(points), model(points))
+
+
+def test_configs_survive_their_card_and_unknown_options_do_not() -> None:
+    for config in (NetworkConfig(), PAPER, replace(NETWORK, basis=77)):
+        assert NetworkConfig.from_dict(config.to_dict()) == config
+    with pytest.raises(ModelError, match="unknown network options: wings") as caught:
+        NetworkConfig.from_dict(NETWORK.to_dict() | {"wings": 2})
+    assert "update" in caught.value.hint
+
+
+# the model that ships
+
+
+def test_the_model_that_ships_loads_and_is_the_one_of_its_card(human: TrainedModel) -> None:
+    assert human.card.template_hash == human.template.hash
+    assert human.network.K == human.template.K == len(human.network.nodes)
+    assert torch.allclose(human.network.nodes, torch.from_numpy(human.template.nodes).float(), atol=1e-6)
+    phi = human.network.anchor_phi
+    assert torch.allclose(phi.sum(1), torch.ones(len(phi)), atol=1e-4)  # the field's law, after storage
+    assert torch.allclose(phi @ human.network.nodes, human.network.anchors, atol=1e-4)
+    assert not human.network.training
+
+
+def test_the_model_that_ships_leaves_its_own_template_at_rest(human: TrainedModel) -> None:
+    rest = torch.from_numpy(human.template.shape.verts[::3].copy()).float()[None]
+    field = build_field(human.template.shape.verts, human.template.nodes, human.template.radius)
+    with torch.inference_mode():
+        moved = field.displacement(human.network(rest))[0]
+    assert moved.norm(dim=1).mean() < 0.035  # 5 cm on a body
+
+
+def test_another_template_beside_the_weights_is_refused(tmp_path: Path) -> None:
+    from meshmatch.templates.template import load_template, save_template
+    from meshmatch.training.run import copy_model
+
+    copy_model(built_in_folder() / "human", tmp_path / "human")
+    template = load_template(tmp_path / "human" / "template.safetensors")
+    save_template(replace(template, radius=0.14), tmp_path / "human" / "template.safetensors")
+    with pytest.raises(ModelError, match="trained with another template"):
+        load_model(tmp_path / "human")
+    with pytest.raises(ModelError, match="no model 'humna'") as caught:
+        load_model("humna")
+    assert "human" in caught.value.hint
