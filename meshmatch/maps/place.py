@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.topology import edges_of
 
 # An edge is torn where its ends belong this much further apart on the resting template (units of sqrt(area))
 # than they are, stretched by this factor.
@@ -35,11 +36,10 @@ def place(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndar
     if shape.is_cloud:
         return foot, resting
     knowing = Surface(fit.points, fit.faces, template_normals, fit.resting)
-    edges = np.unique(np.sort(shape.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    edges = edges_of(shape.faces).vertices
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
-    area = np.bincount(shape.faces.reshape(-1), np.repeat(shape.face_areas, 3), shape.V)
     for _ in range(_ROUNDS):
-        doubted = _doubted(edges, length, resting, area)
+        doubted = _doubted(edges, length, resting, shape.vertex_areas)
         if not doubted.any():
             break
         around = _fill(edges, resting, doubted)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from meshmatch.shapes.shape import squared_lengths
+
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area).
 NORMAL_WEIGHT = 0.15
 # How much a distance on the resting template counts beside one in space.
 RESTING_WEIGHT = 0.2
-_CHUNK = 100_000
+# Queries at a time: what belongs to them then stays in the processor's cache.
+_CHUNK = 8192
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +46,9 @@ class Surface:
         self, verts: np.ndarray, faces: np.ndarray, normals: np.ndarray, resting: np.ndarray | None = None
     ) -> None:
         self.verts, self.faces = verts, faces
-        used = np.unique(faces) if len(faces) else np.arange(len(verts))
-        self._used = used
-        self._tree = cKDTree(_features(verts, normals, resting)[used])
         self._start, self._around = _faces_around(faces, len(verts))
+        self._used = np.flatnonzero(np.diff(self._start)) if len(faces) else np.arange(len(verts))
+        self._tree = cKDTree(_features(verts, normals, resting)[self._used])
 
     def query(
         self, points: np.ndarray, normals: np.ndarray, workers: int = 1, resting: np.ndarray | None = None
@@ -56,28 +59,34 @@ class Surface:
         face = np.full(N, -1, np.int64)
         weights = np.zeros((N, 3))
         distance = np.empty(N)
-        for low in range(0, N, _CHUNK):
+
+        def answer(low: int) -> None:
             part = slice(low, min(low + _CHUNK, N))
             sought = _features(points[part], normals[part], None if resting is None else resting[part])
-            vertex[part] = self._used[self._tree.query(sought, workers=workers)[1]]
+            vertex[part] = self._used[self._tree.query(sought)[1]]
             if len(self.faces):
                 face[part], weights[part], distance[part] = self._on_faces(points[part], vertex[part])
             else:
                 distance[part] = np.linalg.norm(points[part] - self.verts[vertex[part]], axis=1)
+
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(answer, range(0, N, _CHUNK)))
         if not len(self.faces):
             weights[:, 0] = 1.0
         return Footpoints(vertex, face, weights, distance)
 
     def _on_faces(self, points: np.ndarray, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         counts = self._start[vertex + 1] - self._start[vertex]
-        query = np.repeat(np.arange(len(points)), counts)
-        within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        first = np.cumsum(counts) - counts
+        within = np.arange(counts.sum()) - np.repeat(first, counts)
         face = self._around[np.repeat(self._start[vertex], counts) + within]
-        weights = closest_on_triangles(points[query], *(self.verts[self.faces[face, k]] for k in range(3)))
-        foot = np.einsum("nk,nkd->nd", weights, self.verts[self.faces[face]])
-        squared = np.square(foot - points[query]).sum(1)
-        order = np.lexsort((squared, query))
-        best = order[np.searchsorted(query[order], np.arange(len(points)))]
+        corners = self.verts[self.faces[face]]  # N 3 3
+        asked = np.repeat(points, counts, axis=0)
+        weights = closest_on_triangles(asked, corners[:, 0], corners[:, 1], corners[:, 2])
+        squared = squared_lengths(np.einsum("nk,nkd->nd", weights, corners) - asked)
+        # The first of the nearest of each query's faces.
+        nearest = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, first), counts))
+        best = nearest[np.searchsorted(nearest, first)]
         return face[best], weights[best], np.sqrt(squared[best])
 
 
@@ -100,8 +109,8 @@ def closest_on_triangles(points: np.ndarray, a: np.ndarray, b: np.ndarray, c: np
     The plane's foot where it lies inside, else the closest point of the nearest edge.
     """
     ab, ac, ap = b - a, c - a, points - a
-    d00, d01, d11 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
-    d20, d21 = (ap * ab).sum(1), (ap * ac).sum(1)
+    d00, d01, d11 = _dot(ab, ab), _dot(ab, ac), _dot(ac, ac)
+    d20, d21 = _dot(ap, ab), _dot(ap, ac)
     scale = np.maximum(d00 * d11 - d01 * d01, 1e-300)
     v = (d11 * d20 - d01 * d21) / scale
     w = (d00 * d21 - d01 * d20) / scale
@@ -109,13 +118,13 @@ def closest_on_triangles(points: np.ndarray, a: np.ndarray, b: np.ndarray, c: np
     result = np.stack([1 - v - w, v, w], 1)
     out = np.flatnonzero(~inside)
     if len(out):
-        corners = (a[out], b[out], c[out])
+        corners, asked = (a[out], b[out], c[out]), points[out]
         best = np.full(len(out), np.inf)
         for i, j in ((0, 1), (1, 2), (2, 0)):
             along = corners[j] - corners[i]
-            t = ((points[out] - corners[i]) * along).sum(1) / np.maximum((along * along).sum(1), 1e-300)
+            t = _dot(asked - corners[i], along) / np.maximum(_dot(along, along), 1e-300)
             t = np.clip(t, 0, 1)
-            squared = np.square(corners[i] + t[:, None] * along - points[out]).sum(1)
+            squared = squared_lengths(corners[i] + t[:, None] * along - asked)
             closer = squared < best
             best = np.where(closer, squared, best)
             rows = out[closer]
@@ -123,3 +132,8 @@ def closest_on_triangles(points: np.ndarray, a: np.ndarray, b: np.ndarray, c: np
             result[rows, i] = 1 - t[closer]
             result[rows, j] = t[closer]
     return result
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(N,) products of rows; several times as fast as summing along an axis of three."""
+    return np.einsum("ni,ni->n", a, b)

@@ -59,11 +59,19 @@ class Edges:
         larger.
     begins, sizes : (E,) int64
         Where each edge begins in `ordered`, and how many faces it has.
+    stride : int
+        The number of the edge between vertices i < j is i * stride + j.
     """
 
     ordered: Ints
     begins: Ints
     sizes: Ints
+    stride: int
+
+    @property
+    def vertices(self) -> Ints:
+        """(E, 2) the two vertices of each edge, the smaller first; sorted."""
+        return np.stack(np.divmod(self.ordered[self.begins] >> 1, self.stride), axis=1)
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -82,7 +90,7 @@ def edges_of(faces: Ints) -> Edges:
     ordered = np.sort(directed_edges(faces))
     group = ordered >> 1
     begins = np.flatnonzero(np.diff(group, prepend=-1))
-    return Edges(ordered, begins, np.diff(np.append(begins, len(group))))
+    return Edges(ordered, begins, np.diff(np.append(begins, len(group))), _stride(faces))
 
 
 def directed_edges(faces: Ints) -> Ints:
