@@ -18,11 +18,13 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_shape import FitConfig, Refine
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
 from meshmatch.maps.build import build_map
+from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel, load_model
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.direction import check_map, pull_back
 
 # What is going on, on which shape, and which share of it is done.
 Progress = Callable[[str, str, float], None]
@@ -147,6 +149,73 @@ def map_between(
 ) -> VertexMap:
     """The map between two shapes that were fitted with the same model."""
     return build_map(usable(source), source_fit, usable(target), target_fit, workers=workers)
+
+
+@dataclass(frozen=True, eq=False)
+class CarryResult:
+    """The two maps along which things are carried, and where they come from.
+
+    Parameters
+    ----------
+    back : VertexMap
+        From target to source: where on the source the value of each target vertex lies.
+    forward : VertexMap
+        From source to target: where each source vertex comes to lie.
+    match : MatchResult, optional
+        If the shapes were matched; None where a map was given.
+    """
+
+    back: VertexMap
+    forward: VertexMap
+    match: MatchResult | None
+
+
+def carry(
+    source: Shape | str | Path,
+    target: Shape | str | Path,
+    map: VertexMap | str | Path | None = None,
+    *,
+    model: str | Path = "human",
+    refine: Refine = "nodes",
+    seed: int = 0,
+    up: str | None = None,
+    front: str | None = None,
+    workers: int = 2,
+    progress: Progress | None = None,
+) -> CarryResult:
+    """The maps for carrying what lies on `source` to `target`.
+
+    Parameters
+    ----------
+    map : VertexMap or path, optional
+        A map from source to target that is at hand; it is checked and turned round. Without one the shapes are
+        matched, and both maps come from the two fits. The other parameters are those of `match`, and only for
+        that.
+
+    Raises
+    ------
+    MeshmatchError
+        As `match`; or `InputError` if the map was made for other shapes or runs the wrong way.
+    """
+    source, target = as_shape(source), as_shape(target)
+    if map is not None:
+        found = map if isinstance(map, VertexMap) else load_map(map)
+        label = "the map" if isinstance(map, VertexMap) else Path(map).name
+        forward = check_map(found, source, target, label)
+        return CarryResult(pull_back(forward, source, target, workers), forward, None)
+    result = match(
+        source,
+        target,
+        model=model,
+        refine=refine,
+        seed=seed,
+        up=up,
+        front=front,
+        workers=workers,
+        progress=progress,
+    )
+    back = map_between(target, result.target_fit, source, result.source_fit, workers=workers)
+    return CarryResult(back, result.map, result)
 
 
 @lru_cache(maxsize=2)

@@ -44,7 +44,10 @@ OWNERS = {
     "rich": {"experiments", "cli"},
     "robust_laplacian": {"templates", "maps"},
     "safetensors": {"templates", "models", "training"},
-    "scipy": {"shapes", "templates", "models", "training", "fitting", "maps", "render", "experiments"},
+    "scipy": {
+        *("shapes", "templates", "models", "training", "fitting", "maps", "transfer", "render"),
+        "experiments",
+    },
     "torch": {"fields", "models", "training", "fitting"},
     "trimesh": {"shapes"},
     "typer": {"cli"},

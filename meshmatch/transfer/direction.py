@@ -1,0 +1,144 @@
+"""Which way a map runs, and turning it round."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from meshmatch.errors import InputError
+from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
+from meshmatch.shapes.shape import Ints, Shape
+from meshmatch.transfer.image import Image, on_vertex
+
+_OTHER = "match these two again, or keep the map as .npy or .csv, which go by the count of vertices alone"
+
+
+def check_map(found: VertexMap, source: Shape, target: Shape, label: str = "the map") -> VertexMap:
+    """The map, if it is one from `source` to `target`, with what it did not know about them filled in.
+
+    Goes by the hashes of both shapes where the map has them, else by their counts of vertices.
+
+    Raises
+    ------
+    InputError
+        The map was made for another mesh, runs from target to source, or names a vertex or a face that the
+        target does not have.
+    """
+    a, b = source.name or "the source", target.name or "the target"
+    hashes, counts = (found.source_hash, found.target_hash), (found.source_vertices, found.target_vertices)
+    forward = _agrees(hashes, counts, source, target)
+    if not forward and _agrees(hashes, counts, target, source) and found.index.max() < source.V:
+        raise InputError(
+            f"{label} runs the wrong way: from {b} to {a}, where one from {a} to {b} is needed",
+            f"swap the two shapes, or match {a} to {b} ({DIRECTION})",
+        )
+    for side, shape, name in (("source", source, a), ("target", target, b)):
+        digest, count = getattr(found, f"{side}_hash"), getattr(found, f"{side}_vertices")
+        made_for = getattr(found, side)
+        if count not in (UNKNOWN, shape.V):
+            other = f"{made_for or 'another mesh'} of {count} vertices"
+            raise InputError(
+                f"{label} was made for another {side}: {other}, but {name} has {shape.V}",
+                "one entry is needed for each vertex of the source, in the order of its file"
+                if side == "source"
+                else _OTHER,
+            )
+        if digest not in ("", shape.hash):
+            other = f"{made_for or 'a mesh'} ({digest})"
+            raise InputError(
+                f"{label} was made for another {side}: {other}, but {name} is {shape.hash}: its vertices or "
+                "faces differ",
+                _OTHER,
+            )
+    try:
+        made = replace(
+            found,
+            source=found.source or source.name,
+            target=found.target or target.name,
+            source_vertices=source.V,
+            target_vertices=target.V,
+            source_hash=source.hash,
+            target_hash=target.hash,
+        )
+        made.check_faces(target)
+    except InputError as error:
+        raise InputError(f"{label}: {error.message}", error.hint) from error
+    return made
+
+
+def _agrees(hashes: tuple[str, str], counts: tuple[int, int], source: Shape, target: Shape) -> bool:
+    named = all(digest in ("", shape.hash) for digest, shape in zip(hashes, (source, target), strict=True))
+    return named and counts[0] == source.V and counts[1] in (UNKNOWN, target.V)
+
+
+def pull_back(source_to_target: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
+    """A map from target to source, from one from source to target.
+
+    The source's vertices at their matched points, with the source's faces, are an image of the source on the
+    target; each target vertex takes the closest point of it (see `meshmatch.transfer.image`). Confidence falls
+    with the distance: it is low where nothing of the source was mapped to.
+
+    Raises
+    ------
+    InputError
+        As `check_map`.
+    """
+    checked = check_map(source_to_target, source, target)
+    if source.hash == target.hash and _is_identity(checked):
+        return replace(checked, source=target.name, target=source.name)
+    places = Image(checked, source, target).query(target.verts, target_normals(target), workers)
+    index, face, weights = places.vertex, places.face, places.barycentric
+    confidence = places.confidence
+    chosen = _middles(checked, source, target.V)
+    several = np.flatnonzero(chosen >= 0)
+    index[several], face[several] = chosen[several], -1
+    weights[several] = (1.0, 0.0, 0.0)
+    confidence[several] = checked.confidence[chosen[several]]
+    if target.invalid is not None:
+        confidence[target.invalid] = 0.0
+    return VertexMap.between(
+        target,
+        source,
+        index=index,
+        face=face,
+        barycentric=weights,
+        confidence=np.clip(confidence, 0.0, 1.0).astype(np.float32),
+        verdict=checked.verdict,
+        reasons=checked.reasons,
+    )
+
+
+def target_normals(target: Shape) -> np.ndarray:
+    """(V, 3) unit normals of a mesh; zeros for a cloud, whose signs are unsure."""
+    return np.zeros_like(target.verts) if target.is_cloud else target.vertex_normals
+
+
+def _is_identity(found: VertexMap) -> bool:
+    return bool((found.index == np.arange(found.source_vertices)).all() and (found.face < 0).all())
+
+
+def _middles(found: VertexMap, source: Shape, V: int) -> Ints:
+    """(V_tgt,) the middle one of the several source vertices that meet on a target vertex; -1 elsewhere.
+
+    A map of vertex numbers to a coarser target puts a patch of the source on each vertex, and any of them is
+    closest.
+    """
+    best = np.zeros(V)
+    rows = np.flatnonzero(on_vertex(found))
+    at = found.index[rows]
+    np.maximum.at(best, at, found.confidence[rows])
+    sure = found.confidence[rows] >= 0.5 * best[at]
+    if source.invalid is not None:
+        sure &= ~source.invalid[rows]
+    rows, at = rows[sure], at[sure]
+    many = np.bincount(at, minlength=V)
+    middle = np.stack([np.bincount(at, source.verts[rows, k], V) for k in range(3)], axis=1)
+    middle = middle / np.maximum(many, 1)[:, None]
+    away = np.linalg.norm(source.verts[rows] - middle[at], axis=1)
+    order = np.lexsort((rows, away, at))
+    vertex, first = np.unique(at[order], return_index=True)
+    chosen = np.full(V, -1, np.int64)
+    chosen[vertex] = rows[order[first]]
+    chosen[many < 2] = -1
+    return chosen

@@ -1,0 +1,234 @@
+"""The source as it lies on the target: every source vertex at its matched point, with the source's own faces.
+
+A point of the target finds its place on the source as the closest point of that image. Where several parts of
+the image pass by, the most trustworthy wins: facing the same way, confidently mapped, near, and never a triangle
+that the map has torn apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from meshmatch.maps.surface import closest_on_triangles
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.shape import Floats, Ints, Shape, squared_lengths
+from meshmatch.shapes.topology import edges_of
+
+# Distance to the image (units of sqrt(area)) at which confidence has fallen to about 0.37, as in maps.
+SCALE = 0.03
+# How far a part of the image that faces the other way is pushed off, in units of sqrt(area).
+_FACING = 0.15
+# Above this confidence the map is simply believed, and the closest point wins.
+_BELIEVED = 0.5
+# An edge of the image may be this many times as long as the source's, and a little more (units of sqrt(area)).
+_STRETCH, _SLACK = 3.0, 0.02
+# Triangles are searched by size: up to 2, 8, 32 times the median radius, and the rest.
+_SIZES = (2.0, 8.0, 32.0, np.inf)
+_CHUNK, _FIRST, _MOST = 8192, 8, 512
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where N points of the target lie on the source.
+
+    Parameters
+    ----------
+    vertex : (N,) int64
+        The source vertex nearest in weight.
+    face : (N,) int64
+        Source face; -1 where only the vertex is known (always for a cloud).
+    barycentric : (N, 3) float64
+        Weights of the face's corners; (1, 0, 0) where the face is -1.
+    confidence : (N,) float64
+        That of the map there, falling with the distance to the image.
+    distance : (N,) float64
+        Distance to the image, units of the target's file.
+    """
+
+    vertex: Ints
+    face: Ints
+    barycentric: Floats
+    confidence: Floats
+    distance: Floats
+
+
+class Image:
+    """The source laid on the target by a map from source to target.
+
+    Parameters
+    ----------
+    source_to_target : VertexMap
+        Made for these two shapes; see `meshmatch.transfer.direction.check_map`.
+    """
+
+    def __init__(self, source_to_target: VertexMap, source: Shape, target: Shape) -> None:
+        self.points = source_to_target.points(target)
+        self.confidence = source_to_target.confidence.astype(np.float64)
+        self.unit = float(np.sqrt(target.area)) or target.diagonal or 1.0
+        self.normals = _normals_at(source_to_target, target)
+        kept = np.flatnonzero(~torn_faces(source_to_target, source, target, self.points, self.unit))
+        lone = np.ones(source.V, bool)
+        lone[source.faces[kept].ravel()] = False
+        if source.invalid is not None:  # their places are stand-ins
+            kept = kept[~source.invalid[source.faces[kept]].any(axis=1)]
+            lone &= ~source.invalid
+        self._source_faces = source.faces
+        single = np.flatnonzero(lone)
+        # Triangles, then the points that no triangle holds: those of a cloud, or between tears.
+        self.corners = np.concatenate([source.faces[kept], np.repeat(single[:, None], 3, axis=1)])
+        self.face = np.concatenate([kept, np.full(len(single), -1)])
+        held = self.points[self.corners]
+        self._center = held.mean(axis=1)
+        self._radius = np.sqrt(((held - self._center[:, None]) ** 2).sum(axis=2).max(axis=1))
+        self._trees = self._by_size()
+        # A cloud has gaps between its points, which are no reason for doubt.
+        distinct = len(np.unique(self.points, axis=0)) if source.is_cloud else 1
+        self._gap = self.unit / np.sqrt(distinct) if source.is_cloud else 0.0
+
+    def _by_size(self) -> list[tuple[cKDTree, Ints, float]]:
+        """Trees of the centres of small and of large triangles, with their numbers and the largest radius."""
+        usual = float(np.median(self._radius)) or float(self._radius.max())
+        trees, low = [], -1.0
+        for factor in _SIZES:
+            high = factor * usual if usual > 0 else np.inf
+            which = np.flatnonzero((self._radius > low) & (self._radius <= high))
+            if len(which):
+                trees.append((cKDTree(self._center[which]), which, float(self._radius[which].max())))
+            low = high
+        return trees
+
+    def query(self, points: Floats, normals: Floats | None = None, workers: int = 1) -> Places:
+        """Places on the source of (N, 3) points on the target, in its file's frame.
+
+        Parameters
+        ----------
+        normals : (N, 3), optional
+            Unit normals of the target there; zeros where unknown.
+        """
+        points = np.asarray(points, np.float64)
+        N = len(points)
+        facing = np.zeros((N, 3)) if normals is None else np.asarray(normals, np.float64)
+        item, weights = np.empty(N, np.int64), np.empty((N, 3))
+        cost = np.empty(N)
+        for low in range(0, N, _CHUNK):
+            part = slice(low, low + _CHUNK)
+            item[part], weights[part], cost[part] = self._search(points[part], facing[part], workers)
+        corners = self.corners[item]
+        foot = np.einsum("nk,nkd->nd", weights, self.points[corners])
+        distance = np.sqrt(squared_lengths(foot - points))
+        beyond = np.maximum(distance - self._gap, 0.0)
+        confidence = np.einsum("nk,nk->n", weights, self.confidence[corners])
+        confidence = np.clip(confidence, 0, 1) * np.exp(-np.square(beyond / (SCALE * self.unit)))
+        against = self._against(facing, np.einsum("nk,nkd->nd", weights, self.normals[corners]))
+        confidence *= np.exp(-np.square(_FACING / SCALE * against))
+        face = self.face[item]
+        vertex = corners[np.arange(N), weights.argmax(axis=1)]
+        weights[face < 0] = (1.0, 0.0, 0.0)
+        return Places(vertex, face, weights, confidence, distance)
+
+    def _search(self, points: Floats, normals: Floats, workers: int) -> tuple[Ints, Floats, Floats]:
+        """The best item of each point, the weights of its corners, and its cost.
+
+        Centres come nearest first, so that a search ends where no further item can be better. That is exact
+        until `_MOST` items have been tried for a point.
+        """
+        N = len(points)
+        best, item, weights = np.full(N, np.inf), np.zeros(N, np.int64), np.zeros((N, 3))
+
+        def attempt(rows: Ints, items: Ints) -> None:
+            if not len(rows):
+                return
+            found, costs = self._costs(points[rows], normals[rows], items)
+            order = np.lexsort((items, costs, rows))
+            first = order[np.unique(rows[order], return_index=True)[1]]
+            row = rows[first]
+            better = (costs[first] < best[row]) | ((costs[first] == best[row]) & (items[first] < item[row]))
+            first, row = first[better], row[better]
+            best[row], item[row], weights[row] = costs[first], items[first], found[first]
+
+        for tree, which, largest in self._trees:
+            rows, done, ask = np.arange(N), 0, min(_FIRST, len(which))
+            while len(rows):
+                distance, near = (
+                    a.reshape(len(rows), -1) for a in tree.query(points[rows], ask, workers=workers)
+                )
+                if done == 0:
+                    attempt(rows, which[near[:, 0]])
+                    done = 1
+                fresh, items = distance[:, done:], which[near[:, done:]]
+                lower = np.maximum(fresh - self._radius[items], 0.0)
+                row, column = np.nonzero(lower**2 <= best[rows][:, None])
+                attempt(rows[row], items[row, column])
+                if ask >= min(len(which), _MOST):
+                    break
+                rows = rows[np.maximum(distance[:, -1] - largest, 0.0) ** 2 <= best[rows]]
+                done, ask = ask, min(4 * ask, len(which), _MOST)
+        return item, weights, best
+
+    def _costs(self, points: Floats, normals: Floats, items: Ints) -> tuple[Floats, Floats]:
+        """Weights (N, 3) of the closest points of items (N,), and what they cost: squared lengths."""
+        corners = self.corners[items]
+        a, b, c = (self.points[corners[:, k]] for k in range(3))
+        weights = closest_on_triangles(points, a, b, c)
+        foot = weights[:, :1] * a + weights[:, 1:2] * b + weights[:, 2:] * c
+        sure = np.einsum("nk,nk->n", weights, self.confidence[corners])
+        doubt = np.log(_BELIEVED / np.clip(sure, 1e-6, _BELIEVED))
+        against = self._against(normals, np.einsum("nk,nkd->nd", weights, self.normals[corners]))
+        squared = squared_lengths(foot - points)
+        return weights, squared + self.unit**2 * (SCALE**2 * doubt + (_FACING * against) ** 2)
+
+    @staticmethod
+    def _against(a: Floats, b: Floats) -> Floats:
+        """(N,) 0 where two normals lie in one half of space, up to 1 where they are opposite."""
+        lengths = np.sqrt(squared_lengths(a) * squared_lengths(b))
+        return np.maximum(-np.einsum("ni,ni->n", a, b) / np.maximum(lengths, 1e-30), 0.0)
+
+
+def torn_faces(
+    source_to_target: VertexMap, source: Shape, target: Shape, points: Floats, unit: float
+) -> NDArray[np.bool_]:
+    """(F_src,) True for a face whose image `points` (V_src, 3) is far longer than the face itself.
+
+    A map that names vertices alone moves each point by up to an edge of the target, which is allowed for.
+    """
+    if source.is_cloud:
+        return np.zeros(0, bool)
+    around = source.faces[:, [1, 2, 0]]
+    own = np.linalg.norm(source.verts[source.faces] - source.verts[around], axis=2)
+    image = np.linalg.norm(points[source.faces] - points[around], axis=2)
+    usual = image <= np.quantile(image, 0.95)
+    scale = image[usual].sum() / max(own[usual].sum(), 1e-300)
+    rounded = np.where(on_vertex(source_to_target), _edge_lengths(target)[source_to_target.index], 0.0)
+    allowed = _STRETCH * scale * own + rounded[source.faces] + rounded[around] + _SLACK * unit
+    return np.asarray((image > allowed).any(axis=1))
+
+
+def on_vertex(found: VertexMap) -> NDArray[np.bool_]:
+    """(V_src,) True where the matched point is the vertex ``index[i]`` itself."""
+    return np.asarray((found.face < 0) | (found.barycentric.max(axis=1) >= 1.0 - 1e-12))
+
+
+def _edge_lengths(shape: Shape) -> Floats:
+    """(V,) twice the mean length of the edges at each vertex; of a cloud, of the gaps between its points."""
+    if shape.is_cloud:
+        return 2.0 * np.sqrt(shape.vertex_areas)
+    edges = edges_of(shape.faces).vertices
+    length = np.linalg.norm(shape.verts[edges[:, 0]] - shape.verts[edges[:, 1]], axis=1)
+    ends = edges.T.ravel()
+    total = np.bincount(ends, np.tile(length, 2), shape.V)
+    return 2.0 * total / np.maximum(np.bincount(ends, minlength=shape.V), 1)
+
+
+def _normals_at(found: VertexMap, target: Shape) -> Floats:
+    """(V_src, 3) the target's normals at the matched points; zeros on a cloud, whose signs are unsure."""
+    if target.is_cloud:
+        return np.zeros((found.source_vertices, 3))
+    normals = target.vertex_normals[found.index]
+    inside = found.face >= 0
+    corners = target.faces[found.face[inside]]
+    normals[inside] = np.einsum("nk,nkd->nd", found.barycentric[inside], target.vertex_normals[corners])
+    return normals
