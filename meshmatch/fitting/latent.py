@@ -59,6 +59,11 @@ class PaperEnergy:
             + self.config.arap * arap_energy(F).mean()
         )
 
+    def value(self, vectors: np.ndarray) -> float:
+        """The same of an array (K, 3)."""
+        with torch.no_grad():
+            return float(self(torch.from_numpy(vectors).float()[None]))
+
 
 def refine_code(
     model: Deformer,

@@ -94,6 +94,15 @@ def human_source(
     return body_source(restrict(rig, keep, np.array(template.shape.faces)))
 
 
+def unseen_bodies(template: Template, count: int, trained: int = 0, seed: int = 0) -> np.ndarray:
+    """Generated bodies (count, V, 3) in metres on a human template's vertices, of people that a training never drew.
+
+    ``trained`` is the seed of that training: people are drawn with another one, and few of them.
+    """
+    other = trained + 1 + seed
+    return human_source(template, 64, other)(count, torch.Generator().manual_seed(other)).double().numpy()
+
+
 def cached_rig(identities: int, seed: int, progress: Callable[[int, int], None] | None = None) -> Rig:
     """The body rig from the cache, or built into it (a minute or two, once)."""
     path = (

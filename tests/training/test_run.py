@@ -168,6 +168,24 @@ def test_bodies_need_a_template_of_the_body_model(monkeypatch: pytest.MonkeyPatc
     assert torch.equal(drawn, wanted)
 
 
+def test_unseen_bodies_are_of_people_that_the_training_never_drew(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, int]] = []
+
+    def source(template: Template, identities: int, seed: int):
+        asked.append((identities, seed))
+        return lambda count, generator: torch.rand(count, 5, 3, generator=generator)
+
+    monkeypatch.setattr(run, "human_source", source)
+    egg = egg_template()
+    drawn = [run.unseen_bodies(egg, 2, trained, seed) for trained, seed in ((0, 0), (0, 1), (7, 0), (0, 0))]
+    assert [seed for _, seed in asked] == [1, 2, 8, 1]
+    assert all(identities < 4096 for identities, _ in asked)
+    assert drawn[0].shape == (2, 5, 3)
+    assert drawn[0].dtype == np.float64
+    assert np.array_equal(drawn[0], drawn[3])
+    assert not np.array_equal(drawn[0], drawn[1])
+
+
 def test_the_rig_is_built_once_and_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     built: list[int] = []
 
