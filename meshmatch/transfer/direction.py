@@ -133,8 +133,8 @@ def _middles(found: VertexMap, source: Shape, V: int) -> Ints:
         sure &= ~source.invalid[rows]
     rows, at = rows[sure], at[sure]
     many = np.bincount(at, minlength=V)
-    middle = np.stack([np.bincount(at, source.verts[rows, k], V) for k in range(3)], axis=1)
-    middle = middle / np.maximum(many, 1)[:, None]
+    sums = np.stack([np.bincount(at, source.verts[rows, k], V) for k in range(3)], axis=1)
+    middle = sums / np.maximum(many, 1)[:, None]
     away = np.linalg.norm(source.verts[rows] - middle[at], axis=1)
     order = np.lexsort((rows, away, at))
     vertex, first = np.unique(at[order], return_index=True)

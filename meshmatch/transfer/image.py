@@ -26,9 +26,10 @@ _FACING = 0.15
 _BELIEVED = 0.5
 # An edge of the image may be this many times as long as the source's, and a little more (units of sqrt(area)).
 _STRETCH, _SLACK = 3.0, 0.02
-# Triangles are searched by size: up to 2, 8, 32 times the median radius, and the rest.
-_SIZES = (2.0, 8.0, 32.0, np.inf)
-_CHUNK, _FIRST, _MOST = 8192, 8, 512
+# Triangles are searched by size, each class up to twice as large as the one before, and at most so many classes.
+_CLASSES = 12
+# Queries at a time; how many triangles are tried first, and at most.
+_CHUNK, _FIRST, _MOST = 8192, 12, 512
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,16 +91,11 @@ class Image:
         self._gap = self.unit / np.sqrt(distinct) if source.is_cloud else 0.0
 
     def _by_size(self) -> list[tuple[cKDTree, Ints, float]]:
-        """Trees of the centres of small and of large triangles, with their numbers and the largest radius."""
-        usual = float(np.median(self._radius)) or float(self._radius.max())
-        trees, low = [], -1.0
-        for factor in _SIZES:
-            high = factor * usual if usual > 0 else np.inf
-            which = np.flatnonzero((self._radius > low) & (self._radius <= high))
-            if len(which):
-                trees.append((cKDTree(self._center[which]), which, float(self._radius[which].max())))
-            low = high
-        return trees
+        """For triangles of each size: a tree of their centres, their numbers, and the largest radius."""
+        largest = float(self._radius.max()) or 1.0
+        size = np.floor(np.log2(np.maximum(self._radius / largest, 0.5**_CLASSES)))
+        groups = [np.flatnonzero(size == k) for k in np.unique(size)]
+        return [(cKDTree(self._center[own]), own, float(self._radius[own].max())) for own in groups]
 
     def query(self, points: Floats, normals: Floats | None = None, workers: int = 1) -> Places:
         """Places on the source of (N, 3) points on the target, in its file's frame.
@@ -112,11 +108,7 @@ class Image:
         points = np.asarray(points, np.float64)
         N = len(points)
         facing = np.zeros((N, 3)) if normals is None else np.asarray(normals, np.float64)
-        item, weights = np.empty(N, np.int64), np.empty((N, 3))
-        cost = np.empty(N)
-        for low in range(0, N, _CHUNK):
-            part = slice(low, low + _CHUNK)
-            item[part], weights[part], cost[part] = self._search(points[part], facing[part], workers)
+        item, weights, _ = self._search(points, facing, workers)
         corners = self.corners[item]
         foot = np.einsum("nk,nkd->nd", weights, self.points[corners])
         distance = np.sqrt(squared_lengths(foot - points))
@@ -134,7 +126,7 @@ class Image:
         """The best item of each point, the weights of its corners, and its cost.
 
         Centres come nearest first, so that a search ends where no further item can be better. That is exact
-        until `_MOST` items have been tried for a point.
+        until `_MOST` items of a size have been tried for a point.
         """
         N = len(points)
         best, item, weights = np.full(N, np.inf), np.zeros(N, np.int64), np.zeros((N, 3))
@@ -144,29 +136,35 @@ class Image:
                 return
             found, costs = self._costs(points[rows], normals[rows], items)
             order = np.lexsort((items, costs, rows))
-            first = order[np.unique(rows[order], return_index=True)[1]]
+            first = order[np.flatnonzero(np.diff(rows[order], prepend=-1))]
             row = rows[first]
             better = (costs[first] < best[row]) | ((costs[first] == best[row]) & (items[first] < item[row]))
             first, row = first[better], row[better]
             best[row], item[row], weights[row] = costs[first], items[first], found[first]
 
-        for tree, which, largest in self._trees:
-            rows, done, ask = np.arange(N), 0, min(_FIRST, len(which))
-            while len(rows):
-                distance, near = (
-                    a.reshape(len(rows), -1) for a in tree.query(points[rows], ask, workers=workers)
-                )
-                if done == 0:
-                    attempt(rows, which[near[:, 0]])
-                    done = 1
-                fresh, items = distance[:, done:], which[near[:, done:]]
-                lower = np.maximum(fresh - self._radius[items], 0.0)
-                row, column = np.nonzero(lower**2 <= best[rows][:, None])
-                attempt(rows[row], items[row, column])
-                if ask >= min(len(which), _MOST):
-                    break
-                rows = rows[np.maximum(distance[:, -1] - largest, 0.0) ** 2 <= best[rows]]
-                done, ask = ask, min(4 * ask, len(which), _MOST)
+        nearest = cKDTree(self._center).query(points, workers=workers)[1]
+        for low in range(0, N, _CHUNK):
+            some = np.arange(low, min(low + _CHUNK, N))
+            attempt(some, nearest[some])
+        easy = np.argsort(best, kind="stable")  # those near the image together: their searches reach less far
+        for low in range(0, N, _CHUNK):
+            for tree, which, largest in self._trees:
+                rows, done, ask = easy[low : low + _CHUNK], 0, min(_FIRST, len(which))
+                while len(rows):
+                    reach = np.sqrt(best[rows].max()) + largest
+                    distance, near = tree.query(
+                        points[rows], ask, distance_upper_bound=reach * (1 + 1e-9), workers=workers
+                    )
+                    distance, near = distance.reshape(len(rows), -1), near.reshape(len(rows), -1)
+                    row, column = np.nonzero(np.isfinite(distance[:, done:]))
+                    items = which[near[row, column + done]]
+                    lower = np.maximum(distance[row, column + done] - self._radius[items], 0.0)
+                    worth = lower**2 <= best[rows[row]]
+                    attempt(rows[row[worth]], items[worth])
+                    if ask >= min(len(which), _MOST):
+                        break
+                    rows = rows[np.maximum(distance[:, -1] - largest, 0.0) ** 2 <= best[rows]]
+                    done, ask = ask, min(3 * ask, len(which), _MOST)
         return item, weights, best
 
     def _costs(self, points: Floats, normals: Floats, items: Ints) -> tuple[Floats, Floats]:
