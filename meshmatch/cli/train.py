@@ -40,6 +40,15 @@ def train(
         Literal["default", "paper"],
         typer.Option(help="The recipe: what measured best, or the paper's network, losses and rates."),
     ] = "default",
+    start: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL", help="Begin with the weights of a trained model of the same template and preset."
+        ),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=0.0, help="Learning rate; the preset's if not given.")
+    ] = None,
     name: Annotated[
         str | None, typer.Option(metavar="NAME", help="The model's name; the folder's if not given.")
     ] = None,
@@ -93,12 +102,18 @@ def train(
         steps=preset_train.steps if steps is None else steps,
         bf16=preset_train.bf16 if bf16 is None else bf16,
         workers=preset_train.workers if workers is None else workers,
+        rate=preset_train.rate if rate is None else rate,
         minutes=minutes,
         threads=threads,
         seed=seed,
     )
     chosen = replace(chosen, train=settings)
     voice = Voice(quiet or not first)
+    started = None
+    if start is not None:
+        from meshmatch.models.trained import load_model
+
+        started = load_model(start)
     if shapes is not None:
         made = run.read_template(shapes / "template.safetensors")
         source, count = run.folder_source(shapes, made)
@@ -125,6 +140,7 @@ def train(
             category=kind,
             data=data,
             licence=licence,
+            start=started,
             resume=not fresh,
             progress=show,
         )

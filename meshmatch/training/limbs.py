@@ -1,8 +1,8 @@
 """Clinical angles of arms and legs, drawn within anatomical limits.
 
-A mixture of everyday families (standing, reaching, overhead, sitting, crouching, kneeling, bending, lunging)
-and of wide uniform ranges, so that rare poses are rare but present. The order of the draws is part of what a
-seed means: changing it changes every training.
+A mixture of everyday families (standing, reaching, overhead, arms folded, hand at the face; sitting, crouching,
+kneeling, bending, lunging) and of wide uniform ranges, so that rare poses are rare but present. The order of the
+draws is part of what a seed means: changing it changes every training.
 """
 
 from __future__ import annotations
@@ -67,11 +67,23 @@ class Limbs:
     curl: torch.Tensor
 
 
-def draw_limbs(draw: Draw, family: torch.Tensor) -> Limbs:
-    """Angles of one side; ``family`` (B,) is 0..5: stand, wide, crouch or sit, kneel, bend forward, lunge."""
-    arm = torch.multinomial(
-        torch.tensor([0.3, 0.18, 0.16, 0.18, 0.18]), draw.B, True, generator=draw.generator
-    )
+FOLDED = 5
+
+
+def draw_arms(draw: Draw) -> tuple[torch.Tensor, torch.Tensor]:
+    """Families of both arms, each (B,): hang, spread, forward, overhead, any, folded before the body, at the face.
+
+    Folded arms come in pairs most of the time: they touch each other, which is what makes them hard.
+    """
+    shares = torch.tensor([0.26, 0.15, 0.14, 0.16, 0.15, 0.1, 0.04])
+    left, right = (torch.multinomial(shares, draw.B, True, generator=draw.generator) for _ in range(2))
+    both = (left == FOLDED) & (draw.uniform(0, 1) < 0.75)
+    return left, torch.where(both, FOLDED, right)
+
+
+def draw_limbs(draw: Draw, arm: torch.Tensor, family: torch.Tensor) -> Limbs:
+    """Angles of one side; ``arm`` (B,) as `draw_arms` gives it, ``family`` (B,) is 0..5: stand, wide, crouch or
+    sit, kneel, bend forward, lunge."""
     at = torch.arange(draw.B)
     elevation = torch.stack(
         [
@@ -80,6 +92,8 @@ def draw_limbs(draw: Draw, family: torch.Tensor) -> Limbs:
             draw.normal(80, 28),
             draw.normal(150, 20),
             draw.uniform(5, 165),
+            draw.normal(35, 18),
+            draw.normal(55, 25),
         ]
     )[arm, at].clamp(3, 175)
     azimuth = torch.stack(
@@ -89,11 +103,16 @@ def draw_limbs(draw: Draw, family: torch.Tensor) -> Limbs:
             draw.normal(85, 28),
             draw.uniform(-30, 110),
             draw.uniform(-50, 130),
+            draw.normal(75, 28),
+            draw.normal(80, 22),
         ]
     )[arm, at].clamp(-60, 135)
-    elbow = draw.choice(
+    any_elbow = draw.choice(
         [0.45, 0.4, 0.15], [draw.normal(10, 14).abs(), draw.uniform(0, 145), draw.normal(90, 25)]
     )
+    elbow = torch.stack([any_elbow] * FOLDED + [draw.normal(95, 26), draw.normal(130, 14)])[arm, at]
+    # A positive twist turns the forearm inwards.
+    twist = torch.stack([draw.normal(0, 30)] * FOLDED + [draw.normal(45, 24), draw.normal(20, 26)])[arm, at]
     # Families of the legs: stand, wide, crouch or sit, kneel, bend forward, lunge (left or right first).
     flexion = torch.stack(
         [
@@ -129,7 +148,7 @@ def draw_limbs(draw: Draw, family: torch.Tensor) -> Limbs:
     return Limbs(
         arm_elevation=elevation,
         arm_azimuth=azimuth,
-        arm_twist=draw.normal(0, 30).clamp(-80, 80),
+        arm_twist=twist.clamp(-80, 85),
         elbow=elbow.clamp(0, 150),
         pronation=draw.normal(10, 38).clamp(-85, 95),
         hip_flexion=flexion,

@@ -10,14 +10,14 @@ from collections.abc import Callable
 
 import torch
 
-from meshmatch.training.limbs import Draw, Limbs, Still, draw_limbs, mirrored, with_legs
+from meshmatch.training.limbs import FOLDED, Draw, Limbs, Still, draw_arms, draw_limbs, mirrored, with_legs
 from meshmatch.training.rig import Rig
 from meshmatch.training.rotations import DEGREE, rotation_between, rotation_from_vector, unit
 from meshmatch.training.skeleton import forward_kinematics, penetration
 
 
 def sample_free_pose(
-    rig: Rig, heads: torch.Tensor, generator: torch.Generator, tries: int = 4, tolerance: float = 0.02
+    rig: Rig, heads: torch.Tensor, generator: torch.Generator, tries: int = 8, tolerance: float = 0.02
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Of several drawn poses keep the first that is free of self-intersection, else the least bad.
 
@@ -50,8 +50,9 @@ def sample_pose(rig: Rig, heads: torch.Tensor, generator: torch.Generator) -> to
     vectors = torch.zeros(B, J, 3)
     joint = rig.joint
     family = torch.multinomial(torch.tensor([0.34, 0.24, 0.14, 0.08, 0.1, 0.1]), B, True, generator=generator)
-    left, right = draw_limbs(draw, family), draw_limbs(draw, family)
-    same_arms = torch.rand(B, generator=generator) < 0.3
+    arms = draw_arms(draw)
+    left, right = (draw_limbs(draw, arm, family) for arm in arms)
+    same_arms = (torch.rand(B, generator=generator) < 0.3) & (arms[0] != FOLDED)
     same_legs = torch.rand(B, generator=generator) < 0.35
     right = with_legs(mirrored(left, right, same_arms, draw), mirrored(left, right, same_legs, draw))
 

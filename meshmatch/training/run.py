@@ -17,6 +17,7 @@ from meshmatch.errors import OptionError, OutputError
 from meshmatch.models.card import ModelCard, write_card
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig
+from meshmatch.models.trained import TrainedModel
 from meshmatch.templates.prepare import read_registered
 from meshmatch.templates.template import Template, load_template
 from meshmatch.training.datasets import Source, body_source, registered_source
@@ -59,6 +60,7 @@ def recipe(preset: Preset = "default") -> Recipe:
                 noise=0.0,
                 holes=0.0,
                 outliers=0.0,
+                partial=0.0,
                 density=0.0,
                 bumps=0.0,
                 scale=0.0,
@@ -132,13 +134,15 @@ def train_model(
     category: str = "human",
     data: str = "",
     licence: str = "",
+    start: TrainedModel | None = None,
     resume: bool = True,
     progress: Callable[[Progress], None] | None = None,
 ) -> Path:
     """Train, or go on training, and write a model folder.
 
     ``output`` receives ``checkpoint/last.safetensors`` on the way and, at every stop, ``template.safetensors``,
-    ``weights.safetensors`` and last ``card.json``.
+    ``weights.safetensors`` and last ``card.json``. ``start`` gives the first weights; it must have the same
+    template and network.
 
     Returns
     -------
@@ -155,6 +159,8 @@ def train_model(
         ) from error
     config = recipe.train
     model = build_deformer(template, source, recipe.network, recipe.scan, recipe.kernel, config.seed)
+    if start is not None:
+        take_weights(model, template, recipe, start)
     points = build_loss_points(template, recipe.kernel)
     dataset = build_dataset(
         template, source, model, recipe.scan, config.shapes, config.scans_per_shape, config.seed, config.steps
@@ -170,8 +176,25 @@ def train_model(
     trainer.run(dataset, checkpoint, progress, validate)
     if trainer.rank == 0:
         score = validation_error(_averaged(trainer), held_out, points)
-        export(trainer, template, output, recipe, name, category, data, licence, score)
+        export(trainer, template, output, recipe, name, category, data, licence, score, start=start)
     return output
+
+
+def take_weights(model: Deformer, template: Template, recipe: Recipe, start: TrainedModel) -> None:
+    """Begin where a trained model ended.
+
+    Raises
+    ------
+    OptionError
+        It has another template, network or kernel.
+    """
+    same = start.template.hash == template.hash and start.network.config == recipe.network
+    if not (same and start.card.field["kernel"] == recipe.kernel):
+        raise OptionError(
+            f"model {start.card.name} has another template, network or kernel",
+            "start from a model of the same template and preset, or from nothing",
+        )
+    model.load_state_dict(start.network.state_dict())
 
 
 def _averaged(trainer: Trainer) -> Deformer:
@@ -201,6 +224,7 @@ def export(
     licence: str,
     score: float,
     storage: str = "int8",
+    start: TrainedModel | None = None,
 ) -> None:
     """Write the averaged weights as a model folder; the card comes last."""
     from meshmatch.templates.template import save_template
@@ -217,7 +241,7 @@ def export(
         field={"kernel": recipe.kernel, "radius": template.radius, "nodes": template.K},
         data=data,
         licence=licence,
-        recipe={"train": asdict(recipe.train), "scan": asdict(recipe.scan)},
+        recipe={"train": asdict(recipe.train), "scan": asdict(recipe.scan), **_beginning(start)},
         seed=recipe.train.seed,
         steps=trainer.step,
         training_minutes=round(trainer.seconds / 60, 1),
@@ -227,6 +251,13 @@ def export(
         description="",
     )
     write_card(card, output / "card.json")
+
+
+def _beginning(start: TrainedModel | None) -> dict:
+    if start is None:
+        return {}
+    card = start.card
+    return {"start": {"model": card.name, "weights_sha256": card.weights_sha256, "steps": card.steps}}
 
 
 def read_template(name: str | Path) -> Template:

@@ -13,14 +13,16 @@ from meshmatch.training.rotations import DEGREE, rotation_from_vector
 class ScanConfig:
     """How rough the simulated scans are. Lengths in units of sqrt(surface area).
 
-    ``upright``: scans stand in the category's own axes, centred, turned about the vertical only (the paper);
-    otherwise roughly in the core frame, where an aligner puts them.
+    ``holes``, ``outliers``, ``partial`` are shares of the scans: with holes; with up to 10 % stray points; seen
+    from one side or cut by a plane. ``upright``: scans stand in the category's own axes, centred, turned about
+    the vertical only (the paper); otherwise roughly in the core frame, where an aligner puts them.
     """
 
     points: int = 2048
-    noise: float = 0.012
+    noise: float = 0.02
     holes: float = 0.3
-    outliers: float = 0.1
+    outliers: float = 0.15
+    partial: float = 0.12
     density: float = 0.6
     bumps: float = 0.004
     scale: float = 0.04
@@ -88,6 +90,25 @@ def bump(verts: torch.Tensor, amplitude: float, generator: torch.Generator) -> t
     return verts
 
 
+def seen_share(
+    normals: torch.Tensor, centres: torch.Tensor, share: float, generator: torch.Generator
+) -> torch.Tensor:
+    """Factors (B, F) for the chance of each face: nearly 0 where a partial scan does not see it, else 1.
+
+    A ``share`` of the scans is partial. Half of those see what faces one direction, the others lose what lies
+    beyond a plane, at most half of the centres. Faces that hide each other are not told apart.
+    """
+    B = len(centres)
+    direction = torch.nn.functional.normalize(torch.randn(B, 3, 1, generator=generator), dim=1)
+    facing = (normals @ direction)[..., 0] > 0
+    height = (centres @ direction)[..., 0]  # B F
+    rank = (0.5 * torch.rand(B, generator=generator) * height.shape[1]).long()
+    plane = height.sort(dim=1).values[torch.arange(B), rank]
+    kind = torch.rand(B, 1, generator=generator) / max(share, 1e-9)
+    seen = torch.where(kind < 0.5, facing, (height >= plane[:, None]) | (kind >= 1))
+    return torch.where(seen, 1.0, 1e-4)
+
+
 def sample_scan(
     verts: torch.Tensor,
     areas: torch.Tensor,
@@ -100,6 +121,8 @@ def sample_scan(
     a, b, c = (verts[:, faces[:, k]] for k in range(3))
     centres = (a + b + c) / 3  # B F 3
     chance = areas.clone()
+    if config.partial:
+        chance = chance * seen_share(torch.linalg.cross(b - a, c - a), centres, config.partial, generator)
     waves = torch.randn(B, 3, 1, generator=generator) * 4
     strength = config.density * torch.rand(B, 1, generator=generator)
     chance = chance * (strength * torch.sin((centres @ waves)[..., 0])).exp()
@@ -120,7 +143,6 @@ def sample_scan(
     points = a + weight[..., :1] * (b - a) + weight[..., 1:] * (c - a)
     sigma = config.noise * torch.rand(B, 1, 1, generator=generator) ** 3
     points = points + sigma * torch.randn(B, P, 3, generator=generator)
-    stray = torch.rand(B, P, generator=generator) < (
-        0.02 * (torch.rand(B, 1, generator=generator) < config.outliers)
-    )
+    lost = torch.rand(B, 1, generator=generator) < config.outliers
+    stray = torch.rand(B, P, generator=generator) < 0.1 * torch.rand(B, 1, generator=generator) * lost
     return torch.where(stray[..., None], 0.5 * torch.randn(B, P, 3, generator=generator), points)

@@ -53,6 +53,7 @@ def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
     assert (called["name"], called["category"], called["resume"]) == ("mine", "human", True)
     assert "anny" in called["data"]
     assert called["licence"] == "unstated"
+    assert called["start"] is None
     assert called["recipe"] == training.recipe("default")
     assert "step 2 of 2 (8 s): total 0.25, validation 0.0321" in answer.err
     assert f"meshmatch models add {tmp_path / 'mine'}" in answer.err
@@ -68,6 +69,7 @@ def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
         (["--workers", "0"], "workers", 0),
         (["--threads", "2"], "threads", 2),
         (["--seed", "5"], "seed", 5),
+        (["--rate", "0.01"], "rate", 0.01),
     ],
 )
 @pytest.mark.parametrize("preset", ["default", "paper"])
@@ -95,6 +97,14 @@ def test_options_reach_the_run(
 ) -> None:
     assert run("train", "-o", tmp_path / "mine", *words).status == 0
     assert stub.called[name] == value
+
+
+def test_a_training_starts_from_a_model(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    assert run("train", "-o", tmp_path / "mine", "--start", "human").status == 0
+    assert stub.called["start"].card.name == "human"
+    answer = run("train", "-o", tmp_path / "mine", "--start", "humam")
+    assert answer.status == 1
+    assert "human" in answer.err
 
 
 def test_identities(run: Run, stub: Recorder, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.errors import OptionError
 from meshmatch.training.bodies import draw_identities, sample_bodies, skin
 from meshmatch.training.human_template import body_parts, human_template, restrict, standing_body
-from meshmatch.training.limbs import Draw, Still, draw_limbs, mirrored, with_legs
+from meshmatch.training.limbs import FOLDED, Draw, Still, draw_arms, draw_limbs, mirrored, with_legs
 from meshmatch.training.poses import sample_free_pose, sample_pose, still_pose
 from meshmatch.training.rig import Rig, build_rig, load_rig, save_rig
 from meshmatch.training.rotations import rotation_between, rotation_from_vector
@@ -157,11 +157,12 @@ def test_the_first_free_pose_wins_and_else_the_least_bad(rig: Rig, monkeypatch: 
 def test_clinical_angles_stay_within_their_limits() -> None:
     draw = Draw(4000, seeded())
     family = torch.arange(4000) % 6
-    limbs = draw_limbs(draw, family)
+    arms = draw_arms(draw)[0]
+    limbs = draw_limbs(draw, arms, family)
     for name, low, high in (
         ("arm_elevation", 3, 175),
         ("arm_azimuth", -60, 135),
-        ("arm_twist", -80, 80),
+        ("arm_twist", -80, 85),
         ("elbow", 0, 150),
         ("pronation", -85, 95),
         ("hip_flexion", -40, 135),
@@ -172,14 +173,24 @@ def test_clinical_angles_stay_within_their_limits() -> None:
         values = getattr(limbs, name)
         assert low <= values.min() and values.max() <= high, name
         assert values.max() - values.min() > 0.4 * (high - low), name  # and use them
+    assert limbs.elbow[arms == FOLDED].mean() > 80
+    assert limbs.arm_twist[arms == FOLDED].mean() > 30
     assert limbs.hip_flexion[family == 2].mean() > 60  # sitting
     assert limbs.knee[family == 3].mean() > 90  # kneeling
     assert limbs.knee[family == 0].mean() < 12  # standing
 
 
+def test_folded_arms_come_in_pairs() -> None:
+    left, right = (side == FOLDED for side in draw_arms(Draw(4000, seeded())))
+    assert 0.07 < left.float().mean() < 0.13
+    assert right[left].float().mean() > 0.7
+    assert right[~left].float().mean() < 0.13
+
+
 def test_a_mirrored_side_is_nearly_the_other() -> None:
     draw = Draw(500, seeded())
-    left, right = draw_limbs(draw, torch.zeros(500).long()), draw_limbs(draw, torch.zeros(500).long())
+    hanging = standing = torch.zeros(500).long()
+    left, right = draw_limbs(draw, hanging, standing), draw_limbs(draw, hanging, standing)
     mask = torch.arange(500) < 250
     both = mirrored(left, right, mask, draw)
     assert (both.elbow - left.elbow)[mask].abs().mean() < 6
@@ -267,10 +278,10 @@ def test_the_order_of_the_random_draws_has_not_changed(rig: Rig) -> None:
     """
     generator = seeded(0)
     bodies = sample_bodies(rig, 4, generator)
-    golden = [[0.02, 1.0229, 0.02], [0.1156, 1.4316, 0.2164], [0.3741, 1.2656, 0.0191]]
+    golden = [[0.02, 1.0229, 0.02], [0.1349, 1.5153, 0.0525], [0.0823, 1.8709, 0.4317]]
     assert np.allclose(bodies[0, 0:180:60], golden, atol=2e-3)
-    assert np.allclose(bodies.mean((1, 2)), [0.4638, 0.4919, 0.4209, 0.4519], atol=2e-3)
-    assert float(torch.rand(1, generator=generator)) == pytest.approx(0.5698, abs=1e-4)
+    assert np.allclose(bodies.mean((1, 2)), [0.6017, 0.4263, 0.4290, 0.3954], atol=2e-3)
+    assert float(torch.rand(1, generator=generator)) == pytest.approx(0.2012, abs=1e-4)
 
 
 def test_identities_are_blends_of_two(rig: Rig) -> None:

@@ -87,7 +87,7 @@ def test_distances_by_hand() -> None:
 
 def test_loss_points_are_the_field(egg: Template, points: LossPoints) -> None:
     at = loss_vertices(egg, 1000)
-    field = build_field(egg.shape.verts[at], egg.nodes, egg.radius)
+    field = build_field(egg.shape.verts[at], egg.nodes, egg.radius, "smooth")
     vectors = 0.1 * torch.randn(2, egg.K, 3, generator=torch.Generator().manual_seed(0))
     moved = field.displacement(vectors) + torch.from_numpy(egg.shape.verts[at]).float()
     assert torch.allclose(points.moved(vectors), moved, atol=1e-6)

@@ -9,7 +9,7 @@ import torch
 
 from meshmatch.errors import InputError, OptionError, OutputError, TemplateError
 from meshmatch.models.registry import verify_model
-from meshmatch.models.trained import load_model
+from meshmatch.models.trained import TrainedModel, load_model
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.nodes import NodeConfig
@@ -111,6 +111,24 @@ def test_training_goes_on_from_the_checkpoint_unless_told_not_to(prepared: Path,
     assert fresh.weights_sha256 != whole.weights_sha256
 
 
+def test_a_training_may_begin_with_a_models_weights(prepared: Path, tmp_path: Path) -> None:
+    first = load_model(trained(prepared, tmp_path / "first"))
+    slow = replace(SMALL, train=replace(SMALL.train, rate=1e-9, seed=3))
+    second = load_model(trained(prepared, tmp_path / "second", slow, start=first))
+    scratch = load_model(trained(prepared, tmp_path / "scratch", slow))
+
+    def apart(a: TrainedModel, b: TrainedModel) -> float:
+        both = zip(a.network.parameters(), b.network.parameters(), strict=True)
+        return max(float((x - y).detach().abs().max()) for x, y in both)
+
+    assert apart(first, second) < 0.01 < apart(first, scratch)  # but for 8-bit rounding
+    begun = second.card.recipe["start"]
+    assert begun == {"model": "eggs", "weights_sha256": first.card.weights_sha256, "steps": 4}
+    assert "start" not in scratch.card.recipe
+    with pytest.raises(OptionError, match="another template, network or kernel"):
+        trained(prepared, tmp_path / "other", replace(SMALL, kernel="cubic"), start=first)
+
+
 def test_an_output_that_cannot_be_made_is_told(prepared: Path, tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("a file")
     with pytest.raises(OutputError, match="cannot make the folder"):
@@ -128,7 +146,7 @@ def test_the_presets_are_what_they_say() -> None:
     assert (paper.train.shapes, paper.train.scans_per_shape, paper.train.rate) == (16, 1, 1e-3)
     # 1,200 epochs of 1,000 shapes in batches of 16
     assert paper.train.steps == 1_200_000 // 16
-    assert paper.scan == ScanConfig(3000, 0, 0, 0, 0, 0, 0, upright=True)
+    assert paper.scan == ScanConfig(3000, 0, 0, 0, 0, 0, 0, 0, upright=True)
     assert default.network.encoder == "basis"
     assert default.scan.noise > 0
     with pytest.raises(OptionError, match="no preset 'best'") as caught:

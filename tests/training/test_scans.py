@@ -14,12 +14,14 @@ from meshmatch.training.scans import (
     random_rotations,
     rigid_fit,
     sample_scan,
+    seen_share,
     small_rotations,
     surface_area,
     yaw_rotations,
 )
+from tests.conftest import icosphere
 
-CLEAN = ScanConfig(points=4000, noise=0, holes=0, outliers=0, density=0)
+CLEAN = ScanConfig(points=4000, noise=0, holes=0, outliers=0, partial=0, density=0)
 # The unit square z = 0 in two triangles, the second of them cut in four.
 SQUARE = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0], [0, 0.5, 0], [0.5, 1, 0]])
 CORNERS = torch.tensor([[0, 1, 2], [0, 4, 5], [4, 2, 6], [5, 6, 3], [4, 6, 5]])
@@ -124,7 +126,22 @@ def test_outliers_stray_far_from_the_surface() -> None:
         return float((scan(config, B=30)[..., 2].abs() > 1e-3).float().mean())
 
     assert strays(CLEAN) == 0
-    assert 0.01 < strays(replace(CLEAN, outliers=1.0)) < 0.03
+    assert 0.02 < strays(replace(CLEAN, outliers=1.0)) < 0.08  # half of 10 %, on the mean
+
+
+def test_partial_scans_see_one_side_or_lose_a_part() -> None:
+    ball = icosphere(3)
+    centres = torch.from_numpy(ball.verts[ball.faces].mean(axis=1)).float().expand(200, -1, -1)
+    seen = seen_share(centres, centres, 1.0, seeded()) > 0.5
+    share = seen.float().mean(1)
+    assert 0.45 < share.min() and share.max() <= 1
+    assert ((share - 0.5).abs() < 0.03).float().mean() > 0.4  # what faces one way is a half of a ball
+    assert (share > 0.6).float().mean() > 0.25
+    apart = (centres * seen[..., None]).sum(1) / seen.sum(1)[:, None]
+    assert apart.norm(dim=-1).mean() > 0.2  # and all of it on one side
+    assert (seen_share(centres, centres, 0.0, seeded()) == 1).all()
+    some = seen_share(centres, centres, 0.25, seeded()).amin(1) < 0.5
+    assert 0.15 < some.float().mean() < 0.35
 
 
 def test_bumps_are_small_and_smooth() -> None:
