@@ -164,7 +164,7 @@ def register(
         if dense:
             from meshmatch.fitting.dense import dense_shape
 
-            fitted = dense_shape(pipeline.read_model(model).template, fit)
+            fitted = dense_shape(pipeline.read_model(model), fit)
         save_shape(temporary, fitted)
     voice.say(f"laid the template of {model} on {loaded.name}: {_fit_words(fit)}")
     _warn(voice, fit.verdict, fit.reasons)

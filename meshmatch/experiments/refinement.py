@@ -80,18 +80,18 @@ def refined(
 ) -> list[Subject]:
     """Every shape refined both ways from the same start; ``tell`` hears how many are done."""
     nodes, code = NodeRefineConfig(), LatentRefineConfig(steps=steps)
-    system = node_system(model.template)
+    system = node_system(model)
     subjects = []
     for number, shape in enumerate(shapes):
         fit, scan = _start(model, shape, seed)
-        energy = PaperEnergy(model.template, scan, code, np.random.default_rng(seed))
+        energy = PaperEnergy(model, scan, code, np.random.default_rng(seed))
 
         def by_nodes(config: NodeRefineConfig, scan: Scan = scan, fit: Fit = fit) -> np.ndarray:
             return refine_nodes(system, scan, fit.vectors, config)
 
         def by_code(config: LatentRefineConfig, scan: Scan = scan, fit: Fit = fit) -> np.ndarray:
             rng = np.random.default_rng(seed)
-            return refine_code(model.network, model.template, scan, config, rng, start=fit.vectors)
+            return refine_code(model, scan, config, rng, start=fit.vectors)
 
         if number == 0:  # warm up
             by_nodes(replace(nodes, steps=2))
@@ -145,7 +145,7 @@ def draw_bodies(model: TrainedModel, count: int, seed: int) -> list[Shape]:
 
 def body_errors(model: TrainedModel, subjects: Sequence[Subject]) -> dict[str, float]:
     """Mean distance (cm) of the fitted template's vertices from their own places on generated bodies."""
-    system = node_system(model.template)
+    system = node_system(model)
     errors: dict[str, list[float]] = {name: [] for name in METHODS}
     for subject in subjects:
         places = subject.fit.frame.apply(subject.shape.verts)
@@ -159,7 +159,7 @@ def pair_errors(
     model: TrainedModel, subjects: Sequence[Subject], name: str, data: Path, cache: Path | None
 ) -> dict[str, float]:
     """Mean geodesic error (cm) of the maps between all ordered pairs of the subjects, for each method."""
-    bench, system = load_set(name, data), node_system(model.template)
+    bench, system = load_set(name, data), node_system(model)
     by_name = {Path(subject.shape.name).stem: subject for subject in subjects}
     errors = {}
     for method in METHODS:

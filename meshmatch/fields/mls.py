@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from meshmatch.errors import TemplateError
 from meshmatch.templates.support import MINIMUM_EIGENVALUE, support_pairs
 
 Kernel = Literal["cubic", "smooth"]
+KERNELS: tuple[Kernel, ...] = get_args(Kernel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +89,7 @@ def kernel_weights(
     return inside**3, -6 * inside**2 / radius**2
 
 
-def build_field(
-    points: np.ndarray, nodes: np.ndarray, radius: float | np.ndarray, kernel: Kernel = "smooth"
-) -> Field:
+def build_field(points: np.ndarray, nodes: np.ndarray, radius: float | np.ndarray, kernel: Kernel) -> Field:
     """Evaluate the shape functions and their gradient on fixed points.
 
     Parameters
@@ -101,6 +100,7 @@ def build_field(
     radius : float or float array (K,)
         Support radius of the nodes, same unit.
     kernel : {"smooth", "cubic"}
+        That of the model, always: vectors learned with one mean something else with another.
 
     Returns
     -------

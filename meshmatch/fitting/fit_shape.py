@@ -29,7 +29,6 @@ from meshmatch.fitting.system import NodeSystem
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Frame, Shape
-from meshmatch.templates.template import Template
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
@@ -71,9 +70,10 @@ class FitConfig:
 
 
 @lru_cache(maxsize=4)
-def node_system(template: Template) -> NodeSystem:
-    """The template's least-squares system, built once."""
-    return NodeSystem(template)
+def node_system(model: TrainedModel) -> NodeSystem:
+    """The least-squares system of a model's template and field, built once."""
+    shape = model.template.shape
+    return NodeSystem(shape, model.field(shape.verts))
 
 
 def fit_shape(
@@ -104,7 +104,7 @@ def fit_shape(
     began = time.monotonic()
     tell = progress or (lambda what, share: None)
     rng = np.random.default_rng(config.seed)
-    system = node_system(model.template)
+    system = node_system(model)
     frame, scan = take_samples(shape, config.samples, rng)
     tell("orientation", 0.0)
     guesses = _hypotheses(model, scan, config)
@@ -196,9 +196,7 @@ def _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell
     if config.refine == "latent":
         best = candidates[0]
         local = scan.turned(best.rotation, best.centre)
-        vectors = refine_code(
-            model.network, model.template, local, config.latent, rng, lambda k, n: tell("refinement", k / n)
-        )
+        vectors = refine_code(model, local, config.latent, rng, lambda k, n: tell("refinement", k / n))
         return Candidate(best.rotation, best.centre, vectors, two_way_residual(system, local, vectors))
 
     def fitted(candidate: Candidate, nodes: NodeRefineConfig, report=None) -> Candidate:

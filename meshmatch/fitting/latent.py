@@ -11,11 +11,9 @@ import torch
 from scipy.spatial import cKDTree
 
 from meshmatch.fields.energies import arap_energy, volume_energy
-from meshmatch.fields.mls import build_field
 from meshmatch.fitting.scan import Scan
-from meshmatch.models.deformer import Deformer
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import farthest_points
-from meshmatch.templates.template import Template
 
 
 @dataclass(frozen=True)
@@ -40,13 +38,13 @@ class PaperEnergy:
     """
 
     def __init__(
-        self, template: Template, scan: Scan, config: LatentRefineConfig, rng: np.random.Generator
+        self, model: TrainedModel, scan: Scan, config: LatentRefineConfig, rng: np.random.Generator
     ) -> None:
         self.config = config
         chosen = rng.choice(len(scan.points), min(config.points, len(scan.points)), replace=False)
         self.points = torch.from_numpy(scan.points[chosen]).float()
         self._tree = cKDTree(scan.points[chosen])
-        self._template = _on_template(template, min(config.points, template.shape.V))
+        self._template = _on_template(model, min(config.points, model.template.shape.V))
 
     def __call__(self, vectors: torch.Tensor) -> torch.Tensor:
         """Energy (a scalar tensor) of node vectors (1, K, 3) in the core frame."""
@@ -66,8 +64,7 @@ class PaperEnergy:
 
 
 def refine_code(
-    model: Deformer,
-    template: Template,
+    model: TrainedModel,
     scan: Scan,
     config: LatentRefineConfig,
     rng: np.random.Generator,
@@ -84,16 +81,17 @@ def refine_code(
         Node vectors to start from, by default the network's own answer. What the encoder's code does not say
         of them (the learned corrections, where the model has them) stays as a constant offset.
     """
-    energy_of = PaperEnergy(template, scan, config, rng)
+    energy_of = PaperEnergy(model, scan, config, rng)
+    network = model.network
     with torch.no_grad():
-        code = model.encoder(model.encoder.features(energy_of.points[None]))
-        first = model(energy_of.points[None]) if start is None else torch.from_numpy(start).float()[None]
-        offset = first - model.decoder(code)
+        code = network.encoder(network.encoder.features(energy_of.points[None]))
+        first = network(energy_of.points[None]) if start is None else torch.from_numpy(start).float()[None]
+        offset = first - network.decoder(code)
     code = code.detach().clone().requires_grad_(True)
     optimiser = torch.optim.Adam([code], lr=config.rate)
     best, best_vectors = np.inf, None
     for step in range(config.steps):
-        vectors = model.decoder(code) + offset
+        vectors = network.decoder(code) + offset
         energy = energy_of(vectors)
         if float(energy.detach()) < best:
             best, best_vectors = float(energy.detach()), vectors.detach()[0]
@@ -120,16 +118,17 @@ class _Product(torch.autograd.Function):
 
 
 @lru_cache(maxsize=4)
-def _on_template(template: Template, P: int):
+def _on_template(model: TrainedModel, P: int):
     """Template points (P, 3), and functions from node vectors (K, 3) to displacements (P, 3) and slopes (3 P, 3)."""
-    at = farthest_points(template.shape.verts, P)
-    field = build_field(template.shape.verts[at], template.nodes, template.radius)
+    verts = model.template.shape.verts
+    verts = verts[farthest_points(verts, P)]
+    field = model.field(verts)
 
     def applied(matrix: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
         transpose = matrix.t().to_sparse_csr()
         return lambda vectors: _Product.apply(vectors, matrix, transpose)
 
-    return torch.from_numpy(template.shape.verts[at]).float(), applied(field.phi), applied(field.gradient)
+    return torch.from_numpy(verts).float(), applied(field.phi), applied(field.gradient)
 
 
 def _chamfer(moved: torch.Tensor, points: torch.Tensor, tree: cKDTree) -> torch.Tensor:

@@ -14,9 +14,9 @@ from scipy.linalg import solveh_banded
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from meshmatch.fields.mls import Field, build_field
+from meshmatch.fields.mls import Field
 from meshmatch.shapes.sampling import farthest_points
-from meshmatch.templates.template import Template
+from meshmatch.shapes.shape import Shape
 
 # Where the upper triangle xx xy xz yy yz zz belongs in a 3 x 3 block, row by row.
 _BLOCK = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
@@ -26,20 +26,28 @@ _DIAGONAL = [0, 3, 5]
 class NodeSystem:
     """Shape functions of a template, arranged for repeated least squares on its node vectors.
 
+    Parameters
+    ----------
+    shape : Shape
+        The template's mesh, template frame.
+    field : Field
+        The model's field on the mesh's vertices.
+    strain_points : int
+        At how many of them, at most, strain is measured.
+
     Attributes
     ----------
     verts : (V, 3) template vertices, template frame
     faces : (F, 3)
     phi : sparse (V, K)
     slopes : sparse (3 G, K), gradient of the shape functions at G strain points
-    strain_weight : (G,) share of the surface that each strain point stands for, mean 1
+    strain_points : (G,) the vertices that these are
     """
 
-    def __init__(self, template: Template, field: Field | None = None, strain_points: int = 1500) -> None:
-        self.verts = np.asarray(template.shape.verts)
-        self.faces = np.asarray(template.shape.faces)
-        field = field or build_field(self.verts, template.nodes, template.radius)
-        self.K = template.K
+    def __init__(self, shape: Shape, field: Field, strain_points: int = 1500) -> None:
+        self.verts = np.asarray(shape.verts)
+        self.faces = np.asarray(shape.faces)
+        self.K = field.K
         self.phi = _to_scipy(field.phi)
         at = farthest_points(self.verts, min(strain_points, len(self.verts)))
         rows = (3 * at[:, None] + np.arange(3)).reshape(-1)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from meshmatch.errors import ModelError
+from meshmatch.fields.mls import KERNELS, Field, build_field
 from meshmatch.models.card import ModelCard
 from meshmatch.models.checkpoint import load_weights
 from meshmatch.models.deformer import Deformer, NetworkConfig
@@ -22,6 +24,17 @@ class TrainedModel:
     card: ModelCard
     template: Template
     network: Deformer
+
+    def field(self, points: np.ndarray) -> Field:
+        """The field on points (P, 3) of the template's frame, with the kernel that the network was trained with.
+
+        Raises
+        ------
+        TemplateError
+            A point has too few nodes in reach.
+        """
+        nodes, radius = self.template.nodes, self.template.radius
+        return build_field(points, nodes, radius, self.card.field["kernel"])
 
 
 def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
@@ -42,7 +55,8 @@ def load_model(name: str | Path = "human") -> TrainedModel:
     Raises
     ------
     ModelError
-        Unknown name, damaged files, or a template that is not the one the model was trained with.
+        Unknown name, damaged files, a kernel that is not known here, or a template that is not the one the
+        model was trained with.
     """
     folder, card = find_model(name)
     template = load_template(folder / "template.safetensors")
@@ -50,6 +64,11 @@ def load_model(name: str | Path = "human") -> TrainedModel:
         raise ModelError(
             f"model {card.name} was trained with another template ({card.template_hash}, not {template.hash})",
             "add the model again from its source",
+        )
+    if card.field["kernel"] not in KERNELS:
+        raise ModelError(
+            f"model {card.name} has the kernel {card.field['kernel']!r}, not {' or '.join(KERNELS)}",
+            "it may need a newer meshmatch: update it",
         )
     network = blank_deformer(NetworkConfig.from_dict(card.network), template.K)
     expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}

@@ -4,7 +4,6 @@ import json
 import signal
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,13 @@ from meshmatch.errors import InputError, OutputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Frame, Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import Template
 from tests.cli.conftest import Run
+from tests.models.small_model import small_card
 
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -381,7 +382,8 @@ def test_register_in_full_resolution(
     )
     moved = replace(fit(sphere), template_hash=template.hash, vectors=np.tile([0.0, 0.0, 5.0], (42, 1)))
     monkeypatch.setattr(pipeline, "register", lambda *_, **__: moved)
-    monkeypatch.setattr(pipeline, "read_model", lambda name: SimpleNamespace(template=template))
+    model = TrainedModel(small_card(), template, None)  # type: ignore[arg-type]
+    monkeypatch.setattr(pipeline, "read_model", lambda name: model)
     output = two[0].with_name("fitted.ply")
     answer = run("register", two[0], "-o", output, "--dense", "--json")
     assert (answer.status, json.loads(answer.out)["vertices"]) == (0, 642)

@@ -77,7 +77,7 @@ def test_the_error_of_bodies_is_the_distance_to_their_own_vertices(
     # A shape that is the template moved: vectors that move it so are right, and a shift of all nodes is off by itself.
     template, fit = model.template, subjects[0].fit
     right = np.random.default_rng(0).normal(0, 0.02, (template.K, 3))
-    shape = Shape(fit.frame.undo(node_system(template).moved(right)), template.shape.faces, "made")
+    shape = Shape(fit.frame.undo(node_system(model).moved(right)), template.shape.faces, "made")
     answers = {
         "network": Answer(right, 0, 0, 0),
         "code": Answer(right + np.array([0.03, 0, 0]), 0, 0, 0),

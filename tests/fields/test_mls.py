@@ -78,7 +78,7 @@ def test_an_affine_motion_of_the_nodes_is_affine_everywhere(cloud, kernel):
 
 def test_a_rigid_motion_has_no_energy_and_a_stretch_has(cloud):
     points, nodes = cloud
-    field = build_field(points, nodes, 0.7)
+    field = build_field(points, nodes, 0.7, "smooth")
     angle = 0.7
     R = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     rigid = field.deformation_gradient(torch.from_numpy(nodes @ (R - np.eye(3)).T + 0.1).float()[None])
@@ -111,18 +111,18 @@ def test_kernel_slope_is_the_derivative(kernel):
 def test_far_from_the_origin_float32_holds():
     rng = np.random.default_rng(1)
     points, nodes = rng.uniform(-0.5, 0.5, (20, 3)), rng.uniform(-1, 1, (150, 3))
-    near = build_field(points, nodes, 0.7).phi.to_dense()
-    far = build_field(points + 1000, nodes + 1000, 0.7).phi.to_dense()
+    near = build_field(points, nodes, 0.7, "smooth").phi.to_dense()
+    far = build_field(points + 1000, nodes + 1000, 0.7, "smooth").phi.to_dense()
     assert torch.allclose(near, far, atol=1e-5)
 
 
 def test_a_point_out_of_reach_is_named():
     nodes = np.random.default_rng(0).uniform(-1, 1, (100, 3))
     with pytest.raises(TemplateError, match="points 1"):
-        build_field(np.array([[0.0, 0, 0], [9.0, 0, 0]]), nodes, 0.8)
+        build_field(np.array([[0.0, 0, 0], [9.0, 0, 0]]), nodes, 0.8, "smooth")
 
 
 def test_coplanar_nodes_are_not_enough():
     flat = np.random.default_rng(0).uniform(-1, 1, (100, 3)) * [1, 1, 0]
     with pytest.raises(TemplateError, match="non-coplanar"):
-        build_field(np.zeros((1, 3)), flat, 0.8)
+        build_field(np.zeros((1, 3)), flat, 0.8, "smooth")

@@ -181,7 +181,7 @@ def test_predicted_rotations_are_rotations() -> None:
 
 def test_zero_nodes_move_nothing() -> None:
     egg = egg_template()
-    field = build_field(egg.shape.verts, egg.nodes, egg.radius)
+    field = build_field(egg.shape.verts, egg.nodes, egg.radius, "smooth")
     zero = torch.zeros(1, egg.K, 3)
     assert torch.equal(field.displacement(zero), torch.zeros(1, 162, 3))
     assert torch.equal(field.deformation_gradient(zero), torch.eye(3).expand(1, 162, 3, 3))
@@ -257,7 +257,7 @@ def test_the_model_that_ships_loads_and_is_the_one_of_its_card(human: TrainedMod
 
 def test_the_model_that_ships_leaves_its_own_template_at_rest(human: TrainedModel) -> None:
     rest = torch.from_numpy(human.template.shape.verts[::3].copy()).float()[None]
-    field = build_field(human.template.shape.verts, human.template.nodes, human.template.radius)
+    field = human.field(human.template.shape.verts)
     with torch.inference_mode():
         moved = field.displacement(human.network(rest))[0]
     assert moved.norm(dim=1).mean() < 0.035  # 5 cm on a body
