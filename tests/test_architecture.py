@@ -35,7 +35,7 @@ GROUND = ("errors", "config", "outputs")
 
 # Which rooms know which third-party library.
 OWNERS = {
-    "PIL": {"maps", "transfer", "render"},
+    "PIL": {"shapes", "maps", "transfer", "render"},
     "anny": {"training"},
     "embreex": {"render"},
     "fast_simplification": {"shapes"},

@@ -12,7 +12,7 @@ import numpy as np
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.formats import Raw, gltf, obj, off, ply, points, stl
+from meshmatch.shapes.formats import Raw, gltf, gltf_out, obj, off, ply, points, stl
 from meshmatch.shapes.shape import Shape
 
 _READERS: dict[str, Callable[[Path, bytes], Raw]] = {
@@ -30,7 +30,7 @@ _WRITERS: dict[str, Callable[[Path, Shape], None]] = {
     ".obj": obj.write,
     ".off": off.write,
     ".stl": stl.write,
-    ".glb": gltf.write,
+    ".glb": gltf_out.write,
     ".xyz": points.write_xyz,
     ".npy": points.write_npy,
 }
@@ -53,24 +53,36 @@ def load_shape(path: str | Path) -> Shape:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if path.is_dir():
-        raise InputError(f"{path} is a folder, not a file", "name one mesh or point cloud")
-    if not path.exists():
-        raise InputError(f"there is no file {path}", _similar(path))
-    if suffix not in _READERS:
+    if path.exists() and not path.is_dir() and suffix not in _READERS:
         raise InputError(
             f"{path.name}: unknown kind of file {suffix or '(no suffix)'}",
             f"meshmatch reads {', '.join(SUFFIXES)}",
         )
+    data = read_bytes(path)
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
+        raw = _READERS[suffix](path, data)
+    return _shape(path.name, raw)
+
+
+def read_bytes(path: Path) -> bytes:
+    """All of a file.
+
+    Raises
+    ------
+    InputError
+        It is missing, a folder, empty, or may not be read.
+    """
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, not a file", "name one mesh or point cloud")
+    if not path.exists():
+        raise InputError(f"there is no file {path}", _similar(path))
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
     if not data:
         raise InputError(f"{path.name} is empty (0 bytes)", "was the download or the export cut short?")
-    with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
-        raw = _READERS[suffix](path, data)
-    return _shape(path.name, raw)
+    return data
 
 
 def save_shape(path: str | Path, shape: Shape) -> None:

@@ -1,13 +1,14 @@
 """glTF 2.0, binary (glb) and text (gltf): the triangles and points of a scene, where the scene puts them.
 
 Specification: Khronos glTF 2.0. A skinned mesh stands as its joints stand in the file (sections 3.7.3 and
-5.28), so that it fits whatever hangs from the same joints. Animations, morph targets and materials are
-ignored.
+5.28), so that it fits whatever hangs from the same joints. Animations and morph targets are ignored; materials
+are read by `meshmatch.shapes.formats.gltf_look`, files written by `meshmatch.shapes.formats.gltf_out`.
 """
 
 import base64
 import binascii
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged
-from meshmatch.shapes.shape import Shape
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -28,58 +28,14 @@ _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
 def read(path: Path, data: bytes) -> Raw:
     """All triangles and points of the scene, one primitive after the other, parents before children."""
     try:
-        return _Document(path, data).scene()
+        return Document(path, data).scene()
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise damaged(path.name, f"its scene makes no sense ({type(error).__name__}: {error})") from error
 
 
-def write(path: Path, shape: Shape) -> None:
-    """One node, one mesh; 32-bit floats, 32-bit indices."""
-    verts = shape.verts.astype("<f4")
-    views: list[tuple[NDArray[Any], dict[str, Any]]] = [
-        (
-            verts,
-            {
-                "componentType": 5126,
-                "type": "VEC3",
-                "min": verts.min(0).tolist(),
-                "max": verts.max(0).tolist(),
-            },
-        )
-    ]
-    primitive: dict[str, Any] = {
-        "attributes": {"POSITION": 0},
-        "mode": _POINTS if shape.is_cloud else _TRIANGLES,
-    }
-    if shape.colors is not None:
-        primitive["attributes"]["COLOR_0"] = len(views)
-        views.append((shape.colors.astype("<f4"), {"componentType": 5126, "type": "VEC4"}))
-    if not shape.is_cloud:
-        primitive["indices"] = len(views)
-        views.append((shape.faces.astype("<u4").reshape(-1), {"componentType": 5125, "type": "SCALAR"}))
-    accessors, buffer_views, at = [], [], 0
-    for k, (array, accessor) in enumerate(views):
-        accessors.append({"bufferView": k, "count": len(array), **accessor})
-        buffer_views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes})
-        at += array.nbytes
-    document = {
-        "asset": {"version": "2.0", "generator": "meshmatch"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": shape.name}],
-        "meshes": [{"primitives": [primitive], "name": shape.name}],
-        "accessors": accessors,
-        "bufferViews": buffer_views,
-        "buffers": [{"byteLength": at}],
-    }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    head = b"glTF" + np.array([2, 28 + len(text) + at, len(text)], "<u4").tobytes() + b"JSON"
-    body = [head, text, np.array([at], "<u4").tobytes(), b"BIN\0", *(array.tobytes() for array, _ in views)]
-    path.write_bytes(b"".join(body))
+class Document:
+    """A parsed file; its buffers are read when they are asked for."""
 
-
-class _Document:
     def __init__(self, path: Path, data: bytes) -> None:
         self.path, self.name = path, path.name
         self.body = b""
@@ -124,19 +80,14 @@ class _Document:
         verts: list[NDArray[np.float64]] = []
         faces: list[NDArray[np.int64]] = []
         colors: list[NDArray[np.float64] | None] = []
-        for node in self._walk():
-            if "mesh" not in self.nodes[node]:
-                continue
-            for primitive in self.json["meshes"][self.nodes[node]["mesh"]]["primitives"]:
-                if primitive.get("mode", _TRIANGLES) not in (_POINTS, _TRIANGLES, _STRIP, _FAN):
-                    continue  # lines
-                own = self._placed(self.nodes[node], node, primitive)
-                triangles = self._triangles(primitive, len(own))
-                if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
-                    raise damaged(self.name, f"a face names vertex {int(triangles.max())} of {len(own)}")
-                faces.append(triangles + sum(map(len, verts)))
-                verts.append(own)
-                colors.append(self._colors(primitive))
+        for node, primitive in self.primitives():
+            own = self._placed(self.nodes[node], node, primitive)
+            triangles = self.triangles(primitive, len(own))
+            if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
+                raise damaged(self.name, f"a face names vertex {int(triangles.max())} of {len(own)}")
+            faces.append(triangles + sum(map(len, verts)))
+            verts.append(own)
+            colors.append(self.colors(primitive))
         if not verts:
             raise InputError(f"{self.name} holds no triangles and no points", "is there a mesh in its scene?")
         painted = None
@@ -144,6 +95,14 @@ class _Document:
             white = [np.ones((len(own), 4)) for own in verts]
             painted = np.vstack([w if c is None else c for c, w in zip(colors, white, strict=True)])
         return Raw(np.vstack(verts), np.vstack([NO_FACES, *faces]), painted)
+
+    def primitives(self) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Node and primitive of all that is drawn but lines, in the order of `scene`."""
+        for node in self._walk():
+            if "mesh" in self.nodes[node]:
+                for primitive in self.json["meshes"][self.nodes[node]["mesh"]]["primitives"]:
+                    if primitive.get("mode", _TRIANGLES) in (_POINTS, _TRIANGLES, _STRIP, _FAN):
+                        yield node, primitive
 
     def _walk(self) -> list[int]:
         """Node numbers, depth first, parents before children; fills `world`."""
@@ -169,21 +128,21 @@ class _Document:
         """(V, 3) positions in the scene."""
         attributes = primitive["attributes"]
         own = np.hstack(
-            [self._accessor(attributes["POSITION"]), np.ones((self._count(attributes["POSITION"]), 1))]
+            [self.accessor(attributes["POSITION"]), np.ones((self._count(attributes["POSITION"]), 1))]
         )
         if "skin" not in node or "JOINTS_0" not in attributes:
             return np.asarray(own @ self.world[number].T)[:, :3]
         skin = self.json["skins"][node["skin"]]
         bones = np.stack([self.world[joint] for joint in skin["joints"]])
         if "inverseBindMatrices" in skin:
-            inverse = self._accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+            inverse = self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
             bones = bones @ inverse[: len(bones)]
         moved, total = np.zeros((len(own), 4)), np.zeros((len(own), 1))
         for k in range(8):
             if f"JOINTS_{k}" not in attributes:
                 break
-            joints = self._accessor(attributes[f"JOINTS_{k}"], whole=True).astype(np.int64)
-            weights = self._accessor(attributes[f"WEIGHTS_{k}"])
+            joints = self.accessor(attributes[f"JOINTS_{k}"], whole=True).astype(np.int64)
+            weights = self.accessor(attributes[f"WEIGHTS_{k}"])
             for column in range(4):
                 weight = weights[:, column : column + 1]
                 moved += weight * np.einsum("vij,vj->vi", bones[joints[:, column]], own)
@@ -192,12 +151,12 @@ class _Document:
             np.where(total > 0, moved / np.where(total > 0, total, 1.0), own @ self.world[number].T)
         )[:, :3]
 
-    def _triangles(self, primitive: dict[str, Any], V: int) -> NDArray[np.int64]:
+    def triangles(self, primitive: dict[str, Any], V: int) -> NDArray[np.int64]:
         mode = primitive.get("mode", _TRIANGLES)
         if mode == _POINTS:
             return NO_FACES
         if "indices" in primitive:
-            corners = self._accessor(primitive["indices"], whole=True).astype(np.int64).ravel()
+            corners = self.accessor(primitive["indices"], whole=True).astype(np.int64).ravel()
         else:
             corners = np.arange(V)
         if mode == _TRIANGLES:
@@ -210,10 +169,10 @@ class _Document:
         odd = np.arange(len(a)) % 2 == 1
         return np.stack([np.where(odd, b, a), np.where(odd, a, b), c], axis=1)
 
-    def _colors(self, primitive: dict[str, Any]) -> NDArray[np.float64] | None:
+    def colors(self, primitive: dict[str, Any]) -> NDArray[np.float64] | None:
         if "COLOR_0" not in primitive["attributes"]:
             return None
-        values = self._accessor(primitive["attributes"]["COLOR_0"])
+        values = self.accessor(primitive["attributes"]["COLOR_0"])
         out = np.ones((len(values), 4))
         out[:, : values.shape[1]] = np.clip(np.nan_to_num(values), 0.0, 1.0)
         return out
@@ -221,7 +180,7 @@ class _Document:
     def _count(self, number: int) -> int:
         return int(self.json["accessors"][number]["count"])
 
-    def _accessor(self, number: int, whole: bool = False) -> NDArray[np.float64]:
+    def accessor(self, number: int, whole: bool = False) -> NDArray[np.float64]:
         """(count, width) values; whole numbers that stand for 0..1 or -1..1 are divided unless `whole`."""
         accessor = self.json["accessors"][number]
         count, width = int(accessor["count"]), _WIDTHS[accessor["type"]]
@@ -264,28 +223,32 @@ class _Document:
             raise damaged(self.name, f"it needs {end} bytes of data, but holds {len(data)}")
         return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
 
+    def view_bytes(self, number: int) -> bytes:
+        """All bytes of a buffer view, as an image has them."""
+        view = self.json["bufferViews"][number]
+        return self._view(view, 0, int(view["byteLength"]), 1, np.dtype("u1")).tobytes()
+
     def _buffer(self, number: int) -> bytes:
         if number not in self.buffers:
             uri = self.json["buffers"][number].get("uri")
-            if uri is None:
-                self.buffers[number] = self.body
-            elif uri.startswith("data:"):
-                try:
-                    self.buffers[number] = base64.b64decode(uri.split(",", 1)[1], validate=True)
-                except (binascii.Error, IndexError) as error:
-                    raise damaged(self.name, "its embedded data is not base64") from error
-            else:
-                file = (self.path.parent / unquote(uri)).resolve()
-                if not file.is_relative_to(self.path.parent.resolve()):
-                    raise InputError(
-                        f"{self.name} wants data outside its folder: {uri}", "copy the data beside it"
-                    )
-                if not file.is_file():
-                    raise InputError(
-                        f"{self.name} needs the file {uri}, which is not there", "copy it beside the gltf"
-                    )
-                self.buffers[number] = file.read_bytes()
+            self.buffers[number] = self.body if uri is None else self.resource(uri)
         return self.buffers[number]
+
+    def resource(self, uri: str) -> bytes:
+        """What a URI names: data within it, or a file in the folder of this one."""
+        if uri.startswith("data:"):
+            try:
+                return base64.b64decode(uri.split(",", 1)[1], validate=True)
+            except (binascii.Error, IndexError) as error:
+                raise damaged(self.name, "its embedded data is not base64") from error
+        file = (self.path.parent / unquote(uri)).resolve()
+        if not file.is_relative_to(self.path.parent.resolve()):
+            raise InputError(f"{self.name} wants data outside its folder: {uri}", "copy the data beside it")
+        if not file.is_file():
+            raise InputError(
+                f"{self.name} needs the file {uri}, which is not there", "copy it beside the gltf"
+            )
+        return file.read_bytes()
 
 
 def _local(node: dict[str, Any]) -> NDArray[np.float64]:

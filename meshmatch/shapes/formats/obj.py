@@ -1,4 +1,6 @@
-"""Wavefront OBJ: positions and faces. Texture and normal indices are ignored, so seams split nothing."""
+"""Wavefront OBJ: positions and faces. Texture and normal indices are ignored, so seams split nothing; what lies on
+the faces is read by `meshmatch.shapes.formats.obj_look`.
+"""
 
 import re
 from pathlib import Path
@@ -17,15 +19,11 @@ def read(path: Path, data: bytes) -> Raw:
     name = path.name
     if b"\0" in data[:4096]:
         raise InputError(f"{name} is not an obj file: it is binary", "does the suffix fit the content?")
-    if b"\n" not in data:
-        data = data.replace(b"\r", b"\n")
-    if b"\\" in data:
-        data = re.sub(rb"\\\r?\n", b" ", data)
+    data = joined_lines(data)
     if b"#" in data:
         data = re.sub(rb"#[^\n]*", b"", data)
-    (text, vertex_lines), (faces_text, face_lines), (old, old_lines) = lines_of(data, b"v", b"f", b"fo")
-    if len(old_lines):
-        faces_text, face_lines = faces_text + b"\n" + old, np.concatenate([face_lines, old_lines])
+    (text, vertex_lines), *faces_found = lines_of(data, b"v", b"f", b"fo")
+    faces_text, face_lines = with_old(faces_found)
     if len(vertex_lines) == 0:
         raise InputError(
             f"{name} holds no vertices: it has no 'v' lines", "is it a mesh or a point cloud at all?"
@@ -40,6 +38,19 @@ def read(path: Path, data: bytes) -> Raw:
         colors[:, :3] = _channels(columns(values, counts, 3, 6))
     faces = _faces(name, faces_text, face_lines, vertex_lines)
     return Raw(columns(values, counts, 0, 3), faces, colors)
+
+
+def joined_lines(data: bytes) -> bytes:
+    """Text whose lines end in a newline, and none in a backslash."""
+    if b"\n" not in data:
+        data = data.replace(b"\r", b"\n")
+    return re.sub(rb"\\\r?\n", b" ", data) if b"\\" in data else data
+
+
+def with_old(found: list[tuple[bytes, NDArray[np.int64]]]) -> tuple[bytes, NDArray[np.int64]]:
+    """Lines of faces, those of the old spelling ``fo`` last."""
+    (text, lines), (old, old_lines) = found
+    return (text + b"\n" + old, np.concatenate([lines, old_lines])) if len(old_lines) else (text, lines)
 
 
 def write(path: Path, shape: Shape) -> None:
