@@ -1,5 +1,7 @@
 """The tree of verbs."""
 
+from collections.abc import Callable
+
 import typer
 
 from meshmatch import __version__
@@ -9,6 +11,10 @@ from meshmatch.cli.match import match, register
 from meshmatch.cli.models import models
 from meshmatch.cli.prepare import prepare
 from meshmatch.cli.train import train
+from meshmatch.cli.transfer_color import transfer_color
+from meshmatch.cli.transfer_labels import transfer_labels
+from meshmatch.cli.transfer_landmarks import transfer_landmarks
+from meshmatch.cli.transfer_weights import transfer_weights
 
 app = typer.Typer(
     name="meshmatch",
@@ -40,6 +46,11 @@ def root(
     """
 
 
-for verb in (match, register, evaluate, info, prepare, train):
+_VERBS: tuple[Callable[..., None], ...] = (
+    *(match, register, evaluate),
+    *(transfer_color, transfer_labels, transfer_weights, transfer_landmarks),
+    *(info, prepare, train),
+)
+for verb in _VERBS:
     app.command()(verb)
 app.add_typer(models, name="models")

@@ -1,5 +1,6 @@
 """Stanford PLY, text and binary of either byte order."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,18 +52,38 @@ def read(path: Path, data: bytes) -> Raw:
     return Raw(verts, faces, colors)
 
 
-def write(path: Path, shape: Shape) -> None:
-    """Binary little-endian; positions as float where that loses nothing, else double."""
+def write(
+    path: Path,
+    shape: Shape,
+    vertex: Mapping[str, NDArray[Any]] | None = None,
+    face: Mapping[str, NDArray[Any]] | None = None,
+    comments: Sequence[str] = (),
+) -> None:
+    """Binary little-endian; positions as float where that loses nothing, else double.
+
+    Parameters
+    ----------
+    vertex, face : arrays (V,) or (F,) by name, optional
+        Further properties: uint8, int32, or else double. Names are words of ASCII letters, digits and "_".
+    comments : sequence of str
+        Lines for the header.
+    """
     verts = shape.verts
     single = bool((verts.astype(np.float32) == verts).all())
     real, kind = ("float", "<f4") if single else ("double", "<f8")
     fields = [("x", kind), ("y", kind), ("z", kind)]
-    header = ["ply", "format binary_little_endian 1.0", "comment meshmatch", f"element vertex {shape.V}"]
+    header = ["ply", "format binary_little_endian 1.0", "comment meshmatch"]
+    header += [f"comment {' '.join(comment.split())}" for comment in comments]
+    header += [f"element vertex {shape.V}"]
     header += [f"property {real} {axis}" for axis in "xyz"]
     if shape.colors is not None:
         fields += [(channel, "u1") for channel in ("red", "green", "blue", "alpha")]
         header += [f"property uchar {channel}" for channel in ("red", "green", "blue", "alpha")]
-    table = np.zeros(shape.V, dtype=fields)
+    more_fields, more_header = _further(vertex)
+    table = np.zeros(shape.V, dtype=fields + more_fields)
+    header += more_header
+    for label, values in (vertex or {}).items():
+        table[label] = values
     for axis, values in zip("xyz", verts.T, strict=True):
         table[axis] = values if shape.invalid is None else np.where(shape.invalid, np.nan, values)
     if shape.colors is not None:
@@ -71,11 +92,27 @@ def write(path: Path, shape: Shape) -> None:
     chunks = [table.tobytes()]
     if not shape.is_cloud:
         header += [f"element face {shape.F}", "property list uchar int vertex_indices"]
-        rows = np.empty(shape.F, dtype=[("n", "u1"), ("corners", "<i4", 3)])
+        more_fields, more_header = _further(face)
+        header += more_header
+        rows = np.empty(shape.F, dtype=[("n", "u1"), ("corners", "<i4", (3,)), *more_fields])
+        for label, values in (face or {}).items():
+            rows[label] = values
         rows["n"] = 3
         rows["corners"] = shape.faces
         chunks.append(rows.tobytes())
     path.write_bytes("\n".join([*header, "end_header\n"]).encode() + b"".join(chunks))
+
+
+def _further(columns: Mapping[str, NDArray[Any]] | None) -> tuple[list[Any], list[str]]:
+    """Fields of a table, and lines of a header, for further properties."""
+    fields, lines = [], []
+    for label, values in (columns or {}).items():
+        kind, word = {"uint8": ("u1", "uchar"), "int32": ("<i4", "int")}.get(
+            values.dtype.name, ("<f8", "double")
+        )
+        fields.append((label, kind))
+        lines.append(f"property {word} {label}")
+    return fields, lines
 
 
 def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int]:

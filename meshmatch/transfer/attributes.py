@@ -1,0 +1,132 @@
+"""Values, labels and skin weights of the source, pulled back to the vertices of the target.
+
+Smooth things are interpolated between the corners of the source's face; labels are voted on and never averaged.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.shape import Floats, Ints, Shape
+
+NO_LABEL = -1
+
+
+def weights_of(back: VertexMap, source: Shape) -> csr_array:
+    """(V_tgt, V_src) sparse: how much of each source vertex goes into each target vertex; rows sum to 1.
+
+    Parameters
+    ----------
+    back : VertexMap
+        From target to source.
+    """
+    V = back.source_vertices
+    inside = back.face >= 0
+    corners = np.repeat(back.index[:, None], 3, axis=1)
+    corners[inside] = source.faces[back.face[inside]]
+    rows = np.repeat(np.arange(V), 3)
+    kept = back.barycentric.ravel() > 0
+    entries = back.barycentric.ravel()[kept], (rows[kept], corners.ravel()[kept])
+    matrix = csr_array(entries, shape=(V, source.V))
+    matrix.sum_duplicates()
+    return matrix
+
+
+def carry_values(back: VertexMap, source: Shape, values: NDArray[np.float64]) -> Floats:
+    """Numbers (V_src,) or (V_src, D) on the target: (V_tgt,) or (V_tgt, D).
+
+    Interpolated between the corners of the source's face. A value that is not finite takes no part, unless it
+    has most of the weight: then the result is nan.
+    """
+    values = np.asarray(values, np.float64)
+    matrix = weights_of(back, source)
+    finite = np.isfinite(values)
+    if finite.all():
+        return np.asarray(matrix @ values)
+    share = np.asarray(matrix @ finite.astype(np.float64))
+    sums = np.asarray(matrix @ np.where(finite, values, 0.0))
+    return np.where(share >= 0.5, sums / np.maximum(share, 0.5), np.nan)
+
+
+def carry_labels(back: VertexMap, source: Shape, labels: Ints, on_faces: bool = False) -> Ints:
+    """Labels of the target's vertices: those with most weight around their places on the source.
+
+    Parameters
+    ----------
+    labels : (V_src,) or, ``on_faces``, (F_src,) int64
+        A number for each label from 0; `NO_LABEL` for none.
+
+    Returns
+    -------
+    (V_tgt,) int64
+        `NO_LABEL` where nothing around has a label.
+    """
+    return most_votes(vertex_votes(back, source, labels, on_faces))
+
+
+def vertex_votes(back: VertexMap, source: Shape, labels: Ints, on_faces: bool = False) -> csr_array:
+    """(V_tgt, labels) sparse: how much speaks for each label at each target vertex."""
+    places = face_weights(back, source) if on_faces else weights_of(back, source)
+    return csr_array(places @ one_hot(labels))
+
+
+def face_weights(back: VertexMap, source: Shape) -> csr_array:
+    """(V_tgt, F_src) sparse: the source's face at each place; at a vertex all faces around, by their area."""
+    V = back.source_vertices
+    within = (back.face >= 0) & (back.barycentric.max(axis=1) < 1.0 - 1e-9)
+    rows = np.flatnonzero(within)
+    direct = csr_array((np.ones(len(rows)), (rows, back.face[rows])), shape=(V, source.F))
+    rows = np.flatnonzero(~within)
+    at = csr_array((np.ones(len(rows)), (rows, back.index[rows])), shape=(V, source.V))
+    area = source.face_areas / max(float(source.face_areas.max()), 1e-300) + 1e-12
+    return csr_array(direct + at @ faces_at_vertices(source, area))
+
+
+def faces_at_vertices(shape: Shape, weight: Floats) -> csr_array:
+    """(V, F) sparse: `weight` (F,) of each face at each of its corners."""
+    entries = np.repeat(weight, 3), (shape.faces.ravel(), np.repeat(np.arange(shape.F), 3))
+    return csr_array(entries, shape=(shape.V, shape.F))
+
+
+def one_hot(labels: Ints) -> csr_array:
+    """(N, labels) sparse: 1 at the label of each; rows without a label are empty."""
+    rows = np.flatnonzero(labels >= 0)
+    width = int(labels.max(initial=-1)) + 1
+    return csr_array((np.ones(len(rows)), (rows, labels[rows])), shape=(len(labels), max(width, 1)))
+
+
+def most_votes(votes: csr_array) -> Ints:
+    """(N,) the label with most votes in each row, the lowest of equal ones; `NO_LABEL` in an empty row."""
+    votes = csr_array(votes)
+    rows = np.repeat(np.arange(votes.shape[0]), np.diff(votes.indptr))
+    # Sums of thirds differ in the last bits: equal votes should count as equal.
+    order = np.lexsort((votes.indices, -np.round(votes.data, 9), rows))
+    order = order[votes.data[order] > 0]
+    winner, first = np.unique(rows[order], return_index=True)
+    result = np.full(votes.shape[0], NO_LABEL, np.int64)
+    result[winner] = votes.indices[order[first]]
+    return result
+
+
+def carry_weights(back: VertexMap, source: Shape, weights: csr_array, most: int = 4) -> csr_array:
+    """Skin weights (V_src, J) on the target (V_tgt, J): interpolated, at most `most` a vertex, rows sum to 1.
+
+    A vertex of which every source vertex is without weights stays without.
+    """
+    return sparse_rows(csr_array(weights_of(back, source) @ weights), most)
+
+
+def sparse_rows(weights: csr_array, most: int) -> csr_array:
+    """The `most` largest weights of each row, scaled to sum to 1; not positive ones are dropped."""
+    weights = csr_array(weights)
+    rows = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
+    order = np.lexsort((weights.indices, -weights.data, rows))
+    rank = np.arange(len(order)) - weights.indptr[rows[order]]
+    order = order[(rank < most) & (weights.data[order] > 0)]
+    kept = csr_array((weights.data[order], (rows[order], weights.indices[order])), shape=weights.shape)
+    total = np.bincount(rows[order], weights.data[order], weights.shape[0])
+    kept.data /= total[np.repeat(np.arange(kept.shape[0]), np.diff(kept.indptr))]
+    return kept

@@ -1,0 +1,62 @@
+"""Vertex colours: mixed as light, written as each format has them.
+
+Files of shapes write colours as screens do (sRGB), glTF alone writes amounts of light.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.light import to_linear, to_srgb
+from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.transfer.value_files import Values, save_values
+
+CHANNELS = ("red", "green", "blue", "alpha")
+_SHAPES, _TABLES = (".ply", ".glb", ".obj", ".off"), (".npy", ".csv")
+_GLTF = (".glb", ".gltf")
+
+
+def of_file(path: Path, shape: Shape) -> Values:
+    """Light (V, 4) of the vertices of a shape that was read from `path`, alpha last.
+
+    Raises
+    ------
+    InputError
+        It has no vertex colours.
+    """
+    if shape.colors is None:
+        raise InputError(
+            f"{shape.name} has no vertex colours",
+            "give numbers with --values, or carry its texture: meshmatch transfer-texture",
+        )
+    return Values(np.array(shape.colors) if path.suffix.lower() in _GLTF else light(shape.colors), CHANNELS)
+
+
+def light(colors: Floats) -> Floats:
+    """Light of colours (..., 3 or 4) as files have them; alpha is left as it is."""
+    return np.concatenate([to_linear(colors[..., :3]), colors[..., 3:]], axis=-1)
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse a suffix that cannot hold vertex colours (`OptionError`)."""
+    if path.suffix.lower() not in (*_SHAPES, *_TABLES):
+        raise OptionError(
+            f"{path.name}: vertex colours cannot be kept as '{path.suffix or 'a file without a suffix'}'",
+            f"end the name in one of {' '.join((*_SHAPES, *_TABLES))}",
+        )
+
+
+def save(path: Path, shape: Shape, amounts: Floats) -> None:
+    """Write `shape` with vertex colours from light (V, 4); or the colours alone, as screens have them."""
+    check_suffix(path)
+    amounts = np.clip(np.nan_to_num(amounts), 0.0, 1.0)
+    seen = np.concatenate([to_srgb(amounts[:, :3]), amounts[:, 3:]], axis=1)
+    if path.suffix.lower() in _TABLES:
+        save_values(path, Values(seen, CHANNELS), shape)
+        return
+    written = amounts if path.suffix.lower() in _GLTF else seen
+    save_shape(path, Shape(shape.verts, shape.faces, shape.name, written, shape.invalid))

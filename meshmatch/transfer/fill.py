@@ -1,0 +1,191 @@
+"""What to do where the map is not to be trusted: leave blank, or fill in from the neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.linalg import cg
+from scipy.spatial import cKDTree
+
+from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.shapes.topology import edges_of, same_rows
+from meshmatch.transfer.attributes import sparse_rows
+
+_NEIGHBOURS = 8
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """How much of a result is in doubt, and what became of it.
+
+    Parameters
+    ----------
+    total, low : int
+        How many entries there are, and how many below the least confidence.
+    blank, filled : int
+        How many of all were left blank, and filled in. The rest of `low` was kept as it came.
+    """
+
+    total: int
+    low: int
+    blank: int = 0
+    filled: int = 0
+
+
+def vertex_graph(shape: Shape) -> csr_array:
+    """(V, V) sparse, symmetric: lengths of the edges of a mesh, or to the nearest points in a cloud.
+
+    Vertices at one place are joined, so that texture seams cut nothing apart.
+    """
+    if shape.is_cloud:
+        near = cKDTree(shape.verts).query(shape.verts, min(_NEIGHBOURS + 1, shape.V))[1].reshape(shape.V, -1)
+        pairs = np.stack([np.repeat(near[:, 0], near.shape[1] - 1), near[:, 1:].ravel()], axis=1)
+    else:
+        pairs = edges_of(shape.faces).vertices
+    first = same_rows(shape.verts)
+    twins = np.flatnonzero(first != np.arange(shape.V))
+    return _graph(shape.verts, np.concatenate([pairs, np.stack([first[twins], twins], axis=1)]))
+
+
+def face_graph(shape: Shape) -> csr_array:
+    """(F, F) sparse, symmetric: distances between the centres of faces that share an edge."""
+    corners = same_rows(shape.verts)[shape.faces]
+    a, b = corners.ravel(), corners[:, [1, 2, 0]].ravel()
+    key = np.minimum(a, b) * shape.V + np.maximum(a, b)
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(key[order][1:] == key[order][:-1])
+    pairs = np.stack([order[same], order[same + 1]], axis=1) // 3
+    return _graph(shape.verts[shape.faces].mean(axis=1), pairs)
+
+
+def _graph(points: Floats, pairs: Ints) -> csr_array:
+    pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
+    length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    # A length of 0 would be no edge at all.
+    length = np.maximum(length, max(1e-3 * float(np.median(length)), 1e-30) if len(length) else 1.0)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    return csr_array(
+        coo_array((np.tile(length, 2), (both[:, 0], both[:, 1])), shape=(len(points), len(points)))
+    )
+
+
+def nearest_known(graph: csr_array, known: NDArray[np.bool_]) -> Ints:
+    """(N,) for each node the nearest known one along the graph; itself if it is known; -1 out of reach."""
+    nearest = np.where(known, np.arange(len(known)), -1)
+    # Only the unknown and those beside them matter, however large the rest is.
+    beside = np.asarray(graph @ (~known).astype(np.float64)) > 0
+    some = np.flatnonzero(~known | beside)
+    if not known[some].any():
+        return nearest
+    distance, _, first = dijkstra(
+        csr_array(graph[some][:, some]),
+        indices=np.flatnonzero(known[some]),
+        min_only=True,
+        return_predecessors=True,
+    )
+    reached = np.isfinite(distance)
+    nearest[some[reached]] = some[first[reached]]
+    return nearest
+
+
+def diffuse(graph: csr_array, known: NDArray[np.bool_], values: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Values (N, D) whose unknown rows are the weighted mean of their neighbours, nearer ones counting more.
+
+    Returns
+    -------
+    values : (N, D)
+    filled : (N,) bool
+        Which rows were filled in; those that no known row reaches stay as they were.
+    """
+    nearest = nearest_known(graph, known)
+    ask = ~known & (nearest >= 0)
+    out = np.array(values, np.float64)
+    rows = np.flatnonzero(ask)
+    if not len(rows):
+        return out, ask
+    out[rows] = out[nearest[rows]]
+    near = csr_array(graph[rows])
+    near.data = 1.0 / near.data
+    total = np.asarray(near.sum(axis=1)).ravel()
+    inner = csr_array(near[:, rows])
+    system = csr_array(diags_array(total) - inner)
+    fixed = np.where(known[:, None], out, 0.0)
+    right = np.asarray(near @ fixed)
+    scale = diags_array(1.0 / total)
+    for column in range(out.shape[1]):
+        start = out[rows, column]
+        found, _ = cg(system, right[:, column], x0=start, rtol=1e-8, maxiter=2000, M=scale)
+        # Means lie between what they are means of, whatever the last bits say.
+        least, most = fixed[known, column].min(), fixed[known, column].max()
+        out[rows, column] = np.clip(found, least, most)
+    return out, ask
+
+
+def settle_values(
+    values: Floats,
+    confidence: Floats,
+    target: Shape,
+    least: float,
+    blank: Floats | float | None = None,
+    fill: bool = False,
+) -> tuple[Floats, Doubt]:
+    """Values (V, D) of the target with those below the least confidence left blank, filled in, or kept.
+
+    Values that are nan are always in doubt: the source had none there.
+    """
+    flat = values if values.ndim == 2 else values[:, None]
+    low = (confidence < least) | ~np.isfinite(flat).all(axis=1)
+    N = len(low)
+    if fill:
+        out, filled = diffuse(vertex_graph(target), ~low, flat)
+        return out.reshape(values.shape), Doubt(N, int(low.sum()), 0, int(filled.sum()))
+    if blank is not None:
+        out = flat.copy()
+        out[low] = blank
+        return out.reshape(values.shape), Doubt(N, int(low.sum()), int(low.sum()))
+    return values, Doubt(N, int(low.sum()))
+
+
+def settle_weights(
+    weights: csr_array, confidence: Floats, target: Shape, least: float, fill: bool, most: int
+) -> tuple[csr_array, Doubt]:
+    """Skin weights (V, J) of the target with those in doubt filled in, or kept; rows still sum to 1.
+
+    Vertices without weights are always in doubt.
+    """
+    low = (confidence < least) | (np.diff(weights.indptr) == 0)
+    N = len(low)
+    if not fill or not low.any():
+        return weights, Doubt(N, int(low.sum()))
+    graph = vertex_graph(target)
+    # Dense numbers only where they are needed: of the vertices in doubt and those beside them.
+    some = np.flatnonzero(low | (np.asarray(graph @ low.astype(np.float64)) > 0))
+    dense, done = diffuse(csr_array(graph[some][:, some]), ~low[some], weights[some].toarray())
+    filled = np.zeros(N, bool)
+    filled[some[done]] = True
+    kept = csr_array(diags_array((~filled).astype(np.float64)) @ weights)
+    row, column = np.nonzero(np.where(done[:, None], dense, 0.0) > 0)
+    new = csr_array((dense[row, column], (some[row], column)), shape=weights.shape)
+    return sparse_rows(csr_array(kept + new), most), Doubt(N, int(low.sum()), 0, int(filled.sum()))
+
+
+def settle_labels(
+    labels: Ints, confidence: Floats, target: Shape, least: float, blank: bool, fill: bool, on_faces: bool
+) -> tuple[Ints, Doubt]:
+    """Labels (V,) or (F,) of the target with those in doubt left blank (-1), taken from the nearest sure
+    vertex or face along the surface, or kept.
+    """
+    low = (confidence < least) | (labels < 0)
+    out, N = labels.copy(), len(labels)
+    if fill:
+        nearest = nearest_known(face_graph(target) if on_faces else vertex_graph(target), ~low)
+        ask = low & (nearest >= 0)
+        out[ask] = labels[nearest[ask]]
+        return out, Doubt(N, int(low.sum()), int((out < 0).sum()), int(ask.sum()))
+    if blank:
+        out[low] = -1
+    return out, Doubt(N, int(low.sum()), int((out < 0).sum()))
