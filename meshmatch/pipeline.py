@@ -71,7 +71,7 @@ def match(
     up, front : str, optional
         Axes of both files, such as "y" or "-z"; searched where not given.
     landmarks : (source vertices (N,), target vertices (N,)), optional
-        Known pairs, which the map then honours.
+        Known pairs, which the map then honours; only with the refinement "nodes".
     workers : int
         Threads; two fits run side by side.
 
@@ -90,6 +90,11 @@ def match(
     shapes = [as_shape(source), as_shape(target)]
     clean = [usable(shape) for shape in shapes]
     config = FitConfig(refine=refine, seed=seed, up=up, front=front)
+    if landmarks is not None and refine != "nodes":
+        raise OptionError(
+            f"landmarks are honoured by the refinement of nodes, not by {refine!r}",
+            "leave out the landmarks, or choose nodes",
+        )
     set_threads(1 if workers > 1 else workers)
     stop = threading.Event()
     names = _apart(shapes[0].name, shapes[1].name)

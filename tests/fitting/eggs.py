@@ -1,10 +1,22 @@
 """A model of eggs that nobody trained: small, quick, and with everything that fitting asks of a model."""
 
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
 from meshmatch.fields.mls import Kernel
+from meshmatch.fitting.scan import Scan
+from meshmatch.models.card import write_card
+from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import NetworkConfig
 from meshmatch.models.trained import TrainedModel
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.template import save_template
 from tests.models.small_model import small_card
-from tests.training.small import NETWORK, egg_template, small_network
+from tests.training.small import NETWORK, bent_eggs, egg_template, small_network
 
 
 def egg_model(kernel: Kernel = "smooth", network: NetworkConfig = NETWORK) -> TrainedModel:
@@ -19,3 +31,30 @@ def egg_model(kernel: Kernel = "smooth", network: NetworkConfig = NETWORK) -> Tr
         seed=0,
     )
     return TrainedModel(card, template, small_network(template, network, kernel=kernel).eval())
+
+
+def write_model(model: TrainedModel, folder: Path) -> Path:
+    """The same as a model folder."""
+    folder.mkdir(parents=True)
+    save_template(model.template, folder / "template.safetensors")
+    digest = save_weights(model.network.state_dict(), folder / "weights.safetensors", storage="float32")
+    write_card(replace(model.card, weights_sha256=digest), folder / "card.json")
+    return folder
+
+
+def bent_egg(model: TrainedModel, seed: int = 0) -> Shape:
+    """A shape of the category, with the template's triangles."""
+    drawn = bent_eggs(model.template)(1, torch.Generator().manual_seed(seed))[0].double().numpy()
+    return Shape(drawn, model.template.shape.faces, f"egg {seed}")
+
+
+def scan_of(shape: Shape, P: int = 800, seed: int = 0) -> Scan:
+    """Samples of a shape where it is."""
+    samples = sample_surface(shape, P, np.random.default_rng(seed))
+    return Scan(samples.points, samples.normals)
+
+
+def gentle_vectors(model: TrainedModel, size: float = 0.04) -> np.ndarray:
+    """Node vectors (K, 3) of a smooth deformation: a quadratic bend."""
+    x, y, z = model.template.nodes.T
+    return size * np.stack([np.sin(4 * y), 2 * x * y, np.cos(4 * y) * z * 4], 1)

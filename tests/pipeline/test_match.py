@@ -78,6 +78,8 @@ def test_landmarks_are_honoured(dancer: Shape, both) -> None:
         ({"up": "y", "front": "-y"}, OptionError),
         ({"landmarks": (np.array([10**6]), np.array([0]))}, OptionError),
         ({"landmarks": (np.array([0, 1]), np.array([0]))}, OptionError),
+        ({"landmarks": (np.array([0]), np.array([0])), "refine": "none"}, OptionError),
+        ({"landmarks": (np.array([0]), np.array([0])), "refine": "latent"}, OptionError),
     ],
 )
 def test_choices_that_do_not_exist(dancer: Shape, choice: dict, error: type) -> None:

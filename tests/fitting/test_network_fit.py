@@ -1,0 +1,137 @@
+"""The network's own fit: rigid motions, the residual, and readings from tilted frames."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from meshmatch.fitting.fit_shape import node_system
+from meshmatch.fitting.network_fit import Candidate, lay_on, predict, rigid_motion, two_way_residual, variants
+from meshmatch.fitting.scan import Scan, with_normals
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.models.trained import TrainedModel
+from tests.fitting.eggs import bent_egg, egg_model, gentle_vectors, scan_of
+
+
+@pytest.fixture(scope="module")
+def model() -> TrainedModel:
+    return egg_model()
+
+
+@pytest.fixture(scope="module")
+def system(model: TrainedModel) -> NodeSystem:
+    return node_system(model)
+
+
+@pytest.fixture(scope="module")
+def scan(model: TrainedModel) -> Scan:
+    return scan_of(model.template.shape, 300)
+
+
+def test_a_rigid_motion_is_found_again() -> None:
+    rng = np.random.default_rng(0)
+    source = rng.normal(size=(9, 3))
+    R, t = Rotation.random(random_state=3).as_matrix(), rng.normal(size=3)
+    found_R, found_t = rigid_motion(source, source @ R.T + t)
+    assert np.allclose(found_R, R)
+    assert np.allclose(found_t, t)
+
+
+def test_a_mirror_image_gets_a_rotation_all_the_same() -> None:
+    source = np.random.default_rng(1).normal(size=(9, 3))
+    R, _ = rigid_motion(source, source * [-1, 1, 1])
+    assert np.linalg.det(R) == pytest.approx(1)
+
+
+def test_the_residual_is_that_of_a_plain_loop(system: NodeSystem, scan: Scan, model: TrainedModel) -> None:
+    vectors = gentle_vectors(model)
+    moved = system.moved(vectors)
+    ours, theirs = with_normals(moved, system.normals(moved)), with_normals(scan.points, scan.normals)
+    apart = np.sqrt(np.square(ours[:, None] - theirs).sum(-1))
+    for cap in (0.1, 0.03):
+        wanted = 0.5 * np.minimum(apart.min(1), cap).mean() + 0.5 * np.minimum(apart.min(0), cap).mean()
+        assert two_way_residual(system, scan, vectors, stride=1, cap=cap) == pytest.approx(wanted)
+    own = Scan(moved, system.normals(moved))
+    assert two_way_residual(system, own, vectors) == 0
+    assert two_way_residual(system, Scan(scan.points + 9, scan.normals), vectors) == pytest.approx(0.1)
+
+
+def test_predictions_are_means_of_seeded_draws(model: TrainedModel, scan: Scan) -> None:
+    one, again, other = (predict(model.network, scan, 3, np.random.default_rng(k), 100) for k in (0, 0, 1))
+    assert np.array_equal(one, again)
+    assert not np.array_equal(one, other)
+    rng = np.random.default_rng(0)
+    with torch.inference_mode():
+        draws = [
+            model.network(torch.from_numpy(scan.points[rng.choice(300, 100, replace=False)]).float()[None])[0]
+            for _ in range(3)
+        ]
+    assert np.allclose(one, torch.stack(draws).mean(0), atol=1e-5)
+    all_of_it = predict(model.network, scan, 2, np.random.default_rng(5), 10**6)  # more than there are
+    assert all_of_it.shape == (model.template.K, 3)
+
+
+def test_laying_on_again_moves_the_frame_to_where_the_core_went(
+    model: TrainedModel, system: NodeSystem
+) -> None:
+    scan = scan_of(bent_egg(model), 300)
+    scan = Scan(scan.points / 5, scan.normals)
+    core = model.template.core
+    R, c = Rotation.from_rotvec([0.1, 0.4, 0]).as_matrix(), np.array([0.1, 0, 0])
+    first = lay_on(model.network, system, core, scan, R, c, np.random.default_rng(0), rounds=1, draws=1)
+    assert np.array_equal(first.rotation, R)
+    assert np.array_equal(first.centre, c)
+    second = lay_on(model.network, system, core, scan, R, c, np.random.default_rng(0), rounds=2, draws=1)
+    assert np.linalg.det(second.rotation) == pytest.approx(1)
+    # the template's core in the new frame lies, in the scan's, where the first prediction put it, rigidly
+    there = system.moved(first.vectors)[core] @ R.T + c
+    laid = system.verts[core] @ second.rotation.T + second.centre
+    best_R, best_t = rigid_motion(system.verts[core], there)
+    assert np.allclose(laid, system.verts[core] @ best_R.T + best_t)
+
+
+def test_without_a_tilt_every_reading_is_the_networks_own(
+    model: TrainedModel, system: NodeSystem, scan: Scan
+) -> None:
+    candidate = Candidate(np.eye(3), np.zeros(3), np.zeros((system.K, 3)), 0.0)
+    # so few points that every draw is all of them: the order does not matter to the network
+    few = Scan(scan.points[:200], scan.normals[:200])
+    plain = model.network(torch.from_numpy(few.points).float()[None])[0].detach().double().numpy()
+    for degrees, count in ((0.0, 2), (15.0, 3)):
+        found = variants(model.network, system, few, few, candidate, np.random.default_rng(0), count, degrees)
+        assert len(found) == count
+        for each in found:
+            assert each.residual == two_way_residual(system, few, each.vectors, 1)
+            assert np.array_equal(each.rotation, candidate.rotation)
+            assert np.allclose(each.vectors, plain, atol=1e-5) == (degrees == 0)
+
+
+def test_a_tilted_reading_is_turned_back(model: TrainedModel, system: NodeSystem, scan: Scan) -> None:
+    """A network that follows every turn reads the same from every frame."""
+    nodes = torch.from_numpy(model.template.nodes).float()
+    first = torch.from_numpy(scan.points[:200]).float()
+
+    class Follower(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.nodes = nodes
+
+        def forward(self, points: torch.Tensor) -> torch.Tensor:
+            # the points are the first ones, turned and in another order: their moments tell the turn
+            U, _, Vh = torch.linalg.svd(
+                _moment(points[0]).double() @ torch.linalg.inv(_moment(first).double())
+            )
+            return ((U @ Vh).float() @ nodes.T).T[None] - nodes
+
+    def _moment(points: torch.Tensor) -> torch.Tensor:
+        # third-order moments turn like vectors: three of them make a frame
+        lengths = points.square().sum(1)
+        return torch.stack(
+            [points.mean(0), (points * lengths[:, None]).mean(0), (points * lengths[:, None] ** 2).mean(0)], 1
+        )
+
+    few = Scan(scan.points[:200], scan.normals[:200])
+    candidate = Candidate(np.eye(3), np.zeros(3), np.zeros((system.K, 3)), 0.0)
+    found = variants(Follower(), system, few, few, candidate, np.random.default_rng(0), 3, 20.0)  # type: ignore[arg-type]
+    for each in found:
+        assert np.abs(each.vectors).max() < 1e-3

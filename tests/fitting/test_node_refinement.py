@@ -1,0 +1,215 @@
+"""Gauss-Newton on the nodes: its parts by hand, and laws of the whole."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from meshmatch.fitting.fit_shape import node_system
+from meshmatch.fitting.network_fit import two_way_residual
+from meshmatch.fitting.nodes import (
+    NodeRefineConfig,
+    nearest_rotations,
+    pair_terms,
+    refine_nodes,
+    robust_weight,
+    vertex_areas,
+)
+from meshmatch.fitting.scan import Scan, with_normals
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.models.trained import TrainedModel
+from meshmatch.shapes.shape import Shape
+from tests.fitting.eggs import egg_model, gentle_vectors, scan_of
+
+CONFIG = NodeRefineConfig()
+
+
+@pytest.fixture(scope="module")
+def model() -> TrainedModel:
+    return egg_model()
+
+
+@pytest.fixture(scope="module")
+def system(model: TrainedModel) -> NodeSystem:
+    return node_system(model)
+
+
+@pytest.fixture(scope="module")
+def truth(model: TrainedModel) -> np.ndarray:
+    return gentle_vectors(model)
+
+
+@pytest.fixture(scope="module")
+def scan(system: NodeSystem, truth: np.ndarray) -> Scan:
+    """Samples of the template under the true vectors."""
+    return scan_of(Shape(system.moved(truth), system.faces), 2000)
+
+
+def test_robust_weights_by_hand() -> None:
+    offset = np.array([[0.0, 0, 0], [0, 0.1, 0], [0, 0, 0.2], [3, 4, 0]])
+    assert np.allclose(robust_weight(offset, 0.1), [1, 1 / 4, 1 / 25, 1 / (1 + 2500) ** 2])
+
+
+def test_the_areas_of_vertices_add_up_to_the_shapes(system: NodeSystem) -> None:
+    areas = vertex_areas(system.verts, system.faces)
+    assert (areas > 0).all()
+    assert areas.sum() == pytest.approx(Shape(system.verts, system.faces).area)
+    corner = vertex_areas(np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [9, 9, 9]]), np.array([[0, 1, 2]]))
+    assert np.allclose(corner, [1, 1, 1, 0])
+
+
+def test_the_nearest_rotation_is_the_one_that_was_applied() -> None:
+    rng = np.random.default_rng(0)
+    start = np.eye(3) + 0.2 * rng.normal(size=(20, 3, 3))
+    turns = Rotation.random(20, random_state=1).as_matrix()
+    assert np.allclose(nearest_rotations(turns @ start, start), turns)
+    anything = nearest_rotations(rng.normal(size=(20, 3, 3)), start)  # mirrored ones too
+    assert np.allclose(np.linalg.det(anything), 1)
+    assert np.allclose(anything @ anything.transpose(0, 2, 1), np.eye(3))
+
+
+def test_pairs_are_those_of_a_plain_loop(system: NodeSystem) -> None:
+    scan = scan_of(Shape(1.1 * system.verts + 0.02, system.faces), 60)
+    config = replace(CONFIG, back_points=20)
+    vectors = np.zeros((system.K, 3))
+    weights, pulls = pair_terms(system, scan, vectors, 0.08, config)
+
+    normals = system.normals(system.verts)
+    seen, there = with_normals(system.verts, normals), with_normals(scan.points, scan.normals)
+    area = vertex_areas(system.verts, system.faces)
+    pairs = []
+    for v in range(len(seen)):
+        p = int(np.square(there - seen[v]).sum(1).argmin())
+        pairs.append((v, p, area[v] / area.sum()))
+    for p in range(0, 60, 3):
+        v = int(np.square(seen - there[p]).sum(1).argmin())
+        pairs.append((v, p, 1 / 20))
+    H, s = np.zeros((len(seen), 3, 3)), np.zeros((len(seen), 3))
+    for v, p, weight in pairs:
+        n, point = scan.normals[p], scan.points[p]
+        if normals[v] @ n > config.normal_cosine:
+            offset = system.verts[v] - point
+            weight *= 0.5 / (1 + offset @ offset / 0.08**2) ** 2
+            term = weight * (np.outer(n, n) + config.point_share * np.eye(3))
+            H[v] += term
+            s[v] += term @ point
+    assert np.allclose(weights, H.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
+    assert np.allclose(pulls, s)
+    assert weights.any()
+
+
+def test_a_surface_that_faces_the_other_way_is_no_partner(system: NodeSystem, scan: Scan) -> None:
+    inside_out = Scan(scan.points, -scan.normals)
+    weights, _ = pair_terms(system, inside_out, np.zeros((system.K, 3)), 0.1, CONFIG)
+    # a few pairs reach the far side of the egg, where normals agree and the robust weight is nearly nothing
+    right = pair_terms(system, scan, np.zeros((system.K, 3)), 0.1, CONFIG)[0]
+    assert weights.sum() < 0.05 * right.sum()
+
+
+def off_surface(system: NodeSystem, vectors: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """How far vertices (V,) are off the true surface: sliding along it is what no scan can tell."""
+    apart = system.moved(vectors) - system.moved(truth)
+    return np.abs((apart * system.normals(system.moved(truth))).sum(1))
+
+
+def test_a_small_bend_is_found_again(system: NodeSystem, scan: Scan, truth: np.ndarray) -> None:
+    still = np.zeros_like(truth)
+    found = refine_nodes(system, scan, still, CONFIG)
+    assert off_surface(system, still, truth).mean() > 0.015
+    assert off_surface(system, found, truth).mean() < 0.005
+    assert two_way_residual(system, scan, found) < 0.8 * two_way_residual(system, scan, still)
+
+
+def test_what_fits_already_stays(system: NodeSystem, scan: Scan, truth: np.ndarray) -> None:
+    found = refine_nodes(system, scan, truth, CONFIG)
+    assert off_surface(system, found, truth).max() < 0.01
+    assert two_way_residual(system, scan, found) <= two_way_residual(system, scan, truth)
+
+
+def test_each_step_lowers_the_energy_that_it_is_given(
+    system: NodeSystem, scan: Scan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pairs and weights change between the steps; within one, the quadratic energy goes down."""
+    energies: list[tuple[float, float]] = []
+    solve = NodeSystem.solve
+
+    def watched(self, weights, pulls, strain, targets, damping, current):
+        found = solve(self, weights, pulls, strain, targets, damping, current)
+
+        def energy(vectors: np.ndarray) -> float:
+            y = self.moved(vectors)
+            H = weights[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+            data = np.einsum("va,vab,vb->", y, H, y) - 2 * (y * pulls).sum()
+            bent = np.square(self.deformation_gradient(vectors) - targets).sum()
+            return float(data + strain * bent + damping * np.square(vectors - current).sum())
+
+        energies.append((energy(current), energy(found)))
+        return found
+
+    monkeypatch.setattr(NodeSystem, "solve", watched)
+    refine_nodes(system, scan, np.zeros((system.K, 3)), CONFIG)
+    assert len(energies) == CONFIG.steps
+    assert all(after <= before for before, after in energies)
+    assert energies[0][1] < energies[0][0]
+
+
+def test_turning_everything_turns_the_answer(system: NodeSystem, scan: Scan, model: TrainedModel) -> None:
+    Q = Rotation.from_rotvec([0.3, -0.9, 0.4]).as_matrix()
+    turned = Scan(scan.points @ Q.T, scan.normals @ Q.T)
+    nodes = model.template.nodes
+    plain = refine_nodes(system, scan, np.zeros((system.K, 3)), CONFIG)
+    other = refine_nodes(system, turned, nodes @ Q.T - nodes, CONFIG)
+    assert np.allclose(nodes + other, (nodes + plain) @ Q.T, atol=1e-5)
+
+
+def test_landmarks_are_met_and_the_rest_stays_on_the_surface(
+    system: NodeSystem, scan: Scan, truth: np.ndarray
+) -> None:
+    """Pairs a little beside where the surface alone would put them."""
+    at = np.array([3, 40, 90])
+    free = refine_nodes(system, scan, truth, CONFIG)
+    place = system.moved(free)[at] + 0.05 * np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+
+    def apart(vectors: np.ndarray) -> float:
+        return float(np.linalg.norm(system.moved(vectors)[at] - place, axis=1).mean())
+
+    held = refine_nodes(system, scan, truth, CONFIG, (at, place))
+    loose = refine_nodes(system, scan, truth, replace(CONFIG, landmark_weight=0.0), (at, place))
+    firm = refine_nodes(system, scan, truth, replace(CONFIG, landmark_weight=5.0), (at, place))
+    assert np.array_equal(loose, free)
+    assert apart(firm) < apart(held) < 0.2 * apart(free)
+    assert apart(firm) < 0.001
+    assert off_surface(system, held, truth).mean() < 0.01
+
+
+def test_of_a_part_only_what_is_near_it_is_pulled(system: NodeSystem, scan: Scan, truth: np.ndarray) -> None:
+    upper = scan.points[:, 1] > 0
+    half, scale = Scan(scan.points[upper], scan.normals[upper]), 0.03
+    moved = system.moved(truth)
+    to_half = half.tree.query(with_normals(moved, system.normals(moved)))[1]
+    far = np.linalg.norm(moved - half.points[to_half], axis=1) >= 3 * scale
+    never = far & (moved[:, 1] < -0.2)  # nor do points of the half ask for these
+    assert never.sum() > 20
+    config = replace(CONFIG, normal_cosine=-1.0)
+    whole, part = (
+        pair_terms(system, half, truth, scale, config, one_sided)[0] for one_sided in (False, True)
+    )
+    assert (whole[never] != 0).any(1).all()
+    assert (part[never] == 0).all()
+    assert np.array_equal(part[~far], whole[~far])
+
+
+def test_progress_is_told_for_every_step(system: NodeSystem, scan: Scan) -> None:
+    told: list[tuple[int, int]] = []
+    refine_nodes(
+        system,
+        scan,
+        np.zeros((system.K, 3)),
+        replace(CONFIG, steps=3),
+        progress=lambda *now: told.append(now),
+    )
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert np.array_equal(
+        refine_nodes(system, scan, np.ones((system.K, 3)), replace(CONFIG, steps=0)), np.ones((system.K, 3))
+    )

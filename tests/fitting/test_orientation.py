@@ -1,0 +1,167 @@
+"""Proposed core frames: every one is a rotation, obeys what it must, and turns along with the scan."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from meshmatch.errors import OptionError
+from meshmatch.fitting.orientation import (
+    Hypothesis,
+    ask_aligner,
+    axis_vector,
+    forced_frames,
+    propose,
+    standing_grid,
+    turned_copies,
+    with_flips,
+)
+from meshmatch.fitting.scan import Scan, with_normals
+from meshmatch.models.trained import TrainedModel
+from tests.fitting.eggs import bent_egg, egg_model, scan_of
+
+AXES = [sign * axis for axis in np.eye(3) for sign in (1, -1)]
+
+
+@pytest.fixture(scope="module")
+def model() -> TrainedModel:
+    return egg_model()
+
+
+@pytest.fixture(scope="module")
+def points(model: TrainedModel) -> np.ndarray:
+    drawn = scan_of(bent_egg(model), 300).points
+    return drawn / np.ptp(drawn, axis=0).max() + [0.2, 0, -0.1]
+
+
+def check_rotations(matrices: np.ndarray) -> None:
+    assert np.allclose(matrices @ matrices.transpose(0, 2, 1), np.eye(3), atol=1e-6)
+    assert np.allclose(np.linalg.det(matrices), 1, atol=1e-6)
+
+
+def rotations(guesses: list[Hypothesis]) -> np.ndarray:
+    return np.stack([guess.rotation for guess in guesses])
+
+
+def test_a_scan_in_its_core_frame() -> None:
+    rng = np.random.default_rng(0)
+    scan = Scan(rng.normal(size=(20, 3)), rng.normal(size=(20, 3)))
+    R, c = Rotation.random(random_state=1).as_matrix(), rng.normal(size=3)
+    core = scan.turned(R, c)
+    # scan = R core + centre, for rows
+    assert np.allclose(core.points @ R.T + c, scan.points)
+    assert np.allclose(core.normals @ R.T, scan.normals)
+    S, d = Rotation.random(random_state=2).as_matrix(), rng.normal(size=3)
+    twice, once = core.turned(S, d), scan.turned(R @ S, R @ d + c)
+    assert np.allclose(twice.points, once.points)
+    assert np.allclose(twice.normals, once.normals)
+    assert core.tree.query(with_normals(core.points[4:5], core.normals[4:5]))[1] == [4]
+
+
+def test_turned_copies_are_rotations_of_one_seed_and_begin_as_they_are() -> None:
+    turns = turned_copies(12, 3)
+    check_rotations(turns)
+    assert np.array_equal(turns[0], np.eye(3))
+    assert np.array_equal(turns, turned_copies(12, 3))
+    assert not np.allclose(turns[1:], turned_copies(12, 4)[1:])
+
+
+def test_asking_about_turned_copies_is_turning_the_points_and_asking(
+    model: TrainedModel, points: np.ndarray
+) -> None:
+    turns = turned_copies(5, 0)
+    R, t = ask_aligner(model.network, points, turns)
+    aligner = model.network.aligner
+    assert aligner is not None
+    middle = points.mean(0)
+    for k, turn in enumerate(turns):
+        copy = torch.from_numpy((points - middle) @ turn.T).float()[None]
+        with torch.inference_mode():
+            there, centre = model.network.align(aligner.features(copy))
+        assert np.allclose(R[k], turn.T @ there[0].numpy(), atol=1e-4)
+        assert np.allclose(t[k], turn.T @ centre[0].numpy() + middle, atol=1e-4)
+    check_rotations(R)
+
+
+def test_frames_move_along_with_the_scan(model: TrainedModel, points: np.ndarray) -> None:
+    Q, shift = Rotation.from_rotvec([0.5, 1.0, -0.4]).as_matrix(), np.array([1.0, -2, 0.5])
+    turns = turned_copies(4, 1)
+    R, t = ask_aligner(model.network, points, turns @ Q)
+    moved_R, moved_t = ask_aligner(model.network, points @ Q.T + shift, turns)
+    assert np.allclose(moved_R, Q @ R, atol=1e-4)
+    assert np.allclose(moved_t, t @ Q.T + shift, atol=1e-4)
+
+
+def test_hypotheses_are_rotations_with_the_most_voted_first(model: TrainedModel, points: np.ndarray) -> None:
+    found = propose(model.network, points, copies=16, keep=3, seed=0)
+    check_rotations(rotations(found))
+    votes = [guess.votes for guess in found]
+    assert votes == sorted(votes, reverse=True)
+    assert 0 < sum(votes) <= 1 + 1e-9
+    assert 1 <= len(found) <= 3
+    again = propose(model.network, points, copies=16, keep=3, seed=0)
+    assert np.array_equal(rotations(again), rotations(found))
+
+
+def test_flips_keep_each_hypothesis_and_its_centre() -> None:
+    guesses = [
+        Hypothesis(Rotation.random(random_state=k).as_matrix(), np.array([k, 0.0, 1]), 0.5) for k in (0, 1)
+    ]
+    flipped = with_flips(guesses)
+    assert np.allclose(rotations(flipped[:2]), rotations(guesses))
+    check_rotations(rotations(flipped))
+    for k, guess in enumerate(guesses):
+        own = flipped[k::2]
+        assert all(np.array_equal(each.centre, guess.centre) for each in own)
+        # about the guess's own axes: half turns about each, quarter turns about up
+        relative = guess.rotation.T @ rotations(own)
+        angles = np.degrees(Rotation.from_matrix(relative).magnitude())
+        assert np.allclose(sorted(angles), [0, 90, 90, 180, 180, 180], atol=1e-4)
+        halves = relative[np.isclose(angles, 180)]
+        assert np.allclose(np.abs(halves), np.eye(3), atol=1e-9)
+        assert len(np.unique(relative.round(6), axis=0)) == 6
+
+
+def test_the_standing_grid_tries_all_axes_all_round() -> None:
+    grid = standing_grid(np.array([1.0, 2, 3]))
+    assert len(grid) == 72
+    check_rotations(rotations(grid))
+    assert all(np.array_equal(guess.centre, [1, 2, 3]) for guess in grid)
+    ups = rotations(grid)[:, :, 1]
+    for axis in AXES:
+        here = np.isclose(ups @ axis, 1)
+        assert here.sum() == 12
+        fronts = rotations(grid)[here][:, :, 2]
+        nearest = np.sort(fronts @ fronts[0])[-2]
+        assert nearest == pytest.approx(np.cos(np.radians(30)))
+
+
+@pytest.mark.parametrize("up", AXES)
+def test_frames_obey_the_axes_that_are_given(up: np.ndarray) -> None:
+    alone = forced_frames(up, None)
+    assert len(alone) == 12
+    check_rotations(rotations(alone))
+    assert np.allclose(rotations(alone)[:, :, 1], up)
+    facing = forced_frames(None, up)
+    check_rotations(rotations(facing))
+    assert np.allclose(rotations(facing)[:, :, 2], up)
+    for front in AXES:
+        if abs(up @ front) < 0.5:
+            (both,) = forced_frames(up, front)
+            check_rotations(both.rotation[None])
+            assert np.allclose(both.rotation[:, 1], up)
+            assert np.allclose(both.rotation[:, 2], front)
+
+
+@pytest.mark.parametrize(
+    ("name", "vector"), [("y", (0, 1, 0)), ("+x", (1, 0, 0)), ("-z", (0, 0, -1)), ("Y", (0, 1, 0))]
+)
+def test_names_of_axes(name: str, vector: tuple[int, int, int]) -> None:
+    assert np.array_equal(axis_vector(name), vector)
+
+
+@pytest.mark.parametrize("name", ["", "w", "yy", "--y", "+", "y-"])
+def test_what_is_no_axis(name: str) -> None:
+    with pytest.raises(OptionError, match="is no axis") as caught:
+        axis_vector(name)
+    assert caught.value.hint

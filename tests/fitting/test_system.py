@@ -1,0 +1,139 @@
+"""The compiled least squares against a dense one written out, on a template of 36 nodes."""
+
+import numpy as np
+import pytest
+
+from meshmatch.fields.mls import KERNELS
+from meshmatch.fitting.fit_shape import node_system
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.models.trained import TrainedModel
+from tests.fitting.eggs import egg_model, gentle_vectors
+
+ORDER = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+
+
+@pytest.fixture(scope="module", params=KERNELS)
+def model(request: pytest.FixtureRequest) -> TrainedModel:
+    return egg_model(request.param)
+
+
+@pytest.fixture(scope="module")
+def system(model: TrainedModel) -> NodeSystem:
+    shape = model.template.shape
+    return NodeSystem(shape, model.field(shape.verts), strain_points=40)
+
+
+class Problem:
+    """Random terms of a solve, with roots of the weights: H_p = A_p^T A_p. A third of the vertices have none."""
+
+    def __init__(self, system: NodeSystem, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        V, G = len(system.verts), len(system.strain_points)
+        self.roots = rng.normal(size=(V, 3, 3)) * (rng.random((V, 1, 1)) < 2 / 3)
+        self.places = rng.normal(size=(V, 3))
+        self.targets = rng.normal(size=(G, 3, 3))
+        self.current = rng.normal(size=(system.K, 3))
+        self.strain, self.damping = 0.7, 0.05
+        H = self.roots.transpose(0, 2, 1) @ self.roots
+        self.weights = np.stack([H[:, a, b] for a, b in ORDER], 1)
+        self.pulls = np.einsum("vab,vb->va", H, self.places)
+
+    def solve(self, system: NodeSystem) -> np.ndarray:
+        return system.solve(self.weights, self.pulls, self.strain, self.targets, self.damping, self.current)
+
+    def rows(self, system: NodeSystem) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix and right-hand side, a row for each residual; unknown 3 k + a is component a of node k."""
+        phi, slopes = system.phi.toarray(), system.slopes.toarray().reshape(-1, 3, system.K)
+        eye = np.eye(3)
+        data = np.einsum("vab,vk->vakb", self.roots, phi).reshape(-1, 3 * system.K)
+        offset = np.einsum("vab,vb->va", self.roots, self.places - system.verts).ravel()
+        # F[g, a, b] = delta_ab + sum_k u_ka slopes[g, b, k]
+        strain = np.sqrt(self.strain) * np.einsum("gbk,ac->gabkc", slopes, eye).reshape(-1, 3 * system.K)
+        wanted = np.sqrt(self.strain) * (self.targets - eye).ravel()
+        still = np.sqrt(self.damping) * np.eye(3 * system.K)
+        return (
+            np.concatenate([data, strain, still]),
+            np.concatenate([offset, wanted, np.sqrt(self.damping) * self.current.ravel()]),
+        )
+
+    def energy(self, system: NodeSystem, vectors: np.ndarray) -> float:
+        matrix, right = self.rows(system)
+        return float(np.square(matrix @ vectors.ravel() - right).sum())
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_solution_is_that_of_dense_least_squares(system: NodeSystem, seed: int) -> None:
+    problem = Problem(system, seed)
+    matrix, right = problem.rows(system)
+    wanted = np.linalg.lstsq(matrix, right, rcond=None)[0].reshape(-1, 3)
+    assert np.allclose(problem.solve(system), wanted, atol=1e-8)
+
+
+def test_a_step_never_raises_the_energy_that_it_minimises(system: NodeSystem) -> None:
+    problem = Problem(system)
+    found = problem.solve(system)
+    lowest = problem.energy(system, found)
+    rng = np.random.default_rng(5)
+    assert lowest < problem.energy(system, problem.current)
+    for _ in range(5):
+        assert lowest < problem.energy(system, found + 0.01 * rng.normal(size=found.shape))
+
+
+def test_nothing_changes_what_the_caller_holds(system: NodeSystem) -> None:
+    problem = Problem(system)
+    names = ("weights", "pulls", "targets", "current")
+    before = {name: getattr(problem, name).copy() for name in names}
+    first = problem.solve(system)
+    assert all(np.array_equal(getattr(problem, name), before[name]) for name in names)
+    assert np.array_equal(problem.solve(system), first)
+
+
+def test_what_holds_already_is_left_alone(system: NodeSystem, model: TrainedModel) -> None:
+    """Every point at its place and every gradient at its target: the current vectors are the answer."""
+    problem = Problem(system)
+    problem.current = gentle_vectors(model)
+    H = problem.roots.transpose(0, 2, 1) @ problem.roots
+    problem.pulls = np.einsum("vab,vb->va", H, system.moved(problem.current))
+    problem.targets = system.deformation_gradient(problem.current)
+    assert np.allclose(problem.solve(system), problem.current, atol=1e-10)
+
+
+def test_an_affine_motion_of_the_nodes_moves_the_template_by_it(
+    system: NodeSystem, model: TrainedModel
+) -> None:
+    rng = np.random.default_rng(0)
+    A, t = np.eye(3) + 0.3 * rng.normal(size=(3, 3)), rng.normal(size=3)
+    nodes = model.template.nodes
+    vectors = nodes @ A.T + t - nodes
+    assert np.allclose(system.moved(vectors), system.verts @ A.T + t, atol=1e-5)
+    assert np.allclose(system.deformation_gradient(vectors), A, atol=1e-4)
+
+
+def test_the_gradient_is_the_slope_of_the_motion(system: NodeSystem, model: TrainedModel) -> None:
+    """F of a smooth bend against differences of the bend itself, which the field nearly reproduces."""
+    vectors, at, step = gentle_vectors(model), system.strain_points, 1e-4
+    F = system.deformation_gradient(vectors)
+    for axis in range(3):
+        aside = np.zeros(3)
+        aside[axis] = step
+        there, back = (model.field(system.verts[at] + sign * aside) for sign in (1, -1))
+        phi = (there.phi.to_dense() - back.phi.to_dense()).double().numpy() / (2 * step)
+        assert np.allclose(F[:, :, axis] - np.eye(3)[axis], phi @ vectors, atol=5e-3)
+
+
+def test_normals_are_unit_and_outward_and_turn_along(system: NodeSystem, model: TrainedModel) -> None:
+    normals = system.normals(system.verts)
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1)
+    assert ((normals * system.verts).sum(1) > 0).all()
+    a, b, c = (system.verts[system.faces[:, k]] for k in range(3))
+    flat = np.cross(b - a, c - a)
+    by_hand = flat[(system.faces == 7).any(1)].sum(0)
+    assert np.allclose(normals[7], by_hand / np.linalg.norm(by_hand))
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert np.allclose(system.normals(system.verts @ turn.T), normals @ turn.T)
+
+
+def test_the_system_of_a_model_is_built_once(model: TrainedModel) -> None:
+    assert node_system(model) is node_system(model)
+    assert len(node_system(model).strain_points) == model.template.shape.V  # fewer than the most there may be
+    assert len(np.unique(node_system(model).strain_points)) == model.template.shape.V
