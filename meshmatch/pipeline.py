@@ -14,6 +14,7 @@ import numpy as np
 
 from meshmatch.config import set_threads
 from meshmatch.errors import InputError, OptionError
+from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_shape import FitConfig, Refine
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
@@ -114,8 +115,10 @@ def match(
         except BaseException:
             stop.set()  # Ctrl-C, or one fit failed: the other one ends at its next word
             raise
+    known = None
     if landmarks is not None:
-        fits = _honour(loaded, clean, fits, landmarks, config)
+        fits, known = _honour(loaded, clean, fits, landmarks, config)
+    fits = agreed_fits(loaded, [part.shape for part in clean], fits, config, known)
     found = build_map(clean[0], fits[0], clean[1], fits[1], workers=workers)
     notes = tuple(
         f"{shape.name}: {note}" for shape, part in zip(shapes, clean, strict=True) for note in part.notes
@@ -150,10 +153,24 @@ def fit_shape(shape: Shape, *, model: str | Path = "human", refine: Refine = "no
 
 
 def map_between(
-    source: Shape, source_fit: Fit, target: Shape, target_fit: Fit, *, workers: int = 1
+    source: Shape,
+    source_fit: Fit,
+    target: Shape,
+    target_fit: Fit,
+    *,
+    model: str | Path | None = None,
+    workers: int = 1,
 ) -> VertexMap:
-    """The map between two shapes that were fitted with the same model."""
-    return build_map(usable(source), source_fit, usable(target), target_fit, workers=workers)
+    """The map between two shapes that were fitted with the same model.
+
+    Given the ``model``, the fits first agree on how the template stretches, as they do in `match` with refine="nodes";
+    it is for fits refined in that way.
+    """
+    fits = [source_fit, target_fit]
+    if model is not None:
+        shapes = [usable(shape).shape for shape in (source, target)]
+        fits = agreed_fits(read_model(model), shapes, fits, FitConfig(seed=source_fit.seed))
+    return build_map(usable(source), fits[0], usable(target), fits[1], workers=workers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,11 +281,12 @@ def usable(shape: Shape) -> Repaired:
 
 def _honour(
     model: TrainedModel, clean: list[Repaired], fits: list[Fit], landmarks: LandmarkPairs, config: FitConfig
-) -> list[Fit]:
+) -> tuple[list[Fit], list[tuple[np.ndarray, np.ndarray]]]:
     """Fit again with known pairs.
 
     A pair is carried to the template through the first fits; the template point between the two answers is
-    then pulled to the landmark on both shapes.
+    then pulled to the landmark on both shapes. Also returned: for each shape those template vertices and their
+    places in its file.
     """
     from meshmatch.fitting.landmarks import template_vertices
 
@@ -287,10 +305,10 @@ def _honour(
     if len(places[0]) != len(places[1]):
         raise OptionError("landmarks must come in pairs", "one pair of vertices a line")
     at = template_vertices(model.template, fits, places)
+    known = [(at, place) for place in places]
     return [
-        lay_template(model, part.shape, config, (at, place))
-        for part, place in zip(clean, places, strict=True)
-    ]
+        lay_template(model, part.shape, config, pairs) for part, pairs in zip(clean, known, strict=True)
+    ], known
 
 
 def _apart(source: str, target: str) -> tuple[str, str]:

@@ -67,7 +67,8 @@ class PipelineMatcher:
         """Build the map from two fits."""
         from meshmatch.pipeline import map_between
 
-        return map_between(source, source_fit, target, target_fit)
+        agreeing = self.model if self.refine == "nodes" else None
+        return map_between(source, source_fit, target, target_fit, model=agreeing)
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ def refine_nodes(
         scale = config.scale_first ** (1 - t) * config.scale_last**t
         weights, pulls = pair_terms(system, scan, vectors, scale, config, one_sided)
         if landmarks is not None:
-            _add_landmarks(weights, pulls, landmarks, config.landmark_weight)
+            add_landmarks(weights, pulls, landmarks, config.landmark_weight)
         targets = nearest_rotations(system.deformation_gradient(vectors), start) @ start
         share = 1.0 / len(targets)
         vectors = system.solve(weights, pulls, strain * share, targets, config.damping / system.K, vectors)
@@ -124,7 +124,10 @@ def _accumulate(at, point, normal, weight, share, V) -> tuple[np.ndarray, np.nda
     return weights, pulls
 
 
-def _add_landmarks(weights, pulls, landmarks, weight) -> None:
+def add_landmarks(
+    weights: np.ndarray, pulls: np.ndarray, landmarks: tuple[np.ndarray, np.ndarray], weight: float
+) -> None:
+    """Add pairs of template vertices (N,) and positions (N, 3) to `pair_terms`, in place."""
     at, position = landmarks
     np.add.at(weights, (at[:, None], np.array([0, 3, 5])), weight)
     np.add.at(pulls, at, weight * position)

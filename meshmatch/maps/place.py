@@ -17,8 +17,8 @@ from meshmatch.shapes.topology import edges_of
 # than they are, stretched by this factor.
 _TEAR, _STRETCH = 0.06, 3.0
 # A piece between tears is believed if it has this share of the surface.
-_BELIEVED = 0.02
-_ROUNDS, _FILL_STEPS = 2, 60
+_BELIEVED = 0.06
+_ROUNDS, _FILL_STEPS = 3, 120
 
 
 @lru_cache(maxsize=4)

@@ -14,7 +14,7 @@ from meshmatch.shapes.shape import squared_lengths
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area).
 NORMAL_WEIGHT = 0.15
 # How much a distance on the resting template counts beside one in space.
-RESTING_WEIGHT = 0.2
+RESTING_WEIGHT = 0.4
 # Queries at a time: what belongs to them then stays in the processor's cache.
 _CHUNK = 8192
 

@@ -1,0 +1,136 @@
+"""Fits that agree: the mean stretch by hand, and what agreeing does to two fits of one egg."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from meshmatch.fitting.agree import AgreeConfig, agree, agreed_fits, mean_stretch
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_shape import FitConfig, node_system
+from meshmatch.fitting.nodes import NodeRefineConfig
+from meshmatch.fitting.scan import Scan
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.models.trained import TrainedModel
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Frame, Shape
+from tests.fitting.eggs import egg_model
+
+TURNS = Rotation.random(4, random_state=np.random.default_rng(0)).as_matrix()
+
+
+@pytest.fixture(scope="module")
+def model() -> TrainedModel:
+    return egg_model()
+
+
+@pytest.fixture(scope="module")
+def system(model: TrainedModel) -> NodeSystem:
+    return node_system(model)
+
+
+def stretches(*factors: float) -> np.ndarray:
+    """(4, 3, 3) the same stretch along the axes, each under another rotation from the left."""
+    return TURNS @ np.diag(factors)
+
+
+def test_doubling_and_halving_cancel() -> None:
+    common = mean_stretch([stretches(2.0, 1.0, 3.0), stretches(0.5, 1.0, 3.0)])
+    assert np.allclose(common, np.diag([1.0, 1.0, 3.0]))
+
+
+def test_the_mean_of_one_is_its_own_stretch_without_the_turn() -> None:
+    F = np.random.default_rng(1).normal(0, 0.3, (6, 3, 3)) + np.eye(3)
+    common = mean_stretch([F])
+    assert np.allclose(common, common.transpose(0, 2, 1))
+    assert np.allclose(common @ common, F.transpose(0, 2, 1) @ F)
+    assert np.allclose(mean_stretch([TURNS[0] @ F]), common)
+
+
+def test_a_collapsed_point_has_a_finite_mean() -> None:
+    assert np.isfinite(mean_stretch([np.zeros((1, 3, 3)), stretches(1, 1, 1)[:1]])).all()
+
+
+def scan_of(system: NodeSystem) -> Scan:
+    """The resting egg itself."""
+    samples = sample_surface(Shape(system.verts, system.faces), 1500, np.random.default_rng(0))
+    return Scan(samples.points, samples.normals)
+
+
+def slid(system: NodeSystem, nodes: np.ndarray, turn: float) -> np.ndarray:
+    """Node vectors that let the template slide along the egg: twisted about the long axis by up to ``turn``."""
+    angle = turn * np.tanh(nodes[:, 1])
+    x, z = nodes[:, 0], nodes[:, 2]
+    # the egg is 0.8 wide and 1.0 deep: turn on a circle, then back to the ellipse
+    x, z = x / 0.8, z
+    x, z = np.cos(angle) * x + np.sin(angle) * z, -np.sin(angle) * x + np.cos(angle) * z
+    return np.stack([0.8 * x, nodes[:, 1], z], 1) - nodes
+
+
+def test_two_that_slid_apart_come_closer(system: NodeSystem, model: TrainedModel) -> None:
+    scan, nodes = scan_of(system), model.template.nodes
+    apart = [slid(system, nodes, 0.15), slid(system, nodes, -0.15)]
+    nearer = agree(system, [scan, scan], apart, AgreeConfig(steps=6, strain=0.01), NodeRefineConfig())
+
+    def gap(pair: list[np.ndarray]) -> float:
+        return float(np.linalg.norm(system.moved(pair[0]) - system.moved(pair[1]), axis=1).mean())
+
+    assert gap(nearer) < 0.75 * gap(apart)
+    alone = agree(system, [scan], apart[:1], AgreeConfig(steps=6, strain=0.01), NodeRefineConfig())
+    assert gap([alone[0], apart[1]]) > gap(nearer)
+
+
+def test_two_that_are_equal_stay_so_and_the_same_twice(system: NodeSystem, model: TrainedModel) -> None:
+    scan, start = scan_of(system), slid(system, model.template.nodes, 0.1)
+    first = agree(system, [scan, scan], [start, start], AgreeConfig(), NodeRefineConfig())
+    again = agree(system, [scan, scan], [start, start], AgreeConfig(), NodeRefineConfig())
+    assert np.array_equal(first[0], first[1])
+    assert np.array_equal(first[0], again[0])
+
+
+def test_landmarks_hold(system: NodeSystem, model: TrainedModel) -> None:
+    scan, start = scan_of(system), slid(system, model.template.nodes, 0.1)
+    at = np.array([3, 40])
+    places = system.moved(start)[at] + [0.15, 0.0, 0.0]
+    config = AgreeConfig(steps=3)
+
+    def missed(known: object) -> float:
+        moved = system.moved(agree(system, [scan], [start], config, NodeRefineConfig(), known)[0])  # type: ignore[arg-type]
+        return float(np.linalg.norm(moved[at] - places, axis=1).max())
+
+    assert missed([(at, places)]) < 0.25 * missed(None)
+
+
+def fit_of(system: NodeSystem, vectors: np.ndarray, verdict: str = "good") -> Fit:
+    points = system.moved(vectors)
+    frame = Frame(2.0, TURNS[1], np.array([1.0, 2.0, 3.0]))
+    none = np.zeros(len(points))
+    return Fit(
+        "egg", frame, points, vectors, system.verts, system.faces, 0.02, none, verdict, (), "+y", "+z", 0.0, 0
+    )
+
+
+def test_fits_agree_in_their_own_frames(system: NodeSystem, model: TrainedModel) -> None:
+    vectors = [slid(system, model.template.nodes, turn) for turn in (0.15, -0.15)]
+    fits = [fit_of(system, each) for each in vectors]
+    shape = Shape(fits[0].frame.undo(system.verts), system.faces)
+    how = AgreeConfig(steps=6, strain=0.01)
+    agreed = agreed_fits(model, [shape, shape], fits, FitConfig(samples=1500), how=how)
+    before, after = (np.linalg.norm(a.points - b.points, axis=1).mean() for a, b in (fits, agreed))
+    assert after < before
+    for fit in agreed:
+        assert np.allclose(fit.points, system.moved(fit.vectors))
+        assert (
+            0 < fit.vertex_distance.max() < 0.2
+        )  # of the egg's vertices from the template's, in the core frame
+        assert (fit.verdict, fit.residual) == ("good", 0.02)
+
+
+def test_a_poor_fit_has_no_say(system: NodeSystem, model: TrainedModel) -> None:
+    vectors = [slid(system, model.template.nodes, turn) for turn in (0.15, -0.15)]
+    fits = [fit_of(system, vectors[0]), fit_of(system, vectors[1], "poor")]
+    shape = Shape(fits[0].frame.undo(system.verts), system.faces)
+    assert agreed_fits(model, [shape, shape], fits) == fits
+    good = [replace(fit, verdict="good") for fit in fits]
+    assert agreed_fits(model, [shape, shape], good, FitConfig(refine="none")) == good
