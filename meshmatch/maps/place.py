@@ -39,10 +39,10 @@ def place(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndar
     edges = edges_of(shape.faces).vertices
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     for _ in range(_ROUNDS):
-        doubted = _doubted(edges, length, resting, shape.vertex_areas)
+        doubted = small_pieces(edges, length, resting, shape.vertex_areas)
         if not doubted.any():
             break
-        around = _fill(edges, resting, doubted)
+        around = surroundings(edges, resting, doubted)
         ask = np.flatnonzero(doubted & np.isfinite(around).all(1))
         if not len(ask):
             break
@@ -53,8 +53,16 @@ def place(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndar
     return foot, resting
 
 
-def _doubted(edges: np.ndarray, length: np.ndarray, resting: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """(V,) True on small pieces between tears."""
+def small_pieces(edges: np.ndarray, length: np.ndarray, resting: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """(V,) True on small pieces between tears: edges whose ends belong much further apart than they are.
+
+    Parameters
+    ----------
+    edges : (E, 2)
+    length : (E,) of the edges
+    resting : (V, 3) where each vertex belongs
+    area : (V,) around each vertex; lengths are in units of the square root of the whole
+    """
     V = len(resting)
     jump = np.linalg.norm(resting[edges[:, 0]] - resting[edges[:, 1]], axis=1)
     whole = jump < _TEAR + _STRETCH * length
@@ -66,7 +74,7 @@ def _doubted(edges: np.ndarray, length: np.ndarray, resting: np.ndarray, area: n
     return (np.bincount(piece, area) < _BELIEVED * area.sum())[piece]
 
 
-def _fill(edges: np.ndarray, resting: np.ndarray, doubted: np.ndarray) -> np.ndarray:
+def surroundings(edges: np.ndarray, resting: np.ndarray, doubted: np.ndarray) -> np.ndarray:
     """Resting positions with the doubted ones replaced by the average of their surroundings; NaN out of reach."""
     V = len(resting)
     ones = np.ones(len(edges))

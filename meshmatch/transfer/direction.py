@@ -7,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from meshmatch.errors import InputError
+from meshmatch.maps.place import small_pieces, surroundings
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
-from meshmatch.shapes.shape import Ints, Shape
-from meshmatch.transfer.image import Image, on_vertex
+from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.shapes.topology import edges_of
+from meshmatch.transfer.image import Image, Places, on_vertex
+
+_ROUNDS = 2
 
 _OTHER = "match these two again, or keep the map as .npy or .csv, which go by the count of vertices alone"
 
@@ -87,26 +91,66 @@ def pull_back(source_to_target: VertexMap, source: Shape, target: Shape, workers
     checked = check_map(source_to_target, source, target)
     if source.hash == target.hash and _is_identity(checked):
         return replace(checked, source=target.name, target=source.name)
-    places = Image(checked, source, target).query(target.verts, target_normals(target), workers)
-    index, face, weights = places.vertex, places.face, places.barycentric
-    confidence = places.confidence
+    image = Image(checked, source, target)
+    normals = target_normals(target)
+    found = image.query(target.verts, normals, workers)
     chosen = _middles(checked, source, target.V)
     several = np.flatnonzero(chosen >= 0)
-    index[several], face[several] = chosen[several], -1
-    weights[several] = (1.0, 0.0, 0.0)
-    confidence[several] = checked.confidence[chosen[several]]
+    found.vertex[several], found.face[several] = chosen[several], -1
+    found.barycentric[several] = (1.0, 0.0, 0.0)
+    found.confidence[several] = checked.confidence[chosen[several]]
+    _ask_neighbours(image, found, source, target, normals, workers)
+    confidence = found.confidence
     if target.invalid is not None:
         confidence[target.invalid] = 0.0
     return VertexMap.between(
         target,
         source,
-        index=index,
-        face=face,
-        barycentric=weights,
+        index=found.vertex,
+        face=found.face,
+        barycentric=found.barycentric,
         confidence=np.clip(confidence, 0.0, 1.0).astype(np.float32),
         verdict=checked.verdict,
         reasons=checked.reasons,
     )
+
+
+def _ask_neighbours(
+    image: Image, found: Places, source: Shape, target: Shape, normals: Floats, workers: int
+) -> None:
+    """Correct small pieces of the target that lie elsewhere on the source than all around them.
+
+    Where two sheets of the target touch, the closest point can be one of the other sheet. Such pieces ask again,
+    knowing where their neighbours lie. `found` is changed in place.
+    """
+    if target.is_cloud:
+        return
+    edges = edges_of(target.faces).vertices
+    unit, source_unit = (float(np.sqrt(shape.area)) or 1.0 for shape in (target, source))
+    length = np.linalg.norm(target.verts[edges[:, 0]] - target.verts[edges[:, 1]], axis=1) / unit
+    at = places_on(source, found) / source_unit
+    for _ in range(_ROUNDS):
+        doubted = small_pieces(edges, length, at, target.vertex_areas / unit**2)
+        if not doubted.any():
+            return
+        around = surroundings(edges, at, doubted)
+        ask = np.flatnonzero(doubted & np.isfinite(around).all(axis=1))
+        if not len(ask):
+            return
+        near = around[ask] * source_unit
+        again = image.query(target.verts[ask], normals[ask], workers, near)
+        for name in ("vertex", "face", "barycentric", "confidence", "distance"):
+            getattr(found, name)[ask] = getattr(again, name)
+        at[ask] = places_on(source, again) / source_unit
+
+
+def places_on(source: Shape, places: Places) -> Floats:
+    """(N, 3) the points themselves, in the source's frame."""
+    points = source.verts[places.vertex]
+    inside = places.face >= 0
+    corners = source.verts[source.faces[places.face[inside]]]
+    points[inside] = np.einsum("nk,nkd->nd", places.barycentric[inside], corners)
+    return points
 
 
 def target_normals(target: Shape) -> np.ndarray:

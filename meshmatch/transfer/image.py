@@ -22,6 +22,8 @@ from meshmatch.shapes.topology import edges_of
 SCALE = 0.03
 # How far a part of the image that faces the other way is pushed off, in units of sqrt(area).
 _FACING = 0.15
+# How much a distance on the source counts beside one on the target, where it is known where a place should be.
+_NEAR = 0.2
 # Above this confidence the map is simply believed, and the closest point wins.
 _BELIEVED = 0.5
 # An edge of the image may be this many times as long as the source's, and a little more (units of sqrt(area)).
@@ -77,7 +79,8 @@ class Image:
         if source.invalid is not None:  # their places are stand-ins
             kept = kept[~source.invalid[source.faces[kept]].any(axis=1)]
             lone &= ~source.invalid
-        self._source_faces = source.faces
+        self._source_unit = float(np.sqrt(source.area)) or source.diagonal or 1.0
+        self._source = source.verts / self._source_unit
         single = np.flatnonzero(lone)
         # Triangles, then the points that no triangle holds: those of a cloud, or between tears.
         self.corners = np.concatenate([source.faces[kept], np.repeat(single[:, None], 3, axis=1)])
@@ -97,18 +100,28 @@ class Image:
         groups = [np.flatnonzero(size == k) for k in np.unique(size)]
         return [(cKDTree(self._center[own]), own, float(self._radius[own].max())) for own in groups]
 
-    def query(self, points: Floats, normals: Floats | None = None, workers: int = 1) -> Places:
+    def query(
+        self,
+        points: Floats,
+        normals: Floats | None = None,
+        workers: int = 1,
+        near: Floats | None = None,
+    ) -> Places:
         """Places on the source of (N, 3) points on the target, in its file's frame.
 
         Parameters
         ----------
         normals : (N, 3), optional
             Unit normals of the target there; zeros where unknown.
+        near : (N, 3), optional
+            Points of the source, in its file's frame, near which the places should be. They tell the right one
+            of two sheets that touch.
         """
         points = np.asarray(points, np.float64)
         N = len(points)
         facing = np.zeros((N, 3)) if normals is None else np.asarray(normals, np.float64)
-        item, weights, _ = self._search(points, facing, workers)
+        about = None if near is None else np.asarray(near, np.float64) / self._source_unit
+        item, weights, _ = self._search(points, facing, workers, about)
         corners = self.corners[item]
         foot = np.einsum("nk,nkd->nd", weights, self.points[corners])
         distance = np.sqrt(squared_lengths(foot - points))
@@ -122,7 +135,9 @@ class Image:
         weights[face < 0] = (1.0, 0.0, 0.0)
         return Places(vertex, face, weights, confidence, distance)
 
-    def _search(self, points: Floats, normals: Floats, workers: int) -> tuple[Ints, Floats, Floats]:
+    def _search(
+        self, points: Floats, normals: Floats, workers: int, near: Floats | None = None
+    ) -> tuple[Ints, Floats, Floats]:
         """The best item of each point, the weights of its corners, and its cost.
 
         Centres come nearest first, so that a search ends where no further item can be better. That is exact
@@ -135,6 +150,9 @@ class Image:
             if not len(rows):
                 return
             found, costs = self._costs(points[rows], normals[rows], items)
+            if near is not None:
+                place = np.einsum("nk,nkd->nd", found, self._source[self.corners[items]])
+                costs = costs + (_NEAR * self.unit) ** 2 * squared_lengths(place - near[rows])
             order = np.lexsort((items, costs, rows))
             first = order[np.flatnonzero(np.diff(rows[order], prepend=-1))]
             row = rows[first]
@@ -152,12 +170,12 @@ class Image:
                 rows, done, ask = easy[low : low + _CHUNK], 0, min(_FIRST, len(which))
                 while len(rows):
                     reach = np.sqrt(best[rows].max()) + largest
-                    distance, near = tree.query(
+                    distance, close = tree.query(
                         points[rows], ask, distance_upper_bound=reach * (1 + 1e-9), workers=workers
                     )
-                    distance, near = distance.reshape(len(rows), -1), near.reshape(len(rows), -1)
+                    distance, close = distance.reshape(len(rows), -1), close.reshape(len(rows), -1)
                     row, column = np.nonzero(np.isfinite(distance[:, done:]))
-                    items = which[near[row, column + done]]
+                    items = which[close[row, column + done]]
                     lower = np.maximum(distance[row, column + done] - self._radius[items], 0.0)
                     worth = lower**2 <= best[rows[row]]
                     attempt(rows[row[worth]], items[worth])
