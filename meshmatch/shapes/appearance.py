@@ -123,18 +123,24 @@ def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
         An image or material file is missing, damaged, too large, or outside the file's folder; there are no
         texture coordinates for `image`; or the file has no look at all.
     """
+    found = find_appearance(path, shape, image)
+    if found is None:
+        raise InputError(
+            f"{Path(path).name} has no texture and no vertex colours: there is nothing to transfer",
+            "name a picture for its texture coordinates with --image, or export it with its materials",
+        )
+    return found
+
+
+def find_appearance(path: str | Path, shape: Shape, image: str | Path | None = None) -> Appearance | None:
+    """As `load_appearance`, but None where the file has no look at all."""
     path = Path(path)
     reader = ImageReader()
     picture = None if image is None else reader.decode(read_bytes(Path(image)), Path(image).name)
     found = _read(path, shape, reader, picture)
     if len(found.material) != shape.F or (found.colors is not None and len(found.colors) != shape.V):
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
-    if found.plain:
-        raise InputError(
-            f"{path.name} has no texture and no vertex colours: there is nothing to transfer",
-            "name a picture for its texture coordinates with --image, or export it with its materials",
-        )
-    return found
+    return None if found.plain else found
 
 
 def _read(path: Path, shape: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
