@@ -89,7 +89,7 @@ def pull_back(source_to_target: VertexMap, source: Shape, target: Shape, workers
         As `check_map`.
     """
     checked = check_map(source_to_target, source, target)
-    if source.hash == target.hash and _is_identity(checked):
+    if source.hash == target.hash and target.invalid is None and _is_identity(checked):
         return replace(checked, source=target.name, target=source.name)
     image = Image(checked, source, target)
     normals = target_normals(target)

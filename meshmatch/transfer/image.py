@@ -128,7 +128,7 @@ class Image:
         beyond = np.maximum(distance - self._gap, 0.0)
         confidence = np.einsum("nk,nk->n", weights, self.confidence[corners])
         confidence = np.clip(confidence, 0, 1) * np.exp(-np.square(beyond / (SCALE * self.unit)))
-        against = self._against(facing, np.einsum("nk,nkd->nd", weights, self.normals[corners]))
+        against = self._against(facing, corners)
         confidence *= np.exp(-np.square(_FACING / SCALE * against))
         face = self.face[item]
         vertex = corners[np.arange(N), weights.argmax(axis=1)]
@@ -193,15 +193,16 @@ class Image:
         foot = weights[:, :1] * a + weights[:, 1:2] * b + weights[:, 2:] * c
         sure = np.einsum("nk,nk->n", weights, self.confidence[corners])
         doubt = np.log(_BELIEVED / np.clip(sure, 1e-6, _BELIEVED))
-        against = self._against(normals, np.einsum("nk,nkd->nd", weights, self.normals[corners]))
+        against = self._against(normals, corners)
         squared = squared_lengths(foot - points)
         return weights, squared + self.unit**2 * (SCALE**2 * doubt + (_FACING * against) ** 2)
 
-    @staticmethod
-    def _against(a: Floats, b: Floats) -> Floats:
-        """(N,) 0 where two normals lie in one half of space, up to 1 where they are opposite."""
-        lengths = np.sqrt(squared_lengths(a) * squared_lengths(b))
-        return np.maximum(-np.einsum("ni,ni->n", a, b) / np.maximum(lengths, 1e-30), 0.0)
+    def _against(self, normals: Floats, corners: Ints) -> Floats:
+        """(N,) 0 where one of three corners faces into one half of space with a normal, up to 1 where all of
+        them face the opposite way. At a sharp edge their mean may face anywhere.
+        """
+        cosine = np.einsum("nd,nkd->nk", normals, self.normals[corners]).max(axis=1)
+        return np.maximum(-cosine, 0.0)
 
 
 def torn_faces(
@@ -247,4 +248,4 @@ def _normals_at(found: VertexMap, target: Shape) -> Floats:
     inside = found.face >= 0
     corners = target.faces[found.face[inside]]
     normals[inside] = np.einsum("nk,nkd->nd", found.barycentric[inside], target.vertex_normals[corners])
-    return normals
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

@@ -1,0 +1,44 @@
+"""Shapes that lie on one another by construction, and a slow search that cannot be wrong."""
+
+import numpy as np
+
+from meshmatch.maps.surface import closest_on_triangles
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.shape import Shape
+
+
+def split(shape: Shape, name: str = "split") -> tuple[Shape, VertexMap, VertexMap]:
+    """The same surface with four triangles for each; the maps shape -> split and split -> shape, exact."""
+    f = shape.faces
+    ends = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
+    edges, first, inverse = np.unique(ends, axis=0, return_index=True, return_inverse=True)
+    ab, bc, ca = shape.V + inverse.reshape(3, -1)
+    a, b, c = f.T
+    verts = np.concatenate([shape.verts, shape.verts[edges].mean(axis=1)])
+    faces = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
+    fine = Shape(verts, faces, name)
+    side, face = np.divmod(first, shape.F)
+    weights = np.full((len(edges), 3), 0.5)
+    weights[np.arange(len(edges)), (side + 2) % 3] = 0.0
+    back = VertexMap.between(
+        fine,
+        shape,
+        np.concatenate([np.arange(shape.V), edges[:, 0]]),
+        face=np.concatenate([np.full(shape.V, -1), face]),
+        barycentric=np.concatenate([np.tile([1.0, 0, 0], (shape.V, 1)), weights]),
+        verdict="good",
+    )
+    return fine, VertexMap.between(shape, fine, np.arange(shape.V), verdict="good"), back
+
+
+def brute_force(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The closest point on a mesh of each point, by asking every triangle: distances (N,), points (N, 3)."""
+    best, feet = np.full(len(points), np.inf), np.zeros_like(points)
+    for a, b, c in verts[faces]:
+        N = len(points)
+        weights = closest_on_triangles(points, *(np.tile(corner, (N, 1)) for corner in (a, b, c)))
+        found = weights @ np.array([a, b, c])
+        distance = np.linalg.norm(found - points, axis=1)
+        closer = distance < best
+        best[closer], feet[closer] = distance[closer], found[closer]
+    return best, feet

@@ -1,0 +1,237 @@
+"""Maps are checked against their shapes and turned round."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import InputError
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
+from meshmatch.transfer.direction import check_map, pull_back
+from tests.conftest import icosphere
+from tests.transfer.known import brute_force, split
+
+COARSE = Shape(icosphere(1).verts, icosphere(1).faces, "coarse.ply")
+FINE, FORWARD, BACK = split(COARSE, "fine.ply")
+
+
+@pytest.fixture(scope="module")
+def dancer() -> Shape:
+    return load_shape(bundled_folder() / "samples" / "dancer.ply")
+
+
+def test_the_identity_turned_round_is_the_identity(sphere: Shape) -> None:
+    back = pull_back(VertexMap.identity(sphere), sphere, sphere)
+    assert np.array_equal(back.index, np.arange(sphere.V))
+    assert (back.confidence == 1).all()
+    assert np.array_equal(back.points(sphere), sphere.verts)
+
+
+def test_an_identity_written_with_faces_is_one_too(sphere: Shape) -> None:
+    """The short cut for identities is not taken here: the search itself must find every vertex."""
+    face = np.zeros(sphere.V, np.int64)
+    face[sphere.faces[::-1].ravel()] = np.repeat(np.arange(sphere.F)[::-1], 3)
+    weights = (sphere.faces[face] == np.arange(sphere.V)[:, None]).astype(float)
+    written = VertexMap.between(sphere, sphere, np.arange(sphere.V), face=face, barycentric=weights)
+    back = pull_back(written, sphere, sphere)
+    assert np.array_equal(back.points(sphere), sphere.verts)
+    assert (back.confidence == 1).all()
+
+
+@pytest.mark.parametrize("coarse", ["sphere", "dancer"])
+def test_a_finer_copy_finds_its_exact_places(coarse: str, dancer: Shape) -> None:
+    shape = COARSE if coarse == "sphere" else dancer
+    fine, forward, known = split(shape)
+    back = pull_back(forward, shape, fine)
+    assert np.abs(back.points(shape) - known.points(shape)).max() < 1e-9 * shape.diagonal
+    assert back.confidence.min() > 0.999
+    assert (back.source, back.target) == (fine.name, shape.name)
+    assert (back.source_hash, back.target_hash) == (fine.hash, shape.hash)
+
+
+def test_a_coarser_copy_takes_its_own_vertices() -> None:
+    back = pull_back(BACK, FINE, COARSE)
+    assert np.array_equal(back.index, np.arange(COARSE.V))
+    assert np.abs(back.points(FINE) - COARSE.verts).max() < 1e-12
+
+
+def test_the_closest_points_are_those_of_asking_every_triangle() -> None:
+    rng = np.random.default_rng(3)
+    source, target = COARSE, Shape(icosphere(2).verts, icosphere(2).faces, "other")
+    index = np.linalg.norm(source.verts[:, None] - target.verts, axis=2).argmin(axis=1)
+    moved = VertexMap.between(source, target, index, confidence=rng.uniform(0.6, 1, source.V))
+    back = pull_back(moved, source, target)
+    image = target.verts[index]
+    distance, _ = brute_force(target.verts, image, source.faces)
+    corners = source.faces[back.face]
+    found = np.einsum("nk,nkd->nd", back.barycentric, image[corners])
+    found[back.face < 0] = image[back.index[back.face < 0]]
+    assert np.allclose(np.linalg.norm(found - target.verts, axis=1), distance, atol=1e-12)
+    assert distance.max() > 0.01  # not all of them trivial
+
+
+def test_where_vertices_pile_up_the_middle_one_is_taken(sphere: Shape) -> None:
+    """A bare list of vertices puts a patch of a fine source on each vertex of a coarse target."""
+    index = np.linalg.norm(sphere.verts[:, None] - COARSE.verts, axis=2).argmin(axis=1)
+    back = pull_back(VertexMap("", "", index), sphere, COARSE)
+    away = np.linalg.norm(back.points(sphere) - COARSE.verts, axis=1)
+    patch = np.linalg.norm(sphere.verts - COARSE.verts[index], axis=1).max()
+    assert patch > 0.25
+    assert away.max() < 0.5 * patch
+
+
+def test_what_nothing_maps_onto_has_no_confidence(sphere: Shape) -> None:
+    upper = np.flatnonzero(sphere.verts[:, 2] > 0.1)
+    kept = np.isin(sphere.faces, upper).all(axis=1)
+    number = np.cumsum(np.isin(np.arange(sphere.V), upper)) - 1
+    half = Shape(sphere.verts[upper], number[sphere.faces[kept]], "half")
+    back = pull_back(VertexMap.between(half, sphere, upper), half, sphere)
+    assert back.confidence[upper].min() > 0.999
+    assert back.confidence[sphere.verts[:, 2] < -0.5].max() < 0.01
+    assert np.array_equal(back.points(half)[upper], half.verts)
+
+
+def test_a_triangle_torn_between_two_places_carries_nothing(torus: Shape) -> None:
+    """One vertex mapped to the far side would stretch its triangles through the middle, past other vertices."""
+    index = np.arange(torus.V)
+    far = int(np.argmax(np.linalg.norm(torus.verts - torus.verts[0], axis=1)))
+    index[0] = far
+    back = pull_back(VertexMap.between(torus, torus, index), torus, torus)
+    rest = np.setdiff1d(np.arange(torus.V), [0, far])
+    assert np.array_equal(back.index[rest], rest)
+    own = np.linalg.norm(back.points(torus)[0] - torus.verts[0])
+    assert own < 0.2  # its neighbours' side of the tear, not the far one
+    assert back.confidence[0] < 1
+
+
+def slabs(gap: float) -> Shape:
+    """Two square sheets, one above the other, facing away from each other."""
+    n = 9
+    x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
+    flat = np.stack([x.ravel(), y.ravel(), np.zeros(n * n)], axis=1)
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    up = np.concatenate(
+        [
+            np.stack([corner, corner + n, corner + n + 1], 1),
+            np.stack([corner, corner + n + 1, corner + 1], 1),
+        ]
+    )
+    verts = np.concatenate([flat + np.array([0, 0, gap]), flat])
+    return Shape(verts, np.concatenate([up, up[:, ::-1] + n * n]), "slabs")
+
+
+def test_the_sheet_that_faces_the_same_way_wins() -> None:
+    """The map is off by more than the gap between two sheets: distance alone would choose the wrong one."""
+    shape = slabs(0.02)
+    half = shape.V // 2
+    lifted = Shape(shape.verts + np.repeat([[0, 0, -0.018], [0, 0, 0.018]], half, axis=0), shape.faces, "t")
+    face = np.zeros(shape.V, np.int64)
+    face[shape.faces.ravel()] = np.repeat(np.arange(shape.F), 3)
+    weights = (shape.faces[face] == np.arange(shape.V)[:, None]).astype(float)
+    drawn = VertexMap.between(shape, lifted, np.arange(shape.V), face=face, barycentric=weights)
+    back = pull_back(drawn, shape, lifted)
+    assert ((back.index < half) == (np.arange(shape.V) < half)).all()
+
+
+def test_small_pieces_on_the_wrong_sheet_ask_their_neighbours() -> None:
+    """A few vertices of a sheet lie on another sheet that faces the same way: their neighbours know better."""
+    base = slabs(2.0)
+    half = base.V // 2
+    top = base.faces[: base.F // 2]
+    source = Shape(base.verts, np.concatenate([top, top + half]), "two")  # both face up
+    index = np.arange(source.V)
+    # On the target the sheets nearly touch, and a dent brings one vertex of the upper down to the lower.
+    flat = source.verts * [1, 1, 0.01]
+    flat[40, 2] = 0.0
+    target = Shape(flat, source.faces, "touching")
+    back = pull_back(
+        VertexMap.between(source, target, index, confidence=np.full(source.V, 0.99)), source, target
+    )
+    assert ((back.index < half) == (index < half)).all()
+
+
+def test_clouds_take_the_nearest_mapped_point(sphere: Shape) -> None:
+    points = Shape(sphere.verts, np.empty((0, 3), int), "points")
+    some = np.arange(0, sphere.V, 2)
+    fewer = Shape(sphere.verts[some], np.empty((0, 3), int), "fewer")
+    back = pull_back(VertexMap.between(fewer, points, some), fewer, points)
+    nearest = np.linalg.norm(points.verts[:, None] - fewer.verts, axis=2)
+    assert np.allclose(np.linalg.norm(back.points(fewer) - points.verts, axis=1), nearest.min(axis=1))
+    assert (back.face == -1).all()
+    assert back.confidence.min() > 0.5  # gaps between points are no reason for doubt
+
+
+def test_a_vertex_without_a_position_carries_no_confidence(sphere: Shape) -> None:
+    invalid = np.zeros(sphere.V, bool)
+    invalid[5] = True
+    broken = Shape(sphere.verts, sphere.faces, "broken", None, invalid)
+    forward = VertexMap.between(sphere, broken, np.arange(sphere.V))
+    back = pull_back(forward, sphere, broken)
+    assert back.confidence[5] == 0
+    assert np.delete(back.confidence, 5).min() > 0.99
+
+
+def test_verdict_and_reasons_stay() -> None:
+    poor = replace(FORWARD, verdict="poor", reasons=("it is upside down",))
+    back = pull_back(poor, COARSE, FINE)
+    assert (back.verdict, back.reasons) == ("poor", ("it is upside down",))
+
+
+def test_low_confidence_is_carried_back() -> None:
+    half = replace(FORWARD, confidence=np.full(COARSE.V, 0.6))
+    assert np.allclose(pull_back(half, COARSE, FINE).confidence, 0.6, atol=0.01)
+
+
+def test_a_bare_map_learns_its_ends() -> None:
+    made = check_map(VertexMap("", "", FORWARD.index), COARSE, FINE)
+    assert (made.source, made.target, made.target_vertices) == ("coarse.ply", "fine.ply", FINE.V)
+    assert (made.source_hash, made.target_hash) == (COARSE.hash, FINE.hash)
+
+
+@pytest.mark.parametrize("known", ["hashes", "counts", "index alone"])
+def test_a_map_that_runs_the_wrong_way_is_told_so(known: str) -> None:
+    backwards = {
+        "hashes": BACK,
+        "counts": VertexMap("", "", BACK.index, target_vertices=COARSE.V),
+        "index alone": VertexMap("", "", BACK.index),
+    }[known]
+    with pytest.raises(InputError, match=r"m\.npz runs the wrong way: from fine\.ply to coarse\.ply") as told:
+        check_map(backwards, COARSE, FINE, "m.npz")
+    assert "swap the two shapes" in told.value.hint
+
+
+def test_two_poses_of_one_mesh_are_told_apart_by_their_hashes() -> None:
+    posed = Shape(COARSE.verts * [1, 2, 1], COARSE.faces, "posed.ply")
+    there = VertexMap.between(COARSE, posed, np.arange(COARSE.V))
+    assert check_map(there, COARSE, posed) is not None
+    with pytest.raises(InputError, match=r"wrong way: from coarse\.ply to posed\.ply"):
+        check_map(there, posed, COARSE)
+
+
+def test_a_map_made_for_another_mesh_names_both() -> None:
+    other = Shape(COARSE.verts * 2, COARSE.faces, "other.ply")
+    with pytest.raises(
+        InputError, match=rf"another source: coarse\.ply .*{COARSE.hash}.*other\.ply is {other.hash}"
+    ):
+        check_map(FORWARD, other, FINE, "m.npz")
+    moved = Shape(FINE.verts + 1, FINE.faces, "moved.ply")
+    with pytest.raises(InputError, match=r"another target: fine\.ply .*moved\.ply is"):
+        check_map(FORWARD, COARSE, moved, "m.npz")
+
+
+def test_a_map_of_another_count_names_both(sphere: Shape) -> None:
+    with pytest.raises(InputError, match=r"another source: coarse\.ply of 42 vertices, but sphere3 has 642"):
+        check_map(FORWARD, sphere, FINE)
+    with pytest.raises(InputError, match=r"another target: fine\.ply of 162 vertices, but sphere3 has 642"):
+        check_map(FORWARD, COARSE, sphere)
+
+
+def test_an_index_or_face_outside_the_target_is_refused() -> None:
+    with pytest.raises(InputError, match=r"m\.csv: .*only 162 vertices"):
+        check_map(VertexMap("", "", FORWARD.index + 150), COARSE, FINE, "m.csv")
+    high = VertexMap("", "", FORWARD.index, face=np.full(COARSE.V, FINE.F))
+    with pytest.raises(InputError, match=r"m\.csv: .*has only 320 faces"):
+        check_map(high, COARSE, FINE, "m.csv")
