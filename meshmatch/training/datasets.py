@@ -9,6 +9,7 @@ import torch
 
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.training.bodies import sample_bodies
+from meshmatch.training.pose_files import GivenPoses
 from meshmatch.training.rig import Rig
 from meshmatch.training.scans import (
     ScanConfig,
@@ -25,9 +26,9 @@ from meshmatch.training.scans import (
 Source = Callable[[int, torch.Generator], torch.Tensor]
 
 
-def body_source(rig: Rig) -> Source:
-    """Generated human bodies without end."""
-    return lambda count, generator: sample_bodies(rig, count, generator)
+def body_source(rig: Rig, poses: GivenPoses | None = None) -> Source:
+    """Generated human bodies without end; some of them in given poses."""
+    return lambda count, generator: sample_bodies(rig, count, generator, poses)
 
 
 def registered_source(shapes: torch.Tensor) -> Source:

@@ -24,6 +24,7 @@ from meshmatch.training.datasets import Source, body_source, registered_source
 from meshmatch.training.human_template import restrict
 from meshmatch.training.loop import Progress, TrainConfig, Trainer
 from meshmatch.training.losses import LossConfig, LossPoints, distance
+from meshmatch.training.pose_files import GivenPoses
 from meshmatch.training.rig import RIG_VERSION, Rig, build_rig, load_rig, save_rig
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.setup import build_dataset, build_deformer, build_loss_points
@@ -81,9 +82,12 @@ def human_source(
     identities: int = 4096,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
+    poses: GivenPoses | None = None,
 ) -> Source:
-    """Generated bodies on a human template's vertices; the rig is built once and cached."""
+    """Generated bodies on a human template's vertices, some in given poses; the rig is built once and cached."""
     rig = cached_rig(identities, seed, progress)
+    if poses is not None:
+        poses.columns(rig)  # a name that the rig does not know is told now
     # Template vertices are a subset of the body model's: the dense mesh says which.
     from scipy.spatial import cKDTree
 
@@ -93,7 +97,7 @@ def human_source(
             f"template {template.name} is not made from the body model",
             "train on a prepared folder (--shapes), or use a human template",
         )
-    return body_source(restrict(rig, keep, np.array(template.shape.faces)))
+    return body_source(restrict(rig, keep, np.array(template.shape.faces)), poses)
 
 
 def unseen_bodies(template: Template, count: int, trained: int = 0, seed: int = 0) -> np.ndarray:

@@ -20,9 +20,11 @@ class Recorder:
     def __init__(self) -> None:
         self.bodies: tuple[Any, ...] = ()
         self.called: dict[str, Any] = {}
+        self.poses: Any = None
 
-    def human_source(self, template: Any, identities: int, seed: int, progress: Any) -> str:
+    def human_source(self, template: Any, identities: int, seed: int, progress: Any, poses: Any) -> str:
         self.bodies = (template.name, identities, seed)
+        self.poses = poses
         progress(1, 2)
         return "bodies"
 
@@ -112,6 +114,19 @@ def test_identities(run: Run, stub: Recorder, tmp_path: Path) -> None:
     assert stub.bodies == ("human-T", 10, 3)
 
 
+def test_poses_of_a_file_are_mixed_in(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    poses = tmp_path / "dance.csv"
+    poses.write_text("pose,joint,x,y,z\n1,head,0,1,0\n2,head,0,-1,0\n")
+    assert run("train", "-o", tmp_path / "mine", "--poses", poses).status == 0
+    assert (stub.poses.joints, stub.poses.P, stub.poses.share) == (("head",), 2, 0.5)
+    assert stub.called["data"].endswith("50% of them in 2 poses of dance.csv")
+    assert run("train", "-o", tmp_path / "mine", "--poses", poses, "--pose-share", "0.2").status == 0
+    assert stub.poses.share == 0.2
+    assert run("train", "-o", tmp_path / "mine").status == 0
+    assert stub.poses is None
+    assert "dance" not in stub.called["data"]
+
+
 def test_a_prepared_folder_brings_template_and_category(
     run: Run, stub: Recorder, tmp_path: Path, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -151,6 +166,10 @@ def test_of_several_processes_one_speaks(
         (["--name", "../up"], 1, "../up"),
         (["--preset", "best"], 2, "best"),
         (["--steps", "0"], 2, "--steps"),
+        (["--poses", "nowhere.npz"], 1, "nowhere.npz"),
+        (["--poses", "dance.bvh"], 1, "dance.bvh"),
+        (["--poses", "dance.npz", "--shapes", "prepared"], 1, "for generated bodies"),
+        (["--pose-share", "1.5"], 2, "--pose-share"),
     ],
 )
 def test_what_cannot_be_is_told(

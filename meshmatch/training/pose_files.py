@@ -1,0 +1,256 @@
+"""Poses from a file, mixed with the generated ones: npz, json or csv (docs/formats.md).
+
+A pose is a rotation vector (axis times angle, radians) for each joint that the file names; other joints rest.
+Rotations are about the joint's place in the rest pose, in the body's own axes (y up, facing +z, left hand at +x),
+and carry along everything beyond the joint.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.training.rig import Rig
+from meshmatch.training.rotations import rotation_from_vector
+from meshmatch.training.skeleton import forward_kinematics
+
+MOST_BYTES = 60_000_000
+"""A larger file, or a larger array in an archive, is refused before it is read."""
+MOST_VECTORS = 5_000_000
+"""Poses times joints."""
+COLUMNS = ("pose", "joint", "x", "y", "z")
+
+_HINT = "see docs/formats.md for what a file of poses holds"
+
+
+@dataclass(frozen=True, eq=False)
+class GivenPoses:
+    """Poses to learn from besides the generated ones. Valid once built, but for the names of its joints.
+
+    Parameters
+    ----------
+    joints : tuple of str
+        J names of joints of the body rig, each once.
+    vectors : float array (P, J, 3)
+        Rotation vectors in radians, none longer than a full turn.
+    share : float
+        Of the bodies, 0..1, how many stand in a pose of these.
+
+    Raises
+    ------
+    InputError
+        There is no pose, or names and vectors are not as above.
+    OptionError
+        The share is not in 0..1.
+    """
+
+    joints: tuple[str, ...]
+    vectors: np.ndarray
+    share: float = 0.5
+
+    def __post_init__(self) -> None:
+        vectors = np.asarray(self.vectors)
+        if vectors.dtype.kind not in "fiu" or vectors.ndim != 3 or vectors.shape[1:] != (len(self.joints), 3):
+            raise InputError(
+                f"rotations are {vectors.dtype} of {_shown(vectors.shape)}, not numbers of "
+                f"(poses, {len(self.joints)} joints, 3)",
+                _HINT,
+            )
+        if vectors.size == 0:
+            raise InputError("there are no poses in it", _HINT)
+        if len(set(self.joints)) < len(self.joints):
+            twice = next(name for name in self.joints if self.joints.count(name) > 1)
+            raise InputError(f"joint {twice[:80]!r} is named twice", _HINT)
+        vectors = vectors.astype(np.float32)
+        if not np.isfinite(vectors).all():
+            pose, joint, _ = np.argwhere(~np.isfinite(vectors))[0]
+            raise InputError(
+                f"pose {pose} has a rotation of {self.joints[joint][:80]!r} that is not a number", _HINT
+            )
+        angle = np.linalg.norm(vectors, axis=2)
+        if angle.max() > 2 * math.pi + 1e-3:
+            pose, joint = np.unravel_index(int(angle.argmax()), angle.shape)
+            raise InputError(
+                f"pose {pose} turns {self.joints[joint][:80]!r} by {angle[pose, joint]:.4g}, more than a full turn",
+                "angles are in radians: divide degrees by 57.3",
+            )
+        if not 0 <= self.share <= 1:
+            raise OptionError(f"a share must be from 0 to 1, not {self.share:g}")
+        object.__setattr__(self, "vectors", vectors)
+
+    @property
+    def P(self) -> int:
+        return len(self.vectors)
+
+    def columns(self, rig: Rig) -> list[int]:
+        """Where each joint stands in a rig.
+
+        Raises
+        ------
+        InputError
+            The rig has no joint of a name.
+        """
+        strangers = [name for name in self.joints if name not in rig.names]
+        if strangers:
+            near = get_close_matches(strangers[0], rig.names, n=3)
+            raise InputError(
+                f"the body has no joint {strangers[0][:80]!r}",
+                f"did you mean {' or '.join(near)}?" if near else "docs/formats.md names all joints",
+            )
+        return [rig.joint(name) for name in self.joints]
+
+    def mixed(
+        self,
+        rig: Rig,
+        heads: torch.Tensor,
+        world: torch.Tensor,
+        offset: torch.Tensor,
+        generator: torch.Generator,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Give a share of B posed bodies a pose of these instead.
+
+        heads (B, J, 3), world (B, J, 3, 3) and offset (B, J, 3) are those of :func:`forward_kinematics`, as is what
+        is returned.
+        """
+        B, J = heads.shape[:2]
+        taken = torch.rand(B, generator=generator) < self.share
+        pick = torch.randint(self.P, (B,), generator=generator)
+        vectors = torch.zeros(B, J, 3)
+        vectors[:, self.columns(rig)] = torch.from_numpy(self.vectors)[pick]
+        own_world, own_offset = forward_kinematics(rig, heads, rotation_from_vector(vectors))
+        return (
+            torch.where(taken[:, None, None, None], own_world, world),
+            torch.where(taken[:, None, None], own_offset, offset),
+        )
+
+
+def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
+    """Read a file of poses; the suffix says which kind it is.
+
+    Raises
+    ------
+    InputError
+        It is missing, too large or damaged, of another kind, or holds no poses.
+    OptionError
+        The share is not in 0..1.
+    """
+    path = Path(path)
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        raise InputError(f"{path.name} is not a file of poses", f"the suffix is one of {', '.join(_READERS)}")
+    if not path.is_file():
+        raise InputError(f"there is no file {path}", _HINT)
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"it is larger than {MOST_BYTES // 10**6} MB", "split it, or keep fewer poses")
+        joints, vectors = read(path)
+        return GivenPoses(joints, vectors, share)
+    except InputError as error:
+        raise InputError(f"{path.name}: {error.message}", error.hint) from error
+    except _DAMAGE as error:
+        raise InputError(f"{path.name} is no file of poses: {error}", _HINT) from error
+
+
+_DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, csv.Error, zipfile.BadZipFile, zlib.error,
+           NotImplementedError, RecursionError, RuntimeError)  # fmt: skip
+
+
+def _read_npz(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
+    """Arrays `joints` (J,) of text and `rotations` (P, J, 3)."""
+    with zipfile.ZipFile(path) as archive:
+        joints, vectors = (_member(archive, name) for name in ("joints", "rotations"))
+    if joints.dtype.kind not in "US" or joints.ndim != 1:
+        raise ValueError(f"joints are {joints.dtype} of {_shown(joints.shape)}, not a list of names")
+    return _names(joints.astype(np.str_).tolist()), vectors
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """An array of an archive; neither a bomb nor a header that promises too much is followed."""
+    try:
+        info = archive.getinfo(f"{name}.npy")
+    except KeyError:
+        raise ValueError(f"it has no array {name!r}") from None
+    if info.file_size > MOST_BYTES:
+        raise ValueError(f"{name} is larger than {MOST_BYTES // 10**6} MB")
+    data = io.BytesIO(archive.read(info))
+    version = np.lib.format.read_magic(data)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = header(data)
+    if dtype.hasobject or dtype.kind not in "fiuUS":
+        raise ValueError(f"{name} holds {dtype}, neither numbers nor text")
+    if math.prod(shape) * dtype.itemsize > info.file_size - data.tell():
+        raise ValueError(f"{name} is cut short")
+    data.seek(0)
+    array: np.ndarray = np.load(data, allow_pickle=False)
+    return array
+
+
+def _read_json(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
+    """An object with `joints`, a list of names, and `rotations`, lists of numbers."""
+    found: Any = json.loads(path.read_text(encoding="utf-8-sig"))
+    if not isinstance(found, dict) or not {"joints", "rotations"} <= found.keys():
+        raise ValueError("it is not an object with joints and rotations")
+    if not isinstance(found["joints"], list):
+        raise ValueError("joints are not a list of names")
+    try:
+        vectors = np.array(found["rotations"], np.float64)
+    except (ValueError, TypeError):
+        raise ValueError("rotations are not lists of numbers, equally long") from None
+    return _names(found["joints"]), vectors
+
+
+def _read_csv(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
+    """A row `pose, joint, x, y, z` for each joint that is turned; rows of one pose have the same first word."""
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        rows = csv.reader(file)
+        if tuple(word.strip() for word in next(rows, [])) != COLUMNS:
+            raise ValueError(f"its first line is not {','.join(COLUMNS)}")
+        poses: dict[str, int] = {}
+        joints: dict[str, int] = {}
+        turns: dict[tuple[int, int], tuple[float, ...]] = {}
+        for row in rows:
+            if not row:
+                continue
+            if len(row) != len(COLUMNS):
+                raise ValueError(f"line {rows.line_num} has {len(row)} columns, not {len(COLUMNS)}")
+            pose, joint = (word.strip() for word in row[:2])
+            at = poses.setdefault(pose, len(poses)), joints.setdefault(joint, len(joints))
+            if at in turns:
+                raise ValueError(f"line {rows.line_num} turns {joint[:80]!r} of pose {pose[:80]!r} again")
+            try:
+                turns[at] = tuple(float(word) for word in row[2:])
+            except ValueError:
+                raise ValueError(f"line {rows.line_num} has words where numbers belong") from None
+    if len(poses) * len(joints) > MOST_VECTORS:
+        raise ValueError(f"{len(poses)} poses of {len(joints)} joints are too many")
+    vectors = np.zeros((len(poses), len(joints), 3))
+    for at, turn in turns.items():
+        vectors[at] = turn
+    return tuple(joints), vectors
+
+
+def _names(words: Sequence[Any]) -> tuple[str, ...]:
+    if not all(isinstance(word, str) for word in words):
+        raise ValueError("joints are not a list of names")
+    return tuple(words)
+
+
+def _shown(shape: tuple[int, ...]) -> str:
+    return " x ".join(str(n) for n in shape) or "no shape"
+
+
+_READERS = {".npz": _read_npz, ".json": _read_json, ".csv": _read_csv}
+POSE_SUFFIXES = tuple(_READERS)
