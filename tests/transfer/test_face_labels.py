@@ -1,0 +1,113 @@
+"""Labels of faces by a vote of the points in them."""
+
+import numpy as np
+import pytest
+
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.direction import pull_back
+from meshmatch.transfer.face_labels import carry_face_labels, lattice, of_faces
+from tests.conftest import icosphere
+from tests.transfer.known import split
+
+COARSE = icosphere(2)
+FINE, FORWARD, BACK = split(COARSE)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 4])
+def test_the_points_of_a_face_are_spread_evenly(rows: int) -> None:
+    points = lattice(rows)
+    assert points.shape == (rows * rows, 3)
+    assert np.allclose(points.sum(axis=1), 1)
+    assert (points > 0).all()
+    assert np.allclose(points.mean(axis=0), 1 / 3)
+    assert len(np.unique(points.round(9), axis=0)) == rows * rows
+
+
+def test_the_identity_carries_exactly() -> None:
+    labels = np.random.default_rng(0).integers(0, 7, COARSE.F)
+    same = carry_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces=True)
+    assert np.array_equal(same, labels)
+
+
+def test_a_finer_copy_gets_each_face_four_times() -> None:
+    labels = np.random.default_rng(1).integers(0, 7, COARSE.F)
+    found = carry_face_labels(pull_back(FORWARD, COARSE, FINE), COARSE, FINE, labels, on_faces=True)
+    assert np.array_equal(found, np.tile(labels, 4))
+
+
+def test_a_coarser_copy_takes_the_vote_of_its_four_parts() -> None:
+    """Three quarters of each face have one label, the middle has another that every corner misses."""
+    labels = np.repeat([1, 1, 1, 0], COARSE.F)
+    labels[:50] = 2  # and one part in four differs on some
+    found = carry_face_labels(pull_back(BACK, FINE, COARSE), FINE, COARSE, labels, on_faces=True)
+    assert (found == 1).all()
+
+
+def test_a_large_face_asks_its_inside() -> None:
+    """Its three corners agree, but most of it has another label."""
+    n = 12
+    x, y = np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0), indexing="ij")
+    verts = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    faces = np.concatenate(
+        [
+            np.stack([corner, corner + n + 1, corner + n + 2], 1),
+            np.stack([corner, corner + n + 2, corner + 1], 1),
+        ]
+    )
+    sheet = Shape(verts, faces, "sheet")
+    ends = np.array([0, n * (n + 1), (n + 1) ** 2 - 1])
+    large = Shape(verts[ends], np.array([[0, 1, 2]]), "large")
+    labels = np.ones(sheet.V, int)
+    near = np.linalg.norm(verts[:, None] - verts[ends], axis=2).min(axis=1) < 2.5
+    labels[near] = 0
+    back = VertexMap.between(large, sheet, ends)
+    assert carry_face_labels(back, sheet, large, labels, on_faces=False).tolist() == [1]
+    by_face = np.where(near[faces].any(axis=1), 0, 1)
+    assert carry_face_labels(back, sheet, large, by_face, on_faces=True).tolist() == [1]
+
+
+def test_labels_of_vertices_give_those_of_faces() -> None:
+    labels = (COARSE.verts[:, 2] > 0).astype(int)
+    found = carry_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces=False)
+    votes = labels[COARSE.faces].sum(axis=1)
+    assert np.array_equal(found, (votes >= 2).astype(int))
+
+
+def test_a_cloud_labels_faces_too() -> None:
+    points = Shape(COARSE.verts, np.empty((0, 3), int), "points")
+    back = VertexMap.between(COARSE, points, np.arange(COARSE.V))
+    labels = (COARSE.verts[:, 2] > 0).astype(int)
+    found = carry_face_labels(back, points, COARSE, labels, on_faces=False)
+    sure = np.abs(labels[COARSE.faces].sum(axis=1) - 1.5) > 1
+    assert np.array_equal(found[sure], labels[COARSE.faces[sure, 0]])
+    assert set(found) == {0, 1}
+
+
+def test_a_torn_face_goes_with_its_corners() -> None:
+    """Points between two far places lie on neither: nothing is looked up there."""
+    index = np.arange(COARSE.V)
+    far = int(np.argmin(COARSE.verts @ COARSE.verts[0]))
+    index[0] = far
+    back = VertexMap.between(COARSE, COARSE, index)
+    labels = np.full(COARSE.V, 2)
+    labels[far] = 1
+    found = carry_face_labels(back, COARSE, COARSE, labels, on_faces=False)
+    assert (found[(COARSE.faces == 0).any(axis=1)] == 2).all()
+    assert (found == 2).sum() >= COARSE.F - 6
+
+
+@pytest.mark.parametrize("on_faces", [False, True])
+def test_what_has_no_label_stays_without(on_faces: bool) -> None:
+    labels = np.full(COARSE.F if on_faces else COARSE.V, -1)
+    found = carry_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces)
+    assert (found == -1).all()
+    labels[0] = 4
+    some = carry_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces)
+    assert set(some) == {-1, 4} if on_faces else {4} <= set(some) <= {-1, 4}
+
+
+def test_confidence_of_faces() -> None:
+    confidence = COARSE.verts[:, 0] / 2 + 0.5
+    assert np.allclose(of_faces(confidence, COARSE), COARSE.verts[COARSE.faces, 0].mean(axis=1) / 2 + 0.5)

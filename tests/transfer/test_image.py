@@ -1,0 +1,120 @@
+"""Places on the source of points near its image."""
+
+import numpy as np
+import pytest
+
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.image import Image, on_vertex, torn_faces
+from tests.conftest import icosphere
+from tests.maps.solids import bumpy_sphere
+from tests.transfer.known import brute_force, split
+
+
+def own_image(shape: Shape) -> Image:
+    return Image(VertexMap.identity(shape), shape, shape)
+
+
+@pytest.mark.parametrize("reach", [0.01, 0.3, 3.0])
+def test_points_anywhere_find_their_closest_point(reach: float) -> None:
+    shape = bumpy_sphere()  # edges of many lengths, so that several classes of size are searched
+    rng = np.random.default_rng(1)
+    points = shape.verts[rng.integers(0, shape.V, 300)] + rng.normal(size=(300, 3)) * reach
+    image = own_image(shape)
+    assert len(image._trees) > 2
+    places = image.query(points)
+    distance, _ = brute_force(points, shape.verts, shape.faces)
+    assert np.allclose(places.distance, distance, atol=1e-12)
+    corners = shape.verts[shape.faces[places.face]]
+    found = np.einsum("nk,nkd->nd", places.barycentric, corners)
+    assert np.allclose(np.linalg.norm(found - points, axis=1), distance, atol=1e-12)
+    heaviest = shape.faces[places.face, places.barycentric.argmax(axis=1)]
+    assert np.array_equal(places.vertex, heaviest)
+
+
+def test_more_points_than_one_portion_are_each_answered(
+    monkeypatch: pytest.MonkeyPatch, sphere: Shape
+) -> None:
+    points = np.random.default_rng(2).normal(size=(500, 3))
+    whole = own_image(sphere).query(points)
+    monkeypatch.setattr("meshmatch.transfer.image._CHUNK", 37)
+    parts = own_image(sphere).query(points)
+    assert np.array_equal(whole.face, parts.face)
+    assert np.array_equal(whole.barycentric, parts.barycentric)
+
+
+def test_confidence_falls_with_the_distance(sphere: Shape) -> None:
+    heights = np.array([0.0, 0.02, 0.1, 0.3])
+    places = own_image(sphere).query((1 + heights)[:, None] * sphere.verts[:1])
+    assert places.confidence[0] == 1
+    assert (np.diff(places.confidence) < 0).all()
+    unit = np.sqrt(sphere.area)
+    assert np.allclose(places.confidence, np.exp(-((heights / unit / 0.03) ** 2)))
+
+
+def test_a_little_doubt_moves_nothing_but_a_guess_gives_way() -> None:
+    shape = icosphere(2)
+    confidence = np.ones(shape.V)
+    confidence[0] = 0.7
+    places = Image(VertexMap.between(shape, shape, np.arange(shape.V), confidence=confidence), shape, shape)
+    assert places.query(shape.verts[:1]).vertex[0] == 0
+    # A guess lies exactly here, and a sure vertex very near.
+    index = np.arange(shape.V)
+    index[1] = 0
+    confidence = np.ones(shape.V)
+    confidence[0] = 1e-6
+    doubled = VertexMap.between(shape, shape, index, confidence=confidence)
+    found = Image(doubled, shape, shape).query(shape.verts[:1])
+    assert found.confidence[0] > 0.5
+    assert found.vertex[0] != 0
+
+
+def test_a_place_is_sought_near_where_it_is_said_to_be() -> None:
+    """Two far points of the source lie on one point of the target."""
+    two = Shape(np.array([[0.0, 0, 0], [1, 0, 0]]), np.empty((0, 3), int), "two")
+    sphere = icosphere(1)
+    image = Image(VertexMap.between(two, sphere, np.array([4, 4])), two, sphere)
+    for k in (0, 1):
+        assert image.query(sphere.verts[[4]], near=two.verts[[k]]).vertex.tolist() == [k]
+
+
+def test_faces_are_torn_where_their_image_is_far_longer(sphere: Shape) -> None:
+    index = np.arange(sphere.V)
+    index[7] = int(np.argmin(sphere.verts @ sphere.verts[7]))
+    found = VertexMap.between(sphere, sphere, index)
+    torn = torn_faces(found, sphere, sphere, found.points(sphere), float(np.sqrt(sphere.area)))
+    assert np.array_equal(np.flatnonzero(torn), np.flatnonzero((sphere.faces == 7).any(axis=1)))
+
+
+@pytest.mark.parametrize("size", [0.01, 1.0, 1000.0])
+def test_whole_maps_are_not_torn_whatever_the_units(size: float) -> None:
+    shape = icosphere(1)
+    fine, forward, back = split(Shape(shape.verts * size, shape.faces))
+    coarse = Shape(shape.verts * size, shape.faces)
+    for found, a, b in ((forward, coarse, fine), (back, fine, coarse)):
+        assert not torn_faces(found, a, b, found.points(b), float(np.sqrt(b.area))).any()
+    rounded = VertexMap.between(fine, coarse, back.index)  # to vertices alone: each by up to half an edge
+    assert not torn_faces(rounded, fine, coarse, rounded.points(coarse), float(np.sqrt(coarse.area))).any()
+
+
+def test_a_cloud_has_no_faces_to_tear(sphere: Shape) -> None:
+    points = Shape(sphere.verts, np.empty((0, 3), int))
+    found = VertexMap.identity(points)
+    assert torn_faces(found, points, points, points.verts, 1.0).shape == (0,)
+
+
+def test_places_on_vertices_are_known_as_such() -> None:
+    found = VertexMap(
+        "",
+        "",
+        np.array([0, 1, 2]),
+        face=np.array([-1, 4, 4]),
+        barycentric=np.array([[1.0, 0, 0], [0, 1, 0], [0.5, 0.5, 0]]),
+    )
+    assert on_vertex(found).tolist() == [True, True, False]
+
+
+def test_a_map_of_everything_to_one_point_still_answers(sphere: Shape) -> None:
+    found = VertexMap.between(sphere, sphere, np.zeros(sphere.V, int))
+    places = Image(found, sphere, sphere).query(sphere.verts)
+    assert np.allclose(places.distance, np.linalg.norm(sphere.verts - sphere.verts[0], axis=1))
