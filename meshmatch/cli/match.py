@@ -166,13 +166,18 @@ def register(
 
             fitted = dense_shape(pipeline.read_model(model), fit)
         save_shape(temporary, fitted)
+    notes = [f"{loaded.name}: {note}" for note in pipeline.usable(loaded).notes]
+    for note in notes:
+        voice.say(note)
     voice.say(f"laid the template of {model} on {loaded.name}: {_fit_words(fit)}")
     _warn(voice, fit.verdict, fit.reasons)
     voice.say(f"wrote {output}: {fitted.V} vertices, {fitted.F} faces ({fit.seconds:.1f} s)")
     if json:
         size = {"vertices": fitted.V, "faces": fitted.F}
         choices = {"model": model, "refine": refine, "dense": dense}
-        print_json({"output": str(output)} | size | choices | _fit_record(loaded.name, fit))
+        print_json(
+            {"output": str(output)} | size | choices | _fit_record(loaded.name, fit) | {"notes": notes}
+        )
 
 
 _HINT = "is it the model's category? try --up and --front, --landmarks, or leave out --strict to look at it"

@@ -16,7 +16,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
-from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Frame, Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import Template
@@ -370,6 +370,21 @@ def test_register_json(run: Run, two: tuple[Path, Path], stub: Recorder) -> None
     assert answer.err == ""
     assert (record["shape"], record["verdict"], record["up"]) == ("a.ply", "good", "+y")
     assert record["output"] == str(two[0].with_name("fitted.ply"))
+
+
+def test_register_says_what_repair_did(
+    run: Run, two: tuple[Path, Path], stub: Recorder, sphere: Shape
+) -> None:
+    faces = np.concatenate([sphere.faces, sphere.faces[:3]])
+    save_shape(two[0], Shape(sphere.verts, faces))
+    output = two[0].with_name("fitted.ply")
+    answer = run("register", two[0], "-o", output, "--json")
+    (note,) = json.loads(answer.out)["notes"]
+    assert note.startswith("a.ply: 3 ")
+    assert note in " ".join(answer.err.split())
+    whole = run("register", two[1], "-o", output, "--json")
+    assert json.loads(whole.out)["notes"] == []
+    assert "b.ply: 3" not in whole.err
 
 
 def test_register_in_full_resolution(

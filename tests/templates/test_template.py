@@ -95,6 +95,8 @@ def test_the_hash_is_of_what_a_model_depends_on(ball: Template) -> None:
     ]
     assert len({ball.hash, *(other.hash for other in others)}) == 6
     assert replace(ball, name="other", licence="none", label_names=("a", "b")).hash == ball.hash
+    coarse = Shape(ball.shape.verts[:3], np.array([[0, 1, 2]]))
+    assert replace(ball, dense=coarse, labels=np.zeros(ball.shape.V, int)).hash == ball.hash
 
 
 def _nan(array: np.ndarray) -> np.ndarray:
