@@ -72,6 +72,8 @@ class Cost:
 def cost_of(command: Sequence[str]) -> Cost:
     """Run a command to its end and read what the kernel counted.
 
+    Memory is never less than what this process itself holds, for a child begins as its copy.
+
     Raises
     ------
     MeshmatchError

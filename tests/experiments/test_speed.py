@@ -1,0 +1,156 @@
+"""The clock of whole processes: shapes of the sizes that are asked, costs as the system counts them, a record."""
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import MeshmatchError
+from meshmatch.experiments import speed
+from meshmatch.experiments.speed import Case, cost_of, keep_to_cores, main, measure, shape_file, sized, split
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.repair import repair
+from meshmatch.shapes.shape import Shape
+
+
+@pytest.fixture(autouse=True)
+def cores() -> Iterator[None]:
+    """A run keeps its process on few cores for good; the tests after it get theirs back."""
+    before = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
+    yield
+    if before is not None:
+        os.sched_setaffinity(0, before)
+
+
+def python(code: str) -> list[str]:
+    return [sys.executable, "-c", code]
+
+
+def test_a_triangle_in_four() -> None:
+    one = split(Shape(np.array([[0.0, 0, 0], [2, 0, 0], [0, 2, 0]]), np.array([[0, 1, 2]])))
+    assert one.verts[3:].tolist() == [[1, 0, 0], [0, 1, 0], [1, 1, 0]]
+    assert one.face_areas.tolist() == [0.5] * 4
+    normals = np.cross(*(one.verts[one.faces[:, k]] - one.verts[one.faces[:, 0]] for k in (1, 2)))
+    assert normals.tolist() == [[0, 0, 1]] * 4
+
+
+def test_a_split_surface_is_the_same_surface(torus: Shape) -> None:
+    finer = split(torus)
+    assert (finer.V, finer.F) == (
+        torus.V + 3 * torus.F // 2,
+        4 * torus.F,
+    )  # a closed one: an edge for 2/3 of a face
+    assert finer.area == pytest.approx(torus.area)
+    assert np.array_equal(finer.verts[: torus.V], torus.verts)
+    assert not repair(finer).notes
+
+
+def test_shapes_come_in_the_size_that_is_asked(sphere: Shape) -> None:
+    assert sized(sphere, 642) is sphere
+    assert sized(sphere, 600) is sphere  # near enough
+    assert 300 <= sized(sphere, 320).V <= 340
+    assert 1900 <= sized(sphere, 2000).V <= 2200
+    assert not repair(sized(sphere, 2000)).notes
+
+
+def test_the_file_of_a_sample_is_made_once(tmp_path: Path) -> None:
+    path = shape_file("climber@900", tmp_path)
+    assert 850 <= load_shape(path).V <= 990
+    before = path.stat().st_mtime_ns
+    assert shape_file("climber@900", tmp_path) == path
+    assert path.stat().st_mtime_ns == before
+
+
+def test_a_sample_that_is_not_there(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(MeshmatchError, match="could not make nobody@900"):
+        shape_file("nobody@900", tmp_path)
+
+
+def test_costs_are_those_of_the_process() -> None:
+    small = cost_of(python("pass"))
+    work = "import time; x = b'1' * 500_000_000; end = time.process_time() + 0.3"
+    large = cost_of(python(f"{work}\nwhile time.process_time() < end: pass"))
+    assert 0 < small.wall
+    assert small.gigabytes < 0.5 < large.gigabytes < 0.6
+    assert large.cpu >= 0.3
+    assert large.wall >= 0.3
+
+
+def test_a_process_that_fails_is_told_with_its_last_words() -> None:
+    with pytest.raises(MeshmatchError, match="ended with 3: no such luck"):
+        cost_of(python("import sys; print('first\\nno such luck', file=sys.stderr); sys.exit(3)"))
+    with pytest.raises(MeshmatchError, match="it said nothing"):
+        cost_of(python("raise SystemExit(1)"))
+
+
+def test_the_first_run_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands: list[list[str]] = []
+
+    def counted(command: list[str]) -> speed.Cost:
+        commands.append(command)
+        return speed.Cost(len(commands), 0.0, 0.0)
+
+    monkeypatch.setattr(speed, "cost_of", counted)
+    monkeypatch.setattr(speed, "shape_file", lambda word, folder: folder / word.replace("@", "-"))
+    case = Case(("match", "climber@500", "dancer@400", "-o", "@map"), 1.0)
+    assert [cost.wall for cost in measure(case, 3, tmp_path)] == [2, 3, 4]
+    wanted = ["match", tmp_path / "climber-500", tmp_path / "dancer-400", "-o", tmp_path / "map.npy"]
+    assert commands[0] == [sys.executable, "-m", "meshmatch", *map(str, wanted)]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system keeps nobody on a core")
+def test_processes_are_kept_on_few_cores() -> None:
+    assert keep_to_cores(1) == 1
+    assert len(os.sched_getaffinity(0)) == 1
+    seen = python("import os, sys; sys.exit(len(os.sched_getaffinity(0)) != 1)")
+    cost_of(seen)
+
+
+def test_the_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    met = Case(("--help",), 1e6, 1e3)
+    missed = Case(("info", "climber@300"), 1e-6)
+    monkeypatch.setattr(speed, "CASES", {"easy": met, "hard": missed})
+    assert main(["--cases", "easy,hard", "--runs", "1", "--cores", "1"]) == 0
+    lines = capsys.readouterr().out.strip().splitlines()
+    record = json.loads(lines[-1])
+    assert record["benchmark"] == "speed"
+    assert {"date", "commit", "machine", "threads"} <= set(record)
+    easy, hard = record["cases"]["easy"], record["cases"]["hard"]
+    assert (easy["met"], hard["met"]) == (True, False)
+    assert (easy["bar_gigabytes"], hard["bar_gigabytes"]) == (1e3, None)
+    assert len(easy["runs"]) == 1
+    assert easy["runs"][0][0] == easy["wall"] > 0
+    table = "\n".join(lines[:-1])
+    assert all(word in table for word in ("easy", "hard", "yes", "NO"))
+
+
+def test_a_case_that_breaks_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(speed, "CASES", {"broken": Case(("dance",), 1.0)})
+    assert main(["--cases", "broken", "--runs", "1"]) == 1
+    assert "ended with 2" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--cases", "help,sprint"], "no case 'sprint'"),
+        (["--runs", "0"], "begin at 1"),
+        (["--cores", "0"], "begin at 1"),
+    ],
+)
+def test_what_cannot_be_measured(words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(words)
+    assert told in capsys.readouterr().err
+
+
+def test_every_bar_of_the_house_is_a_case() -> None:
+    for name, case in speed.CASES.items():
+        assert case.seconds > 0, name
+        assert all(word.split("@")[0] in ("climber", "dancer") for word in case.words if "@" in word[1:])
