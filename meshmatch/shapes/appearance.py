@@ -143,6 +143,34 @@ def find_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
     return None if found.plain else found
 
 
+def load_coordinates(path: str | Path, shape: Shape) -> NDArray[np.float64] | None:
+    """(F, 3, 2) texture coordinates of every corner, v down, whatever the materials say; None where a face has none.
+
+    Parameters
+    ----------
+    shape : Shape
+        What `load_shape` made of the same file.
+
+    Raises
+    ------
+    InputError
+        The file is damaged.
+    """
+    path = Path(path)
+    found = None
+    if path.suffix.lower() in (".glb", ".gltf"):
+        from meshmatch.shapes.formats.gltf_look import read_coordinates as coordinates_of_gltf
+
+        found = coordinates_of_gltf(path, read_bytes(path))
+    elif path.suffix.lower() == ".obj":
+        from meshmatch.shapes.formats.obj_look import read_coordinates as coordinates_of_obj
+
+        found = coordinates_of_obj(path, read_bytes(path))
+    if found is not None and len(found) != shape.F:
+        raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
+    return found if shape.F else None
+
+
 def _read(path: Path, shape: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):

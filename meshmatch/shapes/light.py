@@ -35,4 +35,4 @@ _BYTE_OF_ROOT: NDArray[np.uint8] = np.round(255.0 * to_srgb((np.arange(_STEPS + 
 def bytes_of(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
     """The nearest byte of an image for amounts of light in 0..1, of any shape; what lies outside is clipped."""
     root = np.sqrt(np.clip(linear, 0.0, 1.0, dtype=np.float32))
-    return _BYTE_OF_ROOT[(root * np.float32(_STEPS) + np.float32(0.5)).astype(np.int32)]
+    return _BYTE_OF_ROOT.take((root * np.float32(_STEPS) + np.float32(0.5)).astype(np.int32))

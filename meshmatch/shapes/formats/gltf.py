@@ -128,7 +128,7 @@ class Document:
         """(V, 3) positions in the scene."""
         attributes = primitive["attributes"]
         own = np.hstack(
-            [self.accessor(attributes["POSITION"]), np.ones((self._count(attributes["POSITION"]), 1))]
+            [self.accessor(attributes["POSITION"]), np.ones((self.count(attributes["POSITION"]), 1))]
         )
         if "skin" not in node or "JOINTS_0" not in attributes:
             return np.asarray(own @ self.world[number].T)[:, :3]
@@ -177,7 +177,8 @@ class Document:
         out[:, : values.shape[1]] = np.clip(np.nan_to_num(values), 0.0, 1.0)
         return out
 
-    def _count(self, number: int) -> int:
+    def count(self, number: int) -> int:
+        """How many values an accessor has."""
         return int(self.json["accessors"][number]["count"])
 
     def accessor(self, number: int, whole: bool = False) -> NDArray[np.float64]:

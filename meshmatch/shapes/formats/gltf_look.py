@@ -34,6 +34,23 @@ def read_look(path: Path, data: bytes, reader: ImageReader, picture: Pixels | No
         raise damaged(path.name, f"its materials make no sense ({type(error).__name__}: {error})") from error
 
 
+def read_coordinates(path: Path, data: bytes) -> NDArray[np.float64] | None:
+    """(F, 3, 2) first texture coordinates of all faces; None where a part has none."""
+    try:
+        document = Document(path, data)
+        parts = [np.empty((0, 3, 2))]
+        for _, primitive in document.primitives():
+            attributes = primitive["attributes"]
+            faces = document.triangles(primitive, document.count(attributes["POSITION"]))
+            if len(faces) and "TEXCOORD_0" not in attributes:
+                return None
+            if len(faces):
+                parts.append(document.accessor(attributes["TEXCOORD_0"])[faces])
+        return np.concatenate(parts)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise damaged(path.name, f"its texture coordinates make no sense ({error})") from error
+
+
 class _Look:
     def __init__(self, document: Document, reader: ImageReader, picture: Pixels | None) -> None:
         self.document, self.json, self.reader, self.picture = document, document.json, reader, picture
@@ -47,7 +64,7 @@ class _Look:
         colors: list[NDArray[np.float64] | None] = []
         counts: list[int] = []
         for _, primitive in self.document.primitives():
-            counts.append(int(self.json["accessors"][primitive["attributes"]["POSITION"]]["count"]))
+            counts.append(self.document.count(primitive["attributes"]["POSITION"]))
             colors.append(self.document.colors(primitive))
             faces = self.document.triangles(primitive, counts[-1])
             uv = self._coordinates(primitive) if len(faces) else None

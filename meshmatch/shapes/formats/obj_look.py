@@ -58,13 +58,7 @@ def read_look(
     """Materials and texture coordinates, face by face in the order of `obj.read`; `picture` replaces all images."""
     data = joined_lines(data)
     named, libraries = (_words(*found) for found in lines_of(data, b"usemtl", b"mtllib"))
-    if b"#" in data:
-        data = re.sub(rb"#[^\n]*", b"", data)
-    (text, vt_lines), *faces_found = lines_of(data, b"vt", b"f", b"fo")
-    faces_text, face_lines = with_old(faces_found)
-    sizes = words_per_line(faces_text)
-    corners, laid = _coordinates(path.name, text, vt_lines, faces_text, face_lines, sizes)
-    lines = np.repeat(face_lines, np.maximum(sizes - 2, 0))
+    corners, laid, lines = _coordinates(path.name, data)
     used = np.searchsorted([line for _, line in named], lines, side="right") - 1  # -1: none named yet
     entries = {} if picture is not None else _libraries(path, [name for name, _ in libraries], shape)
     # Only what faces use is read; a material counts twice where some of its faces have no coordinates.
@@ -93,15 +87,20 @@ def _words(text: bytes, lines: NDArray[np.int64]) -> list[tuple[str, int]]:
     return list(zip(names, lines.tolist(), strict=False))
 
 
-def _coordinates(
-    name: str,
-    text: bytes,
-    vt_lines: NDArray[np.int64],
-    faces_text: bytes,
-    face_lines: NDArray[np.int64],
-    sizes: NDArray[np.int64],
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """(F, 3, 2) coordinates with v up, and (F,) whether all three corners have them."""
+def read_coordinates(path: Path, data: bytes) -> NDArray[np.float64] | None:
+    """(F, 3, 2) texture coordinates of all faces, v down; None where a face has none."""
+    uv, laid, _ = _coordinates(path.name, joined_lines(data))
+    uv[:, :, 1] = 1.0 - uv[:, :, 1]
+    return uv if laid.all() else None
+
+
+def _coordinates(name: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64]]:
+    """(F, 3, 2) coordinates with v up, (F,) whether all three corners have them, and (F,) the line of each face."""
+    if b"#" in data:
+        data = re.sub(rb"#[^\n]*", b"", data)
+    (text, vt_lines), *faces_found = lines_of(data, b"vt", b"f", b"fo")
+    faces_text, face_lines = with_old(faces_found)
+    sizes = words_per_line(faces_text)
     counts = words_per_line(text)
     if len(counts) < len(vt_lines):
         raise damaged(name, "a texture coordinate has no numbers")
@@ -125,7 +124,7 @@ def _coordinates(
     laid = np.asarray((triangles > 0).all(axis=1))
     uv = np.zeros((len(triangles), 3, 2))
     uv[laid] = pairs[triangles[laid] - 1]
-    return uv, laid
+    return uv, laid, np.repeat(face_lines, np.maximum(sizes - 2, 0))
 
 
 def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:

@@ -1,0 +1,201 @@
+"""What lies on the source's faces, ready to be asked for its colour anywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from meshmatch.shapes.appearance import Alpha, Appearance, Material
+from meshmatch.shapes.shape import Floats, cross_product, squared_lengths
+from meshmatch.transfer.ground import Ground, duals
+from meshmatch.transfer.pyramid import Light, Pyramid, wrapped
+from meshmatch.transfer.texels import MOST_ROWS, rows_of, spans
+
+
+class Coat:
+    """The look of a shape: materials, images as pyramids, and how dense their texels lie.
+
+    Parameters
+    ----------
+    look : Appearance
+    ground : Ground
+        Of the same file; lengths are in its unit. For a cloud, whose points are its faces, the look has a material
+        for each point.
+
+    Attributes
+    ----------
+    chart : (F,) int32
+        Faces over whose edges the colours go on without a seam have one number.
+    alpha, cutoff
+        What the alpha of `colors` means.
+    """
+
+    def __init__(self, look: Appearance, ground: Ground) -> None:
+        self.materials = look.materials
+        self._material = look.material
+        self._faces = ground.faces
+        self._colors = None if look.colors is None else list(look.colors.T.astype(np.float32, order="C"))
+        used = [self.materials[k] for k in np.unique(look.material).tolist()]
+        self.alpha, self.cutoff, self._hard = _meaning(used, look.colors)
+        pictured = np.array([m.image is not None for m in self.materials])[look.material]
+        uv = look.uv - 2.0 * np.floor(
+            look.uv.min(axis=1, keepdims=True) / 2.0
+        )  # whole turns of an image say nothing
+        held = np.array(["clamp" in m.wrap for m in self.materials])[look.material]
+        uv[held] = look.uv[held]
+        self._uv = [list(uv[:, :, k].T.astype(np.float32, order="C")) for k in range(2)]
+        self.chart = _charts(ground, look, pictured)
+        self._density = _densities(ground, self.materials, look.material, look.uv)
+        self._pyramids = self._build(look)
+
+    def _build(self, look: Appearance) -> list[Pyramid | None]:
+        """One pyramid for each material with an image; materials that share all of it share the pyramid."""
+        made: dict[tuple[int, object], Pyramid] = {}
+        keys = [(id(m.image), (m.wrap, m.nearest, m.alpha == "opaque")) for m in self.materials]
+        out: list[Pyramid | None] = []
+        present = set(np.unique(look.material).tolist())
+        for number, (key, material) in enumerate(zip(keys, self.materials, strict=True)):
+            if material.image is None or number not in present:
+                out.append(None)
+                continue
+            if key not in made:
+                alike = np.array([other == key for other in keys])
+                made[key] = Pyramid.of(material, known_texels(material, look.uv[alike[look.material]]))
+            out.append(made[key])
+        return out
+
+    def footprint(self, face: NDArray[np.integer], reach: Light) -> Light:
+        """How many texels of its image a step of `reach` (N,) covers on faces (N,)."""
+        return reach * self._density.take(face)
+
+    def colors(self, face: NDArray[np.integer], weights: Light, footprint: Light) -> Light:
+        """Linear colours and alpha (4, N) on faces (N,) at weights (3, N), as wide as `footprint` (N,) texels."""
+        if len(self.materials) == 1:
+            return self._of_one(0, face, weights, footprint)
+        out = np.ones((4, len(face)), np.float32)
+        material = self._material.take(face)
+        for number in np.unique(material).tolist():
+            rows = np.flatnonzero(material == number)
+            out[:, rows] = self._of_one(number, face[rows], weights[:, rows], footprint[rows])
+        return out
+
+    def _of_one(self, number: int, face: NDArray[np.integer], weights: Light, footprint: Light) -> Light:
+        made, pyramid = self.materials[number], self._pyramids[number]
+        out = np.ones((4, len(face)), np.float32)
+        if pyramid is not None:
+            u, v = (_interpolated(weights, columns, face) for columns in self._uv)
+            out = pyramid.look(u, v, footprint)
+        if made.factor != (1.0, 1.0, 1.0, 1.0):
+            out *= np.array(made.factor, np.float32)[:, None]
+        if self._colors is not None:
+            corners = self._faces[face].T
+            for k in range(4):
+                values = [self._colors[k].take(corner) for corner in corners]
+                out[k] *= weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2]
+        if made.alpha == "opaque":
+            out[3] = 1.0
+        elif made.alpha == "mask" and self._hard:
+            out[3] = out[3] >= made.cutoff
+        return out
+
+
+def _interpolated(weights: Light, columns: list[Light], face: NDArray[np.integer]) -> Light:
+    a, b, c = (weight * column.take(face) for weight, column in zip(weights, columns, strict=True))
+    return a + b + c
+
+
+def _meaning(used: list[Material], colors: Floats | None) -> tuple[Alpha, float, bool]:
+    """Alpha and cutoff for all materials together, and whether those of "mask" are decided at once."""
+    kinds = {material.alpha for material in used}
+    cutoffs = {material.cutoff for material in used if material.alpha == "mask"}
+    if "blend" in kinds:
+        return "blend", 0.5, True
+    if "mask" in kinds:
+        return ("mask", cutoffs.pop(), False) if len(cutoffs) == 1 else ("mask", 0.5, True)
+    return "opaque", 0.5, False
+
+
+def known_texels(material: Material, uv: Floats) -> NDArray[np.bool_] | None:
+    """(H, W) True for the texels of an image that lie on the surface, by the coordinates (F, 3, 2) of its faces.
+
+    None where it is not worth asking: an image that is tiled, or laid over itself many times.
+    """
+    assert material.image is not None
+    height, width = material.image.shape[:2]
+    if len(uv) == 0 or (uv.max(axis=1) - uv.min(axis=1)).max() >= 1.0:
+        return None
+    uv = uv - np.floor(uv.min(axis=1, keepdims=True) / 2.0) * 2.0 if "clamp" not in material.wrap else uv
+    corners = uv * np.array([width, height])
+    size = corners.max(axis=1) - corners.min(axis=1) + 1.0
+    if (
+        np.prod(size, axis=1).sum() > 16.0 * width * height + 64.0 * len(uv)
+        or rows_of(corners).sum() > MOST_ROWS
+    ):
+        return None
+    known = np.zeros((height, width), bool)
+    found = spans(corners)
+    for _, column, row in found.expanded():
+        known[wrapped(row, height, material.wrap[1]), wrapped(column, width, material.wrap[0])] = True
+    # triangles so small that they hold no centre still name texels: those that their corners lie on
+    small = np.ones(len(uv), bool)
+    small[found.face] = False
+    at = np.floor(corners[small].reshape(-1, 2)).astype(np.int64)
+    known[wrapped(at[:, 1], height, material.wrap[1]), wrapped(at[:, 0], width, material.wrap[0])] = True
+    return known
+
+
+def _densities(
+    ground: Ground, materials: tuple[Material, ...], material: NDArray[np.int64], uv: Floats
+) -> NDArray[np.float32]:
+    """(F,) texels of its image that lie along a unit of length on each face.
+
+    As an area has them, or half of what the densest direction has if that is more. Without an image a face counts
+    as one texel.
+    """
+    sizes = np.array([(0, 0) if m.image is None else m.image.shape[1::-1] for m in materials], np.float64)
+    corners = uv * sizes[material][:, None]
+    a, b, c = (ground.verts[ground.faces[:, k]] for k in range(3))
+    first, second = duals(b - a, c - a)
+    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    u, v = (one[:, k : k + 1] * first + two[:, k : k + 1] * second for k in range(2))
+    density = reach_of(u, v)
+    plain = sizes[material][:, 0] == 0
+    density[plain] = 1.0 / np.sqrt(2.0 * np.maximum(ground.areas[plain], 1e-12))
+    return density.astype(np.float32)
+
+
+def reach_of(first: Floats, second: Floats) -> Floats:
+    """(N,) the size of a parallelogram (N, 3), (N, 3): the root of its area, or half its longest extent."""
+    a, c = squared_lengths(first), squared_lengths(second)
+    b = np.einsum("ni,ni->n", first, second)
+    longest = np.sqrt((a + c) / 2 + np.sqrt(((a - c) / 2) ** 2 + b * b))
+    area = np.sqrt(squared_lengths(cross_product(first, second)))
+    return np.maximum(np.sqrt(area), longest / 2)
+
+
+def _charts(ground: Ground, look: Appearance, pictured: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """(F,) faces joined over edges where material and texture coordinates agree; without an image, by material."""
+    F = len(ground.faces)
+    joined = []
+    for k in range(3):
+        face = np.flatnonzero(ground.opposite[:, k] >= 0)
+        other, edge = (
+            ground.opposite[face, k].astype(np.int64),
+            ground.opposite_edge[face, k].astype(np.int64),
+        )
+        rows = np.arange(len(face))
+        ends, theirs = ((k + 1) % 3, (k + 2) % 3), ((edge + 1) % 3, (edge + 2) % 3)
+        # the other face runs along the edge the other way round, unless it is turned over
+        same_way = ground.same[face, ends[0]] == ground.same[other, theirs[0]]
+        agree = look.material[face] == look.material[other]
+        for i in (0, 1):
+            corner = np.where(same_way, theirs[i], theirs[1 - i])
+            apart = np.abs(look.uv[face, ends[i]] - look.uv[other[rows], corner]).max(axis=1)
+            agree &= apart < 1e-6
+        joined.append(np.stack([face[agree], other[agree]]))
+    pairs = np.concatenate(joined, axis=1)
+    graph = coo_array((np.ones(pairs.shape[1], np.int8), (pairs[0], pairs[1])), shape=(F, F))
+    chart = np.asarray(connected_components(graph, directed=False)[1], np.int32)
+    return np.where(pictured, chart, F + look.material).astype(np.int32)

@@ -1,0 +1,220 @@
+"""The surface that colours are taken from: points near it slide on it to the closest place.
+
+A point knows a face to begin with, and goes from face to face over shared edges. So it never changes to another
+sheet that merely passes by, and neighbouring points end on neighbouring places.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from meshmatch.maps.surface import closest_on_triangles
+from meshmatch.shapes.shape import Floats, Ints, Shape, cross_product, squared_lengths
+from meshmatch.shapes.topology import same_rows
+
+_INSIDE = np.float32(-1e-5)
+_STEPS, _STEPS_AGAIN = 32, 12
+Near = NDArray[np.float32]
+Faces = NDArray[np.int32]
+
+
+class Ground:
+    """A mesh arranged for sliding; lengths in units of `unit`, seen from `center`.
+
+    Parameters
+    ----------
+    shape : Shape
+        With faces.
+    """
+
+    def __init__(self, shape: Shape) -> None:
+        self.center = shape.bounds.mean(axis=0)
+        self.unit = float(np.sqrt(shape.area)) or shape.diagonal or 1.0
+        self.verts = (shape.verts - self.center) / self.unit
+        self.faces = shape.faces
+        self.same = same_rows(shape.verts)[shape.faces]  # corners by place: seams cut nothing apart
+        self.opposite, self.opposite_edge = _neighbours(shape.faces, self.same)
+        a, b, c = (self.verts[shape.faces[:, k]] for k in range(3))
+        self.areas = 0.5 * np.sqrt(squared_lengths(cross_product(b - a, c - a)))
+        first, second = duals(b - a, c - a)
+        self._flat = (first == 0).all(axis=1) & (second == 0).all(axis=1)
+        self._table = list(np.concatenate([a, first, second], axis=1).T.astype(np.float32, order="C"))
+        self._opposite = list(np.ascontiguousarray(self.opposite.T))
+        self._around = _a_face_of_each_vertex(shape.faces, shape.V)
+        self._broken = np.zeros(shape.F, bool)
+        if shape.invalid is not None:
+            self._broken |= shape.invalid[shape.faces].any(axis=1)
+        self._tree: cKDTree | None = None
+
+    def face_of_vertex(self, vertex: Ints) -> Ints:
+        """A face at each vertex; -1 where there is none."""
+        return self._around[vertex]
+
+    def places(self, face: NDArray[np.integer], weights: NDArray[np.floating]) -> Floats:
+        """(N, 3) points of faces (N,) by weights (N, 3)."""
+        return np.asarray(np.einsum("nk,nkd->nd", weights, self.verts[self.faces[face]]))
+
+    def slide(self, points: Near, face: Faces) -> tuple[Faces, Near, Near]:
+        """The closest place on the surface, as far as sliding gets.
+
+        Parameters
+        ----------
+        points : (3, N) float32
+            x, y and z.
+        face : (N,) int32
+            Where each begins; -1 where that is not known.
+
+        Returns
+        -------
+        face (N,), weights (3, N), and the distance (N,), 0 for all whose foot lies inside its face.
+        """
+        lost = np.flatnonzero(face < 0)
+        if len(lost):
+            face = face.copy()
+            face[lost] = self._nearest_center(points[:, lost])
+        face, weights, outside, tired = self._walk(points, face, _STEPS)
+        if self._flat.any():  # a face without area lets nothing pass
+            tired = np.union1d(tired, np.flatnonzero(self._flat[face]))
+        if len(tired):  # a long way, or round and round: begin near the end of it
+            some = points[:, tired]
+            face[tired], weights[:, tired], out, _ = self._walk(
+                some, self._nearest_center(some), _STEPS_AGAIN
+            )
+            outside = np.concatenate([np.setdiff1d(outside, tired), tired[out]])
+        distance = np.zeros(len(face), np.float32)
+        if len(outside):
+            corners = self.verts[self.faces[face[outside]]]
+            asked = points[:, outside].T.astype(np.float64)
+            held = closest_on_triangles(asked, corners[:, 0], corners[:, 1], corners[:, 2])
+            foot = np.einsum("nk,nkd->nd", held, corners)
+            weights[:, outside] = held.T
+            distance[outside] = np.sqrt(squared_lengths(foot - asked))
+        np.maximum(weights, 0, out=weights)
+        weights /= weights[0] + weights[1] + weights[2]
+        return face, weights, distance
+
+    def _walk(self, points: Near, face: Faces, steps: int) -> tuple[Faces, Near, Ints, Ints]:
+        """Faces and weights where each walk ended; those that ended at an edge; those that did not end.
+
+        Column by column: reductions over three numbers take NumPy fifty times as long.
+        """
+        N = len(face)
+        face = face.copy()
+        weights = np.empty((3, N), np.float32)
+        active, before = np.arange(N), np.full(N, -1, np.int32)
+        at, standing = points, face
+        ended: list[Ints] = []
+        for step in range(steps):
+            away = [at[k] - self._table[k].take(standing) for k in range(3)]
+            second = _product(away, [column.take(standing) for column in self._table[3:6]])
+            third = _product(away, [column.take(standing) for column in self._table[6:9]])
+            held = [1 - second - third, second, third]
+            here = np.s_[:] if step == 0 else active
+            for k in range(3):
+                weights[k, here] = held[k]
+            face[here] = standing
+            go = np.flatnonzero(np.minimum(np.minimum(held[0], second), third) < _INSIDE)
+            if not len(go):
+                return face, weights, np.concatenate([active[:0], *ended]), active[:0]
+            standing, before = standing[go], before[go]
+            least = np.full(len(go), _INSIDE)
+            onward = np.full(len(go), -1, np.int32)
+            for k in range(3):
+                over, weight = self._opposite[k].take(standing), held[k][go]
+                better = (weight < least) & (over >= 0) & (over != before)
+                least = np.where(better, weight, least)
+                onward = np.where(better, over, onward)
+            on = onward >= 0
+            ended.append(active[go[~on]])
+            go, before, standing = go[on], standing[on], onward[on]
+            active, at = active[go], at[:, go]
+        return face, weights, np.concatenate([*ended, active]), active
+
+    def _nearest_center(self, points: Near) -> Faces:
+        if self._tree is None:
+            centers = self.verts[self.faces].mean(axis=1)
+            centers[self._broken | self._flat] = 1e6
+            self._tree = cKDTree(centers)
+        return np.asarray(self._tree.query(points.T)[1], np.int32)
+
+
+class CloudGround(Ground):
+    """A point cloud as a ground: each point with its two nearest neighbours stands for a face.
+
+    Sliding is a search for the nearest point; weights fall with the square of the distance.
+    """
+
+    def __init__(self, shape: Shape) -> None:
+        valid = np.arange(shape.V) if shape.invalid is None else np.flatnonzero(~shape.invalid)
+        near = cKDTree(shape.verts[valid]).query(shape.verts, min(3, len(valid)))[1].reshape(shape.V, -1)
+        faces = np.concatenate([valid[near], valid[near[:, -1:]].repeat(3 - near.shape[1], axis=1)], axis=1)
+        super().__init__(Shape(shape.verts, faces, shape.name, invalid=shape.invalid))
+        self.unit = float(np.sqrt(shape.area)) or shape.diagonal or 1.0
+        self.verts = (shape.verts - self.center) / self.unit
+        self.areas = shape.vertex_areas / self.unit**2
+        self._valid, self._points = valid, cKDTree(self.verts[valid])
+
+    def face_of_vertex(self, vertex: Ints) -> Ints:
+        """The face of a point has its number."""
+        return vertex
+
+    def slide(self, points: Near, face: Faces) -> tuple[Faces, Near, Near]:
+        """The nearest points, wherever the search began; see `Ground.slide`."""
+        place = self._valid[self._points.query(points.T)[1]].astype(np.int32)
+        away = self.verts[self.faces[place]] - points.T[:, None]
+        near = 1.0 / np.maximum(np.einsum("nkd,nkd->kn", away, away), 1e-18)
+        return place, (near / near.sum(axis=0)).astype(np.float32), np.zeros(len(place), np.float32)
+
+
+def ground_of(shape: Shape) -> Ground:
+    """The ground of a mesh or a cloud."""
+    return CloudGround(shape) if shape.is_cloud else Ground(shape)
+
+
+def _product(a: list[Near], b: list[Near]) -> Near:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def duals(first: Floats, second: Floats) -> tuple[Floats, Floats]:
+    """Vectors (F, 3) whose products with a point of a triangle, seen from its first corner, are the weights of
+    its second and third; zeros for a triangle without area.
+    """
+    a, b, c = squared_lengths(first), np.einsum("ni,ni->n", first, second), squared_lengths(second)
+    determinant = a * c - b * b
+    flat = determinant <= 1e-14 * a * c
+    share = np.where(flat, 0.0, 1.0 / np.where(flat, 1.0, determinant))[:, None]
+    return share * (c[:, None] * first - b[:, None] * second), share * (
+        a[:, None] * second - b[:, None] * first
+    )
+
+
+def _a_face_of_each_vertex(faces: Ints, V: int) -> Ints:
+    around = np.full(V, -1, np.int64)
+    around[faces[::-1].ravel()] = np.repeat(np.arange(len(faces) - 1, -1, -1), 3)
+    return around
+
+
+def _neighbours(faces: Ints, same: Ints) -> tuple[Faces, NDArray[np.int8]]:
+    """The face across each edge (F, 3), -1 for none, and which of its edges that is; edge k is opposite corner k.
+
+    Edges that two faces share by their vertices come first; then those that meet at the same places. Where more
+    than two meet there is no telling which goes on, so none does.
+    """
+    F = len(faces)
+    opposite = np.full(3 * F, -1, np.int64)
+    for corners in (faces, same):
+        start, end = corners[:, [1, 2, 0]].ravel(), corners[:, [2, 0, 1]].ravel()
+        free = np.flatnonzero((opposite < 0) & (start != end))
+        stride = int(corners.max()) + 1 if F else 1
+        key = np.minimum(start, end)[free] * stride + np.maximum(start, end)[free]
+        order = np.argsort(key, kind="stable")
+        ordered = key[order]
+        first = np.flatnonzero(np.diff(ordered, prepend=-1))
+        two = first[np.diff(np.append(first, len(ordered))) == 2]
+        a, b = free[order[two]], free[order[two + 1]]
+        opposite[a], opposite[b] = b, a
+    face, edge = np.divmod(opposite, 3)
+    face[opposite < 0] = -1
+    return face.reshape(F, 3).astype(np.int32), edge.reshape(F, 3).astype(np.int8)

@@ -1,0 +1,112 @@
+"""A texture carried from one shape to another along a map: the parts put together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshmatch.errors import OptionError
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.appearance import Appearance
+from meshmatch.shapes.formats.textured import Textured
+from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.transfer.bake import Baked, Choices, bake
+from meshmatch.transfer.coat import Coat
+from meshmatch.transfer.footing import images_of
+from meshmatch.transfer.ground import ground_of
+from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of
+
+LARGEST = 8192
+"""Texels along a side."""
+
+
+@dataclass(frozen=True, eq=False)
+class Worn:
+    """The target with its texture, ready to be written (`meshmatch.shapes.textured_files`)."""
+
+    mesh: Textured
+    baked: Baked
+    atlas: Atlas
+
+
+def check_choices(choices: Choices) -> None:
+    """Refuse sizes that cannot be (`OptionError`)."""
+    if not 16 <= choices.size <= LARGEST:
+        raise OptionError(f"a texture has 16 to {LARGEST} texels a side, not {choices.size}")
+    if not 1 <= choices.samples <= 8:
+        raise OptionError(f"a texel takes 1 to 8 samples each way, not {choices.samples}")
+    if not 0 <= choices.padding <= choices.size // 4:
+        raise OptionError(
+            f"padding of {choices.padding} texels does not go with {choices.size}",
+            f"choose 0 to {choices.size // 4}",
+        )
+
+
+def transfer_texture(
+    source: Shape,
+    look: Appearance,
+    target: Shape,
+    back: VertexMap,
+    *,
+    own: Floats | None = None,
+    keep: Keep = "auto",
+    choices: Choices = Choices(),  # noqa: B008  # frozen
+    tell: Callable[[str, float], None] = lambda what, share: None,
+) -> Worn:
+    """Bake the look of a source for a target mesh.
+
+    Parameters
+    ----------
+    look : Appearance
+        Of the source's file (`load_appearance`).
+    back : VertexMap
+        From target to source (`pipeline.carry(...).back`).
+    own : (F, 3, 2) float64, optional
+        The target's own texture coordinates (`load_coordinates`).
+    keep : {"auto", "keep", "new"}
+        What to do with them.
+    tell : callable
+        Gets what is going on, and the share of it that is done.
+
+    Raises
+    ------
+    InputError, OptionError
+        The target is a cloud or cannot be unwrapped; choices that cannot be.
+    """
+    check_choices(choices)
+    if target.is_cloud:
+        raise OptionError(
+            f"{target.name or 'the target'} is a point cloud, which has no surface for a texture",
+            "its points can have colours: end the output in .ply",
+        )
+    if target.invalid is not None:  # a face with a corner nowhere is no face
+        sound = ~target.invalid[target.faces].any(axis=1)
+        own = None if own is None else own[sound]
+        target = Shape(target.verts, target.faces[sound], target.name)
+    tell("unwrapping", 0.0)
+    atlas = atlas_of(target, own, choices.size, choices.padding, keep)
+    tell("reading the source", 0.0)
+    ground = ground_of(source)
+    coat = Coat(_of_faces(look, source), ground)
+    baked = bake(coat, ground, target, back, atlas.uv, choices, lambda share: tell("baking", share))
+    mesh = Textured(target.verts, target.faces, atlas.uv, baked.alpha, baked.cutoff)
+    return Worn(mesh, baked, atlas)
+
+
+def colors_of_vertices(source: Shape, look: Appearance, target: Shape, back: VertexMap) -> Floats:
+    """(V_tgt, 4) linear colours and alpha of a target's vertices or points, as wide as the gaps between them."""
+    ground = ground_of(source)
+    coat = Coat(_of_faces(look, source), ground)
+    points, start = images_of(ground, back)
+    place, weights, _ = ground.slide(points.T.astype(np.float32, order="C"), start.astype(np.int32))
+    reach = np.sqrt(target.vertex_areas / max(target.area, 1e-300)).astype(np.float32)
+    return coat.colors(place, weights, coat.footprint(place, reach)).T.astype(np.float64)
+
+
+def _of_faces(look: Appearance, source: Shape) -> Appearance:
+    """The look; that of a cloud with each point as a face."""
+    if not source.is_cloud:
+        return look
+    return Appearance(look.materials, np.zeros(source.V, np.int64), np.zeros((source.V, 3, 2)), look.colors)

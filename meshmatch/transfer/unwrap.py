@@ -1,0 +1,185 @@
+"""The atlas of a target: its own texture coordinates where they serve, else new ones.
+
+New ones are xatlas's: charts that hardly stretch, packed side by side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import xatlas
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.transfer.texels import MOST_ROWS, faces_on, rows_of
+
+Keep = Literal["auto", "keep", "new"]
+# Of the texels that are used, so many may lie under two triangles: rounding at the edges of charts.
+_OVERLAP = 0.002
+# Coordinates must use this much of the image, and may leave this much of the surface without room.
+_LEAST_USED, _MOST_STARVED = 0.05, 0.02
+# A triangle is starved if it has this share of the room that its area deserves.
+_STARVED = 1e-3
+# Charts are packed on a grid of this size, with so much of it covered at first.
+_GRID, _DENSITIES = 1024, (0.6, 0.5, 0.4)
+# Way round a chart, in units of sqrt(area): a longer one leaves much of a square empty.
+_LONGEST = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """Texture coordinates that give every place of a surface its own place in an image.
+
+    Parameters
+    ----------
+    uv : (F, 3, 2) float64
+        Within 0..1, u to the right, v down; zeros for a face without area.
+    own : bool
+        True if they are those of the file.
+    note : str
+        Why the file's own are not used; empty if they are, or if there are none.
+    """
+
+    uv: Floats
+    own: bool
+    note: str = ""
+
+
+def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Keep = "auto") -> Atlas:
+    """The coordinates to bake with.
+
+    Parameters
+    ----------
+    own : (F, 3, 2), optional
+        The file's.
+    size, padding : int
+        Of the image; and the least number of texels between new charts.
+    keep : {"auto", "keep", "new"}
+        Own ones where they serve; own ones or an error; new ones.
+
+    Raises
+    ------
+    OptionError
+        "keep", and there are none, or they do not serve.
+    InputError
+        No triangle has an area, or xatlas fails.
+    """
+    if not (shape.face_areas > 0).any():
+        raise InputError(f"{shape.name or 'the target'} has no triangle with an area", "is it a mesh?")
+    if keep == "new" or own is None:
+        if keep == "keep":
+            raise OptionError(
+                f"{shape.name or 'the target'} has no texture coordinates to keep",
+                "leave out --uv keep: new ones are made",
+            )
+        return Atlas(unwrapped(shape, size, padding), False)
+    within, problem = _within(own, shape)
+    problem = problem or _problem(within, shape, size)
+    if not problem:
+        return Atlas(within, True)
+    words = f"{shape.name or 'the target'}: its own texture coordinates cannot be used: {problem}"
+    if keep == "keep":
+        raise OptionError(words, "leave out --uv keep: new ones are made")
+    return Atlas(unwrapped(shape, size, padding), False, f"{words}; new ones were made")
+
+
+def _within(uv: Floats, shape: Shape) -> tuple[Floats, str]:
+    """Coordinates brought into 0..1 by whole numbers, a triangle at a time, which changes nothing on a repeated
+    image; and what is wrong with them.
+    """
+    real = shape.face_areas > 0
+    if not np.isfinite(uv[real]).all():
+        return uv, "some are not numbers"
+    if np.abs(uv[real]).max() > 1e6:
+        return uv, "some are absurdly large"
+    out = np.where(real[:, None, None], uv, 0.0)
+    out = out - np.floor(out.min(axis=1, keepdims=True) + 1e-5)
+    beyond = int((out.max(axis=(1, 2)) > 1.0 + 1e-5).sum())
+    if beyond:
+        return out, f"{beyond} faces reach out of range, over the edge of the image"
+    return np.clip(out, 0.0, 1.0), ""
+
+
+def _problem(uv: Floats, shape: Shape, size: int) -> str:
+    """Why coordinates within 0..1 are no atlas; empty if they are one."""
+    one, two = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    room = 0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+    if room.sum() < _LEAST_USED:
+        return f"they use only {100 * room.sum():.1f} % of the image"
+    if room.sum() > 1.0 + _OVERLAP or rows_of(uv * size).sum() > MOST_ROWS:
+        return f"they overlap ({room.sum():.1f} times the image)"
+    deserved = shape.face_areas / shape.face_areas.sum()
+    starved = float(deserved[room < _STARVED * deserved].sum())
+    if starved > _MOST_STARVED:
+        return f"{100 * starved:.0f} % of the surface has no room in the image"
+    found, twice = faces_on(uv * size, size)
+    share = twice / max(int((found >= 0).sum()), 1)
+    return f"they overlap on {100 * share:.1f} % of their texels" if share > _OVERLAP else ""
+
+
+def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
+    """(F, 3, 2) new coordinates.
+
+    Raises
+    ------
+    InputError
+        xatlas cannot do it.
+    """
+    real = np.flatnonzero(shape.face_areas > 0)
+    used, corners = np.unique(shape.faces[real], return_inverse=True)
+    verts = shape.verts[used]
+    verts = (verts - verts.mean(axis=0)) / max(float(np.sqrt(shape.face_areas.sum())), 1e-300)
+    corners = corners.reshape(-1, 3)
+    try:
+        maker, pack = xatlas.Atlas(), xatlas.PackOptions()
+        pack.resolution, pack.padding = 256, 0
+        maker.add_mesh(verts.astype(np.float32), corners.astype(np.uint32))
+        options = xatlas.ChartOptions()
+        options.max_boundary_length = _LONGEST
+        maker.generate(options, pack)
+        origin, faces, uv = maker[0]
+        if not np.array_equal(origin[faces], corners):
+            raise RuntimeError("faces were lost")
+        charts = uv * (np.array([maker.width, maker.height]) / maker.texels_per_unit)
+        uv = _packed(charts, faces, padding * _GRID / size)
+    except (RuntimeError, IndexError) as error:
+        raise _failed(shape, str(error)) from error
+    out = np.zeros((shape.F, 3, 2))
+    out[real] = uv[faces]
+    return out
+
+
+def _packed(charts: Floats, faces: Ints, padding: float) -> Floats:
+    """(N, 2) charts side by side in a square, on a grid of about `_GRID`, at least `padding` of it apart.
+
+    xatlas finds a width and a height by itself; the most square of a few attempts wins.
+    """
+    one, two = (charts[faces[:, k]] - charts[faces[:, 0]] for k in (1, 2))
+    area = 0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]).sum()
+    best, most = charts, 0.0
+    for density in _DENSITIES:
+        packer, pack = xatlas.Atlas(), xatlas.PackOptions()
+        pack.texels_per_unit = _GRID * np.sqrt(density / area)
+        # what is shrunk to fit later must be further apart now
+        pack.padding, pack.bilinear = int(np.ceil(padding * np.sqrt(density / _DENSITIES[-1]))), True
+        packer.add_uv_mesh(charts.astype(np.float32), faces.astype(np.uint32))
+        packer.generate(xatlas.ChartOptions(), pack)
+        origin, again, uv = packer[0]
+        longest = max(packer.width, packer.height)
+        reached = area * (pack.texels_per_unit / longest) ** 2
+        if reached > most and np.array_equal(origin[again], faces):
+            placed = np.empty_like(charts)
+            placed[origin] = uv * (np.array([packer.width, packer.height]) / longest)
+            best, most = placed, reached
+    if not most:
+        raise RuntimeError("its charts could not be packed")
+    return best
+
+
+def _failed(shape: Shape, why: str) -> InputError:
+    return InputError(
+        f"{shape.name or 'the target'} cannot be unwrapped ({why})",
+        "unwrap it in a modelling program, and use --uv keep",
+    )
