@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError
-from meshmatch.fitting.fit import FAIR_RESIDUAL, GOOD_RESIDUAL, Fit, axis_name
+from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.latent import LatentRefineConfig, refine_code
 from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual, variants
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
@@ -25,7 +25,9 @@ from meshmatch.fitting.orientation import (
     with_flips,
 )
 from meshmatch.fitting.scan import Scan
+from meshmatch.fitting.settle import settle
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.verdict import cloud_allowance, judge
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Frame, Shape
@@ -114,6 +116,8 @@ def fit_shape(
         rough.append(_lay(model, system, coarse, guess, rng, rounds=1, draws=1, stride=1))
         tell("orientation", 0.7 * (number + 1) / len(guesses))
     rough.sort(key=lambda candidate: candidate.residual)
+    if shape.is_cloud:
+        frame, scan, coarse, rough = _settled(model, system, frame, scan, rough[: config.laid], config, rng)
     candidates = [_lay(model, system, scan, guess, rng) for guess in rough[: config.laid]]
     candidates.sort(key=lambda candidate: candidate.residual)
     if config.refine == "nodes":
@@ -123,7 +127,9 @@ def fit_shape(
     core_frame = frame.compose(Frame(1.0, best.rotation.T, best.centre))
     points = system.moved(best.vectors)
     distance = _vertex_distance(core_frame.apply(shape.verts), points)
-    verdict, reasons = judge(best.residual, scan.turned(best.rotation, best.centre), points)
+    local = scan.turned(best.rotation, best.centre)
+    allowance = cloud_allowance(system, local, shape.V, best.vectors, config.seed) if shape.is_cloud else 0.0
+    verdict, reasons = judge(best.residual, local, points, allowance)
     return Fit(
         template_hash=model.template.hash,
         frame=core_frame,
@@ -140,6 +146,19 @@ def fit_shape(
         seconds=time.monotonic() - began,
         seed=config.seed,
     )
+
+
+def _settled(model, system, frame, scan, rough, config, rng) -> tuple[Frame, Scan, Scan, list[Candidate]]:
+    """Frame, samples and candidates of a cloud, its scale and its stray points settled by the best candidate."""
+
+    def lay(part: Scan, start: Candidate) -> Candidate:
+        return _lay(model, system, part, start, rng, rounds=2, draws=2, stride=1)
+
+    settled = [settle(system, scan, candidate, lay) for candidate in rough]
+    scale, scan, best = min(settled, key=lambda each: each[2].residual)
+    others = [Candidate(c.rotation, c.centre / scale, c.vectors, c.residual) for c in rough]
+    coarse = Scan(scan.points[: config.coarse_samples], scan.normals[: config.coarse_samples])
+    return frame.compose(Frame(scale, np.eye(3), np.zeros(3))), scan, coarse, [best, *others]
 
 
 def _readings(model, system, scan, coarse, candidates, config, rng) -> list[Candidate]:
@@ -222,20 +241,3 @@ def _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell
 
 def _vertex_distance(verts: np.ndarray, points: np.ndarray) -> np.ndarray:
     return cKDTree(points).query(verts)[0]
-
-
-def judge(residual: float, scan: Scan, points: np.ndarray) -> tuple[str, tuple[str, ...]]:
-    """Verdict on a fit and the reasons, in words."""
-    reasons = []
-    if residual > GOOD_RESIDUAL:
-        reasons.append(f"template and shape stay {100 * residual:.1f} % of sqrt(area) apart on average")
-    gap = cKDTree(points).query(scan.points)[0]
-    missed = float((gap > 0.06).mean())
-    if missed > 0.02:
-        reasons.append(f"{100 * missed:.0f} % of the shape is not reached by the template")
-    empty = float((cKDTree(scan.points).query(points)[0] > 0.06).mean())
-    if empty > 0.02:
-        reasons.append(f"{100 * empty:.0f} % of the template lies where the shape has no surface")
-    if residual > FAIR_RESIDUAL or missed > 0.06 or empty > 0.06:
-        return "poor", tuple(reasons)
-    return ("fair" if reasons else "good"), tuple(reasons)

@@ -11,10 +11,11 @@ from meshmatch import pipeline
 from meshmatch.cli import main
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import FAIR_RESIDUAL, GOOD_RESIDUAL, Fit, axis_name
-from meshmatch.fitting.fit_shape import REFINEMENTS, FitConfig, Refine, fit_shape, judge, take_samples
+from meshmatch.fitting.fit_shape import REFINEMENTS, FitConfig, Refine, fit_shape, take_samples
 from meshmatch.fitting.landmarks import template_vertices
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.scan import Scan
+from meshmatch.fitting.verdict import judge
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Frame, Shape

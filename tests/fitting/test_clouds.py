@@ -1,0 +1,124 @@
+"""Clouds: a first fit settles their scale and their stray points, and the verdict forgives them their noise."""
+
+import numpy as np
+import pytest
+
+from meshmatch.fitting.fit import GOOD_RESIDUAL
+from meshmatch.fitting.fit_shape import node_system
+from meshmatch.fitting.network_fit import Candidate, two_way_residual
+from meshmatch.fitting.scan import Scan
+from meshmatch.fitting.settle import lonely_points, settle
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.verdict import cloud_allowance, judge
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Shape
+from tests.fitting.eggs import egg_model
+
+EYE, ZERO = np.eye(3), np.zeros(3)
+
+
+@pytest.fixture(scope="module")
+def system() -> NodeSystem:
+    return node_system(egg_model())
+
+
+def cloud_of(system: NodeSystem, P: int, noise: float = 0.0, strays: int = 0) -> Scan:
+    """Points of the resting egg with normals as a cloud estimates them; stray points come last."""
+    rng = np.random.default_rng(0)
+    points = sample_surface(Shape(system.verts, system.faces), P, rng).points
+    points = np.concatenate(
+        [points + noise * rng.standard_normal(points.shape), rng.uniform(-1, 1, (strays, 3))]
+    )
+    return Scan(points, Shape(points, np.empty((0, 3), np.int64)).vertex_normals)
+
+
+class Scaler:
+    """Stands for the network: the template blown up by ``share`` of what the scan is too large by."""
+
+    def __init__(self, system: NodeSystem, nodes: np.ndarray, share: float) -> None:
+        self.nodes, self.share, self.calls = nodes, share, 0
+        self.size = float(np.median(np.linalg.norm(cloud_of(system, 600).points, axis=1)))
+
+    def lay(self, scan: Scan, start: Candidate) -> Candidate:
+        self.calls += 1
+        larger = float(np.median(np.linalg.norm(scan.points, axis=1))) / self.size
+        vectors = (larger**self.share - 1) * self.nodes
+        return Candidate(start.rotation, start.centre, vectors, 0.0)
+
+
+@pytest.mark.parametrize("factor", [0.87, 1.0, 1.15])
+def test_the_scale_is_that_of_the_template(system: NodeSystem, factor: float) -> None:
+    nodes = egg_model().template.nodes
+    scan = cloud_of(system, 600)
+    wrong = Scan(scan.points * factor, scan.normals)
+    network = Scaler(system, nodes, 0.8)
+    first = network.lay(wrong, Candidate(EYE, ZERO, np.zeros_like(nodes), 0.0))
+    scale, settled, best = settle(system, wrong, first, network.lay)
+    assert scale == pytest.approx(factor, rel=0.03)
+    assert np.allclose(settled.points * scale, wrong.points[: len(settled.points)])
+    assert best.residual == 0.0
+
+
+def test_a_wrong_fit_cannot_scale_without_end(system: NodeSystem) -> None:
+    nodes = egg_model().template.nodes
+    blown = Candidate(EYE, ZERO, 4.0 * nodes, 0.0)
+    scale, _, _ = settle(system, cloud_of(system, 300), blown, lambda scan, start: blown)
+    assert scale == pytest.approx(1.3)
+
+
+def test_points_far_away_and_lonely_are_dropped_and_no_others(system: NodeSystem) -> None:
+    scan = cloud_of(system, 800, strays=40)
+    rest = Candidate(EYE, ZERO, np.zeros((system.K, 3)), 0.0)
+    scale, settled, _ = settle(system, scan, rest, lambda part, start: rest)
+    assert scale == 1.0
+    kept = {tuple(point) for point in settled.points}
+    strays = scan.points[800:]
+    near = np.abs(np.linalg.norm(strays[:, None] - scan.points[:800], axis=2)).min(1) < 0.1
+    assert all(tuple(point) in kept for point in scan.points[:800])
+    assert sum(tuple(point) not in kept for point in strays[~near]) > 0.8 * (~near).sum() > 5
+
+
+def test_a_lost_limb_is_not_dropped(system: NodeSystem) -> None:
+    """Far from the template, but as dense as a surface is."""
+    scan = cloud_of(system, 800)
+    limb = scan.points[:400] * 0.3 + [2.0, 0, 0]
+    both = Scan(np.concatenate([scan.points, limb]), np.concatenate([scan.normals, scan.normals[:400]]))
+    rest = Candidate(EYE, ZERO, np.zeros((system.K, 3)), 0.0)
+    assert len(settle(system, both, rest, lambda part, start: rest)[1].points) == 1200
+
+
+def test_lonely_points_by_hand() -> None:
+    grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 2, [0.0]), -1).reshape(-1, 3)
+    assert lonely_points(np.concatenate([grid, [[30.0, 0, 0]]])).nonzero()[0].tolist()[-1] == 64
+    assert not lonely_points(grid)[27]
+
+
+@pytest.mark.parametrize(("P", "noise"), [(3000, 0.0), (3000, 0.03), (400, 0.0), (400, 0.03)])
+def test_a_right_fit_of_a_poor_cloud_is_forgiven(system: NodeSystem, P: int, noise: float) -> None:
+    scan, still = cloud_of(system, P, noise), np.zeros((system.K, 3))
+    clean = sample_surface(Shape(system.verts, system.faces), 3000, np.random.default_rng(1))
+    clear = two_way_residual(system, Scan(clean.points, clean.normals), still)
+    residual = two_way_residual(system, scan, still)
+    allowance = cloud_allowance(system, scan, P, still)
+    explained = np.sqrt(max(residual**2 - allowance**2, 0))
+    assert explained < 1.35 * clear
+    assert cloud_allowance(system, scan, P, still) == allowance
+
+
+def test_noise_has_a_limit(system: NodeSystem) -> None:
+    """A template far from the whole shape is a wrong fit, however noisy it would have to be."""
+    scan = cloud_of(system, 2000)
+    far = Scan(scan.points * 1.5, scan.normals)
+    assert cloud_allowance(system, far, 2000, np.zeros((system.K, 3))) < 0.5 * two_way_residual(
+        system, far, np.zeros((system.K, 3)), cap=1.0
+    )
+
+
+def test_the_verdict_is_of_what_is_not_explained(system: NodeSystem) -> None:
+    scan = cloud_of(system, 2000)
+    assert judge(0.04, scan, system.verts)[0] == "poor"
+    assert (
+        judge(0.04, scan, system.verts, allowance=0.035)[0]
+        == judge(GOOD_RESIDUAL * 0.5, scan, system.verts)[0]
+    )
+    assert judge(0.02, scan, system.verts, allowance=0.03)[0] == judge(0.0, scan, system.verts)[0]
