@@ -26,14 +26,13 @@ from rich.console import Console
 from meshmatch.config import set_threads
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.distances import default_folder
-from meshmatch.experiments.protocols import SET_NAMES, BenchSet, Pair, load_set
+from meshmatch.experiments.protocols import CLOUD_SET, SET_NAMES, BenchSet, Pair, load_set
 from meshmatch.experiments.report import circumstances, explain, print_table
 from meshmatch.experiments.scores import SetScores, evaluate_set
 from meshmatch.maps.curve import draw_curves
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 
 
@@ -91,13 +90,13 @@ def _begin(work: _Work) -> None:
 
 
 @lru_cache(maxsize=64)
-def _shape(path: Path) -> Shape:
-    return load_shape(path)
+def _seen(bench: BenchSet, name: str) -> Shape:
+    return bench.seen(name)
 
 
 def _fit_one(name: str) -> tuple[str, Any, float]:
     assert _work is not None
-    shape = _shape(_work.bench.path(name))
+    shape = _seen(_work.bench, name)
     started = time.perf_counter()
     try:
         fit = _work.matcher.fit(shape)
@@ -112,7 +111,7 @@ def _map_one(pair: Pair) -> tuple[Pair, NDArray[np.int64] | MeshmatchError, floa
     for fit in fits:
         if isinstance(fit, MeshmatchError):
             return pair, fit, 0.0
-    source, target = (_shape(_work.bench.path(name)) for name in pair)
+    source, target = (_seen(_work.bench, name) for name in pair)
     started = time.perf_counter()
     try:
         index = _work.matcher.map(source, fits[0], target, fits[1]).index
@@ -229,7 +228,7 @@ def load_maps(folder: Path, bench: BenchSet, pairs: Iterable[Pair]) -> dict[Pair
 def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser("python -m meshmatch.experiments.bench", description=__doc__)
     parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
-    parser.add_argument("--sets", default=",".join(SET_NAMES), help="some of %(default)s")
+    parser.add_argument("--sets", default=",".join(SET_NAMES), help=f"some of %(default)s, {CLOUD_SET}")
     parser.add_argument("--model", default="human")
     parser.add_argument("--refine", default="nodes", choices=("none", "latent", "nodes"))
     parser.add_argument("--seed", type=int, default=0)

@@ -8,6 +8,9 @@ every shape of a set*, and a set differs from another in how a landmark names it
 - ``faust``: ``tr_reg_NNN.landmarks.npy`` (5000,) vertex ids; all ordered pairs, of one subject or of two. Ten
   consecutive numbers are one subject.
 
+``scape-pcn`` is ``scape`` as the paper's *PC+N*: the matcher gets the vertices alone, with Gaussian noise of 1 % of
+the bounding box's diagonal; errors are measured on the mesh that they come from.
+
 Several landmarks may share a vertex where a mesh is coarser than the landmarks. All of them count.
 """
 
@@ -27,6 +30,8 @@ from meshmatch.shapes.shape import Shape
 
 Pair = tuple[str, str]
 SET_NAMES = ("shrec19", "scape", "faust")
+CLOUD_SET = "scape-pcn"
+NOISE = 0.01  # of the bounding box's diagonal, along each axis
 
 
 @dataclass(frozen=True)
@@ -46,9 +51,17 @@ class BenchSet:
         """The shape as its file has it: every vertex, in the file's order."""
         return load_shape(self.path(shape))
 
+    def seen(self, shape: str) -> Shape:
+        """What the matcher gets of it: the same, or for ``scape-pcn`` its vertices with noise, seeded by its place."""
+        whole = self.shape(shape)
+        if self.name != CLOUD_SET:
+            return whole
+        noise = np.random.default_rng(self.shapes.index(shape)).standard_normal(whole.verts.shape)
+        return Shape(whole.verts + NOISE * whole.diagonal * noise, np.empty((0, 3), np.int64), whole.name)
+
     def landmarks(self, shape: str) -> NDArray[np.int64]:
         """Vertex id of every landmark ``(N,)``; N is the same for every shape of a set."""
-        return _landmarks(self.path(shape), self.name == "scape")
+        return _landmarks(self.path(shape), self.folder.name == "scape")
 
     def group(self, pair: Pair) -> str:
         """What kind of pair this is within its set; empty where there is only one kind."""
@@ -67,9 +80,10 @@ def load_set(name: str, data: Path) -> BenchSet:
     InputError
         The folder lacks the set, or a file that the pairs name.
     """
-    if name not in SET_NAMES:
-        raise OptionError(f"there is no set '{name}'", f"choose from {', '.join(SET_NAMES)}")
-    folder = Path(data) / name
+    known = (*SET_NAMES, CLOUD_SET)
+    if name not in known:
+        raise OptionError(f"there is no set '{name}'", f"choose from {', '.join(known)}")
+    folder = Path(data) / ("scape" if name == CLOUD_SET else name)
     shapes = tuple(sorted((path.stem for path in folder.glob("*.ply")), key=_by_number))
     if not shapes:
         raise InputError(

@@ -245,3 +245,19 @@ def test_a_real_pair(bench: Path, tmp_path: Path) -> None:
     assert good.joined.mean_cm < 1.0  # not 0: several landmarks share a vertex of the source
     assert good.joined.median == 0
     assert 70 < bad.joined.mean_cm < 110
+
+
+def test_the_noisy_cloud_set_is_scape_without_faces_and_with_noise(tmp_path: Path) -> None:
+    data = build(tmp_path)
+    clean, noisy = load_set("scape", data), load_set("scape-pcn", data)
+    assert (noisy.shapes, noisy.pairs) == (clean.shapes, clean.pairs)
+    for name in noisy.shapes:
+        mesh, cloud = noisy.shape(name), noisy.seen(name)
+        assert not mesh.is_cloud and cloud.is_cloud
+        assert mesh.hash == clean.shape(name).hash == clean.seen(name).hash
+        moved = (cloud.verts - mesh.verts) / mesh.diagonal
+        assert 0.008 < moved.std() < 0.012
+        assert noisy.seen(name).hash == cloud.hash
+        assert np.array_equal(noisy.landmarks(name), clean.landmarks(name))
+    first, second = (noisy.seen(name).verts - noisy.shape(name).verts for name in noisy.shapes)
+    assert not np.allclose(first * 2, second)
