@@ -28,6 +28,9 @@ def read_npy(path: Path) -> NDArray[Any]:
     InputError
         The file is damaged, or holds objects.
     """
+    with path.open("rb") as file:
+        if file.read(2) not in (b"\x93N", b"PK"):  # numpy takes anything else for a pickle
+            raise InputError(f"{path.name} is no npy file", "does the suffix fit the content?")
     try:
         # mapped, not loaded: a header that promises more than the file holds allocates nothing
         array = np.load(path, mmap_mode="r", allow_pickle=False)

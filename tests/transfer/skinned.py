@@ -1,0 +1,70 @@
+"""A small glb with a skin, written by hand."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def write_skinned_glb(path: Path, wide: bool = False) -> None:
+    """A sword of one triangle on the knee, a body of two triangles on knee and hip, a stone on nothing.
+
+    Vertices as the scene lists them: 0 to 2 the sword; 3 and 4 on the knee, 5 on both halves, 6 on the hip;
+    7 to 9 the stone. With ``wide`` vertex 3 has eight places for joints, and the hip in the fifth of them.
+    """
+    body = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "<f4")
+    joints = np.array([[0, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 0], [1, 0, 0, 0]], "<u2")
+    weights = np.array([[1, 0, 0, 0], [1, 0, 0, 0], [0.5, 0.5, 0, 0], [1, 0, 0, 0]], "<f4")
+    if wide:
+        weights[0, 0] = 0.75
+    more_joints, more = np.zeros((4, 4), "u1"), np.zeros((4, 4), "u1")
+    more_joints[0, 0], more[0, 0] = 1, 64  # normalised: 64 / 255
+    arrays = [
+        body,
+        np.array([0, 1, 2, 1, 3, 2], "<u2"),
+        joints,
+        weights,
+        np.array([[5, 0, 0], [6, 0, 0], [5, 1, 0]], "<f4"),
+        more_joints,
+        more,
+    ]
+    kinds = {"float32": 5126, "uint16": 5123, "uint8": 5121}
+    accessors: list[dict[str, Any]] = []
+    views, data = [], b""
+    for k, array in enumerate(arrays):
+        kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
+        accessors.append(
+            {"bufferView": k, "count": len(array), "componentType": kinds[array.dtype.name], "type": kind}
+        )
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
+        data += array.tobytes() + b"\0" * (-array.nbytes % 4)
+    accessors[6]["normalized"] = True
+    attributes = {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}
+    if wide:
+        attributes |= {"JOINTS_1": 5, "WEIGHTS_1": 6}
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0, 3, 5]}],
+        "nodes": [
+            {"name": "hip", "children": [1]},
+            {"name": "knee", "children": [2]},
+            {"name": "holder", "children": [4]},
+            {"name": "body", "mesh": 0, "skin": 0},
+            {"name": "sword", "mesh": 1},
+            {"name": "stone", "mesh": 1},
+        ],
+        "meshes": [
+            {"primitives": [{"attributes": attributes, "indices": 1}]},
+            {"primitives": [{"attributes": {"POSITION": 4}}]},
+        ],
+        "skins": [{"joints": [1, 0]}],  # the skin counts its joints in its own order: 0 is the knee
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(data)}],
+    }
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = b"glTF" + np.array([2, 28 + len(text) + len(data), len(text)], "<u4").tobytes() + b"JSON"
+    path.write_bytes(head + text + np.array([len(data)], "<u4").tobytes() + b"BIN\0" + data)

@@ -1,0 +1,162 @@
+"""Numbers of vertices, and vertex colours: written and read, and what files get wrong."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer import colors
+from meshmatch.transfer.value_files import Values, load_values, parse_blank, save_values
+from tests.conftest import icosphere
+
+SHAPE = icosphere(1)
+NUMBERS = np.random.default_rng(0).normal(size=(SHAPE.V, 3)) * 10.0 ** np.arange(-20, 40, 20)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".csv", ".NPY"])
+@pytest.mark.parametrize("columns", [0, 1, 3])
+def test_write_then_read(tmp_path: Path, suffix: str, columns: int) -> None:
+    given = NUMBERS[:, 0].copy() if columns == 0 else NUMBERS[:, :columns].copy()
+    given[7] = np.nan
+    save_values(tmp_path / f"v{suffix}", Values(given), SHAPE)
+    found = load_values(tmp_path / f"v{suffix}", SHAPE)
+    if columns == 1 and suffix == ".csv":
+        given = given[:, 0]  # a single column is a list
+    assert np.array_equal(found.numbers, given, equal_nan=True)
+
+
+def test_names_of_columns_stay(tmp_path: Path) -> None:
+    (tmp_path / "v.csv").write_text("\ufeffheat, loss in %\n" + "1,2\n" * SHAPE.V, encoding="utf-8")
+    found = load_values(tmp_path / "v.csv", SHAPE)
+    assert found.names == ("heat", "loss in %")
+    save_values(tmp_path / "w.csv", found, SHAPE)
+    assert (tmp_path / "w.csv").read_text().splitlines()[:2] == ["vertex,heat,loss in %", "0,1.0,2.0"]
+    assert load_values(tmp_path / "w.csv", SHAPE).names == found.names
+
+
+def test_a_ply_has_a_property_for_each_number(tmp_path: Path) -> None:
+    import trimesh
+
+    save_values(tmp_path / "v.ply", Values(NUMBERS, ("heat", "x", "loss in %")), SHAPE)
+    data = trimesh.load(tmp_path / "v.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
+    for k, name in enumerate(("heat", "x_", "loss_in__")):
+        assert np.array_equal(np.ravel(data[name]), NUMBERS[:, k])
+    assert np.array_equal(load_shape(tmp_path / "v.ply").verts, SHAPE.verts)
+
+
+def rows(count: int, row: str = "1,2\n") -> Callable[[Path], object]:
+    return lambda path: path.write_text(row * count)
+
+
+BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "not there": ("a.npy", lambda path: None, "there is no file"),
+    "empty": ("a.csv", lambda path: path.touch(), "is empty"),
+    "nothing but lines": ("a.csv", rows(9, "\n"), "is empty"),
+    "too few": ("a.csv", rows(41), "41 rows, but sphere1 has 42 vertices"),
+    "too many": ("a.npy", lambda path: np.save(path, np.ones((43, 2))), "43 rows"),
+    "no columns": ("a.npy", lambda path: np.save(path, np.ones((42, 0))), "no columns"),
+    "a cube": ("a.npy", lambda path: np.save(path, np.ones((42, 2, 2))), r"array of \(42, 2, 2\)"),
+    "words": ("a.npy", lambda path: np.save(path, np.array(["a"] * 42)), "not numbers"),
+    "ragged": ("a.csv", lambda path: path.write_text("1,2\n" * 41 + "1\n"), "rows of 1 and of 2"),
+    "a word": ("a.csv", lambda path: path.write_text("1\n" * 41 + "many\n"), "many"),
+    "unsorted": (
+        "a.csv",
+        lambda path: path.write_text("vertex,v\n" + "".join(f"{41 - k},1\n" for k in range(42))),
+        "in order",
+    ),
+    "not text": ("a.csv", lambda path: path.write_bytes(b"\xff\xfe\x00"), "not a csv"),
+    "damaged": ("a.npy", lambda path: path.write_bytes(b"nonsense"), "is no npy file"),
+    "a suffix": ("a.mat", lambda path: path.write_text("x"), "not read from '.mat'"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_values_are_told_in_words(tmp_path: Path, case: str) -> None:
+    name, make, words = BAD[case]
+    make(tmp_path / name)
+    with pytest.raises(InputError, match=words):
+        load_values(tmp_path / name, SHAPE)
+
+
+def test_an_archive_called_npy_is_no_array(tmp_path: Path) -> None:
+    with (tmp_path / "a.npy").open("wb") as file:
+        np.savez(file, a=np.ones(42))
+    with pytest.raises(InputError, match="several arrays"):
+        load_values(tmp_path / "a.npy", SHAPE)
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "expected"),
+    [
+        ("nan", 2, [np.nan, np.nan]),
+        ("0.5", 4, [0.5] * 4),
+        ("1,0,0", 3, [1, 0, 0]),
+        ("1 0 0", 4, [1, 0, 0, 1]),
+        ("#ff0080", 3, [1, 0, 128 / 255]),
+        ("#FF0080", 4, [1, 0, 128 / 255, 1]),
+    ],
+)
+def test_what_stands_for_nothing(text: str, columns: int, expected: list[float]) -> None:
+    assert np.allclose(parse_blank(text, columns), expected, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "columns"), [("red", 3), ("#ff00", 3), ("#gg0000", 3), ("1,2", 3), ("", 1), ("#ff0000", 1)]
+)
+def test_what_cannot_stand_for_nothing(text: str, columns: int) -> None:
+    with pytest.raises(OptionError, match="needed"):
+        parse_blank(text, columns)
+
+
+@pytest.mark.parametrize("name", ["v.obj", "v"])
+def test_values_have_their_suffixes(tmp_path: Path, name: str) -> None:
+    with pytest.raises(OptionError, match="values cannot be kept"):
+        save_values(tmp_path / name, Values(NUMBERS), SHAPE)
+
+
+def painted() -> Shape:
+    shade = np.random.default_rng(1).integers(0, 256, (SHAPE.V, 4)) / 255
+    return Shape(SHAPE.verts, SHAPE.faces, "painted", shade)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".npy", ".csv"])
+def test_colours_are_written_as_they_were(tmp_path: Path, suffix: str) -> None:
+    shape = painted()
+    amounts = colors.of_file(Path("a.ply"), shape).numbers
+    path = tmp_path / f"c{suffix}"
+    colors.save(path, shape, amounts)
+    assert shape.colors is not None
+    table = suffix in (".npy", ".csv")
+    found = load_values(path, shape).numbers if table else load_shape(path).colors
+    assert found is not None
+    channels = 3 if suffix == ".obj" else 4
+    assert np.abs(found[:, :channels] - shape.colors[:, :channels]).max() < 1e-9
+
+
+def test_gltf_holds_light_and_the_others_colours(tmp_path: Path) -> None:
+    """Middle grey on a screen, 188 of 255, is half the light of white."""
+    grey = np.full((SHAPE.V, 4), 0.5)
+    grey[:, 3] = 1
+    colors.save(tmp_path / "c.glb", SHAPE, grey)
+    colors.save(tmp_path / "c.ply", SHAPE, grey)
+    assert np.allclose(load_shape(tmp_path / "c.glb").colors, grey)
+    assert np.allclose(load_shape(tmp_path / "c.ply").colors[:, :3], 188 / 255)
+    for name in ("c.glb", "c.ply"):
+        again = colors.of_file(tmp_path / name, load_shape(tmp_path / name)).numbers
+        assert np.abs(again - grey).max() < 0.005
+
+
+def test_no_colours_is_told_with_what_to_do(tmp_path: Path) -> None:
+    save_shape(tmp_path / "a.ply", SHAPE)
+    with pytest.raises(InputError, match=r"a\.ply has no vertex colours") as told:
+        colors.of_file(tmp_path / "a.ply", load_shape(tmp_path / "a.ply"))
+    assert "--values" in told.value.hint
+
+
+def test_colours_have_their_suffixes(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"c\.stl: vertex colours cannot be kept"):
+        colors.save(tmp_path / "c.stl", SHAPE, np.ones((SHAPE.V, 4)))
