@@ -35,8 +35,8 @@ _SMALLEST = 1e-3  # a stretch below it is taken for it: a logarithm must stay fi
 class AgreeConfig:
     """Steps, weight of the common stretch, robust scale (units of sqrt(area)), share of the pull along the surface."""
 
-    steps: int = 4
-    strain: float = 0.0005
+    steps: int = 6
+    strain: float = 0.0004
     scale: float = 0.05
     point_share: float = 0.1
 
