@@ -239,6 +239,11 @@ class Trainer:
         names, values = zip(*self.model.named_parameters(), strict=True)
         torch._foreach_lerp_([self.average[n] for n in names], [v.detach() for v in values], 1 - keep)
 
+    def close(self) -> None:
+        """Part from the other processes, if there are any; nothing more can be trained."""
+        if self.world > 1 and dist.is_initialized():
+            dist.destroy_process_group()
+
     def averaged_state(self) -> dict[str, torch.Tensor]:
         """State dict of the model with the averaged weights, on the CPU."""
         state = {n: t.detach().cpu().clone() for n, t in self.model.state_dict().items()}

@@ -178,6 +178,7 @@ def train_model(
         return validation_error(model, held_out, points)
 
     trainer.run(dataset, checkpoint, progress, validate)
+    trainer.close()
     if trainer.rank == 0:
         score = validation_error(_averaged(trainer), held_out, points)
         export(trainer, template, output, recipe, name, category, data, licence, score, start=start)
