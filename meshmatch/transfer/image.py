@@ -231,14 +231,14 @@ def on_vertex(found: VertexMap) -> NDArray[np.bool_]:
 
 
 def _edge_lengths(shape: Shape) -> Floats:
-    """(V,) twice the mean length of the edges at each vertex; of a cloud, of the gaps between its points."""
+    """(V,) mean length of the edges at each vertex; of a cloud, of the gaps between its points."""
     if shape.is_cloud:
-        return 2.0 * np.sqrt(shape.vertex_areas)
+        return np.sqrt(shape.vertex_areas)
     edges = edges_of(shape.faces).vertices
     length = np.linalg.norm(shape.verts[edges[:, 0]] - shape.verts[edges[:, 1]], axis=1)
     ends = edges.T.ravel()
     total = np.bincount(ends, np.tile(length, 2), shape.V)
-    return 2.0 * total / np.maximum(np.bincount(ends, minlength=shape.V), 1)
+    return total / np.maximum(np.bincount(ends, minlength=shape.V), 1)
 
 
 def _normals_at(found: VertexMap, target: Shape) -> Floats:

@@ -123,17 +123,20 @@ def slabs(gap: float) -> Shape:
     return Shape(verts, np.concatenate([up, up[:, ::-1] + n * n]), "slabs")
 
 
+def shell(splits: int) -> Shape:
+    """Two concentric spheres that face away from each other, a fiftieth of the radius apart."""
+    ball = icosphere(splits)
+    verts = np.concatenate([ball.verts, 0.98 * ball.verts])
+    return Shape(verts, np.concatenate([ball.faces, ball.faces[:, ::-1] + ball.V]), f"shell{splits}")
+
+
 def test_the_sheet_that_faces_the_same_way_wins() -> None:
-    """The map is off by more than the gap between two sheets: distance alone would choose the wrong one."""
-    shape = slabs(0.02)
-    half = shape.V // 2
-    lifted = Shape(shape.verts + np.repeat([[0, 0, -0.018], [0, 0, 0.018]], half, axis=0), shape.faces, "t")
-    face = np.zeros(shape.V, np.int64)
-    face[shape.faces.ravel()] = np.repeat(np.arange(shape.F), 3)
-    weights = (shape.faces[face] == np.arange(shape.V)[:, None]).astype(float)
-    drawn = VertexMap.between(shape, lifted, np.arange(shape.V), face=face, barycentric=weights)
-    back = pull_back(drawn, shape, lifted)
-    assert ((back.index < half) == (np.arange(shape.V) < half)).all()
+    """Faces of a coarse source cut through both sheets: distance alone would choose the wrong one."""
+    source, target = shell(1), shell(3)
+    few, many = source.V // 2, target.V // 2
+    index = np.concatenate([np.arange(few), many + np.arange(few)])  # a finer sphere begins with the coarser
+    back = pull_back(VertexMap.between(source, target, index), source, target)
+    assert ((back.index < few) == (np.arange(target.V) < many)).all()
 
 
 def test_small_pieces_on_the_wrong_sheet_ask_their_neighbours() -> None:

@@ -97,6 +97,17 @@ def test_whole_maps_are_not_torn_whatever_the_units(size: float) -> None:
     assert not torn_faces(rounded, fine, coarse, rounded.points(coarse), float(np.sqrt(coarse.area))).any()
 
 
+def test_rounding_to_a_coarse_target_tears_nothing(sphere: Shape) -> None:
+    """Each edge becomes a point, or an edge of the target several times as long."""
+    coarse = icosphere(0)
+    index = np.linalg.norm(sphere.verts[:, None] - coarse.verts, axis=2).argmin(axis=1)
+    found = VertexMap.between(sphere, coarse, index)
+    points = found.points(coarse)
+    longest = np.linalg.norm(points[sphere.faces] - points[sphere.faces[:, [1, 2, 0]]], axis=2).max()
+    assert longest > 5 * np.linalg.norm(np.diff(sphere.verts[sphere.faces[0, :2]], axis=0))
+    assert not torn_faces(found, sphere, coarse, points, float(np.sqrt(coarse.area))).any()
+
+
 def test_a_cloud_has_no_faces_to_tear(sphere: Shape) -> None:
     points = Shape(sphere.verts, np.empty((0, 3), int))
     found = VertexMap.identity(points)
