@@ -1,5 +1,6 @@
 """Pictures, looked at by their pixels."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +8,14 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import OptionError, OutputError
-from meshmatch.render import Panel, position_colors, render_shapes
+from meshmatch.render import Look, Panel, position_colors, render_shapes
+from meshmatch.render import picture as module
 from meshmatch.render.colors import to_linear, to_srgb
-from meshmatch.render.picture import facing
+from meshmatch.render.layout import HEIGHT
+from meshmatch.render.scales import Scale, label_colors, label_swatches
 from meshmatch.shapes import Shape
 
-SMALL = {"size": (96, 96), "turn": 0.0, "tilt": 0.0}
+SMALL = Look(size=(96, 96), up="y", front="z", turn=0.0, tilt=0.0)
 RED, GREEN, BLUE = np.eye(3)
 
 
@@ -42,13 +45,15 @@ def something(picture: np.ndarray) -> np.ndarray:
     return np.asarray((picture < 250).any(axis=2))
 
 
-def draw(tmp_path: Path, *panels: object, **rest: object) -> np.ndarray:
+def draw(tmp_path: Path, *panels: object, look: Look = SMALL, labels: list[str] | None = None) -> np.ndarray:
     path = tmp_path / "picture.png"
-    render_shapes(list(panels), path, **{**SMALL, **rest})  # type: ignore[arg-type]
-    return pixels(path)
+    size = render_shapes(list(panels), path, look, labels=labels)  # type: ignore[arg-type]
+    picture = pixels(path)
+    assert picture.shape == (size[1], size[0], 3)
+    return picture
 
 
-def test_a_shape_fills_its_panel_and_nothing_else(tmp_path: Path) -> None:
+def test_a_shape_fills_its_picture_and_nothing_else(tmp_path: Path) -> None:
     for unit in (1e-3, 1.0, 1e5):
         seen = something(draw(tmp_path, (box((0.5 * unit, unit, 0.2 * unit), (9e3 * unit, 0, 0)), None)))
         rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
@@ -60,17 +65,30 @@ def test_a_shape_fills_its_panel_and_nothing_else(tmp_path: Path) -> None:
 
 
 def test_a_wide_shape_is_limited_by_the_width(tmp_path: Path) -> None:
-    seen = something(draw(tmp_path, (box((3, 1, 1)), None), up="y", size=(120, 60)))
-    columns = np.flatnonzero(seen.any(axis=0))
-    assert columns[0] == pytest.approx(5, abs=1)
-    assert columns[-1] == pytest.approx(114, abs=1)
+    seen = something(draw(tmp_path, (box((3, 1, 1)), None), look=replace(SMALL, size=(120, 60))))
+    columns, rows = np.flatnonzero(seen.any(axis=0)), np.flatnonzero(seen.any(axis=1))
+    assert columns[0] == pytest.approx(3, abs=1)
+    assert columns[-1] == pytest.approx(116, abs=1)
+    assert rows.mean() == pytest.approx(29.5, abs=1)
+
+
+def test_without_a_size_the_picture_takes_the_room_that_the_shapes_need(tmp_path: Path) -> None:
+    bare = replace(SMALL, size=None)
+    narrow = draw(tmp_path, (box((0.1, 1, 0.1)), None), look=bare).shape
+    wide = draw(tmp_path, (box((1.5, 1, 0.1)), None), look=bare).shape
+    very_wide = draw(tmp_path, (box((9, 1, 0.1)), None), look=bare).shape
+    assert narrow[0] == wide[0] == HEIGHT
+    assert narrow[1] < 0.7 * HEIGHT
+    assert wide[1] == pytest.approx(1.5 * 0.91 * HEIGHT + 0.09 * HEIGHT, abs=3)
+    assert very_wide[1] == 2000
+    assert very_wide[0] < 0.5 * HEIGHT
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z", "+z", "Z"])
 def test_up_is_up(tmp_path: Path, up: str) -> None:
     axis = "xyz".index(up[-1].lower())
     shape = box((1.0, 1.1, 1.2))
-    picture = draw(tmp_path, (shape, ends(shape, axis)), up=up)
+    picture = draw(tmp_path, (shape, ends(shape, axis)), look=replace(SMALL, up=up, front=None))
     above, below = picture[20, 48], picture[76, 48]
     if up.startswith("-"):
         above, below = below, above
@@ -83,40 +101,29 @@ def test_front_is_to_the_viewer_and_left_stays_left(tmp_path: Path, front: str) 
     shape = box((1.0, 1.0, 1.0))
     axis, sign = "xyz".index(front[-1]), -1 if front.startswith("-") else 1
     near = (shape.verts[:, axis] * sign > 0)[:, None]
-    picture = draw(tmp_path, (shape, np.where(near, RED, BLUE)), up="y", front=front)
+    look = replace(SMALL, front=front)
+    picture = draw(tmp_path, (shape, np.where(near, RED, BLUE)), look=look)
     assert picture[48, 48, 0] > picture[48, 48, 2] + 60
-    rotation = facing(shape, "y", front)
-    assert np.linalg.det(rotation) == pytest.approx(1)  # no mirror
-    right = (shape.verts @ rotation[0] > 0)[:, None]
-    picture = draw(tmp_path, (shape, np.where(right, RED, BLUE)), up="y", front=front)
+    side = np.cross([0, 1, 0], np.eye(3)[axis] * sign)
+    right = (shape.verts @ side > 0)[:, None]
+    picture = draw(tmp_path, (shape, np.where(right, RED, BLUE)), look=look)
     assert picture[48, 70, 0] > picture[48, 70, 2] + 60
     assert picture[48, 25, 2] > picture[48, 25, 0] + 60
-
-
-def test_up_and_front_are_guessed_from_the_extents(tmp_path: Path) -> None:
-    assert np.array_equal(facing(box((0.5, 0.3, 1.8))), [[-1, 0, 0], [0, 0, 1], [0, 1, 0]])
-    assert facing(box((1, 1, 1)))[1].tolist() == [0, 1, 0]
-    assert facing(box((1.8, 0.5, 0.3)))[1].tolist() == [1, 0, 0]
-    assert facing(box((1, 2, 3)), front="z")[1].tolist() == [0, 1, 0]
-    # Turned, the picture of a lying and a standing body is the same.
-    standing, lying = box((0.5, 1.8, 0.3)), box((1.8, 0.3, 0.5))
-    one, other = (something(draw(tmp_path, (shape, None))) for shape in (standing, lying))
-    assert np.array_equal(one, other)
 
 
 def test_a_rotation_of_the_panel_comes_first(tmp_path: Path) -> None:
     shape = box((1, 1.2, 1))
     upside_down = np.diag([1.0, -1.0, -1.0])
-    picture = draw(tmp_path, Panel(shape, ends(shape, 1), rotation=upside_down), up="y")
+    picture = draw(tmp_path, Panel(shape, ends(shape, 1), rotation=upside_down))
     assert picture[20, 48, 2] > picture[20, 48, 0] + 60
 
 
 def test_turn_and_tilt(tmp_path: Path) -> None:
     shape = box((1, 1, 1))
-    picture = draw(tmp_path, (shape, ends(shape, 1)), up="y", front="z", tilt=80.0)
+    picture = draw(tmp_path, (shape, ends(shape, 1)), look=replace(SMALL, tilt=80.0))
     assert picture[48, 48, 0] > 2 * picture[48, 48, 2]  # from above, the lid
     left = np.where((shape.verts[:, 0] < 0)[:, None], RED, BLUE)  # x to the viewer's right
-    picture = draw(tmp_path, (shape, left), up="y", front="z", turn=89.0)
+    picture = draw(tmp_path, (shape, left), look=replace(SMALL, turn=89.0))
     assert picture[48, 48, 0] > 2 * picture[48, 48, 2]  # turned to its own left it shows its right side
 
 
@@ -124,70 +131,83 @@ def test_what_is_nearer_hides_what_is_behind(tmp_path: Path) -> None:
     a, b = box((1, 1, 0.1), (0, 0, 1)), box((2, 2, 0.1), (0, 0, 0))
     both = Shape(np.concatenate([a.verts, b.verts]), np.concatenate([a.faces, b.faces + 8]))
     colors = np.repeat([RED, BLUE], 8, axis=0)
-    picture = draw(tmp_path, (both, colors), up="y", front="z")
+    picture = draw(tmp_path, (both, colors))
     assert picture[48, 48, 0] > 100 > picture[48, 48, 2]
     assert picture[10, 85, 2] > 100 > picture[10, 85, 0]
-    picture = draw(tmp_path, (both, colors), up="y", front="-z")
+    picture = draw(tmp_path, (both, colors), look=replace(SMALL, front="-z"))
     assert picture[48, 48, 2] > 100 > picture[48, 48, 0]
 
 
 def test_colors_are_interpolated_and_alpha_ignored(tmp_path: Path) -> None:
     shape = box((1, 1, 1))
     colors = np.where((shape.verts[:, 1] > 0)[:, None], [0.9, 0.9, 0.9], [0.1, 0.1, 0.1])
-    picture = draw(tmp_path, (shape, colors), up="y", front="z")
+    picture = draw(tmp_path, (shape, colors))
     column = picture[10:86, 48, 0]
     assert (np.diff(column) <= 2).all()
     assert column[0] - column[-1] > 100
     rgba = np.concatenate([colors, np.zeros((8, 1))], axis=1)
-    assert np.array_equal(draw(tmp_path, (shape, rgba), up="y", front="z"), picture)
-    assert np.array_equal(
-        draw(tmp_path, (Shape(shape.verts, shape.faces, "", rgba), None), up="y", front="z"), picture
-    )
+    assert np.array_equal(draw(tmp_path, (shape, rgba)), picture)
+    assert np.array_equal(draw(tmp_path, (Shape(shape.verts, shape.faces, "", rgba), None)), picture)
 
 
-def test_edges_are_antialiased(tmp_path: Path) -> None:
-    triangle = Shape(np.array([[0, 0, 0], [1, 0, 0], [0.3, 1.5, 0]]), np.array([[0, 1, 2]]))
-    inside = draw(tmp_path, (triangle, None), front="z", samples=1)
-    soft = draw(tmp_path, (triangle, None), front="z", samples=3)
-    body = int(np.median(soft[something(soft)][:, 0]))
-    between = [((p[:, :, 0] > body + 15) & (p[:, :, 0] < 240)).sum() for p in (inside, soft)]
-    assert between[0] == 0
-    assert between[1] > 60
+def test_sharp_colors_are_not_mixed(tmp_path: Path) -> None:
+    shape = box((1, 1, 1))
+    picture = draw(tmp_path, Panel(shape, ends(shape, 1), sharp=True))[8:88, 10:86]
+    between = (picture[..., 0] > 60) & (picture[..., 2] > 60)
+    assert between.mean() < 0.05  # the pixels of the border alone
+    assert draw(tmp_path, Panel(shape, ends(shape, 1)))[48, 48, [0, 2]].min() > 60
 
 
-def test_a_hollow_is_darker_than_a_hill(tmp_path: Path) -> None:
-    y, x = np.mgrid[-1:1:41j, -1:1:41j]
-    faces = []
-    for r in range(40):
-        for c in range(40):
-            k = r * 41 + c
-            faces += [[k, k + 1, k + 42], [k, k + 42, k + 41]]
-    centre = []
-    for sign in (1, -1):
-        z = sign * 0.9 * np.exp(-12 * (x**2 + y**2))
-        sheet = Shape(np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1), np.array(faces))
-        centre.append(draw(tmp_path, (sheet, None), up="y", front="z")[46:51, 46:51].mean())
-    assert centre[0] - centre[1] > 20
+def test_faces_have_colors_of_their_own(tmp_path: Path) -> None:
+    shape = box((1, 1, 1))
+    colors = np.where(np.arange(12)[:, None] == 10, RED, BLUE)
+    picture = draw(tmp_path, Panel(shape, face_colors=colors))
+    red = picture[..., 0] > picture[..., 2] + 40
+    assert red.sum() == pytest.approx(88 * 88 / 2, rel=0.05)  # one of the two triangles in front
+
+
+def test_a_square_seen_from_the_front_has_one_color(tmp_path: Path) -> None:
+    square = Shape(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    picture = draw(tmp_path, (square, np.tile([0.8, 0.4, 0.2], (4, 1))))
+    inside = picture[6:90, 6:90].reshape(-1, 3)
+    assert (np.ptp(inside, axis=0) <= 1).all()  # no noise, no slope
+    light = to_linear(inside[0] / 255)
+    assert light / light[0] == pytest.approx(to_linear(np.array([0.8, 0.4, 0.2])) / to_linear(0.8), abs=0.04)
+    assert 0.6 < light[0] / to_linear(0.8) < 1.2  # about as light as it is
+
+
+def test_a_large_cloud_is_thinned_not_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(0).random((1_500, 3))
+    cloud = Shape(points[np.argsort(points[:, 1])], np.zeros((0, 3), int))
+    monkeypatch.setattr("meshmatch.render.figures.MOST_POINTS", 400)
+    seen = something(draw(tmp_path, (cloud, None)))
+    assert all(seen[rows, 10:86].mean() > 0.3 for rows in (slice(10, 30), slice(30, 60), slice(60, 86)))
 
 
 def test_a_cloud_and_points_are_balls(tmp_path: Path) -> None:
     cloud = Shape(box((1, 1, 0.5)).verts, np.zeros((0, 3), int), "dots")
-    seen = something(draw(tmp_path, (cloud, np.tile(GREEN, (8, 1))), up="y", front="z"))
+    seen = something(draw(tmp_path, (cloud, np.tile(GREEN, (8, 1)))))
     assert 4 * 4 < seen.sum() < 4 * 60
     shape = box((1, 1, 1))
     panel = Panel(shape, np.tile(BLUE, (8, 1)), points=[[0, 0, 0.5]], point_colors=[RED], point_radius=0.2)
-    picture = draw(tmp_path, panel, up="y", front="z")
+    picture = draw(tmp_path, panel)
     red = picture[:, :, 0] > picture[:, :, 2] + 40
-    assert red.sum() == pytest.approx(np.pi * (0.2 * 88) ** 2, rel=0.12)
+    assert red.sum() == pytest.approx(np.pi * (0.2 * 88) ** 2, rel=0.08)
     assert np.argwhere(red).mean(axis=0) == pytest.approx([47.5, 47.5], abs=1)
 
 
-def test_a_large_cloud_is_thinned_not_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("meshmatch.render.picture._MOST_BALLS", 400)
-    points = np.random.default_rng(0).random((1_500, 3))
-    cloud = Shape(points[np.argsort(points[:, 1])], np.zeros((0, 3), int))
-    seen = something(draw(tmp_path, (cloud, None), up="y", front="z"))
-    assert all(seen[rows, 10:86].mean() > 0.3 for rows in (slice(10, 30), slice(30, 60), slice(60, 86)))
+def test_a_dense_cloud_is_a_closed_surface(tmp_path: Path, sphere: Shape) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(14_000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    left = np.where(points[:, :1] < 0, RED, BLUE)
+    picture = draw(tmp_path, (Shape(points, np.zeros((0, 3), int)), left))
+    y, x = np.mgrid[:96, :96] - 47.5
+    disc = np.hypot(x, y) < 0.9 * 43
+    assert something(picture)[disc].all()
+    assert (picture[disc & (x < -4)][:, 0] > picture[disc & (x < -4)][:, 2]).all()
+    assert (picture[disc & (x > 4)][:, 2] > picture[disc & (x > 4)][:, 0]).all()
+    assert picture[disc].max(axis=1).min() > 40  # no disc is seen from its dark side
 
 
 def test_a_vertex_without_a_position_is_not_drawn(tmp_path: Path) -> None:
@@ -195,37 +215,154 @@ def test_a_vertex_without_a_position_is_not_drawn(tmp_path: Path) -> None:
     verts = np.concatenate([shape.verts, [[50.0, 0, 0]]])
     faces = np.concatenate([shape.faces, [[0, 1, 8]]])
     broken = Shape(verts, faces, invalid=np.arange(9) == 8)
+    whole = draw(tmp_path, (shape, None))
+    assert np.array_equal(something(draw(tmp_path, (broken, None))), something(whole))
+    colors = np.tile(RED, (12, 1))
     assert np.array_equal(
-        something(draw(tmp_path, (broken, None), up="y", front="z")),
-        something(draw(tmp_path, (shape, None), up="y", front="z")),
+        draw(tmp_path, Panel(broken, face_colors=[*colors, BLUE])),
+        draw(tmp_path, Panel(shape, face_colors=colors)),
     )
     dots = Shape(verts, np.zeros((0, 3), int), invalid=np.arange(9) == 8)
     assert np.array_equal(
-        something(draw(tmp_path, (dots, None), up="y", front="z")),
-        something(draw(tmp_path, (Shape(shape.verts, np.zeros((0, 3), int)), None), up="y", front="z")),
+        something(draw(tmp_path, (dots, None))),
+        something(draw(tmp_path, (Shape(shape.verts, np.zeros((0, 3), int)), None))),
     )
 
 
-def test_panels_stand_side_by_side_with_their_captions(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Shape(np.zeros((1, 3)), np.zeros((0, 3), int), "a point"),
+        Shape(np.zeros((3, 3)), np.array([[0, 1, 2]]), "all at one place"),
+        Shape(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), np.array([[0, 1, 2]]), "a line"),
+        Shape(np.eye(3), np.array([[0, 1, 2]]), "lost", invalid=np.ones(3, bool)),
+    ],
+    ids=lambda shape: shape.name,
+)
+def test_what_has_no_size_is_drawn_all_the_same(tmp_path: Path, shape: Shape) -> None:
+    draw(tmp_path, (shape, None), look=Look(size=(64, 64)))
+
+
+def test_glass_shows_what_is_in_it(tmp_path: Path) -> None:
     shape = box((1, 1, 1))
-    bare = draw(tmp_path, (shape, None), (shape, None), size=(80, 64))
-    assert bare.shape == (64, 160, 3)
-    assert np.array_equal(bare[:, :80], bare[:, 80:])
-    named = draw(tmp_path, (shape, None), Panel(shape, label="hidden"), size=(80, 64), labels=["a", ""])
-    assert named.shape[0] > 64
-    assert np.array_equal(named[:64], bare)
-    strip = something(named[64:])
-    assert strip[:, :80].any()
-    assert not strip[:, 80:].any()
-    long = draw(tmp_path, Panel(shape, label="a caption that is much too long for it"), size=(200, 160))
-    columns = np.flatnonzero(something(long[160:]).any(axis=0))
+    inside = Panel(shape, points=[[0, 0, 0]], point_colors=[RED], point_radius=0.2)
+    solid, glass = (draw(tmp_path, replace(inside, opacity=opacity)) for opacity in (1.0, 0.4))
+    assert abs(solid[48, 48, 0] - solid[48, 48, 2]) < 20
+    assert glass[48, 48, 0] > glass[48, 48, 2] + 30
+    assert something(glass)[10:86, 10:86].all()
+    assert glass[20, 20].min() > solid[20, 20].min()  # the white paper shines through
+
+
+def test_a_shape_laid_over_another_tints_it_where_it_is_in_front(tmp_path: Path) -> None:
+    shape = box((1, 1, 1))
+    bare = draw(tmp_path, (shape, None))
+    outer, inner = box((1, 1, 1.04)), box((1, 1, 0.5))
+    over, under = (draw(tmp_path, Panel(shape, over=other)) for other in (outer, inner))
+    assert (over[48, 48, 2] - over[48, 48, 0]) > (bare[48, 48, 2] - bare[48, 48, 0]) + 30
+    assert np.array_equal(under[10:86, 10:86], bare[10:86, 10:86])
+
+
+def test_shapes_stand_in_a_row_on_one_ground_with_their_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    low, high = box((1, 0.5, 1)), box((1, 1, 1))
+    look = replace(SMALL, size=(240, 100))
+    bare = something(draw(tmp_path, (low, None), (high, None), look=look))
+    halves = [np.argwhere(half) for half in (bare[:, :120], bare[:, 120:])]
+    assert halves[0].max(axis=0)[0] == halves[1].max(axis=0)[0]
+    assert halves[0].min(axis=0)[0] > halves[1].min(axis=0)[0] + 10
+    written: list[tuple[str, float]] = []
+    monkeypatch.setattr(module, "write", lambda image, place, text, *rest: written.append((text, place[0])))
+    draw(tmp_path, (low, None), Panel(high, label="hidden"), look=look, labels=["", "a"])
+    named = something(draw(tmp_path, Panel(low, label="b"), (high, None), look=look))
+    assert [text for text, _ in written] == ["a", "b"]
+    columns = np.flatnonzero(named.any(axis=0))
+    gap = np.flatnonzero(np.diff(columns) > 1)[0]
+    assert written[0][1] == pytest.approx(columns[gap + 1 :].mean(), abs=2)
+    assert written[1][1] == pytest.approx(columns[: gap + 1].mean(), abs=2)
+
+
+def test_names_stay_in_the_picture(tmp_path: Path) -> None:
+    shape = box((1, 1, 1))
+    look = replace(SMALL, size=(200, 200))
+    long = something(draw(tmp_path, Panel(shape, label="a name that is much too long " * 3), look=look))
+    bottom = long[-14:]
+    columns = np.flatnonzero(bottom.any(axis=0))
+    assert len(columns) > 100
     assert columns[0] >= 2
     assert columns[-1] <= 197
 
 
+def test_the_ground_has_a_shadow_beside_the_shape_alone(tmp_path: Path) -> None:
+    look = replace(SMALL, size=(160, 120), tilt=20.0)
+    with_ground = draw(tmp_path, (box((0.4, 1, 0.4)), None), look=look)
+    without = draw(tmp_path, (box((0.4, 1, 0.4)), None), look=replace(look, ground=False))
+    shadow = (with_ground < without - 2).any(axis=2)
+    assert shadow.sum() > 150
+    assert np.median(np.nonzero(shadow)[0]) > 80  # at its feet
+    assert not shadow[:30].any()
+    darker = without.astype(int) - with_ground
+    assert np.ptp(darker[shadow], axis=1).max() <= 8  # grey
+    assert (darker >= -8).all()
+
+
+@pytest.mark.parametrize(
+    ("background", "corner"),
+    [("white", (255, 255, 255)), ("dark", (24, 26, 31)), ("#10A0ff", (16, 160, 255))],
+)
+def test_backgrounds(tmp_path: Path, background: str, corner: tuple[int, int, int]) -> None:
+    shape = box((1, 1, 1))
+    on_white = draw(tmp_path, (shape, None))
+    picture = draw(tmp_path, (shape, None), look=replace(SMALL, background=background))
+    assert tuple(picture[0, 0]) == corner
+    assert np.array_equal(picture[10:86, 10:86], on_white[10:86, 10:86])
+
+
+def test_without_a_background_the_alpha_is_the_coverage(tmp_path: Path) -> None:
+    triangle = Shape(np.array([[0, 0, 0], [1, 0, 0], [0.3, 1.5, 0]]), np.array([[0, 1, 2]]))
+    path = tmp_path / "a.png"
+    render_shapes([(triangle, None)], path, replace(SMALL, background="transparent", ground=False))
+    with Image.open(path) as image:
+        assert image.mode == "RGBA"
+        clear = np.asarray(image, dtype=float)
+    height = 96 * 0.91
+    area = 0.5 * height * height / 1.5
+    assert clear[..., 3].sum() / 255 == pytest.approx(area, rel=4e-3)
+    seen = clear[..., 3] > 100
+    assert np.ptp(clear[seen][:, :3], axis=0).max() <= 3  # not darkened towards the edge
+    assert (clear[clear[..., 3] == 0] == 0).all()
+
+
+def test_letters_are_light_on_dark_paper(tmp_path: Path) -> None:
+    shape = box((1, 1, 1))
+    dark = draw(tmp_path, Panel(shape, label="nnn"), look=replace(SMALL, background="dark"))
+    assert dark[-14:].max() > 180
+    light = draw(tmp_path, Panel(shape, label="nnn"))
+    assert light[-14:].min() < 90
+
+
+def test_a_legend_stands_below(tmp_path: Path) -> None:
+    shape = box((1, 1, 1))
+    labels = label_swatches([0, 1], ["arm", "leg"])
+    for legend in (Scale(0, 1, "error (cm)"), labels):
+        for size in ((200, 220), None):
+            look = replace(SMALL, size=size, legend=legend)
+            picture = draw(tmp_path, (shape, None), look=look)
+            strip = picture[-round(0.06 * len(picture)) - 20 :]
+            saturated = np.ptp(strip, axis=2).max()
+            assert saturated > 60
+    colors = np.round(255 * label_colors([0, 1])).astype(int)
+    assert all((picture == color).all(axis=2).sum() > 40 for color in colors)
+
+
+def test_a_picture_too_small_for_its_legend_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="no room"):
+        draw(tmp_path, (box((1, 1, 1)), None), look=Look(size=(200, 40), legend=Scale(0, 1, "x")))
+
+
 def test_the_same_picture_twice(tmp_path: Path) -> None:
     for name in ("one", "two"):
-        render_shapes([(box((1, 2, 1)), None)], tmp_path / f"{name}.png", size=(64, 64))
+        render_shapes([(box((1, 2, 1)), None)], tmp_path / f"{name}.png", Look(size=(64, 64)))
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
 
 
@@ -236,31 +373,45 @@ def test_refusals(tmp_path: Path) -> None:
         ([(shape, None)], tmp_path / "a.jpg", {}, "PNG"),
         ([], path, {}, "needs a shape"),
         ([(shape, None)], path, {"labels": ["a", "b"]}, "1 labels"),
-        ([(shape, None)], path, {"up": "w"}, "up is no axis"),
-        ([(shape, None)], path, {"front": "up"}, "front is no axis"),
-        ([(shape, None)], path, {"up": "y", "front": "-y"}, "the same axis"),
+        ([(shape, None)], path, {"look": Look(up="w")}, "up is no axis"),
+        ([(shape, None)], path, {"look": Look(front="up")}, "front is no axis"),
+        ([(shape, None)], path, {"look": Look(up="y", front="-y")}, "the same axis"),
         ([(shape, np.ones((7, 3)))], path, {}, r"\(8, 3\)"),
         ([Panel(shape, points=[[0, 0, 0]], point_colors=np.ones((2, 3)))], path, {}, r"\(1, 3\)"),
-        ([(shape, None)], path, {"size": (5, 5)}, "16 x 16"),
-        ([(shape, None)], path, {"samples": 0}, "16 x 16"),
+        ([Panel(shape, face_colors=np.ones((8, 3)))], path, {}, r"\(12, 3\)"),
     ):
         with pytest.raises(OptionError, match=message):
             render_shapes(panels, where, **rest)  # type: ignore[arg-type]
     with pytest.raises(OutputError, match="no folder"):
-        render_shapes([(shape, None)], tmp_path / "deeper" / "a.png", size=(16, 16))
+        render_shapes([(shape, None)], tmp_path / "deeper" / "a.png", Look(size=(16, 16)))
     assert not list(tmp_path.iterdir())
 
 
-def test_position_colors_span_the_extent_and_follow_a_rotation() -> None:
+@pytest.mark.parametrize("size", [(5, 500), (100_000, 20), (8_192, 8_192), (0, 0), (-5, 90)])
+def test_sizes_that_cannot_be(size: tuple[int, int]) -> None:
+    with pytest.raises(OptionError, match="pixels"):
+        Look(size=size)
+
+
+@pytest.mark.parametrize("background", ["blue", "#12345", "#gggggg", "", "0x1234"])
+def test_backgrounds_that_cannot_be(background: str) -> None:
+    with pytest.raises(OptionError, match="no background"):
+        Look(background=background)
+
+
+def test_position_colors_follow_a_rotation_and_tell_places_apart() -> None:
     shape = box((1, 2, 3), (7, 8, 9))
     colors = position_colors(shape)
     assert colors.shape == (8, 3)
     assert colors.min() >= 0
     assert colors.max() <= 1
-    assert np.array_equal(np.unique(colors, axis=0), np.unique(colors[::-1], axis=0))
-    assert len(np.unique(colors, axis=0)) == 8
-    turned = position_colors(shape, np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]]))
-    assert turned == pytest.approx(colors[:, [1, 2, 0]])
+    apart = np.linalg.norm(colors[:, None] - colors[None], axis=2) + np.eye(8)
+    assert apart.min() > 0.03
+    turn = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0.0]])
+    there = Shape(shape.verts @ turn.T, shape.faces)
+    assert position_colors(shape, turn) == pytest.approx(position_colors(there))
+    left = shape.verts[:, 0] > 7
+    assert np.linalg.norm(colors[left] - colors[~left], axis=1).min() > 0.25  # a flip is seen at once
     flat = Shape(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]))
     assert np.isfinite(position_colors(flat)).all()
 

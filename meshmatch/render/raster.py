@@ -1,0 +1,258 @@
+"""From a scene to pixels: one ray for each, and many where that would leave a jagged edge.
+
+Light is asked for once a pixel, spread over neighbours that lie on the same surface, and then shared by all rays of
+the pixel. Work goes on in bands, so that memory does not grow with the picture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.render.light import BLOCK, GROUND_BLOCK, seen_light, shade, shadow
+from meshmatch.render.scene import Floats32, Hits, Scene
+from meshmatch.render.slivers import edge_points, slivers
+from meshmatch.render.window import Window
+
+BAND = 100_000
+"""How many pixels are worked on at once."""
+_HALO = GROUND_BLOCK // 2 + 2  # rows above and below a band that its filter and its edges need
+_CONTRAST = 0.035  # between neighbours, as written, from which an edge is drawn finely
+
+
+def _lattice(count: int, step: int) -> NDArray[np.float64]:
+    """(count, 2) places in a pixel around its middle, one in every row and column: no slope of an edge shows steps."""
+    return (np.stack([np.arange(count), (step * np.arange(count)) % count], axis=1) + 0.5) / count - 0.5
+
+
+_RIM, _INNER = _lattice(16, 7), _lattice(8, 3)  # where an outline runs through a pixel; where colours meet
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """Light (H, W, 3) times alpha, alpha (H, W), and depth (H, W): z of what is seen, -inf where nothing is."""
+
+    light: Floats32
+    alpha: Floats32
+    depth: Floats32
+
+
+def draw(scene: Scene, window: Window) -> Image:
+    """Draw a scene. The same scene gives the same picture, whatever the bands."""
+    H, W = window.height, window.width
+    whole = Image(
+        np.zeros((H, W, 3), np.float32), np.zeros((H, W), np.float32), np.full((H, W), -np.inf, np.float32)
+    )
+    left, top, right, bottom = _inked(scene, window)
+    if left >= right or top >= bottom:
+        return whole
+    part = replace(
+        window,
+        width=right - left,
+        height=bottom - top,
+        left=window.left + left * window.pixel,
+        top=window.top - top * window.pixel,
+    )
+    inner = slice(top, bottom), slice(left, right)
+    inked = Image(whole.light[inner], whole.alpha[inner], whole.depth[inner])
+    edges = edge_points(scene, part)
+    rows = max(1, BAND // part.width)
+    for first in range(0, part.height, rows):
+        _band(scene, part, edges, first, min(part.height, first + rows), (left, top), inked)
+    return whole
+
+
+def _inked(scene: Scene, window: Window) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of the pixels in which anything can be; a pixel of room on each side."""
+    low, high = scene.bounds
+    columns = (np.array([low[0], high[0]]) - window.left) / window.pixel
+    rows = (window.top - np.array([high[1], low[1]])) / window.pixel
+    left, right = np.clip([np.floor(columns[0]) - 1, np.ceil(columns[1]) + 1], 0, window.width).astype(int)
+    top, bottom = np.clip([np.floor(rows[0]) - 1, np.ceil(rows[1]) + 1], 0, window.height).astype(int)
+    return int(left), int(top), int(right), int(bottom)
+
+
+def _band(
+    scene: Scene,
+    window: Window,
+    edges: Floats32,
+    first: int,
+    last: int,
+    corner: tuple[int, int],
+    whole: Image,
+) -> None:
+    """Draw rows of a window whose corner is at a column and row of the picture: blocks are counted from there."""
+    low, high = max(0, first - _HALO), min(window.height, last + _HALO)
+    shape = (high - low, window.width)
+    row, column = np.divmod(np.arange(shape[0] * shape[1]), window.width)
+    row += low
+    hits = scene.look(*window.at(column + 0.5, row + 0.5), window.pixel)
+    met = np.flatnonzero(hits.face != -1)
+    seen = np.ones((len(hits.face), 2), np.float32)
+    seen[met] = seen_light(scene, hits, met, row[met] + corner[1], column[met] + corner[0])
+    for side, which in ((BLOCK, hits.face >= 0), (GROUND_BLOCK, hits.face == -2)):
+        _smooth(seen.reshape(*shape, 2), hits, which.reshape(shape), window.pixel, side)
+    light, alpha = _finished(scene, hits, seen)
+    light, alpha = light.reshape(*shape, 3), alpha.reshape(shape)
+    depth = np.where(hits.face >= 0, hits.place[:, 2], -np.inf).reshape(shape).astype(np.float32)
+    kind = hits.face.reshape(shape) >= 0
+    rim = _differs(kind.astype(np.float32)[..., None], 0.5) | slivers(edges, low, depth, window)
+    inner = (
+        _differs(np.sqrt(np.clip(np.concatenate([light, alpha[..., None]], axis=2), 0, 1)), _CONTRAST) & ~rim
+    )
+    for chosen, places in ((rim, _RIM), (inner, _INNER)):
+        chosen[: first - low] = chosen[last - low :] = False
+        found = np.flatnonzero(chosen)
+        if len(found):
+            fine = _fine(scene, window, hits, seen, shape, low, corner, found, places)
+            light.reshape(-1, 3)[found], alpha.reshape(-1)[found] = fine
+    own = slice(first - low, last - low)
+    whole.light[first:last], whole.alpha[first:last] = light[own], alpha[own]
+    whole.depth[first:last] = depth[own]
+
+
+def _finished(scene: Scene, hits: Hits, seen: Floats32) -> tuple[Floats32, Floats32]:
+    """Light (N, 3) times alpha, and alpha (N,), of all rays."""
+    light = np.zeros((len(hits.face), 3), np.float32)
+    alpha = np.zeros(len(hits.face), np.float32)
+    solid = np.flatnonzero(hits.face >= 0)
+    light[solid] = shade(hits, solid, seen[solid])
+    alpha[solid] = 1.0
+    if scene.opacity < 1:  # glass: clear in the middle, dense at the rim
+        rim = (1 - hits.normal[solid, 2]) ** 2
+        alpha[solid] = scene.opacity + (1 - scene.opacity) * 0.7 * rim
+        light[solid] *= alpha[solid, None]
+    ground = np.flatnonzero(hits.face == -2)
+    alpha[ground] = shadow(seen[ground]) * hits.color[ground, 0]
+    return light, alpha
+
+
+def laid_over(glass: Image, base: Image, reach: float) -> Image:
+    """Glass in front of a picture; where it lies further behind than ``reach`` the base hides it."""
+    with np.errstate(invalid="ignore"):
+        ahead = np.nan_to_num(
+            (glass.depth - base.depth) / np.float32(reach) + 1, nan=1.0, posinf=1.0, neginf=0.0
+        )
+    shown = np.clip(ahead, 0, 1).astype(np.float32)
+    through = 1 - glass.alpha * shown
+    return Image(
+        glass.light * shown[..., None] + base.light * through[..., None],
+        glass.alpha * shown + base.alpha * through,
+        np.maximum(glass.depth, base.depth),
+    )
+
+
+def _smooth(values: Floats32, hits: Hits, which: NDArray[np.bool_], pixel: float, side: int) -> None:
+    """Spread light (H, W, 2) over blocks of pixels of this side, as far as they belong to one surface; in place.
+
+    Only pixels ``which`` (H, W) take part.
+    """
+    if not which.any():
+        return
+    rows, columns = (np.flatnonzero(which.any(axis=axis)) for axis in (1, 0))
+    part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    shape = which.shape
+    place, flat, normal = (a.reshape(*shape, 3)[part] for a in (hits.place, hits.flat, hits.normal))
+    which, found = which[part], values[part]
+    H, W = len(which), which.shape[1]
+    half = side // 2
+    for axis in (0, 1):
+        total, weights = found.copy(), np.ones(which.shape, np.float32)
+        for step in (*range(-half, 0), *range(1, half + 1)):
+            here, there = _shifted(step, axis, (H, W))
+            gap = np.einsum("hwi,hwi->hw", place[there] - place[here], flat[here])
+            turn = np.einsum("hwi,hwi->hw", normal[there], normal[here])
+            weight = np.clip(3.0 - np.abs(gap) / np.float32(pixel), 0, 1) * np.clip(4 * turn - 2.4, 0, 1)
+            # Half at both ends: each residue of a block then weighs the same.
+            weight *= np.float32(0.5 if abs(step) == half else 1.0) * (which[there] & which[here])
+            total[here] += weight[..., None] * found[there]
+            weights[here] += weight
+        found = total / weights[..., None]
+    values[part] = np.where(which[..., None], found, values[part])
+
+
+def _shifted(step: int, axis: int, shape: tuple[int, int]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Two views of an array: each pixel, and the one ``step`` further along the axis."""
+    count = max(0, shape[axis] - abs(step))
+    here = slice(max(0, -step), max(0, -step) + count)
+    there = slice(max(0, step), max(0, step) + count)
+    everything = slice(None)
+    if axis == 0:
+        return (here, everything), (there, everything)
+    return (everything, here), (everything, there)
+
+
+def _differs(values: Floats32, by: float) -> NDArray[np.bool_]:
+    """Pixels (H, W) of values (H, W, C) that differ from a neighbour so much that an edge may run through them."""
+    H, W = values.shape[0], values.shape[1]
+    result = np.zeros((H, W), bool)
+    for axis in (0, 1):
+        here, there = _shifted(1, axis, (H, W))
+        differs = (np.abs(values[there] - values[here]) > by).any(axis=2)
+        result[here] |= differs
+        result[there] |= differs
+    return result
+
+
+def _fine(
+    scene: Scene,
+    window: Window,
+    hits: Hits,
+    seen: Floats32,
+    shape: tuple[int, int],
+    low: int,
+    corner: tuple[int, int],
+    chosen: NDArray[np.int64],
+    places: NDArray[np.float64],
+) -> tuple[Floats32, Floats32]:
+    """Light (N, 3) times alpha, and alpha (N,), of pixels (N,) of a band, each the mean over places (R, 2) in it."""
+    row, column = np.divmod(np.repeat(chosen, len(places)), shape[1])
+    offsets = np.tile(places, (len(chosen), 1))
+    finer = scene.look(
+        *window.at(column + 0.5 + offsets[:, 0], row + low + 0.5 + offsets[:, 1]),
+        window.pixel / np.sqrt(len(places)),
+    )
+    met = np.flatnonzero(finer.face != -1)
+    light_seen = np.ones((len(row), 2), np.float32)
+    light_seen[met], known = _borrowed(finer, met, row[met], column[met], hits, seen, shape, window.pixel)
+    asking = met[~known]
+    # Each ray of a pixel asks other directions, whichever band it is in.
+    number = asking % len(places)
+    deal = (
+        (row[asking] + low + corner[1]) * BLOCK + number // BLOCK,
+        (column[asking] + corner[0]) * BLOCK + number % BLOCK,
+    )
+    light_seen[asking] = seen_light(scene, finer, asking, deal[0], deal[1])
+    light, alpha = _finished(scene, finer, light_seen)
+    return light.reshape(len(chosen), -1, 3).mean(axis=1), alpha.reshape(len(chosen), -1).mean(axis=1)
+
+
+def _borrowed(
+    finer: Hits,
+    met: NDArray[np.int64],
+    row: NDArray[np.int64],
+    column: NDArray[np.int64],
+    hits: Hits,
+    seen: Floats32,
+    shape: tuple[int, int],
+    pixel: float,
+) -> tuple[Floats32, NDArray[np.bool_]]:
+    """Light (N, 2) of fine rays from the pixels around them that lie on the same surface, and where there is one."""
+    place, flat, normal = finer.place[met], finer.flat[met], finer.normal[met]
+    solid = finer.face[met] >= 0
+    total = np.zeros((len(met), 2), np.float32)
+    weights = np.zeros(len(met), np.float32)
+    for down, right in ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)):
+        there = np.clip(row + down, 0, shape[0] - 1) * shape[1] + np.clip(column + right, 0, shape[1] - 1)
+        gap = np.einsum("ni,ni->n", hits.place[there] - place, flat)
+        turn = np.einsum("ni,ni->n", hits.normal[there], normal)
+        weight = np.clip(3.0 - np.abs(gap) / np.float32(pixel), 0, 1) * np.clip(4 * turn - 2.4, 0, 1)
+        face = hits.face[there]
+        weight *= ((face >= 0) == solid) & (face != -1)
+        total += weight[:, None] * seen[there]
+        weights += weight
+    known = weights > 0.05
+    total[known] /= weights[known, None]
+    return total, known

@@ -1,0 +1,197 @@
+"""Numbers and labels as colours, and what a legend says about them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from meshmatch.errors import OptionError
+from meshmatch.render.colors import oklab_to_linear, to_srgb
+
+FloatArray = NDArray[np.float64]
+
+UNKNOWN = (0.62, 0.64, 0.67)
+"""What has no value."""
+
+# Lightness, chroma, hue in degrees (Oklab). Lightness alone orders them, so a grey print can be read too.
+_HEAT = (
+    (0.93, 0.025, 85),
+    (0.86, 0.12, 88),
+    (0.74, 0.165, 58),
+    (0.58, 0.20, 28),
+    (0.40, 0.15, 2),
+    (0.27, 0.10, 335),
+)
+_COLD = ((0.93, 0.025, 85), (0.80, 0.09, 230), (0.62, 0.14, 252), (0.44, 0.15, 264), (0.30, 0.11, 275))
+_FINE = 256
+
+
+def _ramp(stops: Sequence[tuple[float, float, float]]) -> FloatArray:
+    """Written colours (_FINE, 3) between stops, in even steps through Oklab."""
+    at = np.linspace(0, 1, len(stops))
+    light, chroma, hue = np.array(stops, dtype=np.float64).T
+    points = np.stack([light, chroma * np.cos(np.radians(hue)), chroma * np.sin(np.radians(hue))], axis=1)
+    fine = np.linspace(0, 1, _FINE)
+    lab = np.stack([np.interp(fine, at, points[:, k]) for k in range(3)], axis=1)
+    return np.asarray(to_srgb(oklab_to_linear(lab)))
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A scale from numbers to colours.
+
+    Parameters
+    ----------
+    low, high : float
+        The ends; what lies beyond takes the colour of the end.
+    title : str
+        What is measured, with its unit.
+    reverse : bool
+        True where the low numbers are those to look at, such as confidence.
+    beyond : tuple of bool
+        Whether some numbers lie below ``low``, and above ``high``.
+    unknown : bool
+        Whether some have no value.
+    """
+
+    low: float
+    high: float
+    title: str = ""
+    reverse: bool = False
+    beyond: tuple[bool, bool] = (False, False)
+    unknown: bool = False
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
+            raise OptionError(
+                f"a scale cannot run from {self.low:g} to {self.high:g}", "the lower number comes first"
+            )
+
+    @classmethod
+    def of(
+        cls,
+        values: ArrayLike,
+        title: str = "",
+        limits: tuple[float, float] | None = None,
+        *,
+        reverse: bool = False,
+    ) -> Scale:
+        """A scale for these numbers: round ends, from 0 if they are not negative and reach down to it.
+
+        A few numbers far above the others do not count; the legend then says that there are some.
+        """
+        numbers = np.asarray(values, dtype=np.float64).ravel()
+        finite = numbers[np.isfinite(numbers)]
+        unknown = len(finite) < len(numbers)
+        if limits is not None:
+            low, high = limits
+        elif not len(finite):
+            low, high = 0.0, 1.0
+        else:
+            low, high = _round_ends(finite)
+        over = len(finite) > 0 and bool(finite.max() > high + 1e-9 * abs(high))
+        under = len(finite) > 0 and bool(finite.min() < low - 1e-9 * abs(low))
+        return cls(float(low), float(high), title, reverse, (under, over), unknown)
+
+    @property
+    def diverging(self) -> bool:
+        """Whether it runs through 0, so that both signs need a colour."""
+        return self.low < 0 < self.high and not self.reverse
+
+    def colors(self, values: ArrayLike) -> FloatArray:
+        """Written colours (N, 3) of numbers (N,)."""
+        numbers = np.asarray(values, dtype=np.float64)
+        known = np.isfinite(numbers)
+        safe = np.where(known, numbers, self.low)
+        if self.diverging:
+            share = np.clip(safe / max(-self.low, self.high), -1, 1)
+            warm, cold = _ramp(_HEAT), _ramp(_COLD)
+            at = np.round(np.abs(share) * (_FINE - 1)).astype(int)
+            found = np.where((share < 0)[..., None], cold[at], warm[at])
+        else:
+            share = np.clip((safe - self.low) / (self.high - self.low), 0, 1)
+            share = 1 - share if self.reverse else share
+            found = _ramp(_HEAT)[np.round(share * (_FINE - 1)).astype(int)]
+        return np.where(known[..., None], found, UNKNOWN)
+
+    def ticks(self) -> list[tuple[float, str]]:
+        """Round numbers on the scale, each with its words; the ends are among them."""
+        step = nice_step(self.high - self.low, 5)
+        inner = np.arange(np.ceil(self.low / step), np.floor(self.high / step) + 1) * step
+        near = 0.3 * step
+        inner = inner[(inner > self.low + near) & (inner < self.high - near)]
+        places = [self.low, *inner.tolist(), self.high]
+        words = [_word(place, step) for place in places]
+        if self.beyond[0]:
+            words[0] = f"≤ {words[0]}"
+        if self.beyond[1]:
+            words[-1] = f"≥ {words[-1]}"
+        return list(zip(places, words, strict=True))
+
+
+def _round_ends(finite: FloatArray) -> tuple[float, float]:
+    low, high = float(finite.min()), float(finite.max())
+    bulk = float(np.quantile(finite, 0.99))
+    if bulk > 0 and high > 1.6 * bulk:
+        high = bulk
+    if low < 0 < high:
+        reach = max(-low, high)
+        low, high = -reach, reach
+    elif 0 <= low < 0.4 * high:
+        low = 0.0
+    if not high > low:
+        spread = abs(high) if high else 1.0
+        low, high = (0.0, spread) if low >= 0 else (low, low + spread)
+    step = nice_step(high - low, 5)
+    return (
+        float(np.floor(low / step + 1e-9) * step),
+        float(np.ceil(high / step - 1e-9) * step),
+    )
+
+
+def nice_step(span: float, parts: int) -> float:
+    """1, 2 or 5 times a power of ten, such that about ``parts`` of them make the span."""
+    rough = span / parts
+    power = 10.0 ** np.floor(np.log10(rough))
+    return float(power * next(m for m in (1, 2, 5, 10) if m * power >= rough * (1 - 1e-9)))
+
+
+def _word(value: float, step: float) -> str:
+    value = 0.0 if abs(value) < 1e-9 * step else value
+    return f"{value:.4g}".replace("-", "−")
+
+
+@dataclass(frozen=True)
+class Swatches:
+    """Names and their written colours, for a legend."""
+
+    names: tuple[str, ...]
+    colors: tuple[tuple[float, float, float], ...]
+    title: str = ""
+
+
+def label_colors(labels: ArrayLike) -> FloatArray:
+    """Written colours (N, 3) of labels (N,): the same for the same label always, and neighbours far apart."""
+    number = np.asarray(labels, dtype=np.int64)
+    # Hue by the golden angle; three rings of lightness, so that many labels stay apart.
+    hue = np.radians(28.0 + 137.50776 * (number % 1000))
+    light = np.array([0.68, 0.80, 0.55])[number % 3]
+    chroma = np.array([0.145, 0.115, 0.12])[number % 3]
+    lab = np.stack([light, chroma * np.cos(hue), chroma * np.sin(hue)], axis=-1)
+    return np.where((number >= 0)[..., None], to_srgb(oklab_to_linear(lab)), UNKNOWN)
+
+
+def label_swatches(labels: ArrayLike, names: Sequence[str] = (), most: int = 24) -> Swatches:
+    """The legend of labels (N,): those that occur, at most so many. Negative ones are called "none"."""
+    present = np.unique(np.asarray(labels, dtype=np.int64))
+    present = np.concatenate([present[present >= 0], present[present < 0][:1]])
+    shown = present if len(present) <= most else present[: most - 1]
+    words = ["none" if k < 0 else names[k] if k < len(names) else str(k) for k in shown.tolist()]
+    entries = [tuple(color) for color in label_colors(shown).tolist()]
+    if len(shown) < len(present):
+        words.append(f"and {len(present) - len(shown)} more")
+        entries.append(UNKNOWN)
+    return Swatches(tuple(words), tuple(entries))

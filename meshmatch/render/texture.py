@@ -1,0 +1,73 @@
+"""The textures of a file, laid on the triangles of a picture."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.render.surface import FloatArray, IntArray
+from meshmatch.shapes.appearance import Appearance, Material
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.pyramid import Pyramid
+
+Floats32 = NDArray[np.float32]
+
+
+class TexturePaint:
+    """Paint by the materials of a file: image times factor times vertex colour, as glTF defines it.
+
+    Parameters
+    ----------
+    look : Appearance
+    shape : Shape
+        Of the same file.
+    scale : float
+        Length in the file that is 1 in view coordinates.
+    """
+
+    def __init__(self, look: Appearance, shape: Shape, scale: float) -> None:
+        self._look, self._faces = look, shape.faces
+        self._colors = None if look.colors is None else look.colors.astype(np.float32)
+        self._pyramids: dict[int, Pyramid] = {}
+        used = np.unique(look.material).tolist()
+        shared: dict[tuple[int, tuple[str, str], bool, bool], Pyramid] = {}
+        for number in used:
+            material = look.materials[number]
+            if material.image is not None:
+                key = (id(material.image), material.wrap, material.nearest, material.alpha == "opaque")
+                if key not in shared:
+                    shared[key] = Pyramid.of(material)
+                self._pyramids[number] = shared[key]
+        # Texels along a unit of length of each face: as wide as a pixel is, so much is averaged.
+        a, b = look.uv[:, 1] - look.uv[:, 0], look.uv[:, 2] - look.uv[:, 0]
+        flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        solid = 2.0 * shape.face_areas / scale**2
+        sizes = np.array([_texels(material) for material in look.materials])[look.material]
+        self._density = np.sqrt(flat * sizes / np.maximum(solid, 1e-20)).astype(np.float32)
+
+    def at(self, faces: IntArray, weights: FloatArray, footprint: float) -> FloatArray:
+        """Linear colours (N, 4); an alpha below a half is a hole."""
+        weights = np.asarray(weights, np.float32)
+        out = np.ones((len(faces), 4), np.float32)
+        materials = self._look.material[faces]
+        for number in np.unique(materials).tolist():
+            rows = np.flatnonzero(materials == number)
+            material = self._look.materials[number]
+            if number in self._pyramids:
+                uv = np.einsum("nk,nkc->nc", weights[rows], self._look.uv[faces[rows]]).astype(np.float32)
+                wide = np.float32(footprint) * self._density[faces[rows]]
+                out[rows] = self._pyramids[number].look(uv[:, 0], uv[:, 1], wide).T
+            out[rows] *= np.array(material.factor, np.float32)
+        if self._colors is not None:
+            out *= np.einsum("nk,nkc->nc", weights, self._colors[self._faces[faces]])
+        for number in np.unique(materials).tolist():
+            material, rows = self._look.materials[number], materials == number
+            if material.alpha == "opaque":
+                out[rows, 3] = 1.0
+            elif material.alpha == "mask":
+                out[rows, 3] = np.where(out[rows, 3] >= material.cutoff, 1.0, 0.0)
+        return out
+
+
+def _texels(material: Material) -> float:
+    return 0.0 if material.image is None else float(material.image.shape[0] * material.image.shape[1])
