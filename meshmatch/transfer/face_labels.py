@@ -17,8 +17,8 @@ from meshmatch.transfer.direction import target_normals
 from meshmatch.transfer.image import Image, torn_faces
 
 # A face is cut into so many rows of small triangles, whose centres vote: its square of points.
-_ROWS = 4
-# A face this many times as large as the source's usual one may hold more labels than its corners tell.
+_ROWS = 3
+# A face this many times as large as those of the source there may hold more labels than its corners tell.
 _LARGE = 4.0
 
 
@@ -43,7 +43,7 @@ def carry_face_labels(
     area = 0.5 * np.linalg.norm(
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
     )
-    usual = float(np.median(source.face_areas)) if source.F else np.inf
+    usual = _face_area_around(source)[back.index[target.faces]].mean(axis=1)
     ask = np.flatnonzero((np.diff(around.indptr) != 1) | (area > _LARGE * usual))
     if not len(ask):
         return found
@@ -74,6 +74,15 @@ def _around_corners(back: VertexMap, source: Shape, target: Shape, labels: Ints,
     if on_faces:
         occurring = csr_array(faces_at_vertices(source, np.ones(source.F)) @ occurring)
     return csr_array(_incidence(target) @ (touched @ occurring))
+
+
+def _face_area_around(shape: Shape) -> Floats:
+    """(V,) mean area of the faces at each vertex; of a cloud, the area of each point."""
+    if shape.is_cloud:
+        return shape.vertex_areas
+    corners = shape.faces.ravel()
+    total = np.bincount(corners, np.repeat(shape.face_areas, 3), shape.V)
+    return np.asarray(total / np.maximum(np.bincount(corners, minlength=shape.V), 1))
 
 
 def _incidence(shape: Shape) -> csr_array:
