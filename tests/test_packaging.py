@@ -55,6 +55,22 @@ def test_the_wheel_holds_every_module_and_nothing_else(wheel: zipfile.ZipFile) -
     assert {top for top in tops if not top.endswith(".dist-info")} == {"meshmatch"}
 
 
+def test_the_wheel_holds_the_viewer_with_the_licence_of_three(wheel: zipfile.ZipFile) -> None:
+    folder = ROOT / "meshmatch" / "render" / "viewer"
+    files = [path for path in folder.iterdir() if path.suffix != ".py" and path.is_file()]
+    assert {".html", ".css", ".js", ".md", ".LICENSE"} == {path.suffix for path in files}
+    for path in files:
+        assert wheel.read(path.relative_to(ROOT).as_posix()) == path.read_bytes()
+    notice = (folder / "three.LICENSE").read_text(encoding="utf-8")
+    assert notice.startswith("The MIT License")
+    assert notice in (folder / "three.min.js").read_text(encoding="utf-8")
+    assert [
+        name
+        for name in wheel.namelist()
+        if name.endswith(".dist-info/licenses/meshmatch/render/viewer/three.LICENSE")
+    ]
+
+
 def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile) -> None:
     said = metadata(wheel)
     assert said["License-Expression"] == "Apache-2.0"

@@ -15,6 +15,7 @@ from meshmatch.cli.transfer_color import transfer_color
 from meshmatch.cli.transfer_labels import transfer_labels
 from meshmatch.cli.transfer_landmarks import transfer_landmarks
 from meshmatch.cli.transfer_weights import transfer_weights
+from meshmatch.cli.view import view
 
 app = typer.Typer(
     name="meshmatch",
@@ -49,6 +50,7 @@ def root(
 _VERBS: tuple[Callable[..., None], ...] = (
     *(match, register, evaluate),
     *(transfer_color, transfer_labels, transfer_weights, transfer_landmarks),
+    *(view,),
     *(info, prepare, train),
 )
 for verb in _VERBS:

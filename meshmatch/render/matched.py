@@ -96,13 +96,13 @@ def _turns(
 
 def carried_colors(colors: FloatArray, vertex_map: VertexMap, source: Shape, target: Shape) -> FloatArray:
     """Colours ``(V_tgt, 3)`` of the target, from those ``(V_src, 3)`` of the source's vertices."""
-    back = pull_back(vertex_map, source, target)
-    return np.where(_reached(back, vertex_map)[:, None], carry_values(back, source, colors), UNKNOWN)
+    return brought(colors, vertex_map, pull_back(vertex_map, source, target), source)
 
 
-def _reached(back: VertexMap, forward: VertexMap) -> NDArray[np.bool_]:
-    """(V_tgt,) whether something of the source was matched to near each vertex of the target."""
-    return np.asarray(back.confidence > _REACHED * forward.confidence[back.index])
+def brought(colors: FloatArray, forward: VertexMap, back: VertexMap, source: Shape) -> FloatArray:
+    """`carried_colors` where the map back is at hand; grey where nothing of the source was matched to near."""
+    reached = back.confidence > _REACHED * forward.confidence[back.index]
+    return np.where(reached[:, None], carry_values(back, source, colors), UNKNOWN)
 
 
 def confidence_panels(

@@ -1,0 +1,26 @@
+// What the page holds: words as JSON, and arrays as zlib in base64.
+
+function readWords() {
+  return JSON.parse(document.getElementById('words').textContent);
+}
+
+// {name: typed array}; the text is let go of afterwards.
+async function readArrays(table) {
+  const element = document.getElementById('packed');
+  const packed = fromBase64(element.textContent);
+  element.remove();
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('deflate'));
+  const bytes = await new Response(stream).arrayBuffer();
+  const kinds = { Uint8Array, Int8Array, Uint16Array, Uint32Array, Float32Array };
+  const arrays = {};
+  for (const { name, kind, start, length } of table) arrays[name] = new kinds[kind](bytes, start, length);
+  return arrays;
+}
+
+function fromBase64(text) {
+  if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);
+  const binary = atob(text);
+  const bytes = new Uint8Array(binary.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = binary.charCodeAt(i);
+  return bytes;
+}

@@ -1,0 +1,91 @@
+"""A page in headless Chromium: opened, watched for complaints and for the network, and pictured."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+SWITCHES = (
+    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),  # WebGL without a graphics card
+)
+DESKTOP = {"viewport": {"width": 1280, "height": 800}}
+PHONE = {
+    "viewport": {"width": 390, "height": 844},
+    "device_scale_factor": 2,
+    "has_touch": True,
+    "is_mobile": True,
+}
+
+
+def chromium() -> str:
+    """The program, or the test is skipped. MESHMATCH_CHROMIUM names one that is not on the path."""
+    found = os.environ.get("MESHMATCH_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
+    if found is None:
+        pytest.skip("no Chromium here: apt-get install chromium, or set MESHMATCH_CHROMIUM")
+    return found
+
+
+@dataclass(eq=False)
+class Opened:
+    """A page that is open, with what it said and asked for."""
+
+    page: Any
+    said: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+
+    def state(self) -> dict[str, Any]:
+        return dict(self.page.evaluate("meshmatch.state()"))
+
+    def place(self, side: str, vertex: int) -> dict[str, Any]:
+        """x, y on the screen, and whether it is seen."""
+        return dict(self.page.evaluate("([s, v]) => meshmatch.project(s, v)", [side, vertex]))
+
+    def settled(self) -> dict[str, Any]:
+        """The state when two more frames could have been drawn."""
+        self.page.evaluate("new Promise(r => requestAnimationFrame(() => requestAnimationFrame(() => r())))")
+        return self.state()
+
+    def picture(self, path: Path) -> Path:
+        self.settled()
+        self.page.screenshot(path=path)
+        return path
+
+
+@contextmanager
+def browser() -> Iterator[Any]:
+    """Chromium, with nothing of anybody's in it."""
+    program = chromium()
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright drives the browser (extra dev)"
+    )
+    with playwright.sync_playwright() as driver:
+        running = driver.chromium.launch(executable_path=program, args=list(SWITCHES))
+        yield running
+        running.close()
+
+
+@contextmanager
+def opened(running: Any, path: Path, **options: Any) -> Iterator[Opened]:
+    """Open a file, wait until it is drawn; afterwards it must have kept quiet and asked for nothing else."""
+    context = running.new_context(**(DESKTOP | options))
+    page = context.new_page()
+    seen = Opened(page)
+    page.on("console", lambda message: seen.said.append(f"{message.type}: {message.text}"))
+    page.on("pageerror", lambda error: seen.said.append(f"error: {error}"))
+    page.on("request", lambda request: seen.asked.append(request.url))
+    page.goto(path.resolve().as_uri())
+    page.wait_for_selector("html[data-ready]", timeout=60_000)
+    yield seen
+    assert seen.said == []
+    assert seen.asked == [path.resolve().as_uri()]
+    context.close()
