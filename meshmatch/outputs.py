@@ -1,7 +1,8 @@
-"""Output files appear whole or not at all."""
+"""Output files and folders appear whole or not at all."""
 
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -49,3 +50,43 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def folder_on_success(path: str | Path) -> Iterator[Path]:
+    """Give a temporary folder beside `path`, and rename it to `path` when the block ends well.
+
+    On any exception the temporary folder is removed with all that is in it. Nothing of the user's is ever replaced:
+    `path` must be new, or an empty folder.
+
+    Raises
+    ------
+    OutputError
+        `path` is a file or holds something, its folder is missing or cannot be written, or the disk refuses.
+    """
+    path = Path(path)
+    folder = path.parent
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"cannot make the folder {path}: it is a file", "choose another name")
+    if path.is_dir() and any(path.iterdir()):
+        raise OutputError(f"the folder {path} is not empty", "choose a new one, or empty it first")
+    if not folder.is_dir():
+        raise OutputError(
+            f"cannot make {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}"
+        )
+    temporary = folder / f".{path.name[:80]}.{secrets.token_hex(4)}"
+    try:
+        temporary.mkdir()
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the folder {path}: {error.strerror}", "choose another folder with -o"
+        ) from error
+    try:
+        yield temporary
+        if path.is_dir():
+            path.rmdir()  # fails if something came into it since
+        os.replace(temporary, path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror or error}", "is the disk full?") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)

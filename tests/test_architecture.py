@@ -13,8 +13,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "meshmatch"
 
-# From the ground up. A room imports itself and what stands before it. `experiments` measures the pipeline, and so
-# stands after it.
+# From the ground up. A room imports itself and what stands before it. `interpolation` takes its shapes the pipeline's
+# way, and `experiments` measures the pipeline: both stand after it.
 ROOMS = (
     *("errors", "config", "outputs"),
     *(
@@ -29,7 +29,7 @@ ROOMS = (
         "render",
         "collections",
     ),
-    *("pipeline", "experiments", "cli", "__main__"),
+    *("pipeline", "interpolation", "experiments", "cli", "__main__"),
 )
 GROUND = ("errors", "config", "outputs")
 

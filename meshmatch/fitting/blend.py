@@ -1,0 +1,167 @@
+"""What lies between several fits of one template, and beyond them: a curve through them, and how true it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+
+from meshmatch.errors import OptionError
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_shape import node_system, take_samples
+from meshmatch.fitting.turning import FieldPath, Path, RotationBlend, polar
+from meshmatch.shapes.shape import Frame, Shape
+
+if TYPE_CHECKING:
+    from meshmatch.models.trained import TrainedModel
+
+Way = Literal["field", "codes"]
+WAYS: tuple[Way, ...] = get_args(Way)
+_SAMPLES = 2048
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far a pose is from the stretch that it should have, and from the resting template; means over the surface.
+
+    ``volume``: |det F - det S|, and ``arap``: |F^T F - S^T S| (Frobenius), S the stretch of the fits blended by
+    logarithms: 0 at the fits. ``template_volume`` and ``template_arap``: the same for S = I, the paper's energies
+    (without the square); they hold the shapes' own difference from the template.
+    """
+
+    volume: float
+    arap: float
+    template_volume: float
+    template_arap: float
+
+
+class Blend:
+    """A curve through several fits of one template.
+
+    Each quantity is blended with the same weights of the fits: linear between two fits, a natural cubic spline
+    through more; straight on beyond the ends. The fits are met exactly: what the path leaves over at them is blended
+    and added.
+
+    Parameters
+    ----------
+    model : TrainedModel
+    fits : sequence of Fit
+        At least two, of the model's template.
+    times : (n,) increasing, optional
+        When each fit is met; evenly from 0 to 1 by default.
+    shapes : sequence of Shape, optional
+        The repaired shapes, for the way "codes" alone.
+    way : {"field", "codes"}
+        Blend what the field does (`turning`), or the codes that the network has for the shapes.
+
+    Raises
+    ------
+    OptionError
+        Fewer than two fits, fits of another template, times that do not increase, or an unknown way.
+    """
+
+    def __init__(
+        self,
+        model: TrainedModel,
+        fits: Sequence[Fit],
+        times: Sequence[float] | None = None,
+        shapes: Sequence[Shape] | None = None,
+        way: Way = "field",
+    ) -> None:
+        if len(fits) < 2:
+            raise OptionError("there is nothing between fewer than two shapes")
+        for fit in fits:
+            if fit.template_hash != model.template.hash:
+                raise OptionError(
+                    f"the fit is of another template ({fit.template_hash}, not {model.template.hash})",
+                    "use the model that made the fit",
+                )
+        self.times = np.linspace(0, 1, len(fits)) if times is None else np.asarray(times, float)
+        if self.times.shape != (len(fits),) or not (np.diff(self.times) > 0).all():
+            raise OptionError(f"{len(fits)} shapes need as many times, each later than the one before")
+        self._curve = CubicSpline(self.times, np.eye(len(fits)), bc_type="natural")
+        self._keys = np.stack([fit.vectors for fit in fits])
+        self._system = node_system(model)
+        self._field = model.field(self._system.verts)
+        turning = FieldPath(self._system, list(self._keys), model.template.core)
+        self._stretches = turning.stretches
+        if way == "field":
+            self._path: Path = turning
+        elif way == "codes":
+            if shapes is None or len(shapes) != len(fits):
+                raise OptionError("codes are those of shapes: give a shape for each fit")
+            self._path = _code_path(model, shapes, fits)
+        else:
+            raise OptionError(f"no way {way!r} to blend", f"choose one of {', '.join(WAYS)}")
+        self._left = np.stack(
+            [key - self._path(row) for key, row in zip(self._keys, np.eye(len(fits)), strict=True)]
+        )
+        self._turns = RotationBlend([fit.frame.rotation[None] for fit in fits])
+        self._scales = np.array([fit.frame.scale for fit in fits])
+        self._centers = np.stack([fit.frame.center for fit in fits])
+
+    def weights(self, time: float) -> np.ndarray:
+        """Weights (n,) of the fits at a time; they sum to one."""
+        inside = float(np.clip(time, self.times[0], self.times[-1]))
+        near = self._curve(inside)
+        if time == inside:
+            met = np.flatnonzero(self.times == time)
+            return np.eye(len(self.times))[met[0]] if len(met) else near
+        return near + (time - inside) * self._curve(inside, 1)
+
+    def vectors(self, time: float) -> np.ndarray:
+        """Node vectors (K, 3) at a time, core frame."""
+        weights = self.weights(time)
+        if weights.max() == 1.0:  # a fit itself
+            return self._keys[weights.argmax()]
+        return self._path(weights) + np.tensordot(weights, self._left, 1)
+
+    def points(self, vectors: np.ndarray) -> np.ndarray:
+        """Template vertices (V, 3) of a pose (K, 3), core frame."""
+        return self._system.moved(vectors)
+
+    def turns(self, vectors: np.ndarray) -> np.ndarray:
+        """How the field of a pose (K, 3) turns each template vertex: rotations (V, 3, 3)."""
+        F = self._field.deformation_gradient(torch.from_numpy(np.array(vectors)).float()[None])[0]
+        return polar(F.double().numpy())[0]
+
+    def frame(self, time: float) -> Frame:
+        """Between the frames of the fits: it turns, moves and grows from one to the next."""
+        weights = self.weights(time)
+        scale = float(np.exp(weights @ np.log(self._scales)))
+        return Frame(scale, self._turns.at(weights)[0], weights @ self._centers)
+
+    def deviation(self, time: float, vectors: np.ndarray) -> Deviation:
+        """How far a pose (K, 3) is from what it should be at a time."""
+        F = self._system.deformation_gradient(vectors)
+        S = self._stretches.at(self.weights(time))
+        return Deviation(*_apart(F, S), *_apart(F, np.eye(3)[None]))
+
+
+def _apart(F: np.ndarray, S: np.ndarray) -> tuple[float, float]:
+    volume = np.abs(np.linalg.det(F) - np.linalg.det(S)).mean()
+    squares = F.transpose(0, 2, 1) @ F - S.transpose(0, 2, 1) @ S
+    return float(volume), float(np.linalg.norm(squares, axis=(1, 2)).mean())
+
+
+def _code_path(model: TrainedModel, shapes: Sequence[Shape], fits: Sequence[Fit]) -> Path:
+    """Node vectors of blended codes; each code is that of samples of a shape in the core frame of its fit."""
+    network = model.network
+    found = []
+    for shape, fit in zip(shapes, fits, strict=True):
+        frame, scan = take_samples(shape, _SAMPLES, np.random.default_rng(fit.seed))
+        points = torch.from_numpy(fit.frame.apply(frame.undo(scan.points))).float()[None]
+        with torch.inference_mode():
+            found.append(network.encoder(network.encoder.features(points)))
+    codes = torch.cat(found)
+
+    @torch.inference_mode()
+    def path(weights: np.ndarray) -> np.ndarray:
+        blended = torch.from_numpy(weights).float()[None] @ codes
+        return network.decoder(blended)[0].double().numpy()
+
+    return path

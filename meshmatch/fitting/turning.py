@@ -1,0 +1,206 @@
+"""Poses between poses: what the field does at every point is blended, limbs turn and keep their size.
+
+Blending node vectors would move every point along a straight line, and a turning arm would shrink on its way. Here
+the deformation gradient of each fit is split into a rotation and a stretch (polar decomposition). Stretches are
+blended by their logarithms. Rotations are told from neighbour to neighbour, along a spanning tree of the surface
+that prefers neighbours which turn alike: a forearm turns about its elbow and the elbow goes where the upper arm
+takes it. Then follow the node vectors that fit the blended gradients best (least squares), and a few rounds in which
+every point may choose its own rotation anew (local and global steps of Sorkine and Alexa, 2007).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, minimum_spanning_tree
+from scipy.spatial.transform import Rotation
+
+from meshmatch.fitting.nodes import nearest_rotations
+from meshmatch.fitting.system import NodeSystem
+
+# From the weights of the key shapes (n,) to node vectors (K, 3).
+Path = Callable[[np.ndarray], np.ndarray]
+
+_SMALLEST = 1e-3  # a stretch below it is taken for it: a logarithm must stay finite
+_LARGEST = 5.0  # of a logarithm: a stretch of 150, which only a far extrapolation reaches
+_LIKE = 1e-6  # beside a jump, so that an edge without one is an edge still
+
+
+@dataclass(frozen=True)
+class TurnConfig:
+    """Rounds of local and global steps; damping of the first solve and of these."""
+
+    rounds: int = 3
+    damping_first: float = 1e-7
+    damping: float = 1e-4
+
+
+class RotationBlend:
+    """Weighted means of N rotations in each of several keys; exact at the keys.
+
+    In the tangent space at the mean of the keys: for two keys that is the shortest turn from one to the other at
+    constant speed. The order of the keys does not matter.
+
+    Parameters
+    ----------
+    keys : sequence of (N, 3, 3)
+    """
+
+    def __init__(self, keys: Sequence[np.ndarray]) -> None:
+        quaternions = np.stack([Rotation.from_matrix(key).as_quat() for key in keys])  # n N 4
+        # A quaternion and its negative are one rotation; their outer products are the same.
+        outer = np.einsum("kni,knj->nij", quaternions, quaternions)
+        self._mean = Rotation.from_quat(np.linalg.eigh(outer)[1][:, :, -1])
+        back = self._mean.inv()
+        self._logs = np.stack([(back * Rotation.from_matrix(key)).as_rotvec() for key in keys])
+
+    def at(self, weights: np.ndarray) -> np.ndarray:
+        """Rotations (N, 3, 3) for weights (n,) that sum to one."""
+        return (self._mean * Rotation.from_rotvec(np.tensordot(weights, self._logs, 1))).as_matrix()
+
+
+class StretchBlend:
+    """Weighted means, by logarithms, of symmetric stretches.
+
+    Parameters
+    ----------
+    keys : sequence of (N, 3, 3) logarithms
+    """
+
+    def __init__(self, keys: Sequence[np.ndarray]) -> None:
+        self._logs = np.stack(keys)
+
+    def at(self, weights: np.ndarray) -> np.ndarray:
+        """Stretches (N, 3, 3) for weights (n,) that sum to one."""
+        values, axes = np.linalg.eigh(np.tensordot(weights, self._logs, 1))
+        return (axes * np.exp(np.clip(values, -_LARGEST, _LARGEST))[:, None, :]) @ axes.transpose(0, 2, 1)
+
+
+def polar(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """F (N, 3, 3) = R S: the rotations R nearest to F, and the logarithms of the stretches S.
+
+    Where F turns space inside out the smallest stretch would be negative; it is taken for a very small one.
+    """
+    U, sizes, Vh = np.linalg.svd(F)
+    flip = np.where(np.linalg.det(U @ Vh) < 0, -1.0, 1.0)
+    U[:, :, 2] *= flip[:, None]
+    sizes[:, 2] *= flip
+    logs = np.log(np.maximum(sizes, _SMALLEST))
+    return U @ Vh, (Vh.transpose(0, 2, 1) * logs[:, None, :]) @ Vh
+
+
+class FieldPath:
+    """The poses between several fits of one template, by what the field does at its strain points.
+
+    Parameters
+    ----------
+    system : NodeSystem
+    keys : sequence of (K, 3)
+        Node vectors of the fits, each in its core frame.
+    core : (C,) int
+        Vertices of the template that stay in the middle.
+    """
+
+    def __init__(
+        self,
+        system: NodeSystem,
+        keys: Sequence[np.ndarray],
+        core: np.ndarray,
+        config: TurnConfig | None = None,
+    ) -> None:
+        self._system, self._config = system, config or TurnConfig()
+        self._keys = np.stack(keys)
+        parts = [polar(system.deformation_gradient(key)) for key in keys]
+        rotations = [rotation for rotation, _ in parts]
+        self.stretches = StretchBlend([logs for _, logs in parts])
+        self._parent, self._levels = _spanning_order(system, rotations, core)
+        self._joints = RotationBlend([self._from_parent(rotation) for rotation in rotations])
+        self._core = np.asarray(system.phi[core].mean(0)).ravel()  # of the node vectors: how the core moves
+        V = len(system.verts)
+        self._free = np.zeros((V, 6)), np.zeros((V, 3))
+
+    def __call__(self, weights: np.ndarray) -> np.ndarray:
+        """Node vectors (K, 3) for weights (n,) of the keys that sum to one."""
+        config, stretch = self._config, self.stretches.at(weights)
+        straight = np.tensordot(weights, self._keys, 1)
+        vectors = self._solve(self._rotations(weights) @ stretch, config.damping_first, straight, straight)
+        for _ in range(config.rounds):
+            own = nearest_rotations(self._system.deformation_gradient(vectors), stretch)
+            vectors = self._solve(own @ stretch, config.damping, vectors, straight)
+        return vectors
+
+    def _from_parent(self, rotations: np.ndarray) -> np.ndarray:
+        """Rotations (G, 3, 3) as seen from the parent of each point; those of roots as they are."""
+        seen = rotations.copy()
+        child = np.flatnonzero(self._parent >= 0)
+        seen[child] = rotations[self._parent[child]].transpose(0, 2, 1) @ rotations[child]
+        return seen
+
+    def _rotations(self, weights: np.ndarray) -> np.ndarray:
+        whole = self._joints.at(weights)
+        for level in self._levels:
+            whole[level] = whole[self._parent[level]] @ whole[level]
+        return whole
+
+    def _solve(
+        self, targets: np.ndarray, damping: float, near: np.ndarray, straight: np.ndarray
+    ) -> np.ndarray:
+        """Node vectors with the gradients asked for; the core goes where it goes on the straight way."""
+        system = self._system
+        vectors = system.solve(*self._free, 1.0 / len(targets), targets, damping / system.K, near)
+        return vectors + self._core @ (straight - vectors)
+
+
+def _spanning_order(
+    system: NodeSystem, rotations: Sequence[np.ndarray], core: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Parents (G,) of the strain points, -1 for roots, and the other points level by level below their roots.
+
+    One tree for each connected part, along the edges over which the rotations change least. Its root is the point
+    nearest to the middle of the core.
+    """
+    at = system.verts[system.strain_points]
+    G = len(at)
+    a, b = _neighbours(system)
+    jump = np.full(len(a), _LIKE)
+    for R in rotations:
+        jump += np.linalg.norm(R[a] - R[b], axis=(1, 2))
+    tree = minimum_spanning_tree(coo_matrix((jump, (a, b)), (G, G)).tocsr())
+    part = connected_components(tree, directed=False)[1]
+    away = np.linalg.norm(at - system.verts[core].mean(0), axis=1)
+    parent, depth = np.full(G, -1), np.zeros(G, int)
+    for number in range(part.max() + 1):
+        members = np.flatnonzero(part == number)
+        order, before = breadth_first_order(tree, members[away[members].argmin()], directed=False)
+        for point in order[1:]:
+            parent[point] = before[point]
+            depth[point] = depth[before[point]] + 1
+    by_depth = np.argsort(depth, kind="stable")
+    levels = np.split(by_depth, np.cumsum(np.bincount(depth))[:-1])
+    return parent, levels[1:]
+
+
+def _neighbours(system: NodeSystem) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (a < b) of strain points whose regions of the surface touch."""
+    G = len(system.strain_points)
+    edges = np.concatenate([system.faces[:, [0, 1]], system.faces[:, [1, 2]], system.faces[:, [2, 0]]])
+    pairs = _regions(system, edges)[edges]
+    pairs = np.sort(pairs[(pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])], axis=1)
+    code = np.unique(pairs[:, 0] * G + pairs[:, 1])
+    return code // G, code % G
+
+
+def _regions(system: NodeSystem, edges: np.ndarray) -> np.ndarray:
+    """The nearest strain point (V,) of every vertex along the surface; -1 out of reach."""
+    V = len(system.verts)
+    length = np.linalg.norm(system.verts[edges[:, 0]] - system.verts[edges[:, 1]], axis=1)
+    graph = csr_matrix((np.maximum(length, 1e-12), (edges[:, 0], edges[:, 1])), (V, V))
+    found = dijkstra(
+        graph, directed=False, indices=system.strain_points, min_only=True, return_predecessors=True
+    )
+    number = np.full(V + 1, -1)
+    number[system.strain_points] = np.arange(len(system.strain_points))
+    return number[np.where(found[2] < 0, V, found[2])]
