@@ -23,9 +23,32 @@ def prepare(
         Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where everything goes; made if needed.")
     ],
     template: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
-            metavar="FILE", help="The shape that becomes the template; the folder's first if not given."
+            metavar="SHAPE",
+            help="The shape that becomes the template: a name in the folder, or any mesh or cloud. If not given: the "
+            "folder's first where all are registered, else the one that lies nearest to all others.",
+        ),
+    ] = None,
+    align: Annotated[
+        Literal["none", "near", "rigid"] | None,
+        typer.Option(
+            help="How shapes are turned to the template, now and when fitted: as they are given, a little, or "
+            "from any orientation. If not given: none where they are registered, else rigid."
+        ),
+    ] = None,
+    scale: Annotated[
+        Literal["area", "sphere"],
+        typer.Option(
+            help="What is made equal to the template's: surface area, or the radius around the centroid."
+        ),
+    ] = "area",
+    landmarks: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHERE",
+            help="Known points of the shapes: a folder of NAME.npy, or an ending beside them such as "
+            ".landmarks.npy (docs/formats.md).",
         ),
     ] = None,
     strategy: Annotated[
@@ -52,16 +75,18 @@ def prepare(
 ) -> None:
     """Make a template, and shapes to learn from.
 
-    A folder's shapes are checked, normalised and decimated. If all share the template's vertices and triangles they
-    are registered: `meshmatch train --shapes FOLDER` learns from them. Writes template.safetensors, a picture of the
-    nodes (nodes.png) and, from a folder, shapes.safetensors, normalised/ and prepared.json.
+    A folder's shapes are checked, normalised, decimated and brought to the template's position, size and orientation.
+    `meshmatch train --shapes FOLDER` learns from them: from their correspondence if all share the template's vertices
+    and triangles, else without one. Writes template.safetensors, a picture of the nodes (nodes.png) and, from a
+    folder, shapes.safetensors, points.safetensors, normalised/ and prepared.json.
     """
     from meshmatch.errors import OptionError
     from meshmatch.render.picture import Panel, render_shapes
     from meshmatch.shapes.files import load_shape
     from meshmatch.shapes.repair import repair
+    from meshmatch.templates.make import low_resolution, make_template
     from meshmatch.templates.nodes import NodeConfig
-    from meshmatch.templates.prepare import low_resolution, make_template, prepare_folder
+    from meshmatch.templates.prepare import prepare_folder
     from meshmatch.templates.template import save_template
 
     voice = Voice(quiet)
@@ -72,8 +97,9 @@ def prepare(
         )
     if shapes.is_dir() and labels is not None:
         raise OptionError("--labels are of one shape, not of a folder", "name the shape itself")
-    if not shapes.is_dir() and template is not None:
-        raise OptionError("--template goes with a folder of shapes", "one shape is its own template")
+    for option, value in (("--template", template), ("--align", align), ("--landmarks", landmarks)):
+        if not shapes.is_dir() and value is not None:
+            raise OptionError(f"{option} goes with a folder of shapes", "one shape is its own template")
     make_folder(output)
     if shapes.is_dir():
         with voice.progress() as report:
@@ -83,9 +109,13 @@ def prepare(
                 config,
                 template=template,
                 faces=faces,
+                align=align,
+                scale=scale,
+                landmarks=landmarks,
                 progress=lambda done, total: report("checked", shapes.name, done / total),
             )
         bundle, names, registered, notes = made.template, made.names, len(made.shapes), made.notes
+        found: dict[str, object] = {"align": made.align, "scale": scale, "landmarks": made.landmarks}
     else:
         from meshmatch.maps.pairs import load_points
 
@@ -97,10 +127,11 @@ def prepare(
             config,
             labels=parts,
             source=shapes.name,
-            low=low_resolution(clean.shape, faces),
+            low=None if clean.shape.is_cloud else low_resolution(clean.shape, faces),
         )
         save_template(bundle, output / "template.safetensors")
         names, registered, notes = (shapes.name,), 0, clean.notes
+        found = {}
     picture = output / "nodes.png"
     render_shapes(
         [Panel(bundle.shape, label=f"{bundle.name}: {bundle.K} nodes", points=bundle.nodes)], picture
@@ -110,6 +141,7 @@ def prepare(
     voice.say(
         f"wrote {output}: a template of {bundle.shape.V} vertices and {bundle.K} nodes"
         + (f", {registered} registered shapes" if registered else "")
+        + (f", {len(names)} shapes without correspondence" if found and not registered else "")
         + f"; look at {picture}"
     )
     if json:
@@ -122,6 +154,7 @@ def prepare(
                 "nodes": bundle.K,
                 "shapes": list(names),
                 "registered": registered,
+                **found,
                 "notes": list(notes),
             }
         )

@@ -14,7 +14,9 @@ from meshmatch.cli.folders import make_folder
 from meshmatch.cli.voice import Voice, print_json
 
 if TYPE_CHECKING:
+    from meshmatch.models.trained import TrainedModel
     from meshmatch.training.loop import Progress
+    from meshmatch.training.run import Recipe
 
 
 def train(
@@ -32,10 +34,17 @@ def train(
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Learn from the registered shapes of a folder that `meshmatch prepare` made, and use its "
-            "template. Otherwise from generated human bodies (needs the extra `bodies`).",
+            help="Learn from the shapes of a folder that `meshmatch prepare` made, and use its template. Otherwise "
+            "from generated human bodies (needs the extra `bodies`).",
         ),
     ] = None,
+    unsupervised: Annotated[
+        bool,
+        typer.Option(
+            "--unsupervised",
+            help="Learn without correspondence also from registered shapes; others always are.",
+        ),
+    ] = False,
     preset: Annotated[
         Literal["default", "paper"],
         typer.Option(help="The recipe: what measured best, or the paper's network, losses and rates."),
@@ -96,15 +105,20 @@ def train(
     `torchrun --nproc-per-node N -m meshmatch train ...`.
     """
     from meshmatch.config import set_threads
+    from meshmatch.errors import OptionError
 
     set_threads(threads)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
     make_folder(output)
     from meshmatch.models.card import check_name
     from meshmatch.training import run
+    from meshmatch.training.unsupervised import cloud_recipe
 
     label = check_name(name or output.resolve().name)
-    chosen = run.recipe(preset)
+    clouds = shapes is not None and (unsupervised or not _registered(shapes))
+    if unsupervised and shapes is None:
+        raise OptionError("--unsupervised learns from a folder of shapes", "name it with --shapes")
+    chosen = cloud_recipe(preset) if clouds else run.recipe(preset)
     preset_train = chosen.train
     settings = replace(
         preset_train,
@@ -125,12 +139,17 @@ def train(
         started = load_model(start)
     given = None
     if poses is not None:
-        from meshmatch.errors import OptionError
         from meshmatch.training.pose_files import load_poses
 
         if shapes is not None:
             raise OptionError("poses are for generated bodies, not for --shapes", "leave out one of the two")
         given = load_poses(poses, pose_share)
+    if shapes is not None and clouds:
+        with _progress(voice) as show:
+            folder = _without_correspondence(
+                shapes, output, chosen, label, category, licence, started, not fresh, voice, show
+            )
+        return _done(folder, label, voice, json and first)
     if shapes is not None:
         made = run.read_template(shapes / "template.safetensors")
         source, count = run.folder_source(shapes, made)
@@ -164,10 +183,56 @@ def train(
             resume=not fresh,
             progress=show,
         )
+    _done(folder, label, voice, json and first)
+
+
+def _registered(shapes: Path) -> bool:
+    from meshmatch.templates.gather import is_registered
+
+    return is_registered(shapes)
+
+
+def _without_correspondence(
+    shapes: Path,
+    output: Path,
+    recipe: "Recipe",
+    name: str,
+    category: str | None,
+    licence: str,
+    start: "TrainedModel | None",
+    resume: bool,
+    voice: Voice,
+    show: "Callable[[Progress], None]",
+) -> Path:
+    from meshmatch.templates.gather import read_gathered
+    from meshmatch.training import run
+    from meshmatch.training.unsupervised import train_clouds
+
+    made = run.read_template(shapes / "template.safetensors")
+    gathered = read_gathered(shapes, made)
+    count, known = len(gathered.points), len(gathered.template_landmarks)
+    help = f" and {known} known points" if known else ""
+    voice.say(f"learning from {count} shapes without correspondence{help}")
+    return train_clouds(
+        made,
+        gathered,
+        output,
+        recipe=recipe,
+        name=name,
+        category=category or shapes.resolve().name,
+        data=f"{count} shapes of {shapes.resolve().name}, without correspondence{help}",
+        licence=licence,
+        start=start,
+        resume=resume,
+        progress=show,
+    )
+
+
+def _done(folder: Path, label: str, voice: Voice, json: bool) -> None:
     voice.say(
         f"wrote model {label} to {folder}; use it with --model {folder}, or add it: meshmatch models add {folder}"
     )
-    if json and first:
+    if json:
         from meshmatch.models.registry import CARD, read_card
 
         card = read_card(folder / CARD)

@@ -24,6 +24,7 @@ from meshmatch.fitting.orientation import (
     standing_grid,
     with_flips,
 )
+from meshmatch.fitting.placing import placed, scan_frame
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.settle import settle
 from meshmatch.fitting.system import NodeSystem
@@ -107,7 +108,7 @@ def fit_shape(
     tell = progress or (lambda what, share: None)
     rng = np.random.default_rng(config.seed)
     system = node_system(model)
-    frame, scan = take_samples(shape, config.samples, rng)
+    frame, scan = take_samples(shape, config.samples, rng, scan_frame(model, shape))
     tell("orientation", 0.0)
     guesses = _hypotheses(model, scan, config)
     coarse = Scan(scan.points[: config.coarse_samples], scan.normals[: config.coarse_samples])
@@ -179,16 +180,21 @@ def _lay(
     return lay_on(model.network, system, model.template.core, scan, guess.rotation, guess.centre, rng, **how)
 
 
-def take_samples(shape: Shape, P: int, rng: np.random.Generator) -> tuple[Frame, Scan]:
-    """Frame of a shape (area 1, centroid 0) and samples of it in that frame."""
-    frame = sqrt_area_frame(shape)
+def take_samples(
+    shape: Shape, P: int, rng: np.random.Generator, frame: Frame | None = None
+) -> tuple[Frame, Scan]:
+    """Frame of a shape (area 1, centroid 0, if no other is given) and samples of it in that frame."""
+    frame = sqrt_area_frame(shape) if frame is None else frame
     samples = sample_surface(shape, P, rng)
     return frame, Scan(frame.apply(samples.points), samples.normals @ frame.rotation.T)
 
 
 def _hypotheses(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypothesis]:
     """Core frames to try: the aligner's (or a grid where there is none), or those that obey the user's axes."""
-    if model.network.aligner is None:
+    given = placed(model, scan)
+    if given is not None:
+        voted = given
+    elif model.network.aligner is None:
         voted = standing_grid(scan.points.mean(0))
     else:
         voted = with_flips(

@@ -7,6 +7,7 @@ import json
 import math
 import re
 from dataclasses import asdict, dataclass, fields
+from dataclasses import field as entry
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NoReturn
@@ -14,13 +15,17 @@ from typing import Any, NoReturn
 from meshmatch.errors import ModelError
 from meshmatch.outputs import replace_on_success
 
-SCHEMA = 1
+SCHEMA = 2
 MOST_BYTES = 1_000_000
 """A larger file is no card."""
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 _HASH = re.compile(r"[0-9a-f]{16}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
+ORIENTATIONS = ("searched", "none", "near", "rigid")
+"""How a fit finds the orientation: asks the network, takes what the file has, improves that, or tries all turns."""
+SCALES = ("area", "sphere")
+_OLD_FRAME = {"orientation": "searched", "scale": "area"}  # of cards of schema 1
 _FIELD_KEYS = {"kernel": str, "radius": float, "nodes": int}
 
 
@@ -56,6 +61,8 @@ class ModelCard:
         A sentence for people; may be empty.
     schema : int
         Version of this list.
+    frame : dict
+        How a shape is brought to the template: ``orientation`` (one of `ORIENTATIONS`), ``scale`` (of `SCALES`).
 
     Raises
     ------
@@ -80,6 +87,7 @@ class ModelCard:
     created: str
     description: str = ""
     schema: int = SCHEMA
+    frame: dict[str, Any] = entry(default_factory=lambda: dict(_OLD_FRAME))
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -108,6 +116,11 @@ class ModelCard:
         except ValueError:
             _refuse(f"created must be an ISO date such as 2026-01-31, not {_shown(self.created)}")
         self._check_field()
+        if self.frame.keys() != _OLD_FRAME.keys():
+            _refuse(f"frame must have orientation and scale, not {', '.join(self.frame) or 'nothing'}")
+        for key, values in (("orientation", ORIENTATIONS), ("scale", SCALES)):
+            if self.frame[key] not in values:
+                _refuse(f"frame.{key} must be one of {', '.join(values)}, not {_shown(self.frame[key])}")
         _check_metrics(self.metrics)
 
     def _check_field(self) -> None:
@@ -177,6 +190,8 @@ def card_from_json(text: str) -> ModelCard:
             f"the model card has schema {found['schema']}, not {SCHEMA}",
             "it needs a newer meshmatch: update it",
         )
+    if found.get("schema") == 1 and "frame" not in found:
+        found = found | {"schema": SCHEMA, "frame": dict(_OLD_FRAME)}
     known = [item.name for item in fields(ModelCard)]
     unknown = sorted(set(found) - set(known))
     missing = [name for name in known if name not in found]

@@ -60,7 +60,9 @@ class NodeConfig:
             raise OptionError(f"at least one cluster is needed, not {self.clusters}")
 
 
-def choose_nodes(shape: Shape, config: NodeConfig, labels: np.ndarray | None = None) -> np.ndarray:
+def choose_nodes(
+    shape: Shape, config: NodeConfig, labels: np.ndarray | None = None, noisy: bool = False
+) -> np.ndarray:
     """Choose nodes (K', 3) such that every vertex has four non-coplanar ones in reach.
 
     Parameters
@@ -69,6 +71,9 @@ def choose_nodes(shape: Shape, config: NodeConfig, labels: np.ndarray | None = N
         Mesh in the template frame.
     labels : int array (V,), optional
         Body parts, needed by strategy ``parts``.
+    noisy : bool
+        Candidates are the surface's points plus Gaussian noise of ``config.depth``, as suits the mesh of a cloud,
+        whose inside is uncertain; otherwise they lie up to that depth below the surface.
 
     Returns
     -------
@@ -86,8 +91,10 @@ def choose_nodes(shape: Shape, config: NodeConfig, labels: np.ndarray | None = N
         raise OptionError("node strategy 'parts' needs part labels", "use --strategy spectral or geodesic")
     rng = np.random.default_rng(config.seed)
     samples = sample_surface(shape, 30 * config.K, rng)
-    inwards = samples.normals * rng.uniform(0, config.depth, (len(samples.points), 1))
-    candidates = samples.points - inwards
+    if noisy:
+        candidates = samples.points + config.depth * rng.standard_normal(samples.points.shape)
+    else:
+        candidates = samples.points - samples.normals * rng.uniform(0, config.depth, (len(samples.points), 1))
     if config.strategy == "uniform" or shape.is_cloud:
         return _spread(shape, config, candidates)
     own = shape.faces[samples.face, samples.barycentric.argmax(1)]

@@ -1,28 +1,40 @@
-"""`meshmatch prepare`: a template bundle from one shape, and a folder of shapes made ready for training."""
+"""`meshmatch prepare`: a folder of shapes made ready for training, with a template for them."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
-from scipy.spatial import cKDTree
 
-from meshmatch.errors import InputError, MeshmatchError, OutputError, TemplateError
+from meshmatch.errors import InputError, MeshmatchError, OutputError
 from meshmatch.outputs import replace_on_success
+from meshmatch.shapes.align import Align
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig, choose_nodes
+from meshmatch.shapes.triangulate import triangulate_cloud
+from meshmatch.templates.gather import (
+    STRANGE,
+    Scale,
+    find_known,
+    gather,
+    most_typical,
+    read_known,
+    save_gathered,
+)
+from meshmatch.templates.make import LOW_FACES, low_resolution, make_template
+from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.template import Template, save_template
 
-LOW_FACES = 10_000
+MINIMUM_FACES = 50
+MINIMUM_POINTS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,90 +43,15 @@ class Prepared:
 
     shapes : float32 array (N, V, 3), template vertices on every shape, its own axes and unit, centred;
     empty if the folder's meshes are not registered. names : their files. notes : what was found and done.
+    align : how shapes were turned to the template. landmarks : how many points are known on each.
     """
 
     template: Template
     shapes: np.ndarray
     names: tuple[str, ...]
     notes: tuple[str, ...]
-
-
-def low_resolution(shape: Shape, faces: int = LOW_FACES) -> tuple[np.ndarray, np.ndarray]:
-    """Decimate onto a subset of the shape's own vertices: kept indices (V,), faces (F, 3).
-
-    Whatever belongs to a vertex (weights, labels, positions on registered shapes) is then kept by indexing.
-    """
-    if shape.F <= faces:
-        return np.arange(shape.V), np.asarray(shape.faces)
-    small = decimate(shape, faces)
-    nearest = cKDTree(shape.verts).query(small.verts)[1]
-    keep, renumbered = np.unique(nearest, return_inverse=True)
-    corners = renumbered.reshape(-1)[small.faces]
-    a, b, c = corners.T
-    return keep, corners[(a != b) & (b != c) & (c != a)]
-
-
-def make_template(
-    shape: Shape,
-    name: str,
-    config: NodeConfig,
-    *,
-    labels: np.ndarray | None = None,
-    label_names: Sequence[str] = (),
-    core: np.ndarray | None = None,
-    pose: str = "",
-    source: str = "",
-    licence: str = "",
-    low: tuple[np.ndarray, np.ndarray] | None = None,
-) -> Template:
-    """Template bundle of a mesh.
-
-    Parameters
-    ----------
-    shape : Shape
-        Mesh of the resting category, any unit; becomes the dense mesh.
-    labels : int array (V,), optional
-        Part of every vertex of ``shape``; a single part where not given.
-    core : int array, optional
-        Vertices of ``shape`` that fix the category's frame; all where not given.
-    low : (kept vertices, faces), optional
-        A low resolution made before (see :func:`low_resolution`).
-
-    Raises
-    ------
-    TemplateError
-        If nodes cannot support every vertex.
-    InputError
-        If the shape has no faces.
-    """
-    if shape.is_cloud:
-        raise InputError(f"{shape.name} has no faces", "a template is a triangle mesh")
-    keep, faces = low_resolution(shape) if low is None else low
-    small = Shape(shape.verts[keep], faces, name)
-    frame = sqrt_area_frame(small)
-    small = Shape(frame.apply(small.verts), faces, name)
-    parts = np.zeros(shape.V, np.int64) if labels is None else np.asarray(labels, np.int64)
-    if parts.shape != (shape.V,):
-        raise TemplateError(
-            f"{len(parts)} labels for {shape.V} vertices of {shape.name}", "one label a vertex, from 0"
-        )
-    if parts.min() < 0:
-        raise TemplateError(f"{shape.name} has a label below 0: {parts.min()}", "count parts from 0")
-    names = tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1))
-    in_core = np.ones(shape.V, bool) if core is None else np.isin(np.arange(shape.V), core)
-    return Template(
-        name=name,
-        shape=small,
-        dense=Shape(frame.apply(shape.verts), shape.faces, name),
-        nodes=choose_nodes(small, config, None if labels is None else parts[keep]),
-        radius=config.radius,
-        labels=parts[keep],
-        label_names=names,
-        core=np.flatnonzero(in_core[keep]),
-        pose=pose,
-        source=source,
-        licence=licence,
-    )
+    align: Align = "none"
+    landmarks: int = 0
 
 
 def prepare_folder(
@@ -124,66 +61,170 @@ def prepare_folder(
     *,
     template: str | Path | None = None,
     faces: int = LOW_FACES,
+    align: Align | None = None,
+    scale: Scale = "area",
+    landmarks: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Prepared:
     """Check, normalise and decimate every shape of a folder and lay a template for them.
 
-    Writes ``template.safetensors``, ``shapes.safetensors`` (registered shapes), ``normalised/NAME.ply`` and, last,
-    ``prepared.json``. The template is made from the template file, else from the first mesh, after repair. Shapes
-    are registered if all have that file's vertex count and triangles.
+    Writes ``template.safetensors``, ``shapes.safetensors`` (registered shapes), ``points.safetensors`` (samples of
+    all shapes in the template's frame), ``normalised/NAME.ply`` and, last, ``prepared.json``. Shapes are registered if
+    all have the vertex count and triangles of the template's file.
+
+    Parameters
+    ----------
+    template : name or path, optional
+        A shape of the folder, by its name, or any file. By default the first mesh where all are registered, else the
+        shape that lies nearest to all others.
+    align : {"none", "near", "rigid"}, optional
+        How shapes are turned to the template; by default "none" where they are registered, else "rigid".
+    scale : {"area", "sphere"}
+        Which size of every shape is made that of the template.
+    landmarks : folder or suffix, optional
+        Where the known points of shapes are, see `meshmatch.templates.gather`.
 
     Raises
     ------
     InputError
-        No usable shape in the folder; files that cannot be read are named in the notes instead.
+        No usable shape in the folder (files that cannot be read are named in the notes instead), or a template that
+        is nothing like the shapes.
+    OptionError
+        No landmarks where they should be.
     OutputError
         The output folder cannot be written.
     """
     folder, output = Path(folder), Path(output)
     files = sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES)
+    known_files = find_known(landmarks, folder, files)
+    files = [path for path in files if path not in known_files]
+    known_files = find_known(landmarks, folder, files)
     if not files:
         raise InputError(f"no shapes in {folder}", f"files that end in {', '.join(SUFFIXES)} are read")
     _make_folder(output / "normalised")
+    tell = progress or (lambda done, total: None)
     found: list[Repaired] = []
+    known: list[np.ndarray | None] = []
+    stems: list[str] = []
     notes: list[str] = []
-    stems = [path.stem for path in files]
     for number, path in enumerate(files):
         try:
-            clean = repair(load_shape(path))
-            normal = _normalised(clean.shape, faces)
+            clean = _enough(repair(load_shape(path)))
         except MeshmatchError as error:
             notes.append(f"{path.name} left out: {error.message}")
         else:
             notes += [f"{path.name}: {note}" for note in clean.notes]
             found.append(clean)
-            name = path.stem if stems.count(path.stem) == 1 else path.name
-            save_shape(output / "normalised" / f"{name}.ply", normal)
-        if progress is not None:
-            progress(number + 1, len(files))
+            points_file = known_files[number]
+            known.append(None if points_file is None else read_known(points_file, clean))
+            stems.append(path.stem)
+        tell(number + 1, 2 * len(files))
     if not found:
         raise InputError(f"no shape in {folder} could be used", notes[0])
-    if template is not None:
-        first = repair(load_shape(template))
-    else:
-        first = next((clean for clean in found if not clean.shape.is_cloud), found[0])
-    low = low_resolution(first.shape, faces)
+    first, own = _template_shape(folder, template, found, scale, align, config.seed, notes)
+    low = _low(first, faces)
+    stack = _registered(first, found, first.kept_vertex[low[0]], notes)
+    registered = len(stack) > 0
+    how: Align = align or ("none" if registered else "rigid")
     name = folder.resolve().name
     made = make_template(first.shape, name, config, source=f"{first.original.name} of {folder.name}", low=low)
-    stack = _registered(first, found, first.kept_vertex[low[0]], notes)
+    gathered, frames, far = gather(
+        made,
+        found,
+        known,
+        _template_known(first, own, known, landmarks, made, low),
+        how,
+        scale,
+        config.seed,
+        lambda done: tell(len(files) + done * len(files) // len(found), 2 * len(files)),
+        strict=not registered,
+    )
+    for clean, stem, frame, distance in zip(found, stems, frames, far, strict=True):
+        label = stem if stems.count(stem) == 1 else clean.original.name
+        small = clean.shape if clean.shape.F <= faces else decimate(clean.shape, faces)
+        normal = Shape(frame.apply(small.verts), small.faces, small.name)
+        save_shape(output / "normalised" / f"{label}.ply", normal)
+        if distance > STRANGE and not registered:
+            notes.append(f"{clean.original.name} is not much like the template: {100 * distance:.0f} % apart")
     save_template(made, output / "template.safetensors")
+    save_gathered(gathered, output / "points.safetensors")
     with replace_on_success(output / "shapes.safetensors") as temporary:
         save_file({"verts": stack}, temporary)
     names = tuple(clean.original.name for clean in found)
     words = {
         "names": names,
-        "registered": len(stack) > 0,
+        "registered": registered,
         "notes": notes,
         "template": made.hash,
+        "source": first.original.name,
+        "align": how,
+        "scale": scale,
+        "landmarks": gathered.landmarks.shape[1],
+        "frames": [
+            {"scale": f.scale, "rotation": f.rotation.tolist(), "center": f.center.tolist()} for f in frames
+        ],
+        "apart": [round(distance, 5) for distance in far],
         "config": asdict(config),
     }
     with replace_on_success(output / "prepared.json") as temporary:
         Path(temporary).write_text(json.dumps(words, indent=1), encoding="utf-8")
-    return Prepared(made, stack, names, tuple(notes))
+    return Prepared(made, stack, names, tuple(notes), how, gathered.landmarks.shape[1])
+
+
+def _template_shape(
+    folder: Path,
+    wanted: str | Path | None,
+    found: list[Repaired],
+    scale: Scale,
+    how: Align | None,
+    seed: int,
+    notes: list[str],
+) -> tuple[Repaired, int | None]:
+    """The template's shape, and its number if it is one of those that were found."""
+    if wanted is not None:
+        for number, clean in enumerate(found):
+            if str(wanted) in (clean.original.name, Path(clean.original.name).stem):
+                return clean, number
+        path = Path(wanted)
+        same = path.is_file() and path.resolve().parent == folder.resolve()
+        for number, clean in enumerate(found if same else ()):
+            if clean.original.name == path.name:
+                return clean, number
+        return _enough(repair(load_shape(path))), None
+    number = next((k for k, clean in enumerate(found) if not clean.shape.is_cloud), 0)
+    if len(found) > 1 and not _same_faces(found[number], found):
+        number = most_typical(found, how or "rigid", scale, seed)
+        notes.append(f"template: {found[number].original.name}, which lies nearest to all others on average")
+    else:
+        notes.append(f"template: {found[number].original.name}")
+    return found[number], number
+
+
+def _low(first: Repaired, faces: int) -> tuple[np.ndarray, np.ndarray]:
+    return (
+        triangulate_cloud(first.shape, faces) if first.shape.is_cloud else low_resolution(first.shape, faces)
+    )
+
+
+def _template_known(first, own, known, landmarks, made, low) -> np.ndarray | None:
+    """Known points (L, 3) on the template, in its frame; None if there are none at all."""
+    if landmarks is None:
+        return None
+    sizes = {len(places) for places in known if places is not None}
+    if len(sizes) > 1:
+        raise InputError(
+            f"landmark files of {min(sizes)} and of {max(sizes)} points",
+            "row k is the same point on every shape: write -1 where it is missing",
+        )
+    places = known[own] if own is not None else None
+    if places is None or not np.isfinite(places).all():
+        raise InputError(
+            f"the template {first.original.name} has no landmarks, or not all of them",
+            "choose with --template a shape of the folder on which every landmark is known",
+        )
+    # the way from the template's file to its frame, read off two of its vertices' places
+    frame = sqrt_area_frame(Shape(first.shape.verts[low[0]], low[1], made.name))
+    return frame.apply(places)
 
 
 def _make_folder(folder: Path) -> None:
@@ -195,20 +236,29 @@ def _make_folder(folder: Path) -> None:
         ) from error
 
 
-def _normalised(shape: Shape, faces: int) -> Shape:
-    """A shape of at most so many faces with area 1, centred."""
-    small = shape if shape.is_cloud or shape.F <= faces else decimate(shape, faces)
-    return Shape(sqrt_area_frame(small).apply(small.verts), small.faces, small.name)
+def _enough(clean: Repaired) -> Repaired:
+    """The same shape, if there is enough of it to learn from; `InputError` otherwise."""
+    shape = clean.shape
+    if shape.is_cloud and shape.V < MINIMUM_POINTS:
+        raise InputError(f"it has only {shape.V} points", f"at least {MINIMUM_POINTS} are needed")
+    if not shape.is_cloud and shape.F < MINIMUM_FACES:
+        raise InputError(f"it has only {shape.F} usable triangles", f"at least {MINIMUM_FACES} are needed")
+    sqrt_area_frame(shape)
+    return clean
+
+
+def _same_faces(like: Repaired, found: list[Repaired]) -> bool:
+    """Whether all files have one file's vertex count and triangles."""
+    first = like.original
+    return not first.is_cloud and all(
+        clean.original.V == first.V and np.array_equal(clean.original.faces, first.faces) for clean in found
+    )
 
 
 def _registered(first: Repaired, found: list[Repaired], vertices: np.ndarray, notes: list[str]) -> np.ndarray:
     """Vertices (N, V, 3) of the shapes that share the first one's connectivity; N = 0 unless all of them do."""
-    like = first.original
-    same = all(
-        clean.original.V == like.V and np.array_equal(clean.original.faces, like.faces) for clean in found
-    )
     whole = []
-    for clean in found if same and not like.is_cloud else ():
+    for clean in found if _same_faces(first, found) else ():
         invalid = clean.original.invalid
         if invalid is None or not invalid[vertices].any():
             whole.append(clean.original.verts[vertices])
@@ -242,6 +292,6 @@ def read_registered(folder: str | Path, template: Template) -> np.ndarray:
     if not len(shapes):
         raise InputError(
             f"the shapes of {folder} do not share one connectivity",
-            "training needs registered meshes: the same vertices and triangles in every file",
+            "learn without correspondence (--unsupervised); registered means the same triangles in every file",
         )
     return shapes

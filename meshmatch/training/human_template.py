@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import make_template
 from meshmatch.templates.nodes import NodeConfig
-from meshmatch.templates.prepare import make_template
 from meshmatch.templates.template import Template
 from meshmatch.training.bodies import skin
 from meshmatch.training.poses import still_pose

@@ -17,8 +17,10 @@ from safetensors.torch import save_file
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.models.deformer import Deformer
 from meshmatch.outputs import replace_on_success
-from meshmatch.training.datasets import BatchDataset
 from meshmatch.training.losses import LossConfig, LossPoints, losses
+
+# (model, batch, loss points, weights, generator) -> weighted terms by name, their sum under "total".
+Objective = Callable[..., dict[str, torch.Tensor]]
 
 
 @dataclass(frozen=True)
@@ -84,8 +86,11 @@ def learning_rate(step: int, config: TrainConfig) -> float:
 class Trainer:
     """State of a run: weights, their average, the optimiser and the next step. All of it is in a checkpoint."""
 
-    def __init__(self, model: Deformer, points: LossPoints, config: TrainConfig) -> None:
+    def __init__(
+        self, model: Deformer, points: LossPoints, config: TrainConfig, objective: Objective = losses
+    ) -> None:
         self.config = config
+        self.objective = objective
         self.rank = int(os.environ.get("RANK", 0))
         self.world = int(os.environ.get("WORLD_SIZE", 1))
         if torch.cuda.is_available():
@@ -154,7 +159,7 @@ class Trainer:
 
     def run(
         self,
-        data: BatchDataset,
+        data: torch.utils.data.Dataset,
         checkpoint: Path | None = None,
         report: Callable[[Progress], None] | None = None,
         validate: Callable[[Deformer], float] | None = None,
@@ -186,7 +191,7 @@ class Trainer:
             for group in self.optimiser.param_groups:
                 group["lr"] = learning_rate(self.step, config)
             with torch.autocast(self.device.type, torch.bfloat16, enabled=config.bf16):
-                terms = losses(self.model, batch.to(self.device), self.points, config.loss, generator)
+                terms = self.objective(self.model, batch.to(self.device), self.points, config.loss, generator)
             self.optimiser.zero_grad(set_to_none=True)
             terms["total"].backward()
             self._share_gradients()

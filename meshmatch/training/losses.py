@@ -16,7 +16,8 @@ from meshmatch.training.datasets import Batch
 class LossConfig:
     """Weights l1..l4 of the paper, and of the parts that go past it.
 
-    ``robust``: reconstruct with the mean distance instead of the paper's mean squared distance.
+    ``robust``: reconstruct with the mean distance instead of the paper's mean squared distance. ``landmarks``: of known
+    points, where there is no other correspondence.
     """
 
     reconstruction: float = 1.0
@@ -27,6 +28,7 @@ class LossConfig:
     correct: float = 1.0
     robust: bool = False
     correct_points: int = 1024
+    landmarks: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -230,6 +230,7 @@ def export(
     score: float,
     storage: str = "int8",
     start: TrainedModel | None = None,
+    frame: dict[str, str] | None = None,
 ) -> None:
     """Write the averaged weights as a model folder; the card comes last."""
     from meshmatch.templates.template import save_template
@@ -255,6 +256,8 @@ def export(
         created=datetime.date.today().isoformat(),
         description="",
     )
+    if frame is not None:
+        card = replace(card, frame=frame)
     write_card(card, output / "card.json")
 
 

@@ -92,7 +92,7 @@ _WRONG: list[tuple[str, Any, str]] = [
     ("weights_sha256", "ab" * 31, "64 hex digits"),
     ("created", "yesterday", "ISO date"),
     ("created", "2026-02-30", "ISO date"),
-    ("schema", 0, "schema 0, not 1"),
+    ("schema", 0, "schema 0, not 2"),
     ("schema", True, "schema must be a whole number"),
 ]
 
@@ -119,8 +119,8 @@ def test_extra_entries_are_refused() -> None:
 
 
 def test_a_newer_schema_asks_for_an_update_whatever_else_it_holds() -> None:
-    words = json.loads(card_to_json(small_card())) | {"schema": 2, "unheard": 1}
-    with pytest.raises(ModelError, match="schema 2") as caught:
+    words = json.loads(card_to_json(small_card())) | {"schema": 3, "unheard": 1}
+    with pytest.raises(ModelError, match="schema 3") as caught:
         card_from_json(json.dumps(words))
     assert "update" in caught.value.hint
 

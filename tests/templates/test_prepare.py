@@ -48,7 +48,7 @@ def test_registered_shapes_keep_their_correspondence(folder: Path, sphere: Shape
     for n in range(3):
         wanted = egg(sphere, n)[vertex]
         assert np.allclose(stack[n], wanted - wanted.mean(0), atol=2e-5)  # not lost at a million metres
-    assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert seen == [(n, 6) for n in range(1, 7)]  # read, then brought together
     assert made.names == ("egg0.obj", "egg1.obj", "egg2.obj")
     words = json.loads((tmp_path / "out" / "prepared.json").read_text())
     assert words["registered"] is True
@@ -62,9 +62,9 @@ def test_normalised_shapes_have_area_one_and_few_faces(folder: Path, tmp_path: P
     assert [file.name for file in files] == ["egg0.ply", "egg1.ply", "egg2.ply"]
     for file in files:
         shape = load_shape(file)
-        assert shape.area == pytest.approx(1, rel=1e-5)
+        assert shape.area == pytest.approx(1, rel=0.01)  # of the file: decimation loses a little
         assert shape.F <= 612
-        assert np.abs((shape.face_areas[:, None] * shape.verts[shape.faces].mean(1)).sum(0)).max() < 1e-5
+        assert np.abs((shape.face_areas[:, None] * shape.verts[shape.faces].mean(1)).sum(0)).max() < 1e-3
 
 
 def test_files_of_one_stem_do_not_overwrite_each_other(folder: Path, torus: Shape, tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_registered_shape_with_lost_positions_is_left_out(folder: Path, tmp_pa
     assert any("egg2.obj: not among the registered" in note for note in made.notes)
 
 
-def test_clouds_need_a_template_of_another_file(folder: Path, tmp_path: Path, sphere: Shape) -> None:
+def test_a_template_of_clouds_is_a_mesh_or_one_of_them(folder: Path, tmp_path: Path, sphere: Shape) -> None:
     np.save(folder / "a_cloud.npy", sphere.verts)
     made = prepare_folder(folder, tmp_path / "out", FEW)
     assert made.template.shape.F == 1280  # of the first mesh
@@ -133,8 +133,8 @@ def test_clouds_need_a_template_of_another_file(folder: Path, tmp_path: Path, sp
     clouds = tmp_path / "clouds"
     clouds.mkdir()
     np.save(clouds / "a.npy", sphere.verts)
-    with pytest.raises(InputError, match="has no faces"):
-        prepare_folder(clouds, tmp_path / "out2", FEW)
+    made = prepare_folder(clouds, tmp_path / "out2", FEW)
+    assert made.template.shape.V > 600  # triangulated
     made = prepare_folder(clouds, tmp_path / "out2", FEW, template=folder / "egg0.obj")
     assert made.template.shape.F == 1280
     assert made.names == ("a.npy",)

@@ -1,0 +1,96 @@
+"""A template from one shape: two resolutions, nodes, labels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from meshmatch.errors import TemplateError
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.triangulate import triangulate_cloud
+from meshmatch.templates.nodes import NodeConfig, choose_nodes
+from meshmatch.templates.template import Template
+
+LOW_FACES = 10_000
+
+
+def low_resolution(shape: Shape, faces: int = LOW_FACES) -> tuple[np.ndarray, np.ndarray]:
+    """Decimate onto a subset of the shape's own vertices: kept indices (V,), faces (F, 3).
+
+    Whatever belongs to a vertex (weights, labels, positions on registered shapes) is then kept by indexing.
+    """
+    if shape.F <= faces:
+        return np.arange(shape.V), np.asarray(shape.faces)
+    small = decimate(shape, faces)
+    nearest = cKDTree(shape.verts).query(small.verts)[1]
+    keep, renumbered = np.unique(nearest, return_inverse=True)
+    corners = renumbered.reshape(-1)[small.faces]
+    a, b, c = corners.T
+    return keep, corners[(a != b) & (b != c) & (c != a)]
+
+
+def make_template(
+    shape: Shape,
+    name: str,
+    config: NodeConfig,
+    *,
+    labels: np.ndarray | None = None,
+    label_names: Sequence[str] = (),
+    core: np.ndarray | None = None,
+    pose: str = "",
+    source: str = "",
+    licence: str = "",
+    low: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Template:
+    """Template bundle of a mesh.
+
+    Parameters
+    ----------
+    shape : Shape
+        Of the resting category, any unit; a mesh becomes the dense mesh, a cloud is triangulated.
+    labels : int array (V,), optional
+        Part of every vertex of ``shape``; a single part where not given.
+    core : int array, optional
+        Vertices of ``shape`` that fix the category's frame; all where not given.
+    low : (kept vertices, faces), optional
+        A low resolution made before (see :func:`low_resolution`).
+
+    Raises
+    ------
+    TemplateError
+        If nodes cannot support every vertex.
+    InputError
+        If a cloud's points lie on no surface.
+    """
+    if low is None:
+        low = triangulate_cloud(shape, LOW_FACES) if shape.is_cloud else low_resolution(shape)
+    keep, faces = low
+    small = Shape(shape.verts[keep], faces, name)
+    frame = sqrt_area_frame(small)
+    small = Shape(frame.apply(small.verts), faces, name)
+    parts = np.zeros(shape.V, np.int64) if labels is None else np.asarray(labels, np.int64)
+    if parts.shape != (shape.V,):
+        raise TemplateError(
+            f"{len(parts)} labels for {shape.V} vertices of {shape.name}", "one label a vertex, from 0"
+        )
+    if parts.min() < 0:
+        raise TemplateError(f"{shape.name} has a label below 0: {parts.min()}", "count parts from 0")
+    names = tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1))
+    in_core = np.ones(shape.V, bool) if core is None else np.isin(np.arange(shape.V), core)
+    return Template(
+        name=name,
+        shape=small,
+        dense=small if shape.is_cloud else Shape(frame.apply(shape.verts), shape.faces, name),
+        nodes=choose_nodes(small, config, None if labels is None else parts[keep], noisy=shape.is_cloud),
+        radius=config.radius,
+        labels=parts[keep],
+        label_names=names,
+        core=np.flatnonzero(in_core[keep]),
+        pose=pose,
+        source=source,
+        licence=licence,
+    )

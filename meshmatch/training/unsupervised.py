@@ -1,0 +1,158 @@
+"""Training on shapes without correspondence: a folder that `meshmatch prepare` made, a model folder out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from meshmatch.errors import InputError, OutputError
+from meshmatch.fields.mls import build_field
+from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig
+from meshmatch.models.trained import TrainedModel
+from meshmatch.templates.gather import Gathered
+from meshmatch.templates.template import Template
+from meshmatch.training.chamfer import SurfacePoints, build_surface_points, chamfer_losses
+from meshmatch.training.clouds import CloudBatch, CloudConfig, CloudDataset, build_warp
+from meshmatch.training.loop import Progress, TrainConfig, Trainer
+from meshmatch.training.losses import LossConfig
+from meshmatch.training.run import CHECKPOINT, Preset, Recipe, export, take_weights
+from meshmatch.training.scans import ScanConfig
+from meshmatch.training.setup import anchor_vertices, fill_basis
+
+_VALIDATION_SEED = 999_983
+
+
+def cloud_recipe(preset: Preset = "default") -> Recipe:
+    """The recipe of a preset for shapes without correspondence.
+
+    ``paper``: its network, and its weights for segmentation transfer. ``default``: a network for few shapes.
+    """
+    if preset == "paper":
+        loss = LossConfig(volume=1e-4, arap=1e-3, blend=1e-4)
+        train = TrainConfig(
+            steps=4000, shapes=8, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=loss, workers=0
+        )
+        return Recipe(PAPER, train, ScanConfig(points=1024, noise=0.0, scale=0.0), "cubic")
+    network = NetworkConfig(
+        code=128, width=256, depth=1, basis=384, align_basis=0, corrections=2, correct_width=256
+    )
+    loss = LossConfig(volume=1e-4, arap=1e-3, blend=1e-4)
+    train = TrainConfig(
+        steps=3000, shapes=8, scans_per_shape=1, decay=0.5, warm_up=100, average=0.99, loss=loss, workers=0
+    )
+    return Recipe(network, train, ScanConfig(points=1024), "smooth")
+
+
+def build_cloud_dataset(
+    gathered: Gathered, recipe: Recipe, change: CloudConfig | None = None
+) -> CloudDataset:
+    """Batches of a folder's samples, as yet without an encoder."""
+    return CloudDataset(
+        points=torch.from_numpy(gathered.points),
+        normals=torch.from_numpy(gathered.normals),
+        landmarks=torch.from_numpy(gathered.landmarks),
+        warp=build_warp(gathered),
+        encoder=None,
+        scan=recipe.scan,
+        change=change or CloudConfig(),
+        shapes=recipe.train.shapes,
+        seed=recipe.train.seed,
+        length=recipe.train.steps,
+    )
+
+
+def build_cloud_deformer(template: Template, data: CloudDataset, recipe: Recipe, seed: int) -> Deformer:
+    """An untrained network, its basis points laid where the folder's shapes are."""
+    basis = torch.zeros(1, 3)
+    if recipe.network.encoder == "basis":
+        generator = torch.Generator().manual_seed(seed)
+        drawn = replace(data, shapes=64, seed=seed + 1)[0]
+        basis = fill_basis(drawn.points, recipe.network.basis, generator)
+    anchors = template.shape.verts[anchor_vertices(template, template.K)]
+    anchor_phi = build_field(anchors, template.nodes, template.radius, recipe.kernel).phi.to_dense()
+    nodes = torch.from_numpy(template.nodes).float()
+    torch.manual_seed(seed)
+    return Deformer(
+        recipe.network, nodes, torch.from_numpy(anchors).float(), anchor_phi, basis, torch.zeros(1, 3)
+    )
+
+
+def train_clouds(
+    template: Template,
+    gathered: Gathered,
+    output: str | Path,
+    *,
+    recipe: Recipe,
+    name: str,
+    category: str,
+    data: str = "",
+    licence: str = "",
+    start: TrainedModel | None = None,
+    resume: bool = True,
+    change: CloudConfig | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> Path:
+    """Train, or go on training, and write a model folder; as `meshmatch.training.run.train_model`.
+
+    Raises
+    ------
+    InputError
+        There is only one shape.
+    """
+    if len(gathered.points) < 2:
+        raise InputError(
+            "one shape is too few to learn from", "prepare a folder of several; ten or more are better"
+        )
+    output = Path(output)
+    checkpoint = output / "checkpoint" / CHECKPOINT
+    try:
+        checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the folder {checkpoint.parent}: {error.strerror}", "choose another folder"
+        ) from error
+    config = recipe.train
+    dataset = build_cloud_dataset(gathered, recipe, change)
+    model = build_cloud_deformer(template, dataset, recipe, config.seed)
+    if start is not None:
+        take_weights(model, template, recipe, start)
+    dataset = replace(dataset, encoder=model.encoder)
+    points = build_surface_points(template, recipe.kernel, gathered.template_landmarks)
+    trainer = Trainer(model, points, config, chamfer_losses)
+    if resume and checkpoint.is_file():
+        trainer.load(checkpoint)
+    held_out = replace(dataset, seed=_VALIDATION_SEED, shapes=min(32, 2 * len(gathered.points)))[0]
+    trainer.run(dataset, checkpoint, progress, lambda model: surface_error(model, held_out, points))
+    if trainer.rank == 0:
+        trainer.model.load_state_dict(trainer.averaged_state())
+        score = surface_error(trainer.model, held_out, points)
+        frame: dict[str, str] = {"orientation": gathered.align, "scale": gathered.scale}
+        export(
+            trainer,
+            template,
+            output,
+            recipe,
+            name,
+            category,
+            data,
+            licence,
+            score,
+            storage="float16",
+            start=start,
+            frame=frame,
+        )
+    return output
+
+
+@torch.no_grad()
+def surface_error(model: Deformer, batch: CloudBatch, points: SurfacePoints) -> float:
+    """Mean distance both ways between the fitted template and held-out draws of the shapes, units of sqrt(area)."""
+    was = model.training
+    model.eval()
+    batch = batch.to(points.positions.device)
+    terms = chamfer_losses(model, batch, points, LossConfig(blend=0.0), torch.Generator())
+    model.train(was)
+    return float(terms["error"])
