@@ -7,6 +7,7 @@ import typer
 from meshmatch import __version__
 from meshmatch.cli.evaluate import evaluate
 from meshmatch.cli.info import info
+from meshmatch.cli.interpolate import interpolate
 from meshmatch.cli.match import match, register
 from meshmatch.cli.models import models
 from meshmatch.cli.prepare import prepare
@@ -50,6 +51,7 @@ def root(
 _VERBS: tuple[Callable[..., None], ...] = (
     *(match, register, evaluate),
     *(transfer_color, transfer_labels, transfer_weights, transfer_landmarks),
+    interpolate,
     *(view,),
     *(info, prepare, train),
 )
