@@ -1,0 +1,123 @@
+"""The paper's preset from the first word to a map: `train --preset paper`, then `match` and `register` with it."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch import pipeline
+from meshmatch.cli import main
+from meshmatch.fields.mls import build_field
+from meshmatch.fitting.fit_shape import FitConfig, fit_shape
+from meshmatch.models.trained import TrainedModel, load_model
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.training import run
+from tests.training.small import POINTS, egg_template
+
+QUICK = FitConfig(samples=1000, coarse_samples=300)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "FitConfig", lambda **choices: replace(QUICK, **choices))
+
+
+@pytest.fixture(scope="module")
+def eggs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of registered eggs."""
+    folder = tmp_path_factory.mktemp("eggs")
+    egg = egg_template().shape
+    rng = np.random.default_rng(0)
+    for n in range(4):
+        save_shape(
+            folder / f"egg{n}.ply", Shape(egg.verts @ (np.eye(3) + 0.1 * rng.normal(size=(3, 3))), egg.faces)
+        )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(eggs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The preset as it is, but for a narrow network, few points, small batches and a rate that suits 60 steps."""
+    root = tmp_path_factory.mktemp("paper")
+    nodes = ["--nodes", "36", "--radius", "0.45", "--strategy", "uniform"]
+    assert main(["prepare", str(eggs), "-o", str(root / "prepared"), *nodes, "-q"]) == 0
+    plain = run.recipe
+
+    def narrow(preset: run.Preset) -> run.Recipe:
+        chosen = plain(preset)
+        same = (
+            chosen.network.encoder,
+            chosen.network.decoder,
+            chosen.network.align_basis,
+            chosen.network.corrections,
+        )
+        assert same == (POINTS.encoder, POINTS.decoder, POINTS.align_basis, POINTS.corrections)
+        train = replace(chosen.train, shapes=6, rate=5e-3, warm_up=5)
+        return replace(chosen, network=POINTS, scan=replace(chosen.scan, points=96), train=train)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "recipe", narrow)
+        words = ["--preset", "paper", "--steps", "60", "--workers", "0", "--name", "eggs", "-q"]
+        prepared = str(root / "prepared")
+        assert main(["train", "--shapes", prepared, "-o", str(root / "model"), *words]) == 0
+    return root / "model"
+
+
+@pytest.fixture(scope="module")
+def loaded(model: Path) -> TrainedModel:
+    return load_model(model)
+
+
+def test_the_model_has_the_papers_choices(loaded: TrainedModel) -> None:
+    card = loaded.card
+    assert card.steps == 60
+    assert card.field["kernel"] == "cubic"
+    assert (card.network["encoder"], card.network["decoder"]) == ("point", "node")
+    assert card.recipe["scan"]["upright"] is True
+    assert loaded.network.aligner is None
+
+
+def test_its_fits_are_moved_with_the_papers_kernel(loaded: TrainedModel, eggs: Path) -> None:
+    fit = fit_shape(loaded, load_shape(eggs / "egg0.ply"), QUICK)
+    template = loaded.template
+    phi = {
+        kernel: build_field(template.shape.verts, template.nodes, template.radius, kernel)
+        .phi.to_dense()
+        .double()
+        for kernel in ("cubic", "smooth")
+    }
+    off = {
+        kernel: np.abs(template.shape.verts + matrix.numpy() @ fit.vectors - fit.points).max()
+        for kernel, matrix in phi.items()
+    }
+    assert off["cubic"] < 1e-6 < 1e-4 < off["smooth"]
+
+
+def test_match_uses_it(model: Path, eggs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "map.npy"
+    files = eggs / "egg0.ply", eggs / "egg1.ply"
+    assert (
+        main([str(word) for word in ("match", *files, "-o", output, "--model", model, "--json", "-q")]) == 0
+    )
+    record = json.loads(capsys.readouterr().out)
+    assert record["model"] == str(model)
+    assert all(fit["residual"] < 0.04 for fit in record["fits"])  # 0.09 before the refinement
+    index = np.load(output)
+    assert index.shape == (162,)
+    assert len(np.unique(index)) > 50
+
+
+def test_register_uses_it_in_full_resolution(
+    model: Path, eggs: Path, loaded: TrainedModel, tmp_path: Path
+) -> None:
+    files = [tmp_path / "low.ply", tmp_path / "high.ply"]
+    for path, more in zip(files, ([], ["--dense"]), strict=True):
+        words = ["-o", str(path), "--model", str(model), "--threads", "1", "-q", *more]
+        assert main(["register", str(eggs / "egg2.ply"), *words]) == 0
+    low, high = (load_shape(path) for path in files)
+    # these templates have one resolution: two ways through the field, one shape
+    assert loaded.template.dense.V == loaded.template.shape.V
+    assert np.allclose(low.verts, high.verts, atol=1e-5)
