@@ -16,8 +16,9 @@ from meshmatch.config import set_threads
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_shape import FitConfig, Refine
+from meshmatch.fitting.fit_shape import FitConfig, Partial, Refine
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
+from meshmatch.fitting.landmarks import honour_pairs
 from meshmatch.maps.build import build_map
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
@@ -55,6 +56,7 @@ def match(
     seed: int = 0,
     up: str | None = None,
     front: str | None = None,
+    partial: Partial = "auto",
     landmarks: LandmarkPairs | None = None,
     workers: int = 2,
     progress: Progress | None = None,
@@ -71,6 +73,8 @@ def match(
         Gauss-Newton on the nodes, the paper's search over codes, or the network alone.
     up, front : str, optional
         Axes of both files, such as "y" or "-z"; searched where not given.
+    partial : {"auto", "yes", "no"}
+        Whether a shape may be a part of a whole, such as a scan from one side: found out, tried for both, or never.
     landmarks : (source vertices (N,), target vertices (N,)), optional
         Known pairs, which the map then honours; only with the refinement "nodes".
     workers : int
@@ -90,7 +94,7 @@ def match(
     loaded = read_model(model)
     shapes = [as_shape(source), as_shape(target)]
     clean = [usable(shape) for shape in shapes]
-    config = FitConfig(refine=refine, seed=seed, up=up, front=front)
+    config = FitConfig(refine=refine, seed=seed, up=up, front=front, partial=partial)
     if landmarks is not None and refine != "nodes":
         raise OptionError(
             f"landmarks are honoured by the refinement of nodes, not by {refine!r}",
@@ -117,7 +121,7 @@ def match(
             raise
     known = None
     if landmarks is not None:
-        fits, known = _honour(loaded, clean, fits, landmarks, config)
+        fits, known = honour_pairs(loaded, clean, fits, landmarks, config)
     fits = agreed_fits(loaded, [part.shape for part in clean], fits, config, known)
     found = build_map(clean[0], fits[0], clean[1], fits[1], workers=workers)
     notes = tuple(
@@ -134,6 +138,7 @@ def register(
     seed: int = 0,
     up: str | None = None,
     front: str | None = None,
+    partial: Partial = "auto",
     progress: Progress | None = None,
 ) -> Fit:
     """Lay the model's template on one shape; see `match` for the parameters."""
@@ -143,7 +148,7 @@ def register(
         if progress is not None:
             progress(what, shape.name, share)
 
-    config = FitConfig(refine=refine, seed=seed, up=up, front=front)
+    config = FitConfig(refine=refine, seed=seed, up=up, front=front, partial=partial)
     return lay_template(read_model(model), usable(shape).shape, config, None, tell)
 
 
@@ -277,38 +282,6 @@ def usable(shape: Shape) -> Repaired:
             "save each object as a file of its own",
         )
     return clean
-
-
-def _honour(
-    model: TrainedModel, clean: list[Repaired], fits: list[Fit], landmarks: LandmarkPairs, config: FitConfig
-) -> tuple[list[Fit], list[tuple[np.ndarray, np.ndarray]]]:
-    """Fit again with known pairs.
-
-    A pair is carried to the template through the first fits; the template point between the two answers is
-    then pulled to the landmark on both shapes. Also returned: for each shape those template vertices and their
-    places in its file.
-    """
-    from meshmatch.fitting.landmarks import template_vertices
-
-    places = []
-    for part, chosen in zip(clean, landmarks, strict=True):
-        chosen = np.asarray(chosen, np.int64)
-        if chosen.ndim != 1 or len(chosen) == 0 or chosen.min() < 0:
-            raise OptionError("landmarks must be lists of vertex numbers", "one pair of vertices a line")
-        if chosen.max() >= len(part.original_to_repaired):
-            raise OptionError(
-                f"landmark vertex {chosen.max()} is not on {part.shape.name}, which has "
-                f"{len(part.original_to_repaired)} vertices",
-                "numbers start at 0; the source comes first",
-            )
-        places.append(part.shape.verts[part.original_to_repaired[chosen]])
-    if len(places[0]) != len(places[1]):
-        raise OptionError("landmarks must come in pairs", "one pair of vertices a line")
-    at = template_vertices(model.template, fits, places)
-    known = [(at, place) for place in places]
-    return [
-        lay_template(model, part.shape, config, pairs) for part, pairs in zip(clean, known, strict=True)
-    ], known
 
 
 def _apart(source: str, target: str) -> tuple[str, str]:

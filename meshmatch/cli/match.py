@@ -30,6 +30,7 @@ def match(
     refine: options.RefineOption = "nodes",
     up: options.Up = None,
     front: options.Front = None,
+    partial: options.PartialFlag = None,
     landmarks: Annotated[
         Path | None,
         typer.Option(
@@ -67,6 +68,7 @@ def match(
     check_png(picture)
     check_apart([output, picture], [source, target, landmarks])
     voice = Voice(quiet)
+    names = _apart(source, target)
     # Outputs that cannot be written, a mistyped model and broken files are told before the long work.
     with claimed(picture) as drawing:
         with replace_on_success(output) as temporary:
@@ -83,6 +85,7 @@ def match(
                     seed=seed,
                     up=up,
                     front=front,
+                    partial=options.partial_choice(partial),
                     landmarks=pairs,
                     workers=threads,
                     progress=report,
@@ -95,8 +98,7 @@ def match(
             from meshmatch.render.matched import render_match
 
             rotations = result.source_fit.frame.rotation, result.target_fit.frame.rotation
-            render_match(*shapes, found, drawing, rotations=rotations)
-    names = _apart(source, target)
+            render_match(*shapes, found, drawing, rotations=rotations, labels=names)
     _tell_match(voice, result, names, output)
     if picture is not None:
         voice.say(f"drew {picture}: matched places have one colour")
@@ -121,9 +123,14 @@ def register(
     refine: options.RefineOption = "nodes",
     up: options.Up = None,
     front: options.Front = None,
+    partial: options.PartialFlag = None,
     dense: Annotated[
         bool, typer.Option("--dense", help="Write the template in its full resolution.")
     ] = False,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="PNG", help="Draw the template over the shape, the distance as heat."),
+    ] = None,
     seed: options.Seed = 0,
     strict: options.Strict = False,
     json: options.Json = False,
@@ -146,38 +153,53 @@ def register(
     from meshmatch.shapes.shape import Shape
 
     options.check_axes(up, front)
-    check_apart([output], [shape])
+    check_png(picture)
+    check_apart([output, picture], [shape])
     voice = Voice(quiet)
-    with replace_on_success(output) as temporary:
-        save_shape(temporary, Shape(np.eye(3), np.array([[0, 1, 2]])))  # a suffix that cannot be is told now
-        locate_model(model)
-        loaded = load_shape(shape)
-        from meshmatch import pipeline
+    with claimed(picture) as drawing:
+        with replace_on_success(output) as temporary:
+            speck = Shape(np.eye(3), np.array([[0, 1, 2]]))
+            save_shape(temporary, speck)  # a suffix that cannot be is told now
+            locate_model(model)
+            loaded = load_shape(shape)
+            from meshmatch import pipeline
 
-        with voice.progress() as report:
-            fit = pipeline.register(
-                loaded, model=model, refine=refine, seed=seed, up=up, front=front, progress=report
-            )
-        if strict and fit.verdict == "poor":
-            raise PoorFit(f"poor fit, nothing was written: {_why(fit.reasons)}", _HINT)
-        fitted = Shape(fit.points_in_file, fit.faces, output.stem)
-        if dense:
-            from meshmatch.fitting.dense import dense_shape
+            with voice.progress() as report:
+                fit = pipeline.register(
+                    loaded,
+                    model=model,
+                    refine=refine,
+                    seed=seed,
+                    up=up,
+                    front=front,
+                    partial=options.partial_choice(partial),
+                    progress=report,
+                )
+            if strict and fit.verdict == "poor":
+                raise PoorFit(f"poor fit, nothing was written: {_why(fit.reasons)}", _HINT)
+            fitted = Shape(fit.points_in_file, fit.faces, output.stem)
+            if dense:
+                from meshmatch.fitting.dense import dense_shape
 
-            fitted = dense_shape(pipeline.read_model(model), fit)
-        save_shape(temporary, fitted)
+                fitted = dense_shape(pipeline.read_model(model), fit)
+            save_shape(temporary, fitted)
+        if drawing is not None:
+            from meshmatch.render.fitted import render_fit
+
+            render_fit(loaded, fitted, drawing, rotation=fit.frame.rotation)
     notes = [f"{loaded.name}: {note}" for note in pipeline.usable(loaded).notes]
     for note in notes:
         voice.say(note)
     voice.say(f"laid the template of {model} on {loaded.name}: {_fit_words(fit)}")
     _warn(voice, fit.verdict, fit.reasons)
     voice.say(f"wrote {output}: {fitted.V} vertices, {fitted.F} faces ({fit.seconds:.1f} s)")
+    if picture is not None:
+        voice.say(f"drew {picture}: the template over the shape, and how far apart they are")
     if json:
+        files = {"output": str(output), "picture": None if picture is None else str(picture)}
         size = {"vertices": fitted.V, "faces": fitted.F}
         choices = {"model": model, "refine": refine, "dense": dense}
-        print_json(
-            {"output": str(output)} | size | choices | _fit_record(loaded.name, fit) | {"notes": notes}
-        )
+        print_json(files | size | choices | _fit_record(loaded.name, fit) | {"notes": notes})
 
 
 _HINT = "is it the model's category? try --up and --front, --landmarks, or leave out --strict to look at it"

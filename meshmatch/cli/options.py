@@ -26,11 +26,25 @@ Up = Annotated[Axis | None, typer.Option(help="The file's axis that points up. S
 Front = Annotated[
     Axis | None, typer.Option(help="The file's axis that the shape faces. Searched for if not given.")
 ]
+PartialFlag = Annotated[
+    bool | None,
+    typer.Option(
+        "--partial/--whole",
+        help="A shape may be a part, such as a scan from one side: try that too, or never. Found out if not given.",
+    ),
+]
 Seed = Annotated[int, typer.Option(min=0, help="Chooses the samples. The same seed gives the same result.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Write nothing and exit with 1 if a fit is poor.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 Threads = Annotated[int, typer.Option(min=1, help="How many threads to use.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary; warnings stay.")]
+
+
+def partial_choice(partial: bool | None) -> Literal["auto", "yes", "no"]:
+    """The pipeline's word for the flag."""
+    if partial is None:
+        return "auto"
+    return "yes" if partial else "no"
 
 
 def check_axes(up: Axis | None, front: Axis | None) -> None:

@@ -71,7 +71,10 @@ def agreed_fits(
     local = None
     if landmarks is not None:
         local = [(at, fit.frame.apply(place)) for (at, place), fit in zip(landmarks, fits, strict=True)]
-    refined = agree(system, scans, [fit.vectors for fit in fits], how or AgreeConfig(), config.nodes, local)
+    parts = [fit.partial for fit in fits]
+    refined = agree(
+        system, scans, [fit.vectors for fit in fits], how or AgreeConfig(), config.nodes, local, parts
+    )
     agreed = []
     for shape, fit, vectors in zip(shapes, fits, refined, strict=True):
         points = system.moved(vectors)
@@ -95,6 +98,7 @@ def agree(
     config: AgreeConfig,
     nodes: NodeRefineConfig,
     landmarks: Sequence[Landmarks] | None = None,
+    partial: Sequence[bool] | None = None,
 ) -> list[np.ndarray]:
     """Refine the fits of several shapes together.
 
@@ -104,6 +108,7 @@ def agree(
     vectors : (K, 3) node vectors of each fit
     nodes : how pairs of points are found and weighed
     landmarks : optional, for each shape template vertices (N,) and positions (N, 3) in its core frame
+    partial : optional, for each shape whether it shows a part only
 
     Returns
     -------
@@ -116,7 +121,8 @@ def agree(
         gradients = [system.deformation_gradient(each) for each in refined]
         common = mean_stretch(gradients)
         for number, (scan, F) in enumerate(zip(scans, gradients, strict=True)):
-            weights, pulls = pair_terms(system, scan, refined[number], config.scale, pairing)
+            one_sided = partial is not None and partial[number]
+            weights, pulls = pair_terms(system, scan, refined[number], config.scale, pairing, one_sided)
             if landmarks is not None:
                 add_landmarks(weights, pulls, landmarks[number], nodes.landmark_weight)
             targets = nearest_rotations(F, common) @ common

@@ -42,6 +42,8 @@ class Fit:
         The axes of the file that the fit took for up and front, such as "+y" and "-z".
     seconds : float
     seed : int
+    partial : bool
+        The shape was taken for a part: the residual is from the shape to the template only.
     """
 
     template_hash: str
@@ -58,6 +60,7 @@ class Fit:
     front: str
     seconds: float
     seed: int
+    partial: bool = False
 
     @property
     def points_in_file(self) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError
-from meshmatch.fitting.fit import Fit, axis_name
+from meshmatch.fitting.fit import FAIR_RESIDUAL, Fit, axis_name
 from meshmatch.fitting.latent import LatentRefineConfig, refine_code
 from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual, variants
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
@@ -24,21 +24,29 @@ from meshmatch.fitting.orientation import (
     standing_grid,
     with_flips,
 )
+from meshmatch.fitting.part import cost, fit_part
 from meshmatch.fitting.placing import placed, scan_frame
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.settle import settle
 from meshmatch.fitting.system import NodeSystem
-from meshmatch.fitting.verdict import cloud_allowance, judge
+from meshmatch.fitting.verdict import cloud_allowance, empty_share, judge
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.topology import open_edges
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
 
 Refine = Literal["none", "latent", "nodes"]
+Partial = Literal["auto", "yes", "no"]
 REFINEMENTS: tuple[Refine, ...] = ("none", "latent", "nodes")
 Progress = Callable[[str, float], None]
+_Laid = tuple[Frame, Scan, Candidate]
+
+# A fit of the whole that leaves this share of the template without surface may be one of a part; that is believed
+# if its residual is that much smaller. A mesh must be open for it, with a boundary of so many sqrt(area).
+_LEFT, _CLOSER, _OPEN = 0.06, 0.85, 0.3
 
 
 @dataclass(frozen=True)
@@ -48,13 +56,16 @@ class FitConfig:
     samples : points drawn on the surface, of which coarse_samples see every orientation; hypotheses : voted
     orientations, each tried with its flips; laid : of which this many are laid on with care; variants : readings
     of the best from frames tilted by ``tilt`` degrees; finalists : readings that get ``screening`` node steps
-    before the best one gets them all; copies : turned copies that vote on the orientation.
+    before the best one gets them all; copies : turned copies that vote on the orientation; partial : whether the
+    shape may be a part of a whole, tried where a fit of the whole leaves template without surface ("auto"), always
+    or never.
     """
 
     refine: Refine = "nodes"
     seed: int = 0
     up: str | None = None
     front: str | None = None
+    partial: Partial = "auto"
     samples: int = 8000
     coarse_samples: int = 2048
     copies: int = 48
@@ -70,6 +81,8 @@ class FitConfig:
     def __post_init__(self) -> None:
         if self.refine not in REFINEMENTS:
             raise OptionError(f"no refinement {self.refine!r}", f"choose one of {', '.join(REFINEMENTS)}")
+        if self.partial not in ("auto", "yes", "no"):
+            raise OptionError(f"partial cannot be {self.partial!r}", "choose auto, yes or no")
 
 
 @lru_cache(maxsize=4)
@@ -107,8 +120,18 @@ def fit_shape(
     began = time.monotonic()
     tell = progress or (lambda what, share: None)
     rng = np.random.default_rng(config.seed)
-    system = node_system(model)
     frame, scan = take_samples(shape, config.samples, rng, scan_frame(model, shape))
+    laid, partial = _whole(model, shape, frame, scan, config, landmarks, rng, tell), False
+    if landmarks is None and _try_part(model, shape, laid, config):
+        part = _part(model, frame, scan, config, tell)
+        partial = cost(part[2].residual, (frame.scale / part[0].scale) ** 2) < _CLOSER * laid[2].residual
+        laid = part if partial else laid
+    return replace(_finish(model, shape, laid, config, partial), seconds=time.monotonic() - began)
+
+
+def _whole(model, shape, frame, scan, config, landmarks, rng, tell) -> _Laid:
+    """The template on a shape that is taken for a whole."""
+    system = node_system(model)
     tell("orientation", 0.0)
     guesses = _hypotheses(model, scan, config)
     coarse = Scan(scan.points[: config.coarse_samples], scan.normals[: config.coarse_samples])
@@ -124,13 +147,36 @@ def fit_shape(
     if config.refine == "nodes":
         candidates = _readings(model, system, scan, coarse, candidates, config, rng)
     tell("orientation", 1.0)
-    best = _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell)
+    return frame, scan, _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell)
+
+
+def _part(model, frame, scan, config, tell) -> _Laid:
+    """The template on a shape that is taken for a part."""
+    scale, sized, best = fit_part(
+        model,
+        node_system(model),
+        scan,
+        lambda part: _hypotheses(model, part, config),
+        config.nodes,
+        np.random.default_rng(config.seed),
+        variants_count=config.variants,
+        tilt=config.tilt,
+        screening=config.screening,
+        refine=config.refine == "nodes",
+        tell=lambda share: tell("fitting as a part", share),
+    )
+    return frame.compose(Frame(scale, np.eye(3), np.zeros(3))), sized, best
+
+
+def _finish(model, shape, laid: _Laid, config, partial: bool) -> Fit:
+    """The noun, with its verdict."""
+    frame, scan, best = laid
+    system = node_system(model)
     core_frame = frame.compose(Frame(1.0, best.rotation.T, best.centre))
     points = system.moved(best.vectors)
-    distance = _vertex_distance(core_frame.apply(shape.verts), points)
     local = scan.turned(best.rotation, best.centre)
     allowance = cloud_allowance(system, local, shape.V, best.vectors, config.seed) if shape.is_cloud else 0.0
-    verdict, reasons = judge(best.residual, local, points, allowance)
+    verdict, reasons = judge(best.residual, local, points, allowance, partial)
     return Fit(
         template_hash=model.template.hash,
         frame=core_frame,
@@ -139,14 +185,26 @@ def fit_shape(
         resting=system.verts,
         faces=system.faces,
         residual=best.residual,
-        vertex_distance=distance,
+        vertex_distance=cKDTree(points).query(core_frame.apply(shape.verts))[0],
         verdict=verdict,
         reasons=reasons,
         up=axis_name(core_frame.rotation[1]),
         front=axis_name(core_frame.rotation[2]),
-        seconds=time.monotonic() - began,
+        seconds=0.0,
         seed=config.seed,
+        partial=partial,
     )
+
+
+def _try_part(model, shape: Shape, laid: _Laid, config: FitConfig) -> bool:
+    """Whether a fit of a part is worth its time: asked for, or an open shape on which the whole fits badly."""
+    if config.partial != "auto" or config.refine == "latent":
+        return config.partial == "yes"
+    if not shape.is_cloud and boundary_length(shape) < _OPEN * np.sqrt(shape.area):
+        return False
+    _, scan, best = laid
+    local, points = scan.turned(best.rotation, best.centre), node_system(model).moved(best.vectors)
+    return best.residual > FAIR_RESIDUAL or empty_share(local, points) > _LEFT
 
 
 def _settled(model, system, frame, scan, rough, config, rng) -> tuple[Frame, Scan, Scan, list[Candidate]]:
@@ -245,5 +303,7 @@ def _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell
     return fitted(chosen, config.nodes, lambda k, n: tell("refinement", 0.6 + 0.4 * k / n))
 
 
-def _vertex_distance(verts: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return cKDTree(points).query(verts)[0]
+def boundary_length(shape: Shape) -> float:
+    """Length of the edges with one face, in the unit of the file."""
+    ends = shape.verts[open_edges(shape.faces)]  # N 2 3
+    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum())

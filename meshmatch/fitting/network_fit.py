@@ -54,6 +54,16 @@ def two_way_residual(
     return float(0.5 * np.minimum(forward, cap).mean() + 0.5 * np.minimum(back, cap).mean())
 
 
+def one_way_residual(
+    system: NodeSystem, scan: Scan, vectors: np.ndarray, stride: int = 2, cap: float = 0.1
+) -> float:
+    """Mean of the capped 6-D distances from every ``stride``-th scan point to the template."""
+    moved = system.moved(vectors)
+    seen = with_normals(moved, system.normals(moved))
+    back = cKDTree(seen).query(with_normals(scan.points[::stride], scan.normals[::stride]))[0]
+    return float(np.minimum(back, cap).mean())
+
+
 @torch.inference_mode()
 def predict(
     model: Deformer, scan: Scan, draws: int, rng: np.random.Generator, points: int = 2048

@@ -17,7 +17,7 @@ _MOST_NOISE = 0.025
 
 
 def judge(
-    residual: float, scan: Scan, points: np.ndarray, allowance: float = 0.0
+    residual: float, scan: Scan, points: np.ndarray, allowance: float = 0.0, partial: bool = False
 ) -> tuple[str, tuple[str, ...]]:
     """Verdict on a fit and the reasons, in words.
 
@@ -31,6 +31,8 @@ def judge(
         Template vertices as fitted.
     allowance : float
         The part of the residual that the shape itself explains (see `cloud_allowance`); squares add up.
+    partial : bool
+        The shape shows a part only: template without surface is as expected, and such a fit is fair at best.
     """
     reasons = []
     excess = float(np.sqrt(max(residual**2 - allowance**2, 0.0)))
@@ -40,12 +42,20 @@ def judge(
     missed = float((gap > 0.06).mean())
     if missed > 0.02:
         reasons.append(f"{100 * missed:.0f} % of the shape is not reached by the template")
-    empty = float((cKDTree(scan.points).query(points)[0] > 0.06).mean())
+    empty = empty_share(scan, points)
+    if partial:
+        reasons.append(f"taken for a part: {100 * empty:.0f} % of the template has no counterpart")
+        empty = 0.0
     if empty > 0.02:
         reasons.append(f"{100 * empty:.0f} % of the template lies where the shape has no surface")
     if excess > FAIR_RESIDUAL or missed > 0.06 or empty > 0.06:
         return "poor", tuple(reasons)
     return ("fair" if reasons else "good"), tuple(reasons)
+
+
+def empty_share(scan: Scan, points: np.ndarray) -> float:
+    """Share (0..1) of the fitted template's vertices (V, 3) without any of the shape near."""
+    return float((cKDTree(scan.points).query(points)[0] > 0.06).mean())
 
 
 def cloud_allowance(system: NodeSystem, scan: Scan, V: int, vectors: np.ndarray, seed: int = 0) -> float:

@@ -101,6 +101,7 @@ DEFAULTS = {
     "seed": 0,
     "up": None,
     "front": None,
+    "partial": "auto",
     "landmarks": None,
     "workers": 2,
 }
@@ -118,6 +119,8 @@ OPTIONS = [
     *[(["--up", value], "up", value) for value in ("x", "y", "z", "-x", "-y", "-z")],
     *[(["--front", value], "front", value) for value in ("x", "y", "z", "-x", "-y", "-z")],
     (["--seed", "7"], "seed", 7),
+    (["--partial"], "partial", "yes"),
+    (["--whole"], "partial", "no"),
 ]
 
 
@@ -359,7 +362,7 @@ def test_register_hands_options_on(
     run: Run, two: tuple[Path, Path], stub: Recorder, words: list[str], name: str, value: object
 ) -> None:
     assert run("register", two[0], "-o", two[0].with_name("fitted.ply"), *words).status == 0
-    defaults = {key: DEFAULTS[key] for key in ("model", "refine", "seed", "up", "front")}
+    defaults = {key: DEFAULTS[key] for key in ("model", "refine", "seed", "up", "front", "partial")}
     assert {key: stub.called[key] for key in defaults} == defaults | {name: value}
     assert stub.called["shape"].V == 642
 

@@ -1,0 +1,81 @@
+"""Parts of shapes: when one is tried, what it costs, and one side of a real body."""
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import OptionError
+from meshmatch.fitting.fit_shape import FitConfig, boundary_length, fit_shape, node_system
+from meshmatch.fitting.network_fit import one_way_residual
+from meshmatch.fitting.part import SHARES, cost
+from meshmatch.fitting.scan import Scan
+from meshmatch.fitting.verdict import empty_share, judge
+from meshmatch.pipeline import map_between, read_model
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
+from tests.fitting.eggs import egg_model
+
+SQUARE = Shape(np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def test_the_boundary_by_hand() -> None:
+    assert boundary_length(SQUARE) == 8.0
+    closed = Shape(SQUARE.verts, np.concatenate([SQUARE.faces, SQUARE.faces[:, ::-1]]))
+    assert boundary_length(closed) == 0.0
+
+
+def test_a_smaller_share_costs_more() -> None:
+    costs = [cost(0.02, share) for share in SHARES]
+    assert costs[0] == 0.02
+    assert costs == sorted(costs)
+
+
+def test_partial_must_be_a_known_word() -> None:
+    with pytest.raises(OptionError, match="partial cannot be 'maybe'"):
+        FitConfig(partial="maybe")  # type: ignore[arg-type]
+
+
+def test_what_is_not_seen_is_not_held_against_a_part() -> None:
+    system = node_system(egg_model())
+    samples = sample_surface(Shape(system.verts, system.faces), 3000, np.random.default_rng(0))
+    half = samples.points[:, 1] > 0
+    scan, still = Scan(samples.points[half], samples.normals[half]), np.zeros((system.K, 3))
+    assert 0.3 < empty_share(scan, system.verts) < 0.6
+    assert judge(0.02, scan, system.verts)[0] == "poor"
+    verdict, reasons = judge(0.02, scan, system.verts, partial=True)
+    assert verdict == "fair"
+    assert "taken for a part" in reasons[0]
+    assert judge(0.05, scan, system.verts, partial=True)[0] == "poor"
+    whole = Scan(samples.points, samples.normals)
+    assert one_way_residual(system, scan, still) == pytest.approx(
+        one_way_residual(system, whole, still), rel=0.1
+    )
+
+
+def side_of(body: Shape, direction: np.ndarray) -> tuple[Shape, np.ndarray]:
+    """The faces that look one way, as a mesh of their own, and which vertices it kept."""
+    faces = body.faces[body.face_normals @ direction > 0]
+    used = np.unique(faces)
+    return Shape(body.verts[used], np.searchsorted(used, faces), "side"), used
+
+
+def test_one_side_of_a_body_is_found_to_be_a_part_and_matches_the_whole() -> None:
+    dancer = load_shape(bundled_folder() / "samples" / "dancer.ply")
+    side, used = side_of(dancer, np.array([0.3, 0.1, 1.0]))
+    model = read_model("human")
+    whole, part = fit_shape(model, dancer), fit_shape(model, side)
+    assert (whole.partial, part.partial) == (False, True)
+    assert part.verdict != "good"
+    found = map_between(side, part, dancer, whole, model="human").index
+    apart = np.linalg.norm(dancer.verts[found] - dancer.verts[used], axis=1)  # centimetres
+    assert apart.mean() < 5
+    never = fit_shape(model, side, FitConfig(partial="no"))
+    assert not never.partial
+    alone = map_between(side, never, dancer, whole).index
+    assert apart.mean() < np.linalg.norm(dancer.verts[alone] - dancer.verts[used], axis=1).mean()
+
+
+def test_a_whole_stays_a_whole_where_parts_are_tried() -> None:
+    climber = load_shape(bundled_folder() / "samples" / "climber.ply")
+    assert not fit_shape(read_model("human"), climber, FitConfig(partial="yes")).partial
