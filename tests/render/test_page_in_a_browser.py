@@ -212,7 +212,9 @@ def test_a_vertex_can_be_typed(running: Any, file: Path, pair: Pair) -> None:
         for wrong in ("162", "-1", "1e3", "nose"):
             field.fill(wrong)
             field.press("Enter")
-            assert view.page.locator("#status").inner_text() == "stirred.ply has the vertices 0 to 161."
+            assert view.page.locator("#status").inner_text() == (
+                "\u2068stirred.ply\u2069 has the vertices 0 to 161."
+            )
         field.fill("")
         field.press("Enter")
         assert view.settled()["shown"] is None

@@ -7,6 +7,7 @@ import hashlib
 import html
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -30,6 +31,8 @@ from meshmatch.shapes.shape import Floats, Shape
 from meshmatch.transfer.direction import check_map
 
 PAGE_SUFFIXES = (".html", ".htm")
+# Control characters, ends of lines, and marks that turn the direction of writing.
+_UNSEEMLY = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 _SCRIPTS = ("data", "picking", "materials", "drawing", "cameras", "points", "words", "viewer")
 
 
@@ -114,7 +117,7 @@ def write_page(
         "version": __version__,
         "arrays": table,
     }
-    text = _page(words, packed, f"{shown[0]} → {shown[1]}")
+    text = assemble("viewer", _SCRIPTS, words, packed, f"{shown[0]} → {shown[1]}")
     with replace_on_success(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
     notes = tuple(f"{name}: {part.note}" for name, part in zip(shown, parts, strict=True) if part.note)
@@ -157,15 +160,18 @@ def _words(shape: Shape, name: str, part: Drawn, box: Box) -> dict[str, Any]:
 
 
 def _text(value: str) -> str:
-    """A name of any bytes as text that UTF-8 can hold."""
-    return value.encode("utf-8", "replace").decode("utf-8")
+    """A name of any bytes as text that UTF-8 can hold, without what would turn or break the words around it."""
+    return _UNSEEMLY.sub("\ufffd", value.encode("utf-8", "replace").decode("utf-8"))
 
 
-def _page(words: dict[str, Any], packed: str, title: str) -> str:
-    """The whole file. Every part is put in once, in one pass: a name cannot pose as a part."""
-    style = _asset("viewer.css")
+def assemble(name: str, scripts: Sequence[str], words: dict[str, Any], packed: str, title: str) -> str:
+    """The whole file, of ``name``.html, ``name``.css and scripts.
+
+    Every part is put in once, in one pass: a name cannot pose as a part.
+    """
+    style = _asset(f"{name}.css")
     library = _asset("three.min.js")
-    program = "(() => {\n'use strict';\n" + "\n".join(_asset(f"{name}.js") for name in _SCRIPTS) + "})();\n"
+    program = "(() => {\n'use strict';\n" + "\n".join(_asset(f"{part}.js") for part in scripts) + "})();\n"
     # Scripts and styles are allowed by their hashes alone, and nothing may be fetched from anywhere.
     policy = "; ".join(
         [
@@ -186,7 +192,7 @@ def _page(words: dict[str, Any], packed: str, title: str) -> str:
         "words": _json(words),
         "packed": packed,
     }
-    return re.sub(r"<!--(\w+)-->", lambda found: parts[found[1]], _asset("viewer.html"))
+    return re.sub(r"<!--(\w+)-->", lambda found: parts[found[1]], _asset(f"{name}.html"))
 
 
 def _asset(name: str) -> str:

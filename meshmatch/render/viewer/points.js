@@ -191,8 +191,8 @@ function listen(side) {
     const { vertices, name } = words[side];
     const known = vertex >= 0 && vertex < vertices;
     $('status').textContent = known
-      ? `Vertex ${vertex} of ${name} is not among those drawn here.`
-      : `${name} has the vertices 0 to ${vertices - 1}.`;
+      ? `Vertex ${vertex} of ${within(name)} is not among those drawn here.`
+      : `${within(name)} has the vertices 0 to ${vertices - 1}.`;
     $('announce').textContent = $('status').textContent;
   };
   form.addEventListener('submit', (event) => {

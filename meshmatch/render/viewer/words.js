@@ -1,11 +1,14 @@
 // Words and switches around the panels, and the keys.
 
+// A name within a sentence, whichever way it is written.
+const within = (name) => `\u2068${name}\u2069`;
+
 // Parts of each legend: words, the scale, and what may be left out where there is little room.
 const SCALE = Symbol('scale');
 const LEGENDS = {
   matches: () => ['One colour is one place', ': the source by position, the target through the map.'],
   look: () => [
-    `The ${words.look.kind} of ${words[words.look.side].name}`,
+    `The ${words.look.kind} of ${within(words[words.look.side].name)}`,
     ', carried by the map to the other.',
   ],
   own: () => ['Each shape as it is in its file', ''],
@@ -93,7 +96,9 @@ function write() {
     );
     panel(side).querySelector('input').setAttribute('aria-label', `Vertex of the ${side}, ${name}`);
     if (note)
-      $('help-notes').append(listed(`${name} is ${note}. Every vertex drawn stands for one of the file.`));
+      $('help-notes').append(
+        listed(`${within(name)} is ${note}. Every vertex drawn stands for one of the file.`),
+      );
   }
   const verdict = words.verdict;
   $('verdict').dataset.verdict = verdict;
@@ -101,7 +106,7 @@ function write() {
   $('verdict-means').textContent = MEANS[verdict];
   $('reasons').replaceChildren(...words.reasons.map(listed));
   $('help-map').textContent =
-    `For each vertex of ${words.source.name} the map knows its place on ${words.target.name}, and the other way round. ` +
+    `For each vertex of ${within(words.source.name)} the map knows its place on ${within(words.target.name)}, and the other way round. ` +
     'The ring marks that exact place, dashed where it is on the far side; the number is the vertex nearest to it.';
   $('made').textContent =
     `Made by meshmatch ${words.version}, drawn with three.js r${THREE.REVISION} (MIT licence).`;
