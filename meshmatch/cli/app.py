@@ -10,11 +10,13 @@ from meshmatch.cli.info import info
 from meshmatch.cli.interpolate import interpolate
 from meshmatch.cli.match import match, register
 from meshmatch.cli.models import models
+from meshmatch.cli.picture import picture
 from meshmatch.cli.prepare import prepare
 from meshmatch.cli.train import train
 from meshmatch.cli.transfer_color import transfer_color
 from meshmatch.cli.transfer_labels import transfer_labels
 from meshmatch.cli.transfer_landmarks import transfer_landmarks
+from meshmatch.cli.transfer_texture import transfer_texture
 from meshmatch.cli.transfer_weights import transfer_weights
 from meshmatch.cli.view import view
 
@@ -50,9 +52,9 @@ def root(
 
 _VERBS: tuple[Callable[..., None], ...] = (
     *(match, register, evaluate),
-    *(transfer_color, transfer_labels, transfer_weights, transfer_landmarks),
+    *(transfer_texture, transfer_color, transfer_labels, transfer_weights, transfer_landmarks),
     interpolate,
-    *(view,),
+    *(picture, view),
     *(info, prepare, train),
 )
 for verb in _VERBS:

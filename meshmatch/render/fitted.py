@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.maps.surface import Surface
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.figures import Panel
+from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import Scale
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
+from meshmatch.transfer.image import Image
 
 FloatArray = NDArray[np.float64]
+
+
+def render_fit(shape: Shape, fitted: Shape, path: str | Path, *, rotation: FloatArray | None = None) -> None:
+    """Draw `fit_panels` with their scale."""
+    panels, scale = fit_panels(shape, fitted, rotation)
+    render_shapes(panels, path, Look(legend=scale))
 
 
 def fit_panels(
@@ -39,9 +49,7 @@ def fit_panels(
 
 def distances(shape: Shape, fitted: Shape) -> FloatArray:
     """Distance (V,) of each vertex of a shape to the surface of another; nan where it has no position."""
-    unknown = np.zeros_like(fitted.verts)
-    surface = Surface(fitted.verts, fitted.faces, unknown)
-    found = surface.query(shape.verts, np.zeros_like(shape.verts)).distance
+    found = Image(VertexMap.identity(fitted), fitted, fitted).query(shape.verts).distance
     return found if shape.invalid is None else np.where(shape.invalid, np.nan, found)
 
 

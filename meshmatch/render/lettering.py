@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import unicodedata
 from functools import lru_cache
 
 from PIL import Image, ImageDraw, ImageFont
 
 Ink = tuple[int, int, int]
+_NO_CHARACTER = "\ufffe"
 
 
 @lru_cache(maxsize=64)
@@ -20,13 +22,32 @@ def width_of(text: str, size: float) -> float:
     return float(font(size).getlength(text))
 
 
+def readable(text: str) -> str:
+    """The text in letters that the font has, on one line: without accents where need be, else "?"."""
+    out = []
+    for letter in " ".join(text.split()):
+        plain = letter if _has(letter) else unicodedata.normalize("NFKD", letter)
+        kept = "".join(part for part in plain if _has(part) and not unicodedata.combining(part))
+        out.append(kept or ("" if unicodedata.combining(letter) else "?"))
+    return "".join(out)
+
+
+@lru_cache(maxsize=4096)
+def _has(letter: str) -> bool:
+    if letter == " ":
+        return True
+    if unicodedata.category(letter).startswith("C"):
+        return False
+    wanted, missing = (font(32.0).getmask(part) for part in (letter, _NO_CHARACTER))
+    return (wanted.size, bytes(wanted)) != (missing.size, bytes(missing))
+
+
 def fitting(text: str, size: float, room: float) -> tuple[str, float]:
     """The text and the size at which it fits into so many pixels: smaller first, then cut in the middle."""
-    text = " ".join(text.split())
+    text = readable(text)
     while size > 9 and width_of(text, size) > room:
         size *= 0.95
-    kept = len(text)
-    whole = text
+    kept, whole = min(len(text), 400), text
     while width_of(text, size) > room and kept > 2:
         kept -= 1
         text = f"{whole[: (kept + 1) // 2]}…{whole[len(whole) - kept // 2 :]}"

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
 from meshmatch.maps.vertex_map import VertexMap
@@ -26,7 +27,12 @@ Unit = Literal["cm", "x100"]
 
 # A target place that so small a share of the map's confidence reaches is one that nothing was matched to.
 _REACHED = 0.05
-_UNITS = {"cm": (CM_PER_UNIT, "error (cm, at 1.9 m² of skin)"), "x100": (100.0, "error (√area / 100)")}
+# Known points closer than this (units of sqrt(area)) speak for the surface between them.
+_CLOSE = 0.06
+_UNITS = {
+    "cm": (CM_PER_UNIT, "error (cm, on a body with 1.9 m2 of skin)"),
+    "x100": (100.0, "error (hundredths of sqrt(area))"),
+}
 
 
 def render_match(
@@ -174,18 +180,29 @@ def error_panels(
 
 
 def heat_panel(shape: Shape, vertices: NDArray[np.int64], values: FloatArray, scale: Scale) -> Panel:
-    """A shape with numbers (N,) at some of its vertices (N,): painted where most have one, balls where few do."""
+    """A shape with numbers (N,) at some of its vertices (N,): painted where these lie close, balls where not.
+
+    Between them a vertex takes the mean of the nearest; one that is far from all has no value.
+    """
     sums = np.bincount(vertices, values, shape.V)
     count = np.bincount(vertices, minlength=shape.V)
-    if (count > 0).sum() >= 0.5 * shape.V:
-        return Panel(shape, scale.colors(np.where(count > 0, sums / np.maximum(count, 1), np.nan)))
     own = np.flatnonzero(count)
+    means = sums[own] / count[own]
+    unit = float(np.sqrt(shape.area)) or 1.0
+    tree = cKDTree(shape.verts[own])
+    spacing = float(np.median(tree.query(shape.verts[own], 2)[0][:, 1])) if len(own) > 3 else np.inf
+    if spacing < _CLOSE * unit:
+        distance, place = tree.query(shape.verts, 4)
+        weight = 1.0 / (distance + 1e-3 * unit) ** 2
+        painted = (weight * means[place]).sum(axis=1) / weight.sum(axis=1)
+        painted[own] = means
+        return Panel(shape, scale.colors(np.where(distance[:, 0] < 2 * spacing, painted, np.nan)))
     return Panel(
         shape,
         np.tile(_PALE, (shape.V, 1)),
         points=shape.verts[own],
-        point_colors=scale.colors(sums[own] / count[own]),
-        point_radius=0.016 * float(np.sqrt(shape.area)),
+        point_colors=scale.colors(means),
+        point_radius=0.016 * unit,
     )
 
 

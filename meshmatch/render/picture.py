@@ -26,11 +26,11 @@ FloatArray = NDArray[np.float64]
 LARGEST = 8192, 36_000_000
 """The longest side and the most pixels that a picture may have."""
 _GLASS = 0.34  # opacity of glass seen straight on
-_NEAR = 0.03  # glass this far behind a surface still shines through
+_NEAR = 0.006  # glass further behind a surface than this is hidden by it
 BACKGROUNDS: dict[str, Ink | None] = {"white": (255, 255, 255), "dark": (24, 26, 31), "transparent": None}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Look:
     """What a picture has apart from its shapes.
 

@@ -126,9 +126,9 @@ class Scale:
         places = [self.low, *inner.tolist(), self.high]
         words = [_word(place, step) for place in places]
         if self.beyond[0]:
-            words[0] = f"≤ {words[0]}"
+            words[0] = f"< {words[0]}"
         if self.beyond[1]:
-            words[-1] = f"≥ {words[-1]}"
+            words[-1] = f"> {words[-1]}"
         return list(zip(places, words, strict=True))
 
 
@@ -161,7 +161,7 @@ def nice_step(span: float, parts: int) -> float:
 
 def _word(value: float, step: float) -> str:
     value = 0.0 if abs(value) < 1e-9 * step else value
-    return f"{value:.4g}".replace("-", "−")
+    return f"{value:.4g}"
 
 
 @dataclass(frozen=True)

@@ -102,20 +102,25 @@ def test_errors_at_a_few_points_are_balls_where_they_are(sphere: Shape) -> None:
         sphere, sphere, found, known, Errors([0.1, 0.3, 0.5]), "x100", ("a", "b"), (0.0, 40.0)
     )
     assert (scale.low, scale.high) == (0, 40)
-    assert "100" in scale.title
+    assert "sqrt(area)" in scale.title
     assert np.array_equal(panels[0].points, sphere.verts[[5, 9]])
     assert np.array_equal(panels[1].points, sphere.verts[[100, 200, 300]])
     assert np.asarray(panels[0].point_colors) == pytest.approx(scale.colors([30.0, 30.0]), abs=0.02)  # a mean
     assert [panel.label for panel in panels] == ["a", "b"]
 
 
-def test_a_vertex_without_truth_among_many_is_grey_and_in_the_legend(sphere: Shape) -> None:
-    most = np.arange(sphere.V - 40)
-    panels, scale = error_panels(
-        sphere, sphere, VertexMap.identity(sphere), (most, most), Errors(np.full(len(most), 0.01))
-    )
+def test_between_close_points_errors_are_painted_and_far_from_them_grey(sphere: Shape) -> None:
+    left = np.flatnonzero(sphere.verts[:, 0] < 0.3)[::2]
+    values = np.where(sphere.verts[left, 1] > 0, 0.04, 0.0)
+    panels, scale = error_panels(sphere, sphere, VertexMap.identity(sphere), (left, left), Errors(values))
+    colors = np.asarray(panels[0].colors)
+    grey = (colors == UNKNOWN).all(axis=1)
     assert scale.unknown
-    assert (np.asarray(panels[0].colors)[-40:] == UNKNOWN).all()
+    assert grey[sphere.verts[:, 0] > 0.8].all()
+    assert not grey[sphere.verts[:, 0] < 0.2].any()
+    high = (sphere.verts[:, 1] > 0.3) & (sphere.verts[:, 0] < 0.1)
+    assert colors[high] == pytest.approx(scale.colors(np.full(high.sum(), 0.04 * CM_PER_UNIT)), abs=0.02)
+    assert np.array_equal(panels[1].colors, panels[0].colors)
 
 
 def test_errors_and_matches_become_pictures(

@@ -1,0 +1,135 @@
+"""Which way up a shape is shown, and from which side."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import OptionError
+from meshmatch.render.facing import facing, facing_alike
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
+from meshmatch.templates.template import load_template
+from tests.render.test_picture import box
+
+AXES = {sign + name: (-1 if sign else 1) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in ("", "-")}
+
+
+def joined(*parts: Shape) -> Shape:
+    starts = np.cumsum([0, *(part.V for part in parts[:-1])])
+    return Shape(
+        np.concatenate([part.verts for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]),
+    )
+
+
+def body() -> Shape:
+    """A standing template: y up, z to the front, the left hand at +x."""
+    return load_template(bundled_folder() / "human" / "human-A.safetensors").shape
+
+
+def moved(shape: Shape, rotation: np.ndarray) -> Shape:
+    return Shape(17 * shape.verts @ rotation.T + [3.0, -90, 1], shape.faces, shape.name)
+
+
+@pytest.mark.parametrize("up", AXES)
+@pytest.mark.parametrize("front", AXES)
+def test_named_axes_are_taken_as_they_are(up: str, front: str) -> None:
+    shape = box((1, 1.1, 1.2))
+    if up[-1] == front[-1]:
+        with pytest.raises(OptionError, match="the same axis"):
+            facing(shape, up, front)
+        return
+    rotation = facing(shape, up, front)
+    assert rotation @ AXES[up] == pytest.approx([0, 1, 0])
+    assert rotation @ AXES[front] == pytest.approx([0, 0, 1])
+    assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+def test_what_is_no_axis_is_refused() -> None:
+    for words in ({"up": "w"}, {"front": "up"}, {"up": ""}, {"front": "xx"}):
+        with pytest.raises(OptionError, match="is no axis"):
+            facing(box((1, 1, 1)), **words)
+
+
+def test_a_block_shows_its_broad_side_with_y_or_its_length_up() -> None:
+    assert facing(box((1, 1, 1)))[1].tolist() == [0, 1, 0]
+    assert np.array_equal(facing(box((0.5, 0.3, 1.8))), [[-1, 0, 0], [0, 0, 1], [0, 1, 0]])
+    assert facing(box((1, 2, 3)), front="z")[1].tolist() == [0, 1, 0]
+    flat = facing(box((0.2, 1, 1)))
+    assert np.abs(flat[2]).tolist() == [1, 0, 0]
+
+
+@pytest.mark.parametrize("degrees", [0.0, 35.0, 100.0, 180.0, 280.0])
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_a_body_faces_the_viewer_however_it_stands_in_its_file(up: str, degrees: float) -> None:
+    a = np.radians(degrees)
+    spin = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    to_file = np.roll(np.eye(3), "yzx".index(up), axis=0)  # y becomes the file's up
+    turn = to_file @ spin
+    shape = moved(body(), turn)
+    rotation = facing(shape)
+    assert rotation @ turn @ [0, 1, 0] == pytest.approx([0, 1, 0], abs=1e-9)
+    assert (rotation @ turn @ [0, 0, 1])[2] > np.cos(np.radians(25))
+    assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+def test_a_body_as_a_cloud_and_a_body_without_a_place_somewhere() -> None:
+    shape = body()
+    assert facing(Shape(shape.verts, None))[2, 2] > 0.9
+    verts = np.concatenate([shape.verts, [[900.0, 900, 900]]])
+    broken = Shape(verts, shape.faces, invalid=np.arange(len(verts)) == shape.V)
+    assert facing(broken) == pytest.approx(facing(shape))
+    assert facing(Shape(verts[broken.invalid == 0], None)) == pytest.approx(  # type: ignore[index]
+        facing(Shape(verts, None, invalid=broken.invalid))
+    )
+
+
+@pytest.mark.parametrize("name", ["climber.ply", "dancer.ply"])
+def test_the_samples_stand_upright(name: str) -> None:
+    shape = load_shape(bundled_folder() / "samples" / name)
+    height = shape.verts @ facing(shape)[1]
+    assert np.ptp(height) > 0.95 * np.ptp(shape.verts, axis=0).max()
+
+
+def test_what_would_fall_over_lies() -> None:
+    """A quadruped, long along x: it does not stand on its tail."""
+    trunk = box((2.0, 0.5, 0.5), (0, 1.0, 0))
+    legs = [box((0.15, 0.8, 0.15), (x, 0.4, z)) for x in (-0.8, 0.8) for z in (-0.15, 0.15)]
+    head = box((0.4, 0.3, 0.3), (1.3, 1.3, 0))
+    animal = joined(trunk, *legs, head)
+    assert facing(animal)[1].tolist() == [0, 1, 0]
+
+
+def test_another_shape_is_seen_from_the_same_side(torus: Shape) -> None:
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    seen = torus.verts @ facing(torus).T
+    other = moved(torus, turn)
+    rotation = facing_alike(other, other.verts, seen)
+    there = (other.verts - other.verts.mean(axis=0)) @ rotation.T / 17
+    assert there == pytest.approx(seen - seen.mean(axis=0), abs=1e-9)
+
+
+def test_a_standing_body_stays_upright_beside_one_that_leans() -> None:
+    shape = body()
+    b = np.radians(20)
+    leaning = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
+    rotation = facing_alike(shape, shape.verts, shape.verts @ leaning.T)
+    assert rotation == pytest.approx(np.eye(3), abs=1e-6)
+
+
+def test_a_map_to_one_point_says_nothing_about_the_side(torus: Shape) -> None:
+    points = np.tile(torus.verts[:1], (9, 1))
+    assert np.array_equal(facing_alike(torus, points, torus.verts[:9]), facing(torus))
+
+
+def test_real_bodies_face_the_viewer(bench: Path) -> None:
+    """SCAPE lies along x in its files, and faces -z; FAUST stands along y and faces z."""
+    for name, up, front in (("scape/mesh000.ply", 0, None), ("faust/tr_reg_000.ply", 1, [0, 0, 1])):
+        rotation = facing(load_shape(bench / name))
+        assert rotation[1] == pytest.approx(np.eye(3)[up])
+        if front is not None:
+            assert rotation[2] @ front > 0.9

@@ -1,0 +1,93 @@
+"""Textures on triangles."""
+
+import numpy as np
+import pytest
+
+from meshmatch.render.raster import draw
+from meshmatch.render.scene import Scene
+from meshmatch.render.surface import mesh_surface
+from meshmatch.render.texture import TexturePaint
+from meshmatch.render.window import Window
+from meshmatch.shapes.appearance import Appearance, Material
+from meshmatch.shapes.light import to_linear
+from meshmatch.shapes.shape import Shape
+from tests.shapes.painted import CORNERS, FACES, UV, quarters
+
+SQUARE = Shape(CORNERS, FACES, "square")
+PLACES = np.array([[0.25, 0.75], [0.75, 0.75], [0.25, 0.25], [0.75, 0.25]])  # x, y of the quarters
+WHICH = np.array([1, 1, 1, 0])
+QUARTERS = to_linear(np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1.0]]))
+
+
+def weights_at(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Face and weights of places (N, 2) on the square."""
+    face = (places[:, 1] > places[:, 0]).astype(int)
+    weights = []
+    for place, number in zip(places, face, strict=True):
+        corners = np.vstack([CORNERS[FACES[number], :2].T, np.ones(3)])
+        weights.append(np.linalg.solve(corners, [*place, 1.0]))
+    return face, np.array(weights)
+
+
+def look(
+    *materials: Material, which: tuple[int, int] = (0, 0), colors: np.ndarray | None = None
+) -> Appearance:
+    return Appearance(materials, np.array(which), UV[FACES], colors)
+
+
+def paint(appearance: Appearance, footprint: float = 0.01, places: np.ndarray = PLACES) -> np.ndarray:
+    face, weights = weights_at(places)
+    return np.asarray(TexturePaint(appearance, SQUARE, 1.0).at(face, weights, footprint))
+
+
+def test_each_quarter_of_the_image_lies_where_it_should() -> None:
+    found = paint(look(Material(image=quarters(64))))
+    assert found[:, :3] == pytest.approx(QUARTERS, abs=1e-6)
+    assert (found[:, 3] == 1).all()
+
+
+def test_a_wide_footprint_takes_the_mean_in_light() -> None:
+    found = paint(look(Material(image=quarters(64))), footprint=4.0)
+    assert found[:, :3] == pytest.approx(np.tile(QUARTERS.mean(axis=0), (4, 1)), abs=0.02)
+
+
+def test_factor_and_vertex_colours_multiply() -> None:
+    colors = np.tile([0.5, 1.0, 1.0, 1.0], (4, 1))
+    found = paint(look(Material(image=quarters(64), factor=(0.5, 0.25, 1.0, 1.0)), colors=colors))
+    assert found[:, :3] == pytest.approx(QUARTERS * [0.25, 0.25, 1.0], abs=1e-6)
+    plain = paint(look(Material(factor=(0.1, 0.2, 0.3, 1.0)), Material(factor=(1.0, 0, 0, 1)), which=(0, 1)))
+    face, _ = weights_at(PLACES)
+    wanted = np.array([[0.1, 0.2, 0.3], [1.0, 0, 0]])[face]
+    assert plain[:, :3] == pytest.approx(wanted, abs=1e-6)
+
+
+@pytest.mark.parametrize(("alpha", "wanted"), [("opaque", [1, 1]), ("mask", [1, 0]), ("blend", [0.6, 0.2])])
+def test_alpha_means_what_the_material_says(alpha: str, wanted: list[float]) -> None:
+    image = quarters(64)
+    image[:, :32, 3], image[:, 32:, 3] = 153, 51
+    found = paint(look(Material(image=image, alpha=alpha, cutoff=0.5)))  # type: ignore[arg-type]
+    assert found[:2, 3] == pytest.approx(wanted, abs=0.01)
+
+
+def test_a_textured_square_in_a_picture() -> None:
+    appearance = look(Material(image=quarters(64)))
+    surface = mesh_surface(CORNERS, FACES, TexturePaint(appearance, SQUARE, 1.0))
+    light = draw(Scene([surface]), Window(40, 40, 0.0, 1.0, 0.025)).light
+    red, green, blue, white = (light[r, c] for r, c in ((10, 10), (10, 30), (30, 10), (30, 30)))
+    assert red[0] > 5 * red[1:].max()
+    assert green[1] > 5 * green[[0, 2]].max()
+    assert blue[2] > 5 * blue[:2].max()
+    assert np.ptp(white) < 0.12 * white.max()
+
+
+def test_the_middle_of_a_border_is_blended_by_many_rays() -> None:
+    """A border of the image that runs along a slope through the pixels has no steps."""
+    v, u = np.mgrid[0:512, 0:512] / 512
+    image = np.zeros((512, 512, 4), np.uint8)
+    image[...] = np.where((v + 0.1 * u < 0.5)[..., None], [255, 255, 255, 255], [0, 0, 0, 255])
+    appearance = look(Material(image=image))
+    surface = mesh_surface(CORNERS, FACES, TexturePaint(appearance, SQUARE, 1.0))
+    light = draw(Scene([surface]), Window(40, 40, 0.0, 1.0, 0.025)).light[..., 0]
+    share = (light - light.min()) / (light.max() - light.min())
+    height = share.sum(axis=0)[2:38]
+    assert height == pytest.approx(np.linspace(height[0], height[-1], 36), abs=0.25)
