@@ -24,7 +24,8 @@ def interpolate(
             "--output",
             "-o",
             metavar="OUT",
-            help="A name without a suffix: a new folder with a file for each shape. A .png: all in a row.",
+            help="A name without a suffix: a new folder with a file for each shape. A .png: all in a row. An .html: "
+            "a page with a slider.",
         ),
     ],
     frames: Annotated[int, typer.Option("--frames", "-n", min=2, max=1000, help="How many shapes.")] = 9,
@@ -127,8 +128,10 @@ def interpolate(
             _plot(plotted, result, met)
         if kind == "folder":
             interpolation.save_folder(temporary, result, format)
-        else:
+        elif kind == "strip":
             _draw_strip(temporary, result, met)
+        else:
+            _write_page(temporary, result, met)
     _tell(voice, result, files, place)
     voice.say(
         f"wrote {output}: {frames} shapes of {result.steps[0].shape.V} vertices, from time {start:g} to {stop:g} "
@@ -141,16 +144,18 @@ def interpolate(
         print_json(_record(output, plot, result, files) | choices)
 
 
-def _kind(output: Path) -> Literal["folder", "strip"]:
+def _kind(output: Path) -> Literal["folder", "strip", "page"]:
     from meshmatch.errors import OptionError
 
     if output.suffix == "" or output.is_dir():
         return "folder"
     if output.suffix.lower() == ".png":
         return "strip"
+    if output.suffix.lower() in (".html", ".htm"):
+        return "page"
     raise OptionError(
         f"{output.name}: a sequence is not written as {output.suffix}",
-        "a name without a suffix for a folder (see --format), or one that ends in .png",
+        "a name without a suffix for a folder (see --format), or one that ends in .png or .html",
     )
 
 
@@ -164,6 +169,16 @@ def _draw_strip(path: Path, result: "Interpolation", met: dict[float, str]) -> N
         for step in result.steps
     ]
     render_shapes(panels, path)
+
+
+def _write_page(path: Path, result: "Interpolation", met: dict[float, str]) -> None:
+    """In one frame, that of the first shape: what moves in the files moves on the page."""
+    from meshmatch.render.viewer.motion import write_motion
+
+    shapes = [step.shape for step in result.steps]
+    times = [step.time for step in result.steps]
+    title = " → ".join(met.values())
+    write_motion(path, shapes, times, rotation=result.steps[0].rotation, met=met, title=title)
 
 
 def _plot(path: Path, result: "Interpolation", met: dict[float, str]) -> None:

@@ -94,6 +94,18 @@ def test_a_strip_and_a_plot(run: Run, eggs: Path, tmp_path: Path) -> None:
         assert len(image.convert("RGB").getcolors(1 << 20) or []) > 20
 
 
+def test_a_page(run: Run, eggs: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    done = run(
+        *("interpolate", eggs / "a.ply", eggs / "b.ply", "-o", page, "-n", 3, "--through", eggs / "c.ply"),
+        *("--model", eggs / "model"),
+    )
+    assert done.status == 0, done.err
+    text = page.read_text(encoding="utf-8")
+    assert '"met":[[0.0,"a.ply"],[0.5,"c.ply"],[1.0,"b.ply"]]' in text
+    assert "<title>a.ply → c.ply → b.ply</title>" in text
+
+
 def test_files_of_different_units_stay_with_the_first(run: Run, eggs: Path, tmp_path: Path) -> None:
     common = ("--model", eggs / "model", "-n", 2, "--json")
     a, big = load_shape(eggs / "a.ply"), load_shape(eggs / "big.ply")
