@@ -14,6 +14,7 @@ _PUBLIC = {
     "MeshmatchError": "meshmatch.errors",
     "Shape": "meshmatch.shapes.shape",
     "VertexMap": "meshmatch.maps.vertex_map",
+    "interpolate": "meshmatch.interpolation",
     "load_shape": "meshmatch.shapes.files",
     "match": "meshmatch.pipeline",
     "register": "meshmatch.pipeline",

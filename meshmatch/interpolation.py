@@ -18,7 +18,7 @@ from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import Blend, Deviation, Way
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_shape import FitConfig, Refine
+from meshmatch.fitting.fit_shape import FitConfig, Partial, Refine
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
 from meshmatch.maps.place import in_core_frame
 from meshmatch.maps.surface import Surface
@@ -109,6 +109,7 @@ def interpolate(
     seed: int = 0,
     up: str | None = None,
     front: str | None = None,
+    partial: Partial = "auto",
     workers: int = 2,
     progress: Progress | None = None,
 ) -> Interpolation:
@@ -139,7 +140,7 @@ def interpolate(
     loaded = read_model(model)
     shapes = [as_shape(shape) for shape in (source, *through, target)]
     clean = [usable(shape) for shape in shapes]
-    config = FitConfig(refine=refine, seed=seed, up=up, front=front)
+    config = FitConfig(refine=refine, seed=seed, up=up, front=front, partial=partial)
     set_threads(1 if workers > 1 else workers)
     fits = _fits(loaded, clean, config, workers, progress)
     repaired = [part.shape for part in clean]

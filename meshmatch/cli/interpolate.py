@@ -67,6 +67,7 @@ def interpolate(
     refine: options.RefineOption = "nodes",
     up: options.Up = None,
     front: options.Front = None,
+    partial: options.PartialFlag = None,
     seed: options.Seed = 0,
     strict: options.Strict = False,
     json: options.Json = False,
@@ -117,6 +118,7 @@ def interpolate(
                 seed=seed,
                 up=up,
                 front=front,
+                partial=options.partial_choice(partial),
                 workers=threads,
                 progress=report,
             )

@@ -58,6 +58,15 @@ def train(
     rate: Annotated[
         float | None, typer.Option(min=0.0, help="Learning rate; the preset's if not given.")
     ] = None,
+    blend: Annotated[
+        float | None,
+        typer.Option(
+            metavar="WEIGHT",
+            min=0.0,
+            help="Weight of volume and rigidity of what lies between two codes: the paper's l4, 1 for models that "
+            "interpolate by codes. The preset's if not given.",
+        ),
+    ] = None,
     name: Annotated[
         str | None, typer.Option(metavar="NAME", help="The model's name; the folder's if not given.")
     ] = None,
@@ -126,6 +135,7 @@ def train(
         bf16=preset_train.bf16 if bf16 is None else bf16,
         workers=preset_train.workers if workers is None else workers,
         rate=preset_train.rate if rate is None else rate,
+        loss=preset_train.loss if blend is None else replace(preset_train.loss, blend=blend),
         minutes=minutes,
         threads=threads,
         seed=seed,

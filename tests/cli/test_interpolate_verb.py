@@ -80,7 +80,7 @@ def test_a_strip_and_a_plot(run: Run, eggs: Path, tmp_path: Path) -> None:
     done = run(
         *("interpolate", eggs / "a.ply", eggs / "b.ply", "-o", strip, "--plot", plot, "-n", 3),
         *("--from", -0.2, "--to", 1.2, "--model", eggs / "model", "--blend", "codes", "--seed", 3),
-        *("--refine", "none", "--up", "y", "--front", "z", "--json"),
+        *("--refine", "none", "--up", "y", "--front", "z", "--whole", "--json"),
     )
     assert done.status == 0, done.err
     record = json.loads(done.out)

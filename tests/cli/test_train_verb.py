@@ -61,6 +61,14 @@ def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
     assert f"meshmatch models add {tmp_path / 'mine'}" in answer.err
 
 
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_the_weight_of_blends_alone_is_changed(run: Run, stub: Recorder, tmp_path: Path, preset: Any) -> None:
+    assert run("train", "-o", tmp_path / "mine", "--preset", preset, "--blend", 1).status == 0
+    usual = training.recipe(preset)
+    wanted = replace(usual.train, loss=replace(usual.train.loss, blend=1.0))
+    assert stub.called["recipe"] == replace(usual, train=wanted) != usual
+
+
 @pytest.mark.parametrize(
     ("words", "name", "value"),
     [
