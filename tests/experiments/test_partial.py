@@ -1,0 +1,107 @@
+"""Parts of shapes and the measure of confidence, by hand; the command on a small set."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.experiments import partial
+from meshmatch.experiments.partial import area_under_curve, main, part_of, seen_faces
+from meshmatch.experiments.protocols import load_set
+from meshmatch.fitting.fit import Fit
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.shape import Frame, Shape
+from tests.conftest import icosphere
+from tests.experiments.small_bench import build, truth
+
+
+def test_the_area_under_the_curve_by_hand() -> None:
+    right = np.array([True, True, False, False])
+    assert area_under_curve(np.array([0.9, 0.8, 0.2, 0.1]), right) == 1.0
+    assert area_under_curve(np.array([0.1, 0.2, 0.8, 0.9]), right) == 0.0
+    assert area_under_curve(np.array([0.5, 0.5, 0.5, 0.5]), right) == 0.5
+    assert area_under_curve(np.array([0.9, 0.3, 0.5, 0.1]), right) == 0.75
+    assert np.isnan(area_under_curve(np.ones(3), np.ones(3, bool)))
+
+
+def test_the_area_is_the_share_of_ordered_pairs() -> None:
+    rng = np.random.default_rng(0)
+    confidence, right = rng.integers(0, 6, 80) / 5, rng.random(80) < 0.4
+    a, b = confidence[right][:, None], confidence[~right]
+    assert area_under_curve(confidence, right) == pytest.approx((a > b).mean() + 0.5 * (a == b).mean())
+
+
+def test_a_camera_sees_what_faces_it_and_is_not_hidden() -> None:
+    ball = icosphere(3)
+    behind = Shape(
+        np.concatenate([ball.verts, ball.verts * 0.5 - [0, 0, 4.0]]),
+        np.concatenate([ball.faces, ball.faces + ball.V]),
+    )
+    centres = behind.verts[behind.faces].mean(axis=1)
+    seen = seen_faces(behind, centres, np.array([0.0, 0.0, 1.0]))
+    front = behind.face_normals[:, 2] > 0
+    assert np.array_equal(seen[: ball.F], front[: ball.F])
+    assert not seen[ball.F :].any()  # the small ball stands in the shadow of the large one
+    aside = seen_faces(behind, centres, np.array([1.0, 0.0, 0.0]))
+    assert np.array_equal(aside, behind.face_normals[:, 0] > 0)
+
+
+@pytest.mark.parametrize("kind", partial.KINDS)
+def test_parts_keep_their_vertices(kind: partial.Kind) -> None:
+    ball = icosphere(3)
+    for seed in range(5):
+        part, used = part_of(ball, kind, seed)
+        assert np.array_equal(part.verts, ball.verts[used])
+        known = {tuple(face) for face in ball.faces.tolist()}
+        assert all(tuple(face) in known for face in used[part.faces].tolist())
+        assert (0.45 if kind == "view" else 0.5) <= part.F / ball.F <= (0.55 if kind == "view" else 0.9)
+        assert part_of(ball, kind, seed)[0].hash == part.hash
+
+
+class Known:
+    """Stands for the pipeline: right maps, made wrong at some vertices with little confidence."""
+
+    def register(self, shape: Shape, **how: object) -> Fit:
+        none = np.zeros(shape.V)
+        still = np.zeros((1, 3))
+        return Fit(
+            "", Frame.identity(), still, still, still, still, 0.0, none, "good", (), "+y", "+z", 0.0, 0,
+            partial=how.get("partial") == "yes",
+        )  # fmt: skip
+
+    def map_between(self, source: Shape, _: Fit, target: Shape, __: Fit, **how: object) -> VertexMap:
+        _, used = self.parts[source.hash]
+        index = truth(Path(source.name).stem, Path(target.name).stem)[used]
+        wrong = np.arange(len(index)) % 5 == 0
+        index = np.where(wrong, (index + target.V // 2) % target.V, index)
+        return VertexMap.between(source, target, index, confidence=np.where(wrong, 0.1, 0.9))
+
+
+def test_the_command_counts_what_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, known = build(tmp_path / "data"), Known()
+    bench = load_set("shrec19", data)
+    known.parts = {}
+    for name in bench.shapes:
+        for kind in partial.KINDS:
+            part, used = part_of(bench.shape(name), kind, bench.shapes.index(name))
+            known.parts[part.hash] = part, used
+    monkeypatch.setattr(partial, "register", known.register)
+    monkeypatch.setattr(partial, "map_between", known.map_between)
+    words = ["--sets", "shrec19", "--data", str(data), "--cache", str(tmp_path / "kept"), "--partial", "yes"]
+    assert main(words) == 0
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    for kind in partial.KINDS:
+        found = record["sets"]["shrec19"][kind]
+        assert (found["pairs"], found["of"]) == (3, 3)
+        assert found["median_cm"] == 0.0
+        assert 0.05 < found["share_over_15cm"] <= 0.25
+        assert found["auc"] > 0.9
+        assert found["taken_for_parts"] == 1.0
+
+
+def test_a_missing_set_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--sets", "tosca", "--data", str(tmp_path)]) == 1
+    assert "no set" in capsys.readouterr().err
