@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -138,12 +139,21 @@ def known_texels(material: Material, uv: Floats) -> NDArray[np.bool_] | None:
     found = spans(corners)
     for _, column, row in found.expanded():
         known[wrapped(row, height, material.wrap[1]), wrapped(column, width, material.wrap[0])] = True
-    # triangles so small that they hold no centre still name texels: those that their corners lie on
+    # Triangles that hold no centre of a texel still name some; they count where nothing near is known.
     small = np.ones(len(uv), bool)
     small[found.face] = False
-    at = np.floor(corners[small].reshape(-1, 2)).astype(np.int64)
-    known[wrapped(at[:, 1], height, material.wrap[1]), wrapped(at[:, 0], width, material.wrap[0])] = True
+    at = _texels_at(corners[small].mean(axis=1), material, known.shape)
+    alone = ~maximum_filter(known, 3)[at]
+    known[_texels_at(corners[small][alone].reshape(-1, 2), material, known.shape)] = True
     return known
+
+
+def _texels_at(
+    points: Floats, material: Material, shape: tuple[int, ...]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Row and column of the texels on which points (N, 2) lie."""
+    column, row = np.floor(points).astype(np.int64).T
+    return wrapped(row, shape[0], material.wrap[1]), wrapped(column, shape[1], material.wrap[0])
 
 
 def _densities(

@@ -34,9 +34,9 @@ def fill(pixels: Pixels, weight: NDArray[np.float32]) -> list[Pixels]:
     Returns
     -------
     list of (h, w, 4) uint8
-        All levels, `pixels` first. If nothing at all is known they stay as they are.
+        All levels, `pixels` first. If nothing at all is known, everything counts.
     """
-    levels, weights = [pixels], [weight]
+    levels, weights = [pixels], [weight if (weight > 0).any() else np.ones_like(weight)]
     while max(levels[-1].shape[:2]) > 1:
         smaller, lighter = _halved(levels[-1], weights[-1])
         levels.append(smaller)

@@ -16,7 +16,7 @@ from meshmatch.transfer.bake import Baked, Choices, bake
 from meshmatch.transfer.coat import Coat
 from meshmatch.transfer.footing import images_of
 from meshmatch.transfer.ground import ground_of
-from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of
+from meshmatch.transfer.unwrap import Atlas
 
 LARGEST = 8192
 """Texels along a side."""
@@ -28,7 +28,6 @@ class Worn:
 
     mesh: Textured
     baked: Baked
-    atlas: Atlas
 
 
 def check_choices(choices: Choices) -> None:
@@ -49,11 +48,9 @@ def transfer_texture(
     look: Appearance,
     target: Shape,
     back: VertexMap,
-    *,
-    own: Floats | None = None,
-    keep: Keep = "auto",
+    atlas: Atlas,
     choices: Choices = Choices(),  # noqa: B008  # frozen
-    tell: Callable[[str, float], None] = lambda what, share: None,
+    tell: Callable[[float], None] = lambda share: None,
 ) -> Worn:
     """Bake the look of a source for a target mesh.
 
@@ -63,36 +60,26 @@ def transfer_texture(
         Of the source's file (`load_appearance`).
     back : VertexMap
         From target to source (`pipeline.carry(...).back`).
-    own : (F, 3, 2) float64, optional
-        The target's own texture coordinates (`load_coordinates`).
-    keep : {"auto", "keep", "new"}
-        What to do with them.
+    atlas : Atlas
+        Of the target (`meshmatch.transfer.unwrap.atlas_of`), for the size and padding of `choices`.
     tell : callable
-        Gets what is going on, and the share of it that is done.
+        Gets the share that is done.
 
     Raises
     ------
-    InputError, OptionError
-        The target is a cloud or cannot be unwrapped; choices that cannot be.
+    OptionError
+        Choices that cannot be.
     """
     check_choices(choices)
-    if target.is_cloud:
-        raise OptionError(
-            f"{target.name or 'the target'} is a point cloud, which has no surface for a texture",
-            "its points can have colours: end the output in .ply",
-        )
-    if target.invalid is not None:  # a face with a corner nowhere is no face
-        sound = ~target.invalid[target.faces].any(axis=1)
-        own = None if own is None else own[sound]
-        target = Shape(target.verts, target.faces[sound], target.name)
-    tell("unwrapping", 0.0)
-    atlas = atlas_of(target, own, choices.size, choices.padding, keep)
-    tell("reading the source", 0.0)
     ground = ground_of(source)
     coat = Coat(_of_faces(look, source), ground)
-    baked = bake(coat, ground, target, back, atlas.uv, choices, lambda share: tell("baking", share))
-    mesh = Textured(target.verts, target.faces, atlas.uv, baked.alpha, baked.cutoff)
-    return Worn(mesh, baked, atlas)
+    uv = atlas.uv
+    if target.invalid is not None:  # a face with a corner nowhere is no face
+        sound = ~target.invalid[target.faces].any(axis=1)
+        target, uv = Shape(target.verts, target.faces[sound], target.name), uv[sound]
+    baked = bake(coat, ground, target, back, uv, choices, tell)
+    mesh = Textured(target.verts, target.faces, uv, baked.alpha, baked.cutoff)
+    return Worn(mesh, baked)
 
 
 def colors_of_vertices(source: Shape, look: Appearance, target: Shape, back: VertexMap) -> Floats:

@@ -22,10 +22,11 @@ _OVERLAP = 0.002
 _LEAST_USED, _MOST_STARVED = 0.05, 0.02
 # A triangle is starved if it has this share of the room that its area deserves.
 _STARVED = 1e-3
-# Charts are packed on a grid of this size, with so much of it covered at first.
+# Charts are packed on a grid of at most this size, with so much of it covered at first.
 _GRID, _DENSITIES = 1024, (0.6, 0.5, 0.4)
 # Way round a chart, in units of sqrt(area): a longer one leaves much of a square empty.
 _LONGEST = 3.0
+_MARGIN = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +63,15 @@ def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Ke
     Raises
     ------
     OptionError
-        "keep", and there are none, or they do not serve.
+        A cloud; or "keep", and there are no coordinates, or they do not serve.
     InputError
         No triangle has an area, or xatlas fails.
     """
+    if shape.is_cloud:
+        raise OptionError(
+            f"{shape.name or 'the target'} is a point cloud, which has no surface for a texture",
+            "its points can have colours: end the output in .ply",
+        )
     if not (shape.face_areas > 0).any():
         raise InputError(f"{shape.name or 'the target'} has no triangle with an area", "is it a mesh?")
     if keep == "new" or own is None:
@@ -143,16 +149,19 @@ def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
         if not np.array_equal(origin[faces], corners):
             raise RuntimeError("faces were lost")
         charts = uv * (np.array([maker.width, maker.height]) / maker.texels_per_unit)
-        uv = _packed(charts, faces, padding * _GRID / size)
+        grid = min(size, _GRID)
+        uv = _packed(charts, faces, grid, padding * grid / size)
     except (RuntimeError, IndexError) as error:
         raise _failed(shape, str(error)) from error
     out = np.zeros((shape.F, 3, 2))
-    out[real] = uv[faces]
+    # Room at the border too: a repeated image goes on there with its other side.
+    margin = min(_MARGIN, padding) / size
+    out[real] = margin + (1.0 - 2.0 * margin) * uv[faces]
     return out
 
 
-def _packed(charts: Floats, faces: Ints, padding: float) -> Floats:
-    """(N, 2) charts side by side in a square, on a grid of about `_GRID`, at least `padding` of it apart.
+def _packed(charts: Floats, faces: Ints, grid: int, padding: float) -> Floats:
+    """(N, 2) charts side by side in a square, on a grid of about `grid`, at least `padding` of it apart.
 
     xatlas finds a width and a height by itself; the most square of a few attempts wins.
     """
@@ -161,7 +170,7 @@ def _packed(charts: Floats, faces: Ints, padding: float) -> Floats:
     best, most = charts, 0.0
     for density in _DENSITIES:
         packer, pack = xatlas.Atlas(), xatlas.PackOptions()
-        pack.texels_per_unit = _GRID * np.sqrt(density / area)
+        pack.texels_per_unit = grid * np.sqrt(density / area)
         # what is shrunk to fit later must be further apart now
         pack.padding, pack.bilinear = int(np.ceil(padding * np.sqrt(density / _DENSITIES[-1]))), True
         packer.add_uv_mesh(charts.astype(np.float32), faces.astype(np.uint32))

@@ -1,0 +1,128 @@
+"""Atlases: the file's own texture coordinates where they serve, else new ones."""
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.topology import face_parts
+from meshmatch.transfer import unwrap
+from meshmatch.transfer.texels import faces_on, grown
+from meshmatch.transfer.unwrap import atlas_of, unwrapped
+from tests.shapes.painted import CORNERS, FACES, UV
+
+SQUARE = Shape(CORNERS, FACES, "square")
+OWN = UV[FACES]
+
+
+def charts(uv: np.ndarray, shape: Shape) -> np.ndarray:
+    """(F,) a number for each piece of an atlas: faces that share a corner and its coordinates."""
+    keys = np.concatenate([shape.faces.reshape(-1, 1), uv.reshape(-1, 2).round(6)], axis=1)
+    corner = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+    return face_parts(corner.reshape(-1, 3), int(corner.max()) + 1)
+
+
+@pytest.mark.parametrize("padding", [2, 8])
+def test_new_coordinates_are_an_atlas(cube: Shape, torus: Shape, padding: int) -> None:
+    for shape in (cube, torus):
+        uv = unwrapped(shape, 256, padding)
+        assert uv.shape == (shape.F, 3, 2)
+        assert uv.min() >= 0 and uv.max() <= 1
+        found, twice = faces_on(uv * 256, 256)
+        assert twice == 0
+        number = charts(uv, shape)
+        assert 1 < len(np.unique(number)) < shape.F
+        image = np.where(found >= 0, number[found], -1).astype(np.int32)
+        # from both sides, half of the padding may be walked without meeting
+        for chart in np.unique(number):
+            own, others = image == chart, (image >= 0) & (image != chart)
+            reach = grown(np.where(own, 0, -1).astype(np.int32), padding - 1) >= 0
+            assert not (reach & others).any()
+
+
+def test_faces_get_room_by_their_area(sphere: Shape) -> None:
+    uv = unwrapped(sphere, 512, 4)
+    one, two = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    room = np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]) / 2
+    ratio = room / sphere.face_areas
+    assert ratio.max() / ratio.min() < 3
+    assert room.sum() > 0.3
+
+
+def test_the_same_shape_gives_the_same_atlas(sphere: Shape) -> None:
+    np.testing.assert_array_equal(unwrapped(sphere, 128, 2), unwrapped(sphere, 128, 2))
+
+
+def test_faces_without_area_are_left_out(cube: Shape) -> None:
+    faces = np.concatenate([cube.faces, [[0, 0, 1], [2, 2, 2]]])
+    uv = unwrapped(Shape(cube.verts, faces), 64, 1)
+    assert (uv[12:] == 0).all()
+    assert (uv[:12].reshape(12, -1).max(axis=1) > 0).all()
+
+
+def test_size_and_place_of_a_shape_do_not_matter(cube: Shape) -> None:
+    moved = Shape(cube.verts * 1e-4 + 1e3, cube.faces)
+    np.testing.assert_allclose(unwrapped(moved, 64, 1), unwrapped(cube, 64, 1), atol=1e-3)
+
+
+def test_own_coordinates_are_kept_as_they_are() -> None:
+    for keep in ("auto", "keep"):
+        atlas = atlas_of(SQUARE, OWN, 64, 2, keep)  # type: ignore[arg-type]
+        assert atlas.own and not atlas.note
+        np.testing.assert_array_equal(atlas.uv, OWN)
+    assert not atlas_of(SQUARE, OWN, 64, 2, "new").own
+    assert not atlas_of(SQUARE, None, 64, 2).own
+
+
+def test_another_tile_of_the_image_is_the_same_place() -> None:
+    tile = OWN + np.array([3.0, -2.0])
+    tile[1] += (1.0, 5.0)
+    atlas = atlas_of(SQUARE, tile, 64, 2)
+    assert atlas.own
+    np.testing.assert_allclose(atlas.uv, OWN, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("uv", "word"),
+    [
+        (np.stack([OWN[0], OWN[0]]), "overlap on 100.0 % of their texels"),
+        (OWN * 2.0, "reach out of range, over the edge of the image"),
+        (OWN + 0.5, "reach out of range"),
+        (np.concatenate([OWN[:1], OWN[:1]]) * 1.0, "overlap"),
+        (OWN * 0.01, "use only 0.0 % of the image"),
+        (np.stack([OWN[0], np.zeros((3, 2))]), "50 % of the surface has no room"),
+        (np.where(np.arange(6).reshape(2, 3, 1) == 4, np.nan, OWN), "not numbers"),
+        (OWN * 1e7, "absurdly large"),
+    ],
+)
+def test_own_coordinates_that_are_no_atlas(uv: np.ndarray, word: str) -> None:
+    atlas = atlas_of(SQUARE, uv, 64, 2)
+    assert not atlas.own
+    assert word in atlas.note and "new ones were made" in atlas.note
+    assert faces_on(atlas.uv * 64, 64)[1] == 0
+    with pytest.raises(OptionError, match="cannot be used") as caught:
+        atlas_of(SQUARE, uv, 64, 2, "keep")
+    assert "--uv keep" in caught.value.hint
+
+
+def test_many_faces_on_one_place_are_refused_before_they_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    shape = Shape(CORNERS, np.tile(FACES, (500, 1)), "pile")
+    monkeypatch.setattr(unwrap, "faces_on", lambda *_: pytest.fail("they were drawn"))
+    with pytest.raises(OptionError, match="overlap"):
+        atlas_of(shape, np.tile(OWN, (500, 1, 1)), 64, 2, "keep")
+
+
+def test_what_cannot_be_unwrapped(torus: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(OptionError, match="point cloud"):
+        atlas_of(Shape(CORNERS, np.empty((0, 3), int), "cloud"), None, 64, 2)
+    with pytest.raises(InputError, match="no triangle with an area"):
+        atlas_of(Shape(CORNERS, np.array([[0, 0, 1]]), "flat"), None, 64, 2)
+    with pytest.raises(OptionError, match="no texture coordinates to keep"):
+        atlas_of(SQUARE, None, 64, 2, "keep")
+
+    def fails(*_: object) -> None:
+        raise RuntimeError("no")
+
+    monkeypatch.setattr(unwrap, "_packed", fails)
+    with pytest.raises(InputError, match="cannot be unwrapped"):
+        unwrapped(torus, 64, 2)
