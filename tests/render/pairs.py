@@ -22,12 +22,19 @@ class Pair:
 
 
 def stirred(
-    shape: Shape, name: str = "stirred", verdict: str = "good", reasons: tuple[str, ...] = ()
+    shape: Shape,
+    name: str = "stirred",
+    verdict: str = "good",
+    reasons: tuple[str, ...] = (),
+    lean: float = 0.0,
 ) -> Pair:
-    """A shape, and the same one larger, elsewhere, z instead of y up, its vertices in another order."""
+    """A shape, and the same one larger, elsewhere, z instead of y up, its vertices in another order; leaning to
+    one side by so much of its height.
+    """
     order = np.random.default_rng(5).permutation(shape.V)  # new row k is the old row order[k]
     place: NDArray[np.int64] = np.argsort(order)
-    verts = 3.0 * shape.verts[order][:, [0, 2, 1]] * np.array([1.0, -1.0, 1.0]) + 7.0
+    leaning = shape.verts + lean * shape.verts[:, [1]] * np.array([1.0, 0.0, 0.0])
+    verts = 3.0 * leaning[order][:, [0, 2, 1]] * np.array([1.0, -1.0, 1.0]) + 7.0
     target = Shape(verts, place[shape.faces] if shape.F else shape.faces, name)
     confidence = np.linspace(0, 1, shape.V).astype(np.float32)
     words = {"verdict": verdict, "reasons": reasons}

@@ -38,7 +38,7 @@ def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def pair(make_sphere: Callable[[int], Shape]) -> Pair:
-    return stirred(bump(make_sphere(2)), "stirred.ply", "fair", ("stirred.ply: the nose is <b>far</b>",))
+    return stirred(bump(make_sphere(2)), "stirred.ply", "fair", ("stirred.ply: the nose is <b>far</b>",), 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -117,8 +117,8 @@ def test_a_click_keeps_the_point_while_the_shape_turns(running: Any, file: Path,
         after = view.place("source", vertex), view.place("target", int(pair.there.index[vertex]))
         assert view.state()["pin"] == {"side": "source", "row": vertex}  # a drag is no click
         assert abs(after[0]["x"] - before[0]["x"]) > 5
-        # linked: the other view has turned as well, by as much
-        assert after[0]["x"] - before[0]["x"] == pytest.approx(after[1]["x"] - before[1]["x"], abs=0.5)
+        # linked: the other view has turned as well; it leans a little, so not by just as many pixels
+        assert after[1]["x"] - before[1]["x"] == pytest.approx(after[0]["x"] - before[0]["x"], rel=0.2)
         ring = mark(view, "source")
         assert ring is not None
         assert ring == pytest.approx((after[0]["x"], after[0]["y"]), abs=1.0)
