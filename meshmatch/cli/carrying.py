@@ -1,7 +1,7 @@
 """What all the verbs share that carry something from one shape to another: arguments, the map, the words."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,6 +14,7 @@ from meshmatch.cli.voice import Voice
 if TYPE_CHECKING:
     from meshmatch.maps.vertex_map import VertexMap
     from meshmatch.pipeline import MatchResult
+    from meshmatch.render.carried import Scene
     from meshmatch.shapes.shape import Shape
     from meshmatch.transfer.fill import Doubt
 
@@ -37,6 +38,10 @@ Blank = Annotated[
 Least = Annotated[
     float,
     typer.Option("--min-confidence", min=0.0, max=1.0, help="The confidence below which it is too low."),
+]
+Picture = Annotated[
+    Path | None,
+    typer.Option(metavar="PNG", help="Draw what was carried, on SRC and on TGT."),
 ]
 LEAST = 0.3
 
@@ -99,6 +104,45 @@ def output_file(request: Request, output: Path, inputs: list[Path | None]) -> It
         if request.map is None:
             locate_model(request.model)  # a mistyped name is told before the long work
         yield temporary
+
+
+def check_picture(request: Request, picture: Path | None, others: list[Path | None]) -> None:
+    """Refuse a picture that is no PNG, cannot be written, or would replace a file of this command: before the work."""
+    from meshmatch.cli.claims import check_apart, check_png
+    from meshmatch.outputs import replace_on_success
+
+    check_png(picture)
+    check_apart([picture], [request.source, request.target, request.map, *others])
+    if picture is not None:
+        with suppress(_Enough), replace_on_success(picture):
+            raise _Enough
+
+
+class _Enough(Exception):
+    """An output file can be made."""
+
+
+def draw(
+    request: Request,
+    voice: Voice,
+    picture: Path | None,
+    shapes: "tuple[Shape, Shape]",
+    maps: Maps,
+    scene: "Scene",
+) -> None:
+    """Draw what was carried along `maps` between the two shapes."""
+    from meshmatch.outputs import replace_on_success
+    from meshmatch.render.carried import render_carried
+
+    if picture is None:
+        return
+    found = maps.match
+    turns = (
+        (None, None) if found is None else (found.source_fit.frame.rotation, found.target_fit.frame.rotation)
+    )
+    with replace_on_success(picture) as temporary:
+        render_carried(scene, maps.forward, shapes, temporary, rotations=turns, labels=request.names)
+    voice.say(f"drew {picture}: what was carried, on both shapes")
 
 
 def find_maps(request: Request, voice: Voice, source: "Shape", target: "Shape") -> Maps:

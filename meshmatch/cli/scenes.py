@@ -277,8 +277,8 @@ def _of_values(asked: Asked, subjects: list[Subject], names: list[str], look: "L
 def _of_labels(asked: Asked, subjects: list[Subject], names: list[str], look: "Look") -> Drawn:
     import numpy as np
 
-    from meshmatch.render.figures import Panel
-    from meshmatch.render.scales import label_colors, label_swatches
+    from meshmatch.render.carried import labelled
+    from meshmatch.render.scales import label_swatches
     from meshmatch.transfer.label_files import load_labels
 
     loaded = [
@@ -293,11 +293,7 @@ def _of_labels(asked: Asked, subjects: list[Subject], names: list[str], look: "L
         table = np.array([*(number[str(word)] for word in labels.names), -1])
         codes = table[labels.codes]
         all_codes.append(codes)
-        colors = label_colors(codes)
-        if labels.on == "faces":
-            panels.append(Panel(subject.shape, label=name, face_colors=colors))
-        else:
-            panels.append(Panel(subject.shape, colors, name, sharp=True))
+        panels.append(replace(labelled(subject.shape, codes, labels.on == "faces"), label=name))
     swatches = label_swatches(np.concatenate(all_codes), words)
     return Drawn(panels, replace(look, legend=swatches), f"{len(words)} labels", {"labels": words})
 

@@ -33,6 +33,7 @@ def transfer_color(
     fill: carrying.Fill = False,
     blank: carrying.Blank = None,
     min_confidence: carrying.Least = carrying.LEAST,
+    picture: carrying.Picture = None,
     model: options.Model = "human",
     refine: options.RefineOption = "nodes",
     up: options.Up = None,
@@ -72,6 +73,7 @@ def transfer_color(
         check_values_suffix(output)
     else:
         colors.check_suffix(output)
+    carrying.check_picture(request, picture, [output, values])
     voice = Voice(quiet)
     with carrying.output_file(request, output, [values]) as temporary:
         a, b = load_shape(source), load_shape(target)
@@ -94,7 +96,18 @@ def transfer_color(
     carrying.tell_doubt(voice, doubt, min_confidence)
     what = "colours" if values is None else f"{columns} number{'s' if columns > 1 else ''} each"
     voice.say(f"wrote {output}: {what} for the {b.V} vertices of {request.names[1]}")
+    if picture is not None:
+        from meshmatch.render.carried import light_on_both, values_on_both
+
+        if values is None:
+            shown = light_on_both(a, b, given.numbers, carried)
+        else:
+            title = given.names[0] if given.names else values.stem
+            title += "" if columns == 1 else f" (the first of {columns} numbers)"
+            shown = values_on_both(a, b, given.numbers, carried, title)
+        carrying.draw(request, voice, picture, (a, b), result, shown)
     if json:
+        drawn = None if picture is None else str(picture)
         record = carrying.map_record(request, result, result.back)
         record |= carrying.doubt_record(doubt, min_confidence)
-        print_json({"output": str(output), "columns": columns} | record)
+        print_json({"output": str(output), "picture": drawn, "columns": columns} | record)

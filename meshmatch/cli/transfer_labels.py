@@ -40,6 +40,7 @@ def transfer_labels(
     fill: carrying.Fill = False,
     blank: carrying.Blank = None,
     min_confidence: carrying.Least = carrying.LEAST,
+    picture: carrying.Picture = None,
     model: options.Model = "human",
     refine: options.RefineOption = "nodes",
     up: options.Up = None,
@@ -70,6 +71,7 @@ def transfer_labels(
     request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
     carrying.check_request(request, fill, blank)
     check_labels_suffix(output)
+    carrying.check_picture(request, picture, [output, labels])
     voice = Voice(quiet)
     with carrying.output_file(request, output, [labels]) as temporary:
         a, b = load_shape(source), load_shape(target)
@@ -94,7 +96,18 @@ def transfer_labels(
     carrying.tell_doubt(voice, doubt, min_confidence, kind)
     used = len(np.unique(carried.codes))
     voice.say(f"wrote {output}: {used} different labels on the {len(found)} {kind} of {request.names[1]}")
+    if picture is not None:
+        from meshmatch.render.carried import labels_on_both
+
+        words = [str(name) for name in given.names]
+        theirs = np.where(carried.codes < len(words), carried.codes, -1)  # a blank comes after the names
+        faces = given.on == "faces", kind == "faces"
+        shown = labels_on_both(a, b, given.codes, theirs, words, faces)
+        carrying.draw(request, voice, picture, (a, b), result, shown)
     if json:
+        drawn = None if picture is None else str(picture)
         record = carrying.map_record(request, result, result.back)
         record |= carrying.doubt_record(doubt, min_confidence)
-        print_json({"output": str(output), "from": given.on, "to": kind, "labels": used} | record)
+        print_json(
+            {"output": str(output), "picture": drawn, "from": given.on, "to": kind, "labels": used} | record
+        )

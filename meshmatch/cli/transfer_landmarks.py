@@ -24,6 +24,7 @@ def transfer_landmarks(
     ],
     map: carrying.MapOption = None,
     min_confidence: carrying.Least = carrying.LEAST,
+    picture: carrying.Picture = None,
     model: options.Model = "human",
     refine: options.RefineOption = "nodes",
     up: options.Up = None,
@@ -52,6 +53,7 @@ def transfer_landmarks(
     request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
     carrying.check_request(request)
     check_landmarks_suffix(output)
+    carrying.check_picture(request, picture, [output, landmarks])
     voice = Voice(quiet)
     with carrying.output_file(request, output, [landmarks]) as temporary:
         a, b = load_shape(source), load_shape(target)
@@ -70,7 +72,13 @@ def transfer_landmarks(
     if len(low) > 10:
         voice.warn(f"and so are {len(low) - 10} more")
     voice.say(f"wrote {output}: {len(found.names)} landmarks on {request.names[1]}")
+    if picture is not None:
+        from meshmatch.render.carried import points_on_both
+
+        shown = points_on_both(a, b, given.points, found.points)
+        carrying.draw(request, voice, picture, (a, b), result, shown)
     if json:
+        drawn = None if picture is None else str(picture)
         record = carrying.map_record(request, result, result.forward)
         doubt = {"min_confidence": min_confidence, "low_confidence": len(low)}
-        print_json({"output": str(output), "landmarks": len(found.names)} | doubt | record)
+        print_json({"output": str(output), "picture": drawn, "landmarks": len(found.names)} | doubt | record)

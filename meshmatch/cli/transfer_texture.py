@@ -72,6 +72,7 @@ def transfer_texture(
         ),
     ] = None,
     min_confidence: carrying.Least = carrying.LEAST,
+    picture: carrying.Picture = None,
     model: options.Model = "human",
     refine: options.RefineOption = "nodes",
     up: options.Up = None,
@@ -110,6 +111,7 @@ def transfer_texture(
     painted = b.is_cloud or output.suffix.lower() in _COLORS
     files = [output] if painted else files_of(output)
     check_apart(files, [source, target, map, image])
+    carrying.check_picture(request, picture, [*files, image])
     with ExitStack() as claims:
         # The obj, which names the others, is claimed first and so renamed last.
         temporary = [claims.enter_context(replace_on_success(file)) for file in files]
@@ -133,8 +135,16 @@ def transfer_texture(
             record["baking_seconds"] = round(record["baking_seconds"] + unwrapping, 3)
     what = "with vertex colours" if painted else f"with a texture of {size} x {size}"
     voice.say(f"wrote {' '.join(str(file) for file in files)}: {request.names[1]} {what}")
+    if picture is not None:
+        from meshmatch.render.carried import looks_on_both
+        from meshmatch.shapes.appearance import find_appearance
+
+        worn = load_shape(output)
+        shown = looks_on_both(a, worn, look, find_appearance(output, worn))
+        carrying.draw(request, voice, picture, (a, b), result, shown)
     if json:
-        written = {"output": str(output), "files": [str(file) for file in files]}
+        drawn = None if picture is None else str(picture)
+        written = {"output": str(output), "picture": drawn, "files": [str(file) for file in files]}
         print_json(written | record | carrying.map_record(request, result, result.back))
 
 

@@ -25,6 +25,7 @@ def transfer_weights(
     map: carrying.MapOption = None,
     fill: carrying.Fill = False,
     min_confidence: carrying.Least = carrying.LEAST,
+    picture: carrying.Picture = None,
     model: options.Model = "human",
     refine: options.RefineOption = "nodes",
     up: options.Up = None,
@@ -54,6 +55,7 @@ def transfer_weights(
     request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
     carrying.check_request(request, fill)
     check_weights_suffix(output)
+    carrying.check_picture(request, picture, [output, weights])
     voice = Voice(quiet)
     with carrying.output_file(request, output, [weights]) as temporary:
         a, b = load_shape(source), load_shape(target)
@@ -71,8 +73,15 @@ def transfer_weights(
         voice.warn(f"{bare} of the {b.V} vertices have no weights, because nothing moves them on {a.name}")
     joints = len(np.unique(carried.indices))
     voice.say(f"wrote {output}: weights of {joints} joints for the {b.V} vertices of {request.names[1]}")
+    if picture is not None:
+        from meshmatch.render.carried import labels_on_both
+        from meshmatch.transfer.attributes import most_votes
+
+        shown = labels_on_both(a, b, most_votes(given.matrix), most_votes(carried), given.names)
+        carrying.draw(request, voice, picture, (a, b), result, shown)
     if json:
+        drawn = None if picture is None else str(picture)
         record = carrying.map_record(request, result, result.back)
         record |= carrying.doubt_record(doubt, min_confidence)
         counts = {"joints": len(given.names), "used_joints": joints, "without_weights": bare}
-        print_json({"output": str(output)} | counts | record)
+        print_json({"output": str(output), "picture": drawn} | counts | record)

@@ -75,7 +75,7 @@ def match_panels(
     look: Look | None = None,
 ) -> list[Panel]:
     """Source and target, matched places in one colour; grey where nothing was matched to. See `render_match`."""
-    turns = _turns(source, target, vertex_map, rotations, look or Look())
+    turns = same_side(source, target, vertex_map, rotations, look or Look())
     here = position_colors(source, turns[0])
     there = carried_colors(here, vertex_map, source, target)
     names = labels or (source.name, target.name)
@@ -85,7 +85,7 @@ def match_panels(
     ]
 
 
-def _turns(
+def same_side(
     source: Shape, target: Shape, vertex_map: VertexMap, rotations: Rotations, look: Look
 ) -> tuple[FloatArray, FloatArray]:
     """Rotations that show both shapes from the same side."""
@@ -120,7 +120,7 @@ def confidence_panels(
     look: Look | None = None,
 ) -> tuple[list[Panel], Scale]:
     """Source and target in the heat of the map's confidence, and its scale: dark is doubt."""
-    turns = _turns(source, target, vertex_map, rotations, look or Look())
+    turns = same_side(source, target, vertex_map, rotations, look or Look())
     back = pull_back(vertex_map, source, target)
     scale = Scale(0.0, 1.0, "confidence of the map", reverse=True)
     names = labels or (source.name, target.name)
@@ -173,7 +173,7 @@ def error_panels(
     scale = Scale.of(values, title, limits)
     names = labels or (source.name, target.name)
     panels = []
-    turns = _turns(source, target, vertex_map, (None, None), look or Look())
+    turns = same_side(source, target, vertex_map, (None, None), look or Look())
     for shape, vertices, name, rotation in zip((source, target), known, names, turns, strict=True):
         panels.append(replace(heat_panel(shape, vertices, values, scale), label=name, rotation=rotation))
     return panels, replace(scale, unknown=any(panel.points is None and _gaps(panel) for panel in panels))
@@ -199,14 +199,15 @@ def heat_panel(shape: Shape, vertices: NDArray[np.int64], values: FloatArray, sc
         return Panel(shape, scale.colors(np.where(distance[:, 0] < 2 * spacing, painted, np.nan)))
     return Panel(
         shape,
-        np.tile(_PALE, (shape.V, 1)),
+        np.tile(PALE, (shape.V, 1)),
         points=shape.verts[own],
         point_colors=scale.colors(means),
         point_radius=0.016 * unit,
     )
 
 
-_PALE = (0.88, 0.88, 0.89)
+PALE = (0.88, 0.88, 0.89)
+"""Of a shape that only carries points."""
 
 
 def _gaps(panel: Panel) -> bool:

@@ -158,3 +158,49 @@ def test_a_curve_that_cannot_be_is_told_before_the_work(
     answer = run("evaluate", *files, *truth, "--curve", tmp_path / name)
     assert answer.status == 1
     assert "error: " in answer.err
+
+
+@pytest.mark.parametrize("unit", ["cm", "x100"])
+def test_the_errors_as_heat_on_both_shapes(
+    run: Run, files: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unit: str
+) -> None:
+    from meshmatch.render import matched
+
+    real, legends = matched.render_shapes, []
+
+    def watched(panels: object, path: Path, look: matched.Look) -> None:
+        legends.append(look.legend)
+        real(panels, path, look)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(matched, "render_shapes", watched)
+    picture = tmp_path / "errors.png"
+    words = ("evaluate", *files, *write_truth(tmp_path, "column"), "--picture", picture, "--unit", unit)
+    answer = run(*words)
+    assert answer.status == 0, answer.err
+    assert "cm" in answer.out
+    with Image.open(picture) as image:
+        pixels = np.asarray(image, dtype=int)
+    red = (pixels[..., 0] > pixels[..., 2] + 60) & (pixels[..., 1] < 120)
+    assert red.sum() > 500  # the vertices that were thrown to another place
+    assert ("cm" if unit == "cm" else "sqrt(area)") in legends[0].title
+
+
+def test_a_picture_of_errors_needs_the_truth_and_a_place(
+    run: Run, files: tuple[Path, ...], tmp_path: Path
+) -> None:
+    truth = write_truth(tmp_path, "column")
+    before = sorted(path.name for path in tmp_path.iterdir())
+    for words, told in (
+        (["--picture", tmp_path / "e.png"], "needs the truth"),
+        ([*truth, "--picture", tmp_path / "e.jpg"], "is a PNG"),
+        ([*truth, "--picture", tmp_path / "no" / "e.png"], "no folder"),
+        (
+            [*truth, "--picture", tmp_path / "e.png", "--curve", tmp_path / "e.png"],
+            "an output of this command",
+        ),
+    ):
+        answer = run("evaluate", *files, *words)
+        assert answer.status == 1
+        assert told in answer.err
+        assert answer.out == ""
+    assert sorted(path.name for path in tmp_path.iterdir()) == before

@@ -367,6 +367,36 @@ def test_register_hands_options_on(
     assert stub.called["shape"].V == 642
 
 
+def test_register_draws_the_template_over_the_shape(
+    run: Run, two: tuple[Path, Path], stub: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    picture = two[0].with_name("p.png")
+    answer = run("register", two[0], "-o", two[0].with_name("fitted.ply"), "--picture", picture, "--json")
+    assert answer.status == 0, answer.err
+    assert json.loads(answer.out)["picture"] == str(picture)
+    assert f"drew {picture}" in answer.err
+    with Image.open(picture) as image:
+        assert len(np.unique(np.asarray(image).reshape(-1, 3), axis=0)) > 1000
+
+    def failing(*_: object, **__: object) -> None:
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr("meshmatch.render.fitted.render_fit", failing)
+    words = ("register", two[0], "-o", two[0].with_name("second.ply"), "--picture", picture)
+    assert run(*words).status == 1
+    assert two[0].with_name("second.ply").exists()
+
+
+@pytest.mark.parametrize("name", ["p.jpg", "nowhere/p.png", "fitted.ply", "a.ply"])
+def test_a_picture_that_register_cannot_write_is_told_before_the_work(
+    run: Run, two: tuple[Path, Path], stub: Recorder, name: str
+) -> None:
+    words = ("register", two[0], "-o", two[0].with_name("fitted.ply"), "--picture", two[0].parent / name)
+    assert run(*words).status == 1
+    assert stub.called == {}
+    assert not two[0].with_name("fitted.ply").exists()
+
+
 def test_register_json(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
     answer = run("register", two[0], "-o", two[0].with_name("fitted.ply"), "--json", "--quiet")
     record = json.loads(answer.out)

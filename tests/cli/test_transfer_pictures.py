@@ -1,0 +1,207 @@
+"""The pictures of transfer-color, -labels, -weights, -landmarks and -texture."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from meshmatch import pipeline
+from meshmatch.maps.files import load_map, save_map
+from meshmatch.render import carried
+from meshmatch.render.figures import Panel
+from meshmatch.render.picture import Look
+from meshmatch.render.scales import UNKNOWN, Scale, Swatches, label_colors
+from meshmatch.shapes.files import load_shape, save_shape
+from tests.cli.conftest import Run
+from tests.cli.test_transfer_verbs import call, pair, well  # noqa: F401  (pair is a fixture)
+from tests.shapes.painted import encoded, quarters, write_square_obj
+
+VERBS = ("transfer-color", "transfer-labels", "transfer-weights", "transfer-landmarks")
+
+
+class Drawn:
+    """Stands for the renderer: keeps what it was given."""
+
+    def __call__(self, panels: Any, path: Path, look: Look) -> None:
+        self.panels: list[Panel] = list(panels)
+        self.look = look
+        path.write_bytes(b"a picture")
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> Drawn:
+    recorder = Drawn()
+    monkeypatch.setattr(carried, "render_shapes", recorder)
+    return recorder
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_picture_of_both_shapes(run: Run, pair: Path, verb: str) -> None:  # noqa: F811
+    answer = well(run(*call(verb, "--picture", "p.png", "--json")))
+    assert json.loads(answer.out)["picture"] == "p.png"
+    assert "drew p.png: what was carried, on both shapes" in answer.err
+    with Image.open("p.png") as image:
+        pixels = np.asarray(image)
+    assert image.size[0] > image.size[1]
+    left, right = np.split(pixels, [image.size[0] // 2], axis=1)
+    assert (left < 240).any(axis=2).mean() > 0.1
+    assert (right < 240).any(axis=2).mean() > 0.1
+    assert json.loads(well(run(*call(verb, "--json"))).out)["picture"] is None
+
+
+def test_colours_and_numbers(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811
+    well(run(*call("transfer-color", "--picture", "p.png")))
+    a, b = load_shape("a.ply"), load_shape("b.ply")
+    assert a.colors is not None
+    assert np.asarray(drawn.panels[0].colors) == pytest.approx(a.colors[:, :3], abs=1e-6)
+    assert np.asarray(drawn.panels[1].colors) == pytest.approx(b.verts / 2 + 0.5, abs=0.05)
+    assert [panel.label for panel in drawn.panels] == ["a.ply", "b.ply"]
+    well(run(*call("transfer-color", "--values", "values.npy", "--picture", "p.png", out="v.npy")))
+    scale = drawn.look.legend
+    assert isinstance(scale, Scale)
+    assert scale.title == "values (the first of 3 numbers)"
+    assert np.array_equal(drawn.panels[0].colors, scale.colors(a.verts[:, 0]))
+    assert np.asarray(drawn.panels[1].colors) == pytest.approx(scale.colors(b.verts[:, 0]), abs=0.05)
+    np.save("one.npy", a.verts[:, 1])
+    well(run(*call("transfer-color", "--values", "one.npy", "--picture", "p.png", out="v.npy")))
+    assert isinstance(drawn.look.legend, Scale)
+    assert drawn.look.legend.title == "one"
+
+
+@pytest.mark.parametrize("to", ["vertices", "faces"])
+def test_labels_and_those_left_blank(run: Run, pair: Path, drawn: Drawn, to: str) -> None:  # noqa: F811
+    a = load_shape("a.ply")
+    unsure = np.where(a.verts[:, 0] > 0, 1.0, 0.1)
+    save_map("ab.npz", replace(load_map("ab.npz"), confidence=unsure))
+    words = ("--to", to, "--blank", "9", "--picture", "p.png")
+    well(run(*call("transfer-labels", *words)))
+    legend = drawn.look.legend
+    assert isinstance(legend, Swatches)
+    assert legend.names == ("0", "1", "none")
+    here, there = drawn.panels
+    assert here.sharp
+    assert np.asarray(here.colors)[load_shape("a.ply").verts[:, 2] > 0] == pytest.approx(
+        label_colors([1] * 73)
+    )
+    found = np.asarray(there.colors if to == "vertices" else there.face_colors)
+    labels = np.load("out.npy")
+    assert (found[labels == 9] == UNKNOWN).all()
+    assert (labels == 9).any()
+    assert found[labels == 0] == pytest.approx(label_colors(np.zeros((labels == 0).sum(), int)))
+
+
+def test_weights_show_the_heaviest_joint(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811
+    well(run(*call("transfer-weights", "--picture", "p.png")))
+    assert isinstance(drawn.look.legend, Swatches)
+    assert drawn.look.legend.names == ("up", "down")
+    z = load_shape("b.ply").verts[:, 2]
+    found = np.asarray(drawn.panels[1].colors)
+    assert found[z > 0.1] == pytest.approx(label_colors(np.zeros((z > 0.1).sum(), int)))
+    assert found[z < -0.1] == pytest.approx(label_colors(np.ones((z < -0.1).sum(), int)))
+
+
+def test_landmarks_are_balls_of_one_colour(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811
+    well(run(*call("transfer-landmarks", "--picture", "p.png")))
+    a = load_shape("a.ply")
+    for panel in drawn.panels:
+        assert np.asarray(panel.points) == pytest.approx(a.verts[[3, 7]], abs=1e-6)
+        assert np.array_equal(panel.point_colors, label_colors([0, 1]))
+
+
+def test_a_texture_on_both(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811
+    write_square_obj(pair / "square.obj")
+    (pair / "square.mtl").write_text("newmtl paint\nmap_Kd skin.png\n")
+    (pair / "skin.png").write_bytes(encoded(quarters(8)))
+    square = load_shape("square.obj")
+    save_shape("plain.ply", square)
+    np.save("same.npy", np.arange(4))
+    words = ("transfer-texture", "square.obj", "plain.ply", "--map", "same.npy", "--size", "64")
+    well(run(*words, "-o", "out.glb", "--picture", "p.png"))
+    assert all(panel.appearance is not None and panel.appearance.textured for panel in drawn.panels)
+    well(run(*words, "-o", "out.ply", "--picture", "p.png"))
+    assert drawn.panels[1].appearance is not None
+    assert not drawn.panels[1].appearance.textured
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize(
+    ("picture", "told"),
+    [
+        ("p.jpg", "a picture is a PNG"),
+        ("nowhere/p.png", "there is no folder"),
+        ("here.png", "it is a folder"),
+        ("in.png", "an input of this command"),
+    ],
+)
+def test_a_picture_that_cannot_be_is_told_before_the_work(
+    run: Run,
+    pair: Path,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+    verb: str,
+    picture: str,
+    told: str,
+) -> None:
+    Path("here.png").mkdir()
+    Path("in.png").write_bytes(Path("ab.npz").read_bytes())
+
+    def begun(*_: object, **__: object) -> None:
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr("meshmatch.cli.carrying.find_maps", begun)
+    before = sorted(path.name for path in pair.iterdir())
+    answer = run(*call(verb, "--picture", picture, map="in.png"))
+    assert answer.status == 1
+    assert told in answer.err
+    assert len(answer.err.splitlines()) == 2
+    assert sorted(path.name for path in pair.iterdir()) == before
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_picture_that_fails_costs_no_output(
+    run: Run,
+    pair: Path,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+    verb: str,
+) -> None:
+    from meshmatch.errors import OutputError
+
+    def failing(*_: object, **__: object) -> None:
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr(carried, "render_shapes", failing)
+    before = {path.name for path in pair.iterdir()}
+    assert run(*call(verb, "--picture", "p.png")).status == 1
+    new = {path.name for path in pair.iterdir()} - before
+    assert len(new) == 1
+    assert next(iter(new)).startswith("out.")
+
+
+def test_after_a_match_shapes_are_turned_as_their_fits_say(
+    run: Run,
+    pair: Path,  # noqa: F811
+    drawn: Drawn,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from types import SimpleNamespace
+
+    from meshmatch.shapes.shape import Frame
+    from meshmatch.transfer.direction import pull_back
+
+    a, b = load_shape("a.ply"), load_shape("b.ply")
+    forward = load_map("ab.npz", a, b)
+    fits = [
+        SimpleNamespace(
+            frame=Frame(1.0, np.diag([s, 1.0, s]), np.zeros(3)), verdict="good", up="+y", front="z"
+        )
+        for s in (1.0, -1.0)
+    ]
+    match = SimpleNamespace(notes=(), source_fit=fits[0], target_fit=fits[1], seconds=1.0)
+    result = SimpleNamespace(back=pull_back(forward, a, b), forward=forward, match=match)
+    monkeypatch.setattr(pipeline, "carry", lambda *_, **__: result)
+    well(run(*call("transfer-color", "--picture", "p.png", map=None)))
+    for panel, made in zip(drawn.panels, fits, strict=True):
+        assert np.array_equal(panel.rotation, made.frame.rotation)
