@@ -32,7 +32,9 @@ DTYPES = {
     "Uint32Array": np.uint32,
     "Float32Array": np.float32,
 }
-HOSTILE = "</script><script>alert(1)</script><!--packed--><b a='\"'>&amp;\u2028\u202e.ply"
+HOSTILE = (
+    "</script><script>alert(1)</script ><script /x><!--<script <!--packed--><b a='\"'>&amp;\u2028\u202e.ply"
+)
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +206,7 @@ def test_names_cannot_break_out(tmp_path: Path, pair: Pair) -> None:
     assert page.words["reasons"] == [f"{shown}: far"]
     ((_, title),) = page.all("title")
     assert title == f"{shown} → <!--title-->"
-    assert "alert(1)</script>" not in page.text
+    assert "alert(1)</script" not in page.text
 
 
 def test_a_name_that_is_no_text_is_shown_as_far_as_it_goes(tmp_path: Path, pair: Pair) -> None:
