@@ -33,9 +33,11 @@ class Worn:
 def check_choices(choices: Choices) -> None:
     """Refuse sizes that cannot be (`OptionError`)."""
     if not 16 <= choices.size <= LARGEST:
-        raise OptionError(f"a texture has 16 to {LARGEST} texels a side, not {choices.size}")
+        raise OptionError(
+            f"a texture has 16 to {LARGEST} texels a side, not {choices.size}", "1024 or 2048 suit most"
+        )
     if not 1 <= choices.samples <= 8:
-        raise OptionError(f"a texel takes 1 to 8 samples each way, not {choices.samples}")
+        raise OptionError(f"a texel takes 1 to 8 samples each way, not {choices.samples}", "2 or 3 suit most")
     if not 0 <= choices.padding <= choices.size // 4:
         raise OptionError(
             f"padding of {choices.padding} texels does not go with {choices.size}",

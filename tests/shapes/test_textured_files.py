@@ -101,7 +101,7 @@ def test_trimesh_sees_the_same_colours(
     image[..., 3] = 255
     path = tmp_path / f"ball{suffix}"
     save_textured(path, Textured(mesh.verts, mesh.faces, mesh.uv), image)
-    (other,) = trimesh.load_scene(path, process=False, maintain_order=True).geometry.values()
+    (other,) = trimesh.load_scene(path, process=False).geometry.values()
     material = other.visual.material
     picture = material.baseColorTexture if suffix == ".glb" else material.image
     np.testing.assert_array_equal(np.asarray(picture.convert("RGBA")), image)

@@ -1,0 +1,441 @@
+"""transfer-texture through the program's only door. Maps are made by construction; the last test alone matches."""
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch import pipeline
+from meshmatch.maps.files import load_map, save_map
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes import textured_files
+from meshmatch.shapes.appearance import Appearance, load_appearance
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats.textured import Textured
+from meshmatch.shapes.images import png_bytes
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import save_textured
+from meshmatch.templates.location import bundled_folder
+from meshmatch.transfer.texels import faces_on
+from meshmatch.transfer.unwrap import unwrapped
+from tests.cli.conftest import Answer, Run
+from tests.conftest import icosphere
+from tests.shapes.painted import FACES, encoded, quarters, write_gltf, write_square_obj
+from tests.transfer.known import split
+
+SMALL = ("--size", "64", "--padding", "2", "--threads", "1")
+
+
+def picture(size: int = 32) -> np.ndarray:
+    """Slow waves: close by, colours are nearly the same."""
+    y, x = np.mgrid[:size, :size] / size
+    image = np.full((size, size, 4), 255, np.uint8)
+    image[..., :3] = np.round(127 + 100 * np.stack([np.sin(5 * x), np.sin(4 * y), np.cos(5 * x * y)], -1))
+    return image
+
+
+@pytest.fixture
+def pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a textured a.glb, a finer b.ply of the same surface, and a map between them."""
+    monkeypatch.chdir(tmp_path)
+    ball = icosphere(2)
+    save_textured("a.glb", Textured(ball.verts, ball.faces, unwrapped(ball, 32, 2)), picture())
+    fine, _, _ = split(ball)
+    save_shape("b.ply", fine)
+    a, b = load_shape("a.glb"), load_shape("b.ply")
+    # copies at the seams lie where the first ones do
+    first = [int(np.linalg.norm(ball.verts - vertex, axis=1).argmin()) for vertex in a.verts]
+    save_map("ab.npz", VertexMap.between(a, b, first, verdict="good"))
+    return tmp_path
+
+
+def call(
+    *more: str | Path, target: str = "b.ply", out: str = "out.glb", map: str | None = "ab.npz"
+) -> list[str]:
+    words = ["transfer-texture", "a.glb", target, "-o", out, *([] if map is None else ["--map", map])]
+    return [*words, *SMALL, *map_str(more)]
+
+
+def map_str(words: tuple[str | Path, ...]) -> list[str]:
+    return [str(word) for word in words]
+
+
+def well(answer: Answer) -> Answer:
+    assert answer.status == 0, answer.err
+    return answer
+
+
+def seen(path: str, at: np.ndarray) -> np.ndarray:
+    """(N, 3) bytes of what a textured file shows nearest to points of the unit sphere."""
+    shape = load_shape(path)
+    look = load_appearance(path, shape)
+    return colors_at(shape, look, at)
+
+
+def colors_at(shape: Shape, look: Appearance, at: np.ndarray) -> np.ndarray:
+    image = look.materials[0].image
+    assert image is not None
+    middle = shape.verts[shape.faces].mean(axis=1)
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    face = (at @ middle.T).argmax(axis=1)
+    uv = look.uv[face].mean(axis=1)
+    row, column = (np.floor(uv[:, k] * image.shape[1 - k]).astype(int) for k in (1, 0))
+    return image[row, column, :3].astype(int)
+
+
+def sample_points() -> np.ndarray:
+    fine = icosphere(3)
+    points = fine.verts[fine.faces].mean(axis=1)[::7]
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+# What it does
+
+
+@pytest.mark.parametrize("out", ["out.glb", "out.obj", "two words.OBJ"])
+def test_a_finer_copy_shows_the_same(run: Run, pair: Path, out: str) -> None:
+    answer = well(run(*call(out=out)))
+    shape, b = load_shape(out), load_shape("b.ply")
+    np.testing.assert_allclose(shape.verts[: b.V], b.verts, atol=1e-6)
+    if out != "out.glb":
+        np.testing.assert_array_equal(shape.faces, b.faces)
+    off = np.abs(seen(out, sample_points()) - seen("a.glb", sample_points())).max(axis=1)
+    assert np.median(off) < 20 and (off < 60).mean() > 0.9  # the middles of two triangles, not one place
+    assert "used the map ab.npz" in answer.err
+    assert "new texture coordinates: " in answer.err
+    assert f"wrote {out}" in answer.err
+    assert answer.out == ""
+
+
+def test_json_says_all_of_it(run: Run, pair: Path) -> None:
+    answer = well(run(*call("--json", "-q", out="out.obj")))
+    record = json.loads(answer.out)
+    assert answer.err == ""
+    assert record["files"] == ["out.obj", "out.mtl", "out.png"]
+    assert (record["size"], record["uv"], record["alpha"]) == (64, "new", "opaque")
+    assert 0.1 < record["used"] < 1
+    assert record["low_confidence_share"] == record["filled_share"] == record["blank_share"] == 0
+    assert record["source"] == "a.glb" and record["target"] == "b.ply" and record["map"] == "ab.npz"
+    assert record["baking_seconds"] > 0
+
+
+def test_the_targets_own_coordinates_are_used_replaced_or_demanded(run: Run, pair: Path) -> None:
+    b = load_shape("b.ply")
+    own = unwrapped(b, 64, 2)
+    save_textured("b.glb", Textured(b.verts, b.faces, own), picture())
+    b2 = load_shape("b.glb")
+    found = load_map("ab.npz")
+    save_map("ab2.npz", VertexMap.between(load_shape("a.glb"), b2, found.index))
+    for uv in ("auto", "keep"):
+        answer = well(run(*call("--uv", uv, "--json", target="b.glb", map="ab2.npz")))
+        assert json.loads(answer.out)["uv"] == "own"
+        shape = load_shape("out.glb")
+        np.testing.assert_allclose(load_appearance("out.glb", shape).uv, own, atol=1e-6)
+    assert (
+        json.loads(well(run(*call("--uv", "new", "--json", target="b.glb", map="ab2.npz"))).out)["uv"]
+        == "new"
+    )
+
+
+def test_overlapping_coordinates_are_replaced_with_a_note(run: Run, pair: Path) -> None:
+    b = load_shape("b.ply")
+    mirrored = np.abs(b.verts[b.faces][:, :, :2]) * 0.9
+    save_textured("b.obj", Textured(b.verts, b.faces, mirrored), picture())
+    save_map("ab2.npz", replace(load_map("ab.npz"), target_hash=load_shape("b.obj").hash))
+    answer = well(run(*call("--json", target="b.obj", map="ab2.npz")))
+    assert "note: b.obj: its own texture coordinates cannot be used: they overlap" in answer.err
+    assert json.loads(answer.out)["uv_note"]
+    before = {path.name for path in pair.iterdir()}
+    refused(run(*call("--uv", "keep", target="b.obj", map="ab2.npz")), "they overlap", pair, before)
+
+
+def test_size_samples_and_padding(run: Run, pair: Path) -> None:
+    def image() -> np.ndarray:
+        found = load_appearance("out.glb", load_shape("out.glb")).materials[0].image
+        assert found is not None
+        return found
+
+    well(run(*call("--size", "48")))
+    assert image().shape == (48, 48, 4)
+    kinds = []
+    for samples in ("1", "3"):
+        well(run(*call("--samples", samples)))
+        kinds.append(image())
+    assert (kinds[0] != kinds[1]).any()
+    well(run(*call("--padding", "0")))
+    look = load_appearance("out.glb", load_shape("out.glb"))
+    off = faces_on(look.uv * 64, 64)[0] < 0
+    assert (image()[off, :3] == 0).all()
+    well(run(*call("--padding", "4")))
+    assert image()[..., :3].max(axis=2).min() > 0
+
+
+def test_doubt_is_kept_filled_or_left_blank(run: Run, pair: Path) -> None:
+    found = load_map("ab.npz")
+    a = load_shape("a.glb")
+    sure = np.where(a.verts[:, 2] > 0.3, 0.0, 1.0).astype(np.float32)
+    save_map("doubt.npz", replace(found, confidence=sure))
+    share = (1 - 0.3) / 2  # of a sphere, above z = 0.3
+    kept = run(*call("--json", map="doubt.npz"))
+    record = json.loads(well(kept).out)
+    assert record["low_confidence_share"] == pytest.approx(share, abs=0.08)
+    assert "has less confidence than 0.3: kept as it came" in kept.err
+    top = np.array([[0.0, 0.0, 1.0]])
+    was = seen("out.glb", top)
+
+    record = json.loads(well(run(*call("--json", "--fill", map="doubt.npz"))).out)
+    assert record["filled_share"] == record["low_confidence_share"]
+    assert (seen("out.glb", top) != was).any()
+    answer = well(run(*call("--json", "--blank", "#ff0080", map="doubt.npz")))
+    assert json.loads(answer.out)["blank_share"] > 0.2 and "left blank" in answer.err
+    np.testing.assert_array_equal(seen("out.glb", top), [[255, 0, 128]])
+    record = json.loads(well(run(*call("--json", "--blank", "0", map="doubt.npz"))).out)
+    assert record["alpha"] == "mask"
+    assert load_appearance("out.glb", load_shape("out.glb")).materials[0].alpha == "mask"
+    record = json.loads(well(run(*call("--json", "--min-confidence", "0", map="doubt.npz"))).out)
+    assert record["low_confidence_share"] == 0
+
+
+def test_clouds_and_ply_get_vertex_colours(run: Run, pair: Path) -> None:
+    b = load_shape("b.ply")
+    np.save("b.npy", b.verts)
+    cloud = load_shape("b.npy")
+    save_map("cloud.npz", VertexMap.between(load_shape("a.glb"), cloud, load_map("ab.npz").index))
+    for target, map, out in (("b.npy", "cloud.npz", "out.ply"), ("b.ply", "ab.npz", "mesh.ply"),
+                             ("b.npy", "cloud.npz", "cloud.obj"), ("b.ply", "ab.npz", "mesh.off")):  # fmt: skip
+        answer = well(run(*call("--json", target=target, map=map, out=out)))
+        found = load_shape(out)
+        assert found.colors is not None and found.V == b.V
+        assert found.is_cloud == (target == "b.npy")
+        assert "with vertex colours" in answer.err
+        assert json.loads(answer.out)["files"] == [out]
+    assert not Path("cloud.mtl").exists()
+    assert np.ptp(found.colors[:, :3]) > 0.5
+    # and a painted mesh is a source like any other
+    save_map("ba.npz", VertexMap.between(load_shape("mesh.ply"), b, np.arange(b.V)))
+    words = ["transfer-texture", "mesh.ply", "b.ply", "-o", "again.glb", "--map", "ba.npz", *SMALL]
+    well(run(*words))
+    off = np.abs(seen("again.glb", sample_points()) - seen("a.glb", sample_points())).max(axis=1)
+    assert np.median(off) < 20
+
+
+def test_doubt_about_vertex_colours(run: Run, pair: Path) -> None:
+    sure = np.where(load_shape("a.glb").verts[:, 2] > 0.3, 0.0, 1.0).astype(np.float32)
+    save_map("doubt.npz", replace(load_map("ab.npz"), confidence=sure))
+    record = json.loads(well(run(*call("--json", "--blank", "1,0,0", map="doubt.npz", out="out.ply"))).out)
+    colors = load_shape("out.ply").colors
+    assert colors is not None and record["blank"] > 0
+    top = load_shape("b.ply").verts[:, 2].argmax()
+    np.testing.assert_array_equal(colors[top, :3], [1, 0, 0])
+    record = json.loads(well(run(*call("--json", "--fill", map="doubt.npz", out="out.ply"))).out)
+    assert record["filled"] > 0
+
+
+def test_a_picture_for_a_source_that_names_none(run: Run, pair: Path) -> None:
+    write_square_obj(pair / "square.obj", mtl=None)
+    (pair / "skin.png").write_bytes(encoded(quarters(32)))
+    square = load_shape("square.obj")
+    save_map("id.npz", VertexMap.identity(square))
+    words = ["transfer-texture", "square.obj", "square.obj", "-o", "out.obj", "--map", "id.npz", *SMALL]
+    well(run(*words, "--size", "32", "--image", "skin.png"))
+    look = load_appearance("out.obj", load_shape("out.obj"))
+    np.testing.assert_array_equal(look.materials[0].image, quarters(32))
+    np.testing.assert_array_equal(load_shape("out.obj").faces, FACES)
+
+
+def test_the_same_words_give_the_same_bytes(run: Run, pair: Path) -> None:
+    well(run(*call()))
+    first = Path("out.glb").read_bytes()
+    well(run(*call("--threads", "2")))
+    assert Path("out.glb").read_bytes() == first
+
+
+# What can be wrong
+
+
+@pytest.fixture
+def no_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    def begun(*_: object, **__: object) -> None:
+        raise AssertionError("a fit began")
+
+    monkeypatch.setattr(pipeline, "lay_template", begun)
+
+
+def refused(answer: Answer, words: str, folder: Path, before: set[str]) -> None:
+    """One line, a hint, status 1, and nothing new in the folder."""
+    lines = answer.err.strip().splitlines()
+    assert answer.status == 1, answer.err
+    assert [line.partition(":")[0] for line in lines] == ["error", "hint"], answer.err
+    assert words in answer.err
+    assert answer.out == ""
+    assert {path.name for path in folder.iterdir()} == before
+
+
+def plain_source() -> None:
+    save_shape("a.glb", icosphere(2))
+
+
+def missing_image() -> None:
+    write_gltf(Path("a.gltf"), images=["skin.png"], primitives=[{"material": 0}])
+    Path("a.gltf").rename("a.glb")
+    write_square_obj(Path("a.obj"))
+    Path("square.mtl").write_text("newmtl paint\nmap_Kd skin.png\n")
+
+
+def damaged_source() -> None:
+    Path("a.glb").write_bytes(Path("a.glb").read_bytes()[:2000])
+
+
+def damaged_image() -> None:
+    whole = Path("a.glb").read_bytes()
+    at = whole.index(b"IDAT")
+    Path("a.glb").write_bytes(whole[: at + 8] + bytes(64) + whole[at + 72 :])
+
+
+def wild_coordinates() -> None:
+    ball = icosphere(2)
+    uv = unwrapped(ball, 32, 2)
+    uv[5] = 1e8
+    save_textured("a.glb", Textured(ball.verts, ball.faces, uv), picture())
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (plain_source, "a.glb has no texture and no vertex colours: there is nothing to transfer"),
+        (damaged_source, "a.glb"),
+        (damaged_image, "damaged image"),
+        (wild_coordinates, "texture coordinates of 1 faces are out of range"),
+    ],
+)
+def test_sources_that_cannot_be_used(
+    run: Run, pair: Path, no_fit: None, spoil: Callable[[], None], words: str
+) -> None:
+    spoil()
+    before = {path.name for path in pair.iterdir()}
+    refused(run(*call(map=None)), words, pair, before)
+
+
+def test_a_missing_image_beside_an_obj(run: Run, pair: Path, no_fit: None) -> None:
+    missing_image()
+    before = {path.name for path in pair.iterdir()}
+    answer = run("transfer-texture", "a.obj", "b.ply", "-o", "out.glb", *SMALL)
+    refused(answer, "a.obj needs the image skin.png of its material paint, which is not there", pair, before)
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (("--size", "8"), "16 to 8192 texels"),
+        (("--size", "9000"), "16 to 8192 texels"),
+        (("--samples", "0"), "1 to 8 samples"),
+        (("--padding", "33"), "padding of 33 texels"),
+        (("--blank", "purple"), "--blank purple"),
+        (("--blank", "2,0,0"), "colours lie in 0..1"),
+        (("--blank", "0", "--fill"), "contradict each other"),
+        (("--up", "y", "--front", "y"), "lie along one axis"),
+        (("--image", "gone.png"), "there is no file gone.png"),
+        (("--image", "b.ply"), "b.ply is no image that can be read"),
+        (("--uv", "keep"), "b.ply has no texture coordinates to keep"),
+        (("--model", "nobody"), "nobody"),
+    ],
+)
+def test_choices_that_cannot_be(
+    run: Run, pair: Path, no_fit: None, words: tuple[str, ...], what: str
+) -> None:
+    refused(run(*call(*words, map=None)), what, pair, {path.name for path in pair.iterdir()})
+
+
+def test_axes_and_a_map_do_not_go_together(run: Run, pair: Path) -> None:
+    refused(run(*call("--up", "y")), "--up is for matching", pair, {path.name for path in pair.iterdir()})
+
+
+@pytest.mark.parametrize(
+    ("out", "what"),
+    [
+        ("out.stl", "a texture cannot be kept as '.stl'"),
+        ("out", "a file without a suffix"),
+        ("a.glb", "is an input of this command"),
+        ("gone/out.glb", "there is no folder gone"),
+    ],
+)
+def test_outputs_that_cannot_be(run: Run, pair: Path, no_fit: None, out: str, what: str) -> None:
+    refused(run(*call(out=out, map=None)), what, pair, {path.name for path in pair.iterdir()})
+
+
+def test_the_companions_of_an_obj_replace_no_input(run: Run, pair: Path, no_fit: None) -> None:
+    Path("skin.png").write_bytes(png_bytes(picture()))
+    answer = run(*call("--image", "skin.png", out="skin.obj", map=None))
+    refused(answer, "cannot write skin.png: it is an input", pair, {path.name for path in pair.iterdir()})
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_a_folder_that_may_not_be_written(run: Run, pair: Path, no_fit: None) -> None:
+    (pair / "locked").mkdir(mode=0o500)
+    refused(
+        run(*call(out="locked/out.glb", map=None)), "cannot write", pair, {p.name for p in pair.iterdir()}
+    )
+
+
+def test_a_companion_that_cannot_be_written_stops_all(run: Run, pair: Path, no_fit: None) -> None:
+    (pair / "out.png").mkdir()
+    answer = run(*call(out="out.obj", map=None))
+    refused(answer, "cannot write out.png: it is a folder", pair, {path.name for path in pair.iterdir()})
+
+
+def test_clouds_have_no_surface(run: Run, pair: Path, no_fit: None) -> None:
+    np.save("b.npy", load_shape("b.ply").verts)
+    answer = run(*call("--uv", "keep", target="b.npy", out="out.ply", map=None))
+    refused(answer, "b.npy gets vertex colours", pair, {path.name for path in pair.iterdir()})
+    answer = run(*call("--uv", "keep", out="out.ply", map=None))
+    refused(answer, "end the output in .glb or .obj", pair, {path.name for path in pair.iterdir()})
+
+
+def test_maps_that_do_not_fit(run: Run, pair: Path) -> None:
+    a, b = load_shape("a.glb"), load_shape("b.ply")
+    save_map("ba.npz", VertexMap.between(b, a, np.zeros(b.V, int)))
+    save_map("other.npz", VertexMap.between(icosphere(1), b, np.zeros(42, int)))
+    before = {path.name for path in pair.iterdir()}
+    refused(run(*call(map="ba.npz")), "runs the wrong way", pair, before)
+    refused(run(*call(map="other.npz")), "made for another source", pair, before)
+    gone = run(*call(map="gone.npz"))
+    assert gone.status == 1 and gone.err.startswith("error: there is no file gone.npz")
+
+
+def test_a_full_disk_leaves_nothing(run: Run, pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    before = {path.name for path in pair.iterdir()}
+    monkeypatch.setattr(textured_files.gltf_out, "write_textured", full)
+    refused(run(*call("-q")), "No space left on device", pair, before)
+
+
+# The whole road
+
+
+def test_without_a_map_the_two_are_matched(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    samples = bundled_folder() / "samples"
+    answer = run(
+        "transfer-texture", samples / "dancer-textured.glb", samples / "climber.ply", "-o", "out.glb",
+        *("--size", "512", "--refine", "none", "--seed", "1", "--json"),
+    )  # fmt: skip
+    record = json.loads(well(answer).out)
+    assert "matched dancer-textured.glb to climber.ply" in answer.err
+    assert record["verdict"] in ("good", "fair", "poor")
+    assert record["model"] == "human" and record["seed"] == 1
+    shape = load_shape("out.glb")
+    look = load_appearance("out.glb", shape)
+    # striped socks on the lowest part, hair on top: the climber's up is z
+    middle = shape.verts[shape.faces].mean(axis=1)
+    top = middle[:, 2] > np.quantile(shape.verts[:, 2], 0.995)
+    image = look.materials[0].image
+    assert image is not None
+    uv = look.uv[top].mean(axis=1)
+    hair = image[(uv[:, 1] * 512).astype(int), (uv[:, 0] * 512).astype(int), :3].astype(int)
+    assert np.median(np.abs(hair - (92, 56, 33)).max(axis=1)) < 40
