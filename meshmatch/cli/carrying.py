@@ -1,7 +1,7 @@
 """What all the verbs share that carry something from one shape to another: arguments, the map, the words."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -108,18 +108,10 @@ def output_file(request: Request, output: Path, inputs: list[Path | None]) -> It
 
 def check_picture(request: Request, picture: Path | None, others: list[Path | None]) -> None:
     """Refuse a picture that is no PNG, cannot be written, or would replace a file of this command: before the work."""
-    from meshmatch.cli.claims import check_apart, check_png
-    from meshmatch.outputs import replace_on_success
+    from meshmatch.cli.claims import check_apart, check_writable
 
-    check_png(picture)
     check_apart([picture], [request.source, request.target, request.map, *others])
-    if picture is not None:
-        with suppress(_Enough), replace_on_success(picture):
-            raise _Enough
-
-
-class _Enough(Exception):
-    """An output file can be made."""
+    check_writable(picture)
 
 
 def draw(

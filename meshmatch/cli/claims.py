@@ -1,7 +1,7 @@
 """Output files, claimed before the work begins."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from meshmatch.errors import OptionError
@@ -35,3 +35,15 @@ def check_png(path: Path | None) -> None:
     """Refuse a picture that is no PNG (`OptionError`)."""
     if path is not None and path.suffix.lower() != ".png":
         raise OptionError(f"{path.name}: a picture is a PNG", "end the name in .png")
+
+
+def check_writable(path: Path | None) -> None:
+    """Refuse a picture that is no PNG (`OptionError`) or cannot be written (`OutputError`), long before it is."""
+    check_png(path)
+    if path is not None:
+        with suppress(_Enough), replace_on_success(path):
+            raise _Enough
+
+
+class _Enough(Exception):
+    """The file can be made."""

@@ -81,7 +81,8 @@ def prepare(
     folder, shapes.safetensors, points.safetensors, normalised/ and prepared.json.
     """
     from meshmatch.errors import OptionError
-    from meshmatch.render.picture import Panel, render_shapes
+    from meshmatch.render.fitted import nodes_panel
+    from meshmatch.render.picture import render_shapes
     from meshmatch.shapes.files import load_shape
     from meshmatch.shapes.repair import repair
     from meshmatch.templates.make import low_resolution, make_template
@@ -133,9 +134,7 @@ def prepare(
         names, registered, notes = (shapes.name,), 0, clean.notes
         found = {}
     picture = output / "nodes.png"
-    render_shapes(
-        [Panel(bundle.shape, label=f"{bundle.name}: {bundle.K} nodes", points=bundle.nodes)], picture
-    )
+    render_shapes([nodes_panel(bundle)], picture)
     for note in notes:
         voice.say(note)
     voice.say(

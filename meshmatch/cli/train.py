@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from meshmatch.cli import options
+from meshmatch.cli.claims import check_png, check_writable
 from meshmatch.cli.folders import make_folder
 from meshmatch.cli.voice import Voice, print_json
 
@@ -101,6 +102,9 @@ def train(
     ] = None,
     threads: options.Threads = 1,
     seed: options.Seed = 0,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Draw the losses of this run over its steps.")
+    ] = None,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Start anew instead of going on from the folder's checkpoint.")
     ] = False,
@@ -118,7 +122,9 @@ def train(
 
     set_threads(threads)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
+    check_png(picture)
     make_folder(output)
+    check_writable(picture)
     from meshmatch.models.card import check_name
     from meshmatch.training import run
     from meshmatch.training.unsupervised import cloud_recipe
@@ -155,11 +161,11 @@ def train(
             raise OptionError("poses are for generated bodies, not for --shapes", "leave out one of the two")
         given = load_poses(poses, pose_share)
     if shapes is not None and clouds:
-        with _progress(voice) as show:
+        with _progress(voice, picture if first else None) as show:
             folder = _without_correspondence(
                 shapes, output, chosen, label, category, licence, started, not fresh, voice, show
             )
-        return _done(folder, label, voice, json and first)
+        return _done(folder, label, voice, json and first, picture)
     if shapes is not None:
         made = run.read_template(shapes / "template.safetensors")
         source, count = run.folder_source(shapes, made)
@@ -179,7 +185,7 @@ def train(
         if given is not None and poses is not None:
             data += f", {given.share:.0%} of them in {given.P} poses of {poses.name}"
         kind = category or "human"
-    with _progress(voice) as show:
+    with _progress(voice, picture if first else None) as show:
         folder = run.train_model(
             made,
             source,
@@ -193,7 +199,7 @@ def train(
             resume=not fresh,
             progress=show,
         )
-    _done(folder, label, voice, json and first)
+    _done(folder, label, voice, json and first, picture)
 
 
 def _registered(shapes: Path) -> bool:
@@ -238,7 +244,7 @@ def _without_correspondence(
     )
 
 
-def _done(folder: Path, label: str, voice: Voice, json: bool) -> None:
+def _done(folder: Path, label: str, voice: Voice, json: bool, picture: Path | None) -> None:
     voice.say(
         f"wrote model {label} to {folder}; use it with --model {folder}, or add it: meshmatch models add {folder}"
     )
@@ -249,6 +255,7 @@ def _done(folder: Path, label: str, voice: Voice, json: bool) -> None:
         print_json(
             {
                 "output": str(folder),
+                "picture": None if picture is None else str(picture),
                 "model": card.name,
                 "steps": card.steps,
                 "training_minutes": card.training_minutes,
@@ -258,14 +265,16 @@ def _done(folder: Path, label: str, voice: Voice, json: bool) -> None:
 
 
 @contextmanager
-def _progress(voice: Voice) -> "Iterator[Callable[[Progress], None]]":
-    """A bar with the losses while people watch; a line now and then where they read a log."""
+def _progress(voice: Voice, picture: Path | None) -> "Iterator[Callable[[Progress], None]]":
+    """A bar with the losses while people watch; a line now and then where they read a log; at the end a picture."""
     lines = 0
+    seen: list[Progress] = []
 
     with voice.progress() as report:
 
         def show(now: "Progress") -> None:
             nonlocal lines
+            seen.append(now)
             words = ", ".join(f"{name} {value:.4g}" for name, value in now.terms.items())
             if now.validation is not None:
                 words += f", validation {now.validation:.4f}"
@@ -275,3 +284,13 @@ def _progress(voice: Voice) -> "Iterator[Callable[[Progress], None]]":
                 voice.say(f"step {now.step} of {now.steps} ({now.seconds:.0f} s): {words}")
 
         yield show
+    if picture is not None and not seen:
+        voice.say(f"{picture} was not drawn: the run ended before its first report")
+    elif picture is not None:
+        from meshmatch.render.losses import draw_losses
+
+        names = dict.fromkeys(name for now in seen for name in now.terms)
+        terms = {name: [now.terms.get(name, float("nan")) for now in seen] for name in names}
+        known = {now.step: now.validation for now in seen if now.validation is not None}
+        draw_losses(picture, [now.step for now in seen], terms, known)
+        voice.say(f"drew {picture}: the losses over the steps")

@@ -187,3 +187,46 @@ def test_what_cannot_be_is_told(
     assert answer.status == status
     assert told in answer.err
     assert stub.called == {}
+
+
+def test_the_losses_as_a_picture(
+    run: Run, stub: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from meshmatch.render import losses
+
+    drawn: dict[str, Any] = {}
+
+    def kept(path: Path, steps: Any, terms: Any, validation: Any) -> None:
+        drawn.update(path=path, steps=steps, terms=terms, validation=validation)
+
+    monkeypatch.setattr(losses, "draw_losses", kept)
+    picture = tmp_path / "mine" / "losses.png"  # in the folder that is made first
+    answer = run("train", "-o", tmp_path / "mine", "--picture", picture, "--json")
+    assert answer.status == 0, answer.err
+    assert drawn == {
+        "path": picture,
+        "steps": [1, 2],
+        "terms": {"total": [0.5, 0.25]},
+        "validation": {2: 0.0321},
+    }
+    assert f"drew {picture}" in answer.err
+    assert json.loads(answer.out)["picture"] == str(picture)
+    drawn.clear()
+    monkeypatch.setenv("RANK", "1")
+    assert run("train", "-o", tmp_path / "mine", "--picture", picture).status == 0
+    assert drawn == {}
+
+
+def test_a_run_without_a_report_has_no_picture(
+    run: Run, stub: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "train_model", lambda *_, **__: tmp_path / "mine")
+    answer = run("train", "-o", tmp_path / "mine", "--picture", tmp_path / "l.png")
+    assert "was not drawn" in answer.err
+    assert not (tmp_path / "l.png").exists()
+
+
+@pytest.mark.parametrize("name", ["l.jpg", "nowhere/l.png"])
+def test_a_picture_of_losses_that_cannot_be(run: Run, stub: Recorder, tmp_path: Path, name: str) -> None:
+    assert run("train", "-o", tmp_path / "mine", "--picture", tmp_path / name).status == 1
+    assert stub.called == {}
