@@ -33,12 +33,14 @@ _SMALLEST = 1e-3  # a stretch below it is taken for it: a logarithm must stay fi
 
 @dataclass(frozen=True)
 class AgreeConfig:
-    """Steps, weight of the common stretch, robust scale (units of sqrt(area)), share of the pull along the surface."""
+    """Steps, weight of the common stretch, robust scale (units of sqrt(area)), share of the pull along the surface, and
+    how many points of the scan are paired with the template."""
 
-    steps: int = 6
+    steps: int = 8
     strain: float = 0.0004
     scale: float = 0.05
     point_share: float = 0.1
+    back_points: int = 8000
 
 
 def agreed_fits(
@@ -116,7 +118,7 @@ def agree(
         Better node vectors, one for each shape.
     """
     refined = list(vectors)
-    pairing = replace(nodes, point_share=config.point_share)
+    pairing = replace(nodes, point_share=config.point_share, back_points=config.back_points)
     for _ in range(config.steps):
         gradients = [system.deformation_gradient(each) for each in refined]
         common = mean_stretch(gradients)

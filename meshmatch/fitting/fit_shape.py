@@ -29,7 +29,7 @@ from meshmatch.fitting.placing import placed, scan_frame
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.settle import settle
 from meshmatch.fitting.system import NodeSystem
-from meshmatch.fitting.verdict import cloud_allowance, empty_share, judge
+from meshmatch.fitting.verdict import cloud_allowance, empty_share, judge, unexplained
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Frame, Shape
@@ -175,7 +175,7 @@ def _finish(model, shape, laid: _Laid, config, partial: bool) -> Fit:
     core_frame = frame.compose(Frame(1.0, best.rotation.T, best.centre))
     points = system.moved(best.vectors)
     local = scan.turned(best.rotation, best.centre)
-    allowance = cloud_allowance(system, local, shape.V, best.vectors, config.seed) if shape.is_cloud else 0.0
+    allowance = _allowance(model, shape, local, best, config)
     verdict, reasons = judge(best.residual, local, points, allowance, partial)
     return Fit(
         template_hash=model.template.hash,
@@ -196,6 +196,12 @@ def _finish(model, shape, laid: _Laid, config, partial: bool) -> Fit:
     )
 
 
+def _allowance(model, shape: Shape, local: Scan, best: Candidate, config: FitConfig) -> float:
+    if not shape.is_cloud:
+        return 0.0
+    return cloud_allowance(node_system(model), local, shape.V, best.vectors, config.seed)
+
+
 def _try_part(model, shape: Shape, laid: _Laid, config: FitConfig) -> bool:
     """Whether a fit of a part is worth its time: asked for, or an open shape on which the whole fits badly."""
     if config.partial != "auto" or config.refine == "latent":
@@ -204,7 +210,8 @@ def _try_part(model, shape: Shape, laid: _Laid, config: FitConfig) -> bool:
         return False
     _, scan, best = laid
     local, points = scan.turned(best.rotation, best.centre), node_system(model).moved(best.vectors)
-    return best.residual > FAIR_RESIDUAL or empty_share(local, points) > _LEFT
+    allowance = _allowance(model, shape, local, best, config)
+    return unexplained(best.residual, allowance) > FAIR_RESIDUAL or empty_share(local, points) > _LEFT
 
 
 def _settled(model, system, frame, scan, rough, config, rng) -> tuple[Frame, Scan, Scan, list[Candidate]]:

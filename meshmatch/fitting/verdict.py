@@ -35,7 +35,7 @@ def judge(
         The shape shows a part only: template without surface is as expected, and such a fit is fair at best.
     """
     reasons = []
-    excess = float(np.sqrt(max(residual**2 - allowance**2, 0.0)))
+    excess = unexplained(residual, allowance)
     if excess > GOOD_RESIDUAL:
         reasons.append(f"template and shape stay {100 * excess:.1f} % of sqrt(area) apart on average")
     gap = cKDTree(points).query(scan.points)[0]
@@ -51,6 +51,11 @@ def judge(
     if excess > FAIR_RESIDUAL or missed > 0.06 or empty > 0.06:
         return "poor", tuple(reasons)
     return ("fair" if reasons else "good"), tuple(reasons)
+
+
+def unexplained(residual: float, allowance: float) -> float:
+    """What is left of a residual where squares add up."""
+    return float(np.sqrt(max(residual**2 - allowance**2, 0.0)))
 
 
 def empty_share(scan: Scan, points: np.ndarray) -> float:
