@@ -209,7 +209,7 @@ def _tell(voice: Voice, result: "Interpolation", files: list[Path], asked: str) 
     worst = max(result.steps, key=lambda step: step.deviation.arap)
     voice.say(
         f"at time 1 the mesh is {100 * result.to_target:.2f} % of {files[-1].name}'s size (the root of its area) away "
-        f"from it; volume is off by {worst.deviation.volume:.3f} and distances by {worst.deviation.arap:.3f} at most"
+        f"from it; volume is off by {worst.deviation.volume:.3f} and rigidity by {worst.deviation.arap:.3f} at most"
     )
 
 

@@ -161,8 +161,22 @@ def test_three_times_one_way_is_smooth_and_straight_on_beyond(model: TrainedMode
     step = 1e-4
     at = [blend.weights(0.5 + k * step) for k in (-1, 0, 1)]
     assert np.abs(at[0] - 2 * at[1] + at[2]).max() < 20 * step**2  # no kink at the one in the middle
-    beyond = [blend.weights(1 + k) for k in (0.1, 0.2, 0.3)]
+    end = [blend.weights(1 - k * step) for k in (0, 1, 2)]
+    assert np.abs(end[0] - 2 * end[1] + end[2]).max() < 0.01 * step**2 + 1e-12  # no bend at the ends either
+    beyond = [blend.weights(1 + k) for k in (0.0, 0.1, 0.2)]
     assert np.allclose(beyond[0] - 2 * beyond[1] + beyond[2], 0)
+    assert np.allclose(
+        (beyond[1] - beyond[0]) / 0.1, (end[0] - end[1]) / step, atol=1e-3
+    )  # at the same speed
+    assert np.allclose(Blend(model, three[:2]).weights(1.2), [-0.2, 1.2])
+
+
+def test_the_core_goes_straight(model: TrainedModel, three: list[Fit]) -> None:
+    blend, core = Blend(model, three[::2]), model.template.core
+    ends = [fit.points[core].mean(0) for fit in three[::2]]
+    for time in (0.3, 1.2):
+        found = blend.points(blend.vectors(time))[core].mean(0)
+        assert np.allclose(found, (1 - time) * ends[0] + time * ends[1])
 
 
 def test_a_bending_egg_keeps_its_size(model: TrainedModel, three: list[Fit]) -> None:
