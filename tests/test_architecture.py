@@ -39,6 +39,7 @@ OWNERS = {
     "anny": {"training"},
     "embreex": {"render"},
     "fast_simplification": {"shapes"},
+    "meshmonk": {"experiments"},
     "platformdirs": {"models", "training", "experiments"},
     "pymeshlab": {"shapes"},
     "rich": {"experiments", "cli"},
@@ -164,7 +165,7 @@ def test_dependencies_are_those_that_are_imported() -> None:
     extras = project["optional-dependencies"]
     used = set().union(*(third_party(path.read_text(encoding="utf-8")) for path in modules()))
     used = {DISTRIBUTIONS.get(name, name) for name in used} | {"numpy"}
-    optional = bare(extras["meshlab"]) | bare(extras["bodies"])
+    optional = bare(extras["meshlab"]) | bare(extras["bodies"]) | bare(extras["bench"])
     assert bare(project["dependencies"]) == used - optional
     assert optional <= used
 

@@ -118,6 +118,33 @@ def test_extra_entries_are_refused() -> None:
         card_from_json(json.dumps(words))
 
 
+def test_a_card_of_the_first_schema_is_read_as_it_was_meant() -> None:
+    words = json.loads(card_to_json(small_card())) | {"schema": 1}
+    del words["frame"]
+    card = card_from_json(json.dumps(words))
+    assert (card.schema, card.frame) == (2, {"orientation": "searched", "scale": "area"})
+    assert card == small_card()
+    with pytest.raises(ModelError, match="missing entries: frame"):
+        card_from_json(json.dumps(words | {"schema": 2}))
+    with pytest.raises(ModelError, match="schema 1, not 2"):
+        card_from_json(json.dumps(words | {"frame": {"orientation": "none", "scale": "area"}}))
+
+
+@pytest.mark.parametrize(
+    ("frame", "told"),
+    [
+        ({}, "frame must have orientation and scale"),
+        ({"orientation": "none"}, "frame must have"),
+        ({"orientation": "sideways", "scale": "area"}, "frame.orientation must be one of"),
+        ({"orientation": "none", "scale": 3}, "frame.scale must be one of"),
+        ({"orientation": "none", "scale": "area", "more": 1}, "frame must have"),
+    ],
+)
+def test_a_wrong_frame_is_refused(frame: dict[str, object], told: str) -> None:
+    with pytest.raises(ModelError, match=told):
+        small_card(frame=frame)
+
+
 def test_a_newer_schema_asks_for_an_update_whatever_else_it_holds() -> None:
     words = json.loads(card_to_json(small_card())) | {"schema": 3, "unheard": 1}
     with pytest.raises(ModelError, match="schema 3") as caught:

@@ -10,8 +10,8 @@ from safetensors.numpy import load_file, save_file
 
 from meshmatch.errors import InputError, TemplateError
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.make import low_resolution, make_template
+from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.template import Template, load_template, save_template
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.3)

@@ -6,8 +6,8 @@ import torch
 from meshmatch.fields.mls import Kernel
 from meshmatch.models.deformer import Deformer, NetworkConfig
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.make import make_template
+from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import BatchDataset, Source
 from meshmatch.training.losses import LossPoints

@@ -1,0 +1,135 @@
+"""From a folder without correspondence to a map, through the program's only door."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.models.card import read_card
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.training.loop import Progress
+from tests.cli.conftest import Run
+from tests.conftest import icosphere
+
+FEW = ("--nodes", "60", "--radius", "0.35", "--strategy", "uniform", "-q")
+
+
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("meshmatch.render.picture.render_shapes", lambda panels, path: None)
+
+
+@pytest.fixture
+def eggs(tmp_path: Path) -> Path:
+    """Three eggs of different connectivity, two of them with a known tip."""
+    folder = tmp_path / "eggs"
+    folder.mkdir()
+    for n, splits in enumerate((2, 3, 2)):
+        ball = icosphere(splits)
+        shape = Shape(ball.verts * [0.8, 1.4 + 0.1 * n, 1.0], ball.faces)
+        save_shape(folder / f"egg{n}.ply", shape)
+        if n:
+            np.save(folder / f"egg{n}.tip.npy", [int(shape.verts[:, 1].argmax())])
+    return folder
+
+
+def test_prepare_says_what_it_chose(run: Run, eggs: Path, tmp_path: Path) -> None:
+    answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1], "--json")
+    record = json.loads(answer.out)
+    assert (record["registered"], record["align"], record["scale"], record["landmarks"]) == (
+        0,
+        "rigid",
+        "area",
+        0,
+    )
+    assert "which lies nearest to all others" in answer.err
+    assert "3 shapes without correspondence" in answer.err
+
+
+def test_options_reach_the_folder(run: Run, eggs: Path, tmp_path: Path) -> None:
+    words = ("--align", "near", "--scale", "sphere", "--landmarks", ".tip.npy", "--template", "egg1")
+    answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW, *words, "--json")
+    record = json.loads(answer.out)
+    assert (record["align"], record["scale"], record["landmarks"]) == ("near", "sphere", 1)
+    assert record["vertices"] == 642
+    words_of = json.loads((tmp_path / "out" / "prepared.json").read_text())
+    assert (words_of["align"], words_of["source"]) == ("near", "egg1.ply")
+
+
+def test_from_a_folder_to_a_map(run: Run, eggs: Path, tmp_path: Path) -> None:
+    assert run("prepare", eggs, "-o", tmp_path / "out", *FEW, "--align", "none").status == 0
+    answer = run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", "--steps", "3")
+    assert answer.status == 0, answer.err
+    assert "learning from 3 shapes without correspondence" in answer.err
+    card = read_card(tmp_path / "mine" / "card.json")
+    assert card.frame == {"orientation": "none", "scale": "area"}
+    assert (card.steps, card.category) == (3, "out")
+    assert "without correspondence" in card.data
+    answer = run(
+        *("match", eggs / "egg0.ply", eggs / "egg1.ply", "-o", tmp_path / "map.npy"),
+        *("--model", tmp_path / "mine", "-q"),
+    )
+    assert answer.status == 0, answer.err
+    assert np.load(tmp_path / "map.npy").shape == (162,)
+
+
+@pytest.mark.parametrize(("registered", "words"), [(True, ["--unsupervised"]), (False, [])])
+def test_known_points_and_preset_reach_the_training(
+    run: Run, eggs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, registered: bool, words: list[str]
+) -> None:
+    called = {}
+
+    def stub(template, gathered, output, **rest):
+        called.update(rest, known=gathered.landmarks.shape, output=output)
+        rest["progress"](Progress(1, 1, 1e-3, 1.0, {"total": 0.5}))
+        return output
+
+    monkeypatch.setattr("meshmatch.training.unsupervised.train_clouds", stub)
+    if registered:
+        (eggs / "egg1.ply").unlink()
+    prepared = ("--landmarks", ".tip.npy", "--template", "egg2")
+    assert run("prepare", eggs, "-o", tmp_path / "out", *FEW, *prepared).status == 0
+    answer = run(
+        *("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", "--preset", "paper", *words),
+        *("--category", "egg", "--licence", "CC0", "--seed", "4", "--fresh"),
+    )
+    assert answer.status == 0, answer.err
+    assert called["known"] == (2 if registered else 3, 1, 3)
+    assert (called["category"], called["licence"], called["resume"]) == ("egg", "CC0", False)
+    assert called["recipe"].network.encoder == "point"
+    assert called["recipe"].train.seed == 4
+    assert "1 known points" in called["data"]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["prepare", "eggs/egg0.ply", "-o", "out", "--align", "none"], "--align goes with a folder"),
+        (["prepare", "eggs/egg0.ply", "-o", "out", "--landmarks", ".x"], "--landmarks goes with a folder"),
+        (["prepare", "eggs", "-o", "out", "--landmarks", ".nothing"], "has landmarks"),
+        (["prepare", "eggs", "-o", "out", "--template", "egg9"], "egg9"),
+        (["prepare", "eggs", "-o", "out", "--template", "needle.ply", *FEW], "nothing like the template"),
+        (["prepare", "bad", "-o", "out"], "no shape in bad could be used"),
+        (["train", "-o", "mine", "--unsupervised"], "--unsupervised learns from a folder"),
+        (["train", "-o", "mine", "--shapes", "alone"], "one shape is too few"),
+    ],
+)
+def test_what_cannot_be_is_told_in_a_line_and_a_hint(
+    run: Run, eggs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], told: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ball = icosphere(3)
+    save_shape(tmp_path / "needle.ply", Shape(ball.verts * [0.07, 1, 0.07], ball.faces))
+    Path("bad").mkdir()
+    np.save("bad/three.npy", np.eye(3))
+    np.save("bad/same.npy", np.ones((400, 3)))
+    if "alone" in words:
+        Path("one").mkdir()
+        np.save("one/cloud.npy", ball.verts)
+        assert run("prepare", "one", "-o", "alone", *FEW).status == 0
+    answer = run(*words)
+    assert answer.status == 1
+    assert told in answer.err and "hint:" in answer.err
+    assert not Path("out/prepared.json").exists()

@@ -1,0 +1,68 @@
+"""A category's card says how its shapes are placed, and fitting does as it says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from meshmatch.fitting.fit_shape import FitConfig, fit_shape
+from meshmatch.fitting.placing import placed, scan_frame
+from meshmatch.models.deformer import NetworkConfig
+from meshmatch.models.trained import TrainedModel
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.gather import template_radius
+from tests.fitting.eggs import bent_egg, egg_model, scan_of
+
+PLAIN = NetworkConfig(code=16, width=32, depth=1, basis=24, align_basis=0, corrections=0)
+QUICK = FitConfig(refine="none", samples=600, coarse_samples=300)
+
+
+def wanting(orientation: str, scale: str = "area") -> TrainedModel:
+    model = egg_model(network=PLAIN)
+    card = replace(model.card, frame={"orientation": orientation, "scale": scale})
+    return replace(model, card=card)
+
+
+def turned_template(model: TrainedModel, vector: list[float]) -> Shape:
+    turn = Rotation.from_rotvec(vector).as_matrix()
+    return Shape(model.template.shape.verts @ turn.T, model.template.shape.faces, "egg")
+
+
+def test_a_searched_category_asks_its_network() -> None:
+    model = egg_model()
+    assert placed(model, scan_of(model.template.shape)) is None
+
+
+def test_a_given_orientation_is_taken_as_it_is() -> None:
+    model = wanting("none")
+    [only] = placed(model, scan_of(turned_template(model, [0, 0, 1.0]))) or []
+    assert np.array_equal(only.rotation, np.eye(3)) and not only.centre.any()
+    fit = fit_shape(model, turned_template(model, [0, 0, 0.2]), QUICK)
+    assert (fit.up, fit.front) == ("+y", "+z")
+
+
+@pytest.mark.parametrize(("orientation", "vector"), [("near", [0.2, 0.1, 0.1]), ("rigid", [0.5, 2.0, -1.0])])
+def test_an_orientation_is_found_by_alignment(orientation: str, vector: list[float]) -> None:
+    model = wanting(orientation)
+    shape = turned_template(model, vector)
+    found = placed(model, scan_of(shape)) or []
+    turn = Rotation.from_rotvec(vector).as_matrix()
+    # an egg of three axes looks the same after half a turn about any of them
+    halves = [np.eye(3), *(2 * np.outer(axis, axis) - np.eye(3) for axis in np.eye(3))]
+    assert any(np.allclose(guess.rotation, turn @ half, atol=0.06) for guess in found for half in halves)
+    assert len(found) == 1 if orientation == "near" else 1 < len(found) <= 4
+    fit = fit_shape(model, shape, QUICK)
+    assert fit.residual < 0.06  # far more where the orientation is wrong
+    assert fit_shape(wanting("none"), shape, QUICK).residual > fit.residual
+
+
+def test_the_scale_of_the_card_is_used() -> None:
+    model = wanting("none", "sphere")
+    egg = bent_egg(model)
+    frame = scan_frame(model, egg)
+    reach = np.linalg.norm(frame.apply(egg.verts), axis=1).max()
+    assert reach == pytest.approx(template_radius(model.template))
+    assert fit_shape(model, egg, QUICK).frame.scale == pytest.approx(frame.scale)
+    there = scan_frame(wanting("none"), egg).apply(egg.verts)
+    assert Shape(there, egg.faces).area == pytest.approx(1)

@@ -1,0 +1,229 @@
+"""Shapes without correspondence: the typical one, one frame for all, known points, and what is refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.repair import repair
+from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.templates.gather import (
+    find_known,
+    is_registered,
+    most_typical,
+    read_gathered,
+    read_known,
+    template_radius,
+    unit_frame,
+)
+from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.prepare import prepare_folder
+from meshmatch.templates.template import load_template
+from tests.conftest import icosphere
+
+FEW = NodeConfig(strategy="uniform", K=60, radius=0.35)
+NONE = np.empty((0, 3), np.int64)
+
+
+def pear(splits: int, stretch: float = 1.0) -> Shape:
+    """Three different axes and a thick end; the number of triangles differs with `splits`."""
+    ball = icosphere(splits)
+    verts = ball.verts * [0.8, 1.5 * stretch, 1.0]
+    verts[:, 0] *= 1 + 0.5 * ball.verts[:, 1]
+    return Shape(verts, ball.faces)
+
+
+@pytest.fixture
+def pears(tmp_path: Path) -> Path:
+    """Four pears of different connectivity, unit, place and turn; the third stands as its template does."""
+    folder = tmp_path / "pears"
+    folder.mkdir()
+    for n, (splits, stretch) in enumerate([(2, 0.8), (3, 1.3), (2, 1.0), (3, 1.05)]):
+        shape = pear(splits, stretch)
+        turn = Rotation.from_rotvec([0, 0, 0.5 * (n - 2)]).as_matrix()
+        save_shape(folder / f"pear{n}.ply", Shape(10.0**n * shape.verts @ turn.T + n, shape.faces))
+    return folder
+
+
+def test_a_folder_without_correspondence(pears: Path, tmp_path: Path) -> None:
+    made = prepare_folder(pears, tmp_path / "out", FEW)
+    assert (len(made.shapes), made.align, made.landmarks) == (0, "rigid", 0)
+    assert any(note.startswith("template: pear") for note in made.notes)
+    assert not is_registered(tmp_path / "out")
+    template = load_template(tmp_path / "out" / "template.safetensors")
+    gathered = read_gathered(tmp_path / "out", template)
+    assert gathered.points.shape == gathered.normals.shape == (4, 4096, 3)
+    assert (gathered.align, gathered.scale) == ("rigid", "area")
+    words = json.loads((tmp_path / "out" / "prepared.json").read_text())
+    for number, (name, each) in enumerate(zip(words["names"], words["frames"], strict=True)):
+        frame = Frame(each["scale"], np.array(each["rotation"]), np.array(each["center"]))
+        original = load_shape(pears / name)
+        there = Shape(frame.apply(original.verts), original.faces)
+        assert there.area == pytest.approx(1, rel=1e-6)
+        gap = np.linalg.norm(there.verts[:, None] - gathered.points[number][None, :2000], axis=2).min(0)
+        assert gap.max() < 0.15  # samples lie on the shape, in the frame that was written down
+    assert max(words["apart"]) < 0.06  # turned to the template
+    assert len(list((tmp_path / "out" / "normalised").iterdir())) == 4
+
+
+def test_the_typical_shape_is_the_middle_one() -> None:
+    shapes = [repair(pear(2, stretch)) for stretch in (0.5, 0.8, 1.0, 1.25, 2.0)]
+    assert most_typical(shapes, "none", "area", 0) in (1, 2, 3)
+    lonely = [repair(pear(2, stretch)) for stretch in (2.0, 1.0, 1.02, 0.98)]
+    assert most_typical(lonely, "none", "area", 0) != 0
+    clouds = [
+        repair(Shape(pear(3).verts, NONE)),
+        repair(pear(2, 0.7)),
+        repair(Shape(pear(3, 1.1).verts, NONE)),
+    ]
+    assert most_typical(clouds, "none", "area", 0) == 1  # a mesh, if there is one
+
+
+def test_the_template_by_name_by_file_and_of_a_cloud(pears: Path, tmp_path: Path) -> None:
+    def hash_of(template: str | Path) -> str:
+        return prepare_folder(pears, tmp_path / "out", FEW, template=template).template.hash
+
+    by_stem = hash_of("pear1")
+    assert hash_of("pear1.ply") == hash_of(pears / "pear1.ply") == by_stem
+    assert hash_of("pear0") != by_stem
+    cloud = tmp_path / "cloud.npy"
+    np.save(cloud, pear(3).verts)
+    made = prepare_folder(pears, tmp_path / "out", FEW, template=cloud).template
+    assert made.shape.V > 600 and made.dense is made.shape
+    with pytest.raises(InputError, match="pear9"):
+        hash_of("pear9")
+
+
+def test_nodes_of_a_cloud_scatter_around_it(tmp_path: Path) -> None:
+    """Of a mesh they lie below the surface; of a cloud on both sides, by Gaussian noise."""
+    ball = icosphere(3)
+    for n, faces in enumerate((ball.faces, NONE)):
+        (tmp_path / f"in{n}").mkdir()
+        for k in range(2):
+            save_shape(tmp_path / f"in{n}" / f"{k}.ply", Shape(ball.verts * (1 + k), faces))
+    radius = np.sqrt(1 / (4 * np.pi))
+    below, around = (
+        np.linalg.norm(prepare_folder(tmp_path / f"in{n}", tmp_path / "out", FEW).template.nodes, axis=1)
+        for n in (0, 1)
+    )
+    assert below.max() < radius * 1.01
+    assert 0.2 < (around > radius).mean() < 0.95
+    assert around.std() > below.std()
+
+
+def test_the_sphere_scale_is_the_templates_radius(pears: Path, tmp_path: Path) -> None:
+    made = prepare_folder(pears, tmp_path / "out", FEW, scale="sphere", template="pear2")
+    gathered = read_gathered(tmp_path / "out", made.template)
+    assert gathered.scale == "sphere"
+    reach = np.linalg.norm(gathered.points, axis=2).max(1)
+    assert np.allclose(reach, template_radius(made.template), rtol=0.12)
+    frame = unit_frame(pear(2), "sphere", 0.5)
+    assert np.linalg.norm(frame.apply(pear(2).verts), axis=1).max() == pytest.approx(0.5)
+
+
+def test_known_points_follow_their_shapes(pears: Path, tmp_path: Path) -> None:
+    tips = {}
+    for n in range(4):
+        shape = load_shape(pears / f"pear{n}.ply")
+        plain = pear(2 if n % 2 == 0 else 3)
+        tips[n] = np.array([plain.verts[:, 1].argmax(), plain.verts[:, 1].argmin()])
+        if n == 1:  # as places, one of them missing
+            place = shape.verts[tips[n]]
+            place[1] = np.nan
+            np.save(pears / "pear1.tips.npy", place)
+        elif n != 3:
+            np.save(pears / f"pear{n}.tips.npy", tips[n])
+    made = prepare_folder(pears, tmp_path / "out", FEW, landmarks=".tips.npy", template="pear2")
+    assert made.landmarks == 2
+    assert made.names == tuple(f"pear{n}.ply" for n in range(4))  # the files of points are no shapes
+    gathered = read_gathered(tmp_path / "out", made.template)
+    known = gathered.landmarks
+    assert np.isnan(known[1, 1]).all() and np.isnan(known[3]).all()
+    top, bottom = made.template.shape.verts[gathered.template_landmarks]
+    assert top[1] > 0.25 and bottom[1] < -0.25
+    assert np.linalg.norm(known[0] - [top, bottom], axis=1).max() < 0.25
+    assert np.linalg.norm(known[1, 0] - top) < 0.25
+
+
+def test_known_points_in_a_folder_of_their_own_and_as_text(pears: Path, tmp_path: Path) -> None:
+    points = tmp_path / "points"
+    points.mkdir()
+    (points / "pear2.txt").write_text("0\n-1\n5\n")
+    files = sorted(pears.glob("*.ply"))
+    found = find_known(points, pears, files)
+    assert found == [None, None, points / "pear2.txt", None]
+    clean = repair(load_shape(pears / "pear2.ply"))
+    known = read_known(points / "pear2.txt", clean)
+    assert np.allclose(known[[0, 2]], clean.original.verts[[0, 5]]) and np.isnan(known[1]).all()
+    with pytest.raises(InputError, match="has no landmarks, or not all"):
+        prepare_folder(pears, tmp_path / "out", FEW, landmarks=points, template="pear2")
+    with pytest.raises(OptionError, match=r"no shape of .* has landmarks"):
+        find_known(".nothing", pears, files)
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ([0, 99999], "names vertex 99999"),
+        ([0, -2], "counted"),
+        ([0.5, 1.0], "holds no landmarks"),
+        ([[1, 2], [3, 4]], "holds no landmarks"),
+        ([], "holds no landmarks"),
+    ],
+)
+def test_wrong_known_points_are_told(pears: Path, tmp_path: Path, values: list, told: str) -> None:
+    np.save(tmp_path / "x.npy", np.array(values))
+    with pytest.raises(InputError) as caught:
+        read_known(tmp_path / "x.npy", repair(load_shape(pears / "pear0.ply")))
+    assert told in caught.value.message + caught.value.hint
+    (tmp_path / "x.npy").write_bytes(b"no numbers")
+    with pytest.raises(InputError, match="cannot read the landmarks"):
+        read_known(tmp_path / "x.npy", repair(load_shape(pears / "pear0.ply")))
+
+
+def test_files_of_different_length_do_not_belong_together(pears: Path, tmp_path: Path) -> None:
+    np.save(pears / "pear0.tips.npy", np.arange(3))
+    np.save(pears / "pear2.tips.npy", np.arange(2))
+    with pytest.raises(InputError, match="of 2 and of 3 points"):
+        prepare_folder(pears, tmp_path / "out", FEW, landmarks=".tips.npy", template="pear2")
+
+
+def test_a_template_of_another_kind_is_refused(pears: Path, tmp_path: Path) -> None:
+    needle = icosphere(3)
+    save_shape(tmp_path / "needle.ply", Shape(needle.verts * [0.05, 1, 0.05], needle.faces))
+    wide = NodeConfig(strategy="uniform", K=60, radius=0.6)
+    with pytest.raises(InputError, match="nothing like the template") as caught:
+        prepare_folder(pears, tmp_path / "out", wide, template=tmp_path / "needle.ply", scale="sphere")
+    assert "--template" in caught.value.hint
+    assert not (tmp_path / "out" / "prepared.json").exists()
+
+
+def test_few_points_one_point_and_strays_are_left_out_or_told(pears: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    np.save(pears / "three.npy", np.eye(3))
+    np.save(pears / "same.npy", np.ones((500, 3)))
+    fog = np.concatenate([pear(3).verts[:64], rng.uniform(-9, 9, (576, 3))])  # 90 % of it are strays
+    np.save(pears / "fog.npy", fog)
+    made = prepare_folder(pears, tmp_path / "out", FEW)
+    notes = "\n".join(made.notes)
+    assert "three.npy left out: it has only 3 points" in notes
+    assert "same.npy left out" in notes
+    assert "fog.npy is not much like the template" in notes
+
+
+def test_a_damaged_or_foreign_folder_is_told(pears: Path, tmp_path: Path) -> None:
+    made = prepare_folder(pears, tmp_path / "out", FEW)
+    other = prepare_folder(pears, tmp_path / "other", FEW, template="pear0").template
+    if other.hash == made.template.hash:
+        other = prepare_folder(pears, tmp_path / "other", FEW, template="pear1").template
+    with pytest.raises(InputError, match="another template"):
+        read_gathered(tmp_path / "out", other)
+    with pytest.raises(InputError, match="not a prepared folder"):
+        read_gathered(tmp_path, made.template)
+    (tmp_path / "out" / "points.safetensors").write_bytes(b"?")
+    with pytest.raises(InputError, match="not a prepared folder"):
+        read_gathered(tmp_path / "out", made.template)
