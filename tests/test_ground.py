@@ -13,7 +13,7 @@ import meshmatch
 from meshmatch import errors
 from meshmatch.config import set_threads
 from meshmatch.errors import InputError, MeshmatchError, OutputError
-from meshmatch.outputs import replace_on_success
+from meshmatch.outputs import folder_on_success, replace_on_success
 
 
 def test_error_has_a_line_and_a_hint() -> None:
@@ -138,3 +138,38 @@ def test_loading_a_shape_needs_neither_torch_nor_a_mesh_library(tmp_path: Path) 
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+def test_a_folder_appears_whole(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    for name in ("new", "empty"):
+        with folder_on_success(tmp_path / name) as temporary:
+            assert temporary.parent == tmp_path
+            (temporary / "a.txt").write_text("a")
+            assert not (tmp_path / name / "a.txt").exists()
+        assert (tmp_path / name / "a.txt").read_text() == "a"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "new"]
+
+
+@pytest.mark.parametrize("stop", [ValueError, KeyboardInterrupt])
+def test_a_failed_folder_leaves_nothing(tmp_path: Path, stop: type[BaseException]) -> None:
+    with pytest.raises(stop), folder_on_success(tmp_path / "new") as temporary:
+        (temporary / "a.txt").write_text("a")
+        raise stop
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    wrong = {"full": "is not empty", "file": "it is a file", "no/where": "there is no folder"}
+    for name, words in wrong.items():
+        with pytest.raises(OutputError, match=words), folder_on_success(tmp_path / name):
+            pytest.fail("the block must not run")
+    with pytest.raises(OutputError, match="cannot write"), folder_on_success(tmp_path / "late"):
+        (tmp_path / "late").mkdir()
+        (tmp_path / "late" / "theirs.txt").write_text("came in between")
+    assert (tmp_path / "full" / "mine.txt").read_text() == "mine"
+    assert (tmp_path / "late" / "theirs.txt").read_text() == "came in between"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "full", "late"]
