@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from meshmatch.errors import InputError, TemplateError
+from meshmatch.errors import TemplateError
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import low_resolution, make_template
 from meshmatch.templates.nodes import NodeConfig
@@ -176,9 +176,13 @@ def test_what_is_no_bundle_is_refused(tmp_path: Path, content: bytes) -> None:
         load_template(tmp_path / "none.safetensors")
 
 
-def test_a_cloud_is_no_template_and_labels_must_fit(sphere: Shape) -> None:
-    with pytest.raises(InputError, match="no faces"):
-        make_template(Shape(sphere.verts, np.empty((0, 3), int), "dots"), "dots", FEW)
+def test_the_points_of_a_cloud_are_joined_to_a_template(sphere: Shape) -> None:
+    made = make_template(Shape(sphere.verts, np.empty((0, 3), int), "dots"), "dots", FEW)
+    assert made.shape.F > 600
+    assert np.allclose(np.linalg.norm(made.shape.verts, axis=1), (4 * np.pi) ** -0.5, rtol=0.05)  # area 1
+
+
+def test_labels_must_fit(sphere: Shape) -> None:
     with pytest.raises(TemplateError, match="5 labels for 642"):
         make_template(sphere, "ball", FEW, labels=np.zeros(5, int))
     with pytest.raises(TemplateError, match="a label below 0"):
