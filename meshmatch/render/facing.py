@@ -23,6 +23,7 @@ _TALL = 1.05  # bodies that stand are taller
 _FALLS = -0.03  # how far the middle may lie outside the feet: scans are cut
 _LEANS = -0.2  # and where y or z, which are usually up, point up: poses are alive
 _SOLE = 0.035  # what is that near the ground carries
+_NEAR_AXIS = np.cos(np.radians(35.0))
 _TORSO = 0.2  # half width in which there is the chest, and no arm
 
 
@@ -49,6 +50,20 @@ def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Flo
     if abs(upward @ ahead) > 1e-6:
         raise OptionError(f"up and front are the same axis: '{up}' and '{front}'")
     return np.stack([np.cross(upward, ahead), upward, ahead])
+
+
+def upright(rotation: FloatArray) -> FloatArray:
+    """A rotation ``(3, 3)`` whose up is made an axis of the file, if it lies near one.
+
+    The frame of a fit is that of a torso, which leans; files nearly always have an axis that points up.
+    """
+    axis = int(np.abs(rotation[1]).argmax())
+    upward = np.sign(rotation[1, axis]) * np.eye(3)[axis]
+    ahead = rotation[2] - (rotation[2] @ upward) * upward
+    length = float(np.linalg.norm(ahead))
+    if rotation[1] @ upward < _NEAR_AXIS or length < 0.5:
+        return rotation
+    return np.stack([np.cross(upward, ahead / length), upward, ahead / length])
 
 
 def facing_alike(shape: Shape, points: FloatArray, seen: FloatArray) -> FloatArray:

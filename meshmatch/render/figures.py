@@ -24,7 +24,7 @@ MOST_POINTS = 60_000
 """Of a larger cloud every n-th point is drawn: more would be smaller than a pixel."""
 _SPARSE = 12_000  # points; fewer are balls, more are discs that lie on the surface
 _NODE_COLOR = (0.86, 0.30, 0.12)
-_VEIL_COLOR = (0.20, 0.52, 0.86)
+_VEIL_COLOR = (0.06, 0.44, 0.92)
 _SHADOW = 0.42  # how far around its foot a figure throws a shadow
 
 
@@ -191,7 +191,7 @@ def _given(colors: ArrayLike | None, count: int, plain: tuple[float, float, floa
     array = np.asarray(colors, dtype=np.float64)
     if array.shape not in ((count, 3), (count, 4)):
         raise OptionError(f"colours must be an array of ({count}, 3) or ({count}, 4), not {array.shape}")
-    return to_linear(np.clip(array[:, :3], 0.0, 1.0))
+    return to_linear(np.clip(np.nan_to_num(array[:, :3]), 0.0, 1.0))
 
 
 def _gaps(points: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.render.facing import upright
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import Scale
@@ -41,6 +42,7 @@ def fit_panels(
     distance = distances(shape, fitted)
     scale = Scale.of(distance, "distance to the template (unit of the file)", limits)
     name = shape.name if label is None else label
+    rotation = None if rotation is None else upright(rotation)
     return [
         Panel(shape, label=f"{name} and the template", rotation=rotation, over=fitted),
         Panel(shape, scale.colors(distance), "how far apart they are", rotation=rotation),

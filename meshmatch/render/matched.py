@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.colors import position_colors
-from meshmatch.render.facing import facing, facing_alike
+from meshmatch.render.facing import facing, facing_alike, upright
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import UNKNOWN, Scale
@@ -89,7 +89,7 @@ def same_side(
     source: Shape, target: Shape, vertex_map: VertexMap, rotations: Rotations, look: Look
 ) -> tuple[FloatArray, FloatArray]:
     """Rotations that show both shapes from the same side."""
-    first, second = rotations
+    first, second = (None if rotation is None else upright(rotation) for rotation in rotations)
     if first is None:
         first = facing(source, look.up, look.front)
     if second is None and (look.up is not None or look.front is not None):

@@ -27,7 +27,7 @@ class TexturePaint:
 
     def __init__(self, look: Appearance, shape: Shape, scale: float) -> None:
         self._look, self._faces = look, shape.faces
-        self._colors = None if look.colors is None else look.colors.astype(np.float32)
+        self._colors = None if look.colors is None else np.nan_to_num(look.colors).astype(np.float32)
         self._pyramids: dict[int, Pyramid] = {}
         used = np.unique(look.material).tolist()
         shared: dict[tuple[int, tuple[str, str], bool, bool], Pyramid] = {}

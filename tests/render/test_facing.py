@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import OptionError
-from meshmatch.render.facing import facing, facing_alike
+from meshmatch.render.facing import facing, facing_alike, upright
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
@@ -119,6 +119,24 @@ def test_a_standing_body_stays_upright_beside_one_that_leans() -> None:
     leaning = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
     rotation = facing_alike(shape, shape.verts, shape.verts @ leaning.T)
     assert rotation == pytest.approx(np.eye(3), abs=1e-6)
+
+
+def rotation_about(axis: list[float], degrees: float) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(np.radians(degrees) * np.array(axis)).as_matrix())
+
+
+def test_the_frame_of_a_torso_that_leans_is_made_upright() -> None:
+    frame = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0.0]])  # z up, x to the front
+    leaning = rotation_about([1, 0, 0], 25) @ frame
+    assert upright(leaning) == pytest.approx(frame)
+    turned = rotation_about([0, 1, 0], 40) @ frame
+    assert upright(rotation_about([0, 0, 1], -20) @ turned)[1] == pytest.approx([0, 0, 1])
+    assert upright(turned) == pytest.approx(turned)
+    for lying in (rotation_about([1, 0, 0], 44) @ frame, rotation_about([0, 0, 1], 40) @ frame):
+        assert np.array_equal(upright(lying), lying)  # between two axes: as the fit says
+    assert upright(-np.diag([-1.0, 1, 1])) == pytest.approx(-np.diag([-1.0, 1, 1]))
 
 
 def test_a_map_to_one_point_says_nothing_about_the_side(torus: Shape) -> None:

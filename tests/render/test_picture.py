@@ -243,6 +243,26 @@ def test_what_has_no_size_is_drawn_all_the_same(tmp_path: Path, shape: Shape) ->
     draw(tmp_path, (shape, None), look=Look(size=(64, 64)))
 
 
+@pytest.mark.parametrize("unit", [1e-25, 1e-6, 1e9, 1e40])
+def test_a_unit_is_any_number(tmp_path: Path, unit: float, cube: Shape) -> None:
+    usual = draw(tmp_path, (cube, None), look=Look(size=(64, 64)))
+    shape = Shape(unit * (cube.verts + 3), cube.faces)
+    assert np.abs(draw(tmp_path, (shape, None), look=Look(size=(64, 64))) - usual).max() <= 3
+
+
+def test_what_lies_far_away_makes_the_rest_small_and_nothing_worse(tmp_path: Path) -> None:
+    for away, seen in ((30.0, True), (1e7, False)):
+        near, far = box((1, 1, 1)), box((1, 1, 1), (away, 0, 0))
+        both = Shape(np.concatenate([near.verts, far.verts]), np.concatenate([near.faces, far.faces + 8]))
+        assert something(draw(tmp_path, (both, None), look=Look(size=(64, 64)))).any() == seen
+
+
+def test_colours_that_are_no_numbers_are_black(tmp_path: Path) -> None:
+    shape = box((1, 1, 1))
+    colors = np.full((8, 3), np.nan)
+    assert draw(tmp_path, (shape, colors))[48, 48].max() < 40
+
+
 def test_glass_shows_what_is_in_it(tmp_path: Path) -> None:
     shape = box((1, 1, 1))
     inside = Panel(shape, points=[[0, 0, 0]], point_colors=[RED], point_radius=0.2)
