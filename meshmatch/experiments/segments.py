@@ -148,7 +148,7 @@ def measure(
         threads=threads,
         seed=seed,
         tell=tell,
-        nodes=NodeConfig(strategy="geodesic", K=nodes, radius=radius, seed=seed),
+        nodes=NodeConfig(strategy="uniform", K=nodes, radius=radius, seed=seed),
     )
     for label, config in (
         ("network alone", FitConfig(seed=seed, refine="none", partial="no")),
