@@ -1,0 +1,101 @@
+"""The benchmark of textures: its measure, its cases where they are cheap, its command line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import MeshmatchError
+from meshmatch.experiments import texture
+from meshmatch.experiments.texture import Loss, colors_at, main, nearest_map
+from meshmatch.shapes.appearance import Appearance, Material
+from meshmatch.shapes.shape import Shape
+from tests.shapes.painted import CORNERS, FACES, UV, quarters
+from tests.transfer.known import split
+
+
+def test_losses_by_hand() -> None:
+    one = np.zeros((2, 3))
+    two = one.copy()
+    two[0, 0] = 1.0
+    loss = Loss.between(one, two)
+    assert loss.mean == pytest.approx(255 / 6)
+    assert loss.psnr == pytest.approx(10 * np.log10(6))
+    assert Loss.between(one, one).psnr == np.inf
+
+
+def test_the_nearest_map_of_a_finer_copy_is_exact(sphere: Shape) -> None:
+    fine, there, back = split(sphere)
+    np.testing.assert_allclose(nearest_map(sphere, fine).points(fine), there.points(fine), atol=1e-9)
+    np.testing.assert_allclose(nearest_map(fine, sphere).points(sphere), back.points(sphere), atol=1e-9)
+
+
+def test_colours_at_points_of_a_square() -> None:
+    square = Shape(CORNERS, FACES)
+    look = Appearance((Material(image=quarters(16)),), np.zeros(2, np.int64), UV[FACES])
+    found = colors_at(square, look, np.array([[0.25, 0.75, 0], [0.75, 0.75, 0.3], [0.25, 0.25, 0]]))
+    np.testing.assert_allclose(found, [[1, 0, 0], [0, 1, 0], [0, 0, 1]], atol=1e-6)
+
+
+def test_a_body_to_itself(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(texture, "POINTS", 2000)
+    words = ["--cases", "itself,spot", "--size", "512", "--samples", "1", "--threads", "1", "--no-clock"]
+    assert main([*words, "--data", str(tmp_path), "--keep", str(tmp_path / "kept")]) == 0
+    heard = capsys.readouterr().out
+    record = json.loads(heard.strip().splitlines()[-1])
+    assert record["threads"] == 1 and record["size"] == 512
+    assert record["cases"]["spot"] is None and "no data" in heard
+    found = record["cases"]["itself"]
+    # half of the sample's own texels: blurred, but the same
+    assert 0 < found["there"]["mean"] < found["there and back"]["mean"] < 12
+    assert found["there"]["psnr"] > 20
+    assert sorted(file.name for file in (tmp_path / "kept").iterdir()) == [
+        "itself-back.glb",
+        "itself-there.glb",
+    ]
+
+
+def test_the_clock_reads_a_whole_command(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[list[str]] = []
+
+    def cost(command: list[str]) -> texture.Cost:
+        asked.append(command)
+        return texture.Cost(float(len(asked)), 2.0, 3.0)
+
+    monkeypatch.setattr(texture, "cost_of", cost)
+    monkeypatch.setattr(texture, "VERTICES", 100)
+    assert main(["--cases", "none", "--data", str(tmp_path)]) == 0
+    heard = capsys.readouterr().out
+    found = json.loads(heard.strip().splitlines()[-1])["clock"]
+    assert (found["seconds"], found["gigabytes"], found["met"]) == (3.0, 3.0, False)
+    assert "NOT met" in heard
+    assert len(asked) == 4 and "transfer-texture" in asked[0] and "2048" in asked[0]
+
+
+def test_words_that_cannot_be(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for words in (["--cases", "nobody"], ["--threads", "0"]):
+        with pytest.raises(SystemExit) as stopped:
+            main(words)
+        assert stopped.value.code == 2
+    assert main(["--cases", "itself", "--size", "1", "--no-clock"]) == 1
+    assert "16 to 8192" in capsys.readouterr().err
+
+    def broken(*_: object) -> None:
+        raise MeshmatchError("it broke", "mend it")
+
+    monkeypatch.setattr(texture, "trip_of", broken)
+    assert main(["--cases", "itself", "--no-clock"]) == 1
+    assert "mend it" in capsys.readouterr().err
+
+
+def test_the_cow_loses_next_to_nothing(bench: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(texture, "POINTS", 5000)
+    trip = texture.trip_of("spot", bench)
+    record = texture.measure("spot", trip, texture.Choices(size=512, workers=1), None)
+    assert isinstance(record["there and back"], dict)
+    assert record["there and back"]["psnr"] > 31
