@@ -1,7 +1,7 @@
 """How much a texture loses on its way: ``python -m meshmatch.experiments.texture``.
 
-Each case carries the texture of a shape A to a shape B and back to A, each time into a new atlas, and asks for the
-colours at random points of A: before, on B, and after the way back. Errors are of sRGB bytes (0..255), the mean over
+Each case carries the texture of a shape A to a shape B, into a new atlas, and back to A, to its own texture
+coordinates where they serve; and asks for the colours at random points of A: before, on B, and after the way back. Errors are of sRGB bytes (0..255), the mean over
 points and channels, and PSNR.
 
 - *itself*: A is the sample body that ships; B is A, in another atlas. What resampling costs, and nothing else.
@@ -143,13 +143,15 @@ def measure(name: str, trip: Trip, choices: Choices, keep: Path | None) -> dict[
     rng = np.random.default_rng(0)
     samples = sample_surface(trip.source, POINTS, rng).points
 
-    def carried(source: Shape, look: Appearance, target: Shape, back: VertexMap) -> Worn:
-        atlas = atlas_of(target, None, choices.size, choices.padding, "new")
+    def carried(
+        source: Shape, look: Appearance, target: Shape, back: VertexMap, own: Floats | None = None
+    ) -> Worn:
+        atlas = atlas_of(target, own, choices.size, choices.padding)
         return transfer_texture(source, look, target, back, atlas, choices)
 
     before = colors_at(trip.source, trip.look, samples)
     there = carried(trip.source, trip.look, trip.target, trip.there)
-    again = carried(trip.target, look_of(there), trip.source, trip.back)
+    again = carried(trip.target, look_of(there), trip.source, trip.back, trip.look.uv)
     after = colors_at(trip.source, look_of(again), samples)
     if keep is not None:
         save_textured(keep / f"{name}-there.glb", there.mesh, there.baked.image)
