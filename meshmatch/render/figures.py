@@ -56,8 +56,8 @@ class Panel:
     rotation : (3, 3) float, optional
         Into a frame with y up and z to the front, as `Frame.rotation` of a fit has it; overrides the axes of
         the picture.
-    opacity : float
-        Below 1 the shape is glass around its points.
+    glass : bool
+        The shape is clear around its points.
     over : Shape, optional
         Another shape in the same frame, laid over this one as coloured glass.
     """
@@ -72,7 +72,7 @@ class Panel:
     point_colors: ArrayLike | None = None
     point_radius: float | None = None
     rotation: ArrayLike | None = None
-    opacity: float = 1.0
+    glass: bool = False
     over: Shape | None = None
 
 
@@ -120,7 +120,7 @@ def _figure(panel: Panel, up: str | None, front: str | None, turn: float, tilt: 
         return np.asarray(on_ground.place(positions) @ lean.T)
 
     skin = _skin(shape, _paint(panel, on_ground.scale), seen, on_ground, lean)
-    solid, glass = ([skin], []) if panel.opacity >= 1 else ([], [skin])
+    solid, glass = ([], [skin]) if panel.glass else ([skin], [])
     if len(points):
         radius = 0.011 if panel.point_radius is None else panel.point_radius / on_ground.scale
         tint = _given(panel.point_colors, len(points), _NODE_COLOR)
@@ -132,7 +132,7 @@ def _figure(panel: Panel, up: str | None, front: str | None, turn: float, tilt: 
     width, _, depth = on_ground.half
     flat = max(np.sin(np.radians(tilt)), 0.0)
     spot = np.array([0.0, 0.0, width + _SHADOW, (depth + _SHADOW) * flat])
-    return Figure(solid, glass, np.stack([used.min(axis=0), used.max(axis=0)]), spot, panel.opacity < 1)
+    return Figure(solid, glass, np.stack([used.min(axis=0), used.max(axis=0)]), spot, panel.glass)
 
 
 def drawn_points(shape: Shape) -> FloatArray:
@@ -155,8 +155,11 @@ def _paint(panel: Panel, scale: float) -> Paint:
     shape = panel.shape
     if panel.face_colors is not None:
         return FacePaint(_given(panel.face_colors, shape.F, CLAY))
-    if panel.colors is None and panel.appearance is not None and not shape.is_cloud:
-        return TexturePaint(panel.appearance, shape, scale)
+    look = panel.appearance
+    if panel.colors is None and look is not None and not shape.is_cloud:
+        return TexturePaint(look, shape, scale)
+    if panel.colors is None and look is not None and look.colors is not None:
+        return VertexPaint(np.nan_to_num(look.colors[:, :3]), shape.faces)
     given = panel.colors if panel.colors is not None else shape.colors
     return VertexPaint(_given(given, shape.V, CLAY), shape.faces, panel.sharp)
 

@@ -58,4 +58,4 @@ def distances(shape: Shape, fitted: Shape) -> FloatArray:
 def nodes_panel(template: Template, label: str | None = None) -> Panel:
     """A template as glass, with its nodes in it."""
     name = f"{template.name}: {template.K} nodes" if label is None else label
-    return Panel(template.shape, label=name, points=template.nodes, opacity=0.4)
+    return Panel(template.shape, label=name, points=template.nodes, glass=True)

@@ -11,6 +11,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.pyramid import Pyramid
 
 Floats32 = NDArray[np.float32]
+_NOTHING = 0.05  # an alpha below this is meant to be invisible
 
 
 class TexturePaint:
@@ -46,10 +47,13 @@ class TexturePaint:
         self._density = np.sqrt(flat * sizes / np.maximum(solid, 1e-20)).astype(np.float32)
 
     def at(self, faces: IntArray, weights: FloatArray, footprint: float) -> FloatArray:
-        """Linear colours (N, 4); an alpha below a half is a hole."""
+        """Linear colours (N, 4); the last is 1, or 0 for a hole."""
         weights = np.asarray(weights, np.float32)
         out = np.ones((len(faces), 4), np.float32)
         materials = self._look.material[faces]
+        tint = np.ones((len(faces), 4), np.float32)
+        if self._colors is not None:
+            tint = np.einsum("nk,nkc->nc", weights, self._colors[self._faces[faces]])
         for number in np.unique(materials).tolist():
             rows = np.flatnonzero(materials == number)
             material = self._look.materials[number]
@@ -57,16 +61,22 @@ class TexturePaint:
                 uv = np.einsum("nk,nkc->nc", weights[rows], self._look.uv[faces[rows]]).astype(np.float32)
                 wide = np.float32(footprint) * self._density[faces[rows]]
                 out[rows] = self._pyramids[number].look(uv[:, 0], uv[:, 1], wide).T
-            out[rows] *= np.array(material.factor, np.float32)
-        if self._colors is not None:
-            out *= np.einsum("nk,nkc->nc", weights, self._colors[self._faces[faces]])
-        for number in np.unique(materials).tolist():
-            material, rows = self._look.materials[number], materials == number
-            if material.alpha == "opaque":
-                out[rows, 3] = 1.0
-            elif material.alpha == "mask":
-                out[rows, 3] = np.where(out[rows, 3] >= material.cutoff, 1.0, 0.0)
+            own = tint[rows] * np.array(material.factor, np.float32)
+            out[rows, :3] *= own[:, :3]
+            out[rows, 3] = _solid(material, out[rows, 3], own[:, 3])
         return out
+
+
+def _solid(material: Material, image: Floats32, factor: Floats32) -> NDArray[np.bool_]:
+    """(N,) whether there is anything, by the alpha of the image and of what it is multiplied by.
+
+    Half-transparent glass is drawn as if it were solid; what an image cuts out, such as hair from its card, is not.
+    """
+    if material.alpha == "opaque":
+        return np.ones(len(image), bool)
+    if material.alpha == "mask":
+        return np.asarray(image * factor >= material.cutoff)
+    return np.asarray((image >= 0.5) & (factor >= _NOTHING))
 
 
 def _texels(material: Material) -> float:

@@ -264,7 +264,7 @@ def test_templates_and_models_show_their_nodes(
     answer = run("picture", what, "-o", two[0].with_name("o.png"))
     assert answer.status == 0, answer.err
     (panel,) = drawn.panels
-    assert panel.opacity < 1
+    assert panel.glass
     assert panel.points is not None
     assert f"{len(np.asarray(panel.points))} nodes" in panel.label
     assert run("picture", what, "-o", two[0].with_name("o.png"), "--plain").status == 0

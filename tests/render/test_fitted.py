@@ -57,6 +57,6 @@ def test_nodes_shine_through_the_template() -> None:
     template = load_template(bundled_folder() / "human" / "human-T.safetensors")
     panel = nodes_panel(template)
     assert np.array_equal(panel.points, template.nodes)
-    assert panel.opacity < 1
+    assert panel.glass
     assert panel.label == f"human-T: {template.K} nodes"
     assert nodes_panel(template, "x").label == "x"

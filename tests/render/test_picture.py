@@ -14,6 +14,7 @@ from meshmatch.render.colors import to_linear, to_srgb
 from meshmatch.render.layout import HEIGHT
 from meshmatch.render.scales import Scale, label_colors, label_swatches
 from meshmatch.shapes import Shape
+from meshmatch.shapes.appearance import vertex_colors_alone
 
 SMALL = Look(size=(96, 96), up="y", front="z", turn=0.0, tilt=0.0)
 RED, GREEN, BLUE = np.eye(3)
@@ -196,6 +197,16 @@ def test_a_cloud_and_points_are_balls(tmp_path: Path) -> None:
     assert np.argwhere(red).mean(axis=0) == pytest.approx([47.5, 47.5], abs=1)
 
 
+def test_the_look_of_a_cloud_is_its_light(tmp_path: Path) -> None:
+    """Appearance holds light, a shape's own colours are as written: a file of either kind looks the same."""
+    points = box((1, 1, 0.5)).verts
+    colors = np.tile([0.5, 0.25, 0.75, 1.0], (8, 1))
+    cloud = Shape(points, np.zeros((0, 3), int), "dots", colors)
+    look = vertex_colors_alone(cloud)
+    bare = Shape(points, np.zeros((0, 3), int), "dots")
+    assert np.abs(draw(tmp_path, Panel(bare, appearance=look)) - draw(tmp_path, (cloud, None))).max() <= 1
+
+
 def test_a_dense_cloud_is_a_closed_surface(tmp_path: Path, sphere: Shape) -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(14_000, 3))
@@ -266,11 +277,11 @@ def test_colours_that_are_no_numbers_are_black(tmp_path: Path) -> None:
 def test_glass_shows_what_is_in_it(tmp_path: Path) -> None:
     shape = box((1, 1, 1))
     inside = Panel(shape, points=[[0, 0, 0]], point_colors=[RED], point_radius=0.2)
-    solid, glass = (draw(tmp_path, replace(inside, opacity=opacity)) for opacity in (1.0, 0.4))
+    solid, clear = (draw(tmp_path, replace(inside, glass=glass)) for glass in (False, True))
     assert abs(solid[48, 48, 0] - solid[48, 48, 2]) < 20
-    assert glass[48, 48, 0] > glass[48, 48, 2] + 30
-    assert something(glass)[10:86, 10:86].all()
-    assert glass[20, 20].min() > solid[20, 20].min()  # the white paper shines through
+    assert clear[48, 48, 0] > clear[48, 48, 2] + 30
+    assert something(clear)[10:86, 10:86].all()
+    assert clear[20, 20].min() > solid[20, 20].min()  # the white paper shines through
 
 
 def test_a_shape_laid_over_another_tints_it_where_it_is_in_front(tmp_path: Path) -> None:

@@ -61,12 +61,25 @@ def test_factor_and_vertex_colours_multiply() -> None:
     assert plain[:, :3] == pytest.approx(wanted, abs=1e-6)
 
 
-@pytest.mark.parametrize(("alpha", "wanted"), [("opaque", [1, 1]), ("mask", [1, 0]), ("blend", [0.6, 0.2])])
-def test_alpha_means_what_the_material_says(alpha: str, wanted: list[float]) -> None:
+@pytest.mark.parametrize(
+    ("alpha", "factor", "wanted"),
+    [
+        ("opaque", 0.0, [1, 1]),
+        ("mask", 1.0, [1, 0]),
+        ("mask", 0.7, [0, 0]),
+        ("blend", 1.0, [1, 0]),
+        ("blend", 0.3, [1, 0]),  # glass, not a hole
+        ("blend", 0.01, [0, 0]),
+    ],
+)
+def test_alpha_means_what_the_material_says(alpha: str, factor: float, wanted: list[int]) -> None:
     image = quarters(64)
     image[:, :32, 3], image[:, 32:, 3] = 153, 51
-    found = paint(look(Material(image=image, alpha=alpha, cutoff=0.5)))  # type: ignore[arg-type]
-    assert found[:2, 3] == pytest.approx(wanted, abs=0.01)
+    material = Material(image=image, factor=(1.0, 1.0, 1.0, factor), alpha=alpha, cutoff=0.5)  # type: ignore[arg-type]
+    assert paint(look(material))[:2, 3].tolist() == wanted
+    faint = np.tile([1.0, 1.0, 1.0, factor], (4, 1))
+    material = Material(image=image, alpha=alpha, cutoff=0.5)  # type: ignore[arg-type]
+    assert paint(look(material, colors=faint))[:2, 3].tolist() == wanted
 
 
 def test_a_textured_square_in_a_picture() -> None:
