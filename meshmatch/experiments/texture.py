@@ -1,8 +1,8 @@
 """How much a texture loses on its way: ``python -m meshmatch.experiments.texture``.
 
 Each case carries the texture of a shape A to a shape B, into a new atlas, and back to A, to its own texture
-coordinates where they serve; and asks for the colours at random points of A: before, on B, and after the way back. Errors are of sRGB bytes (0..255), the mean over
-points and channels, and PSNR.
+coordinates where they serve; and asks for the colours at random points of A: before, on B, and after the way back.
+Errors are of sRGB bytes (0..255), the mean over points and channels, and PSNR.
 
 - *itself*: A is the sample body that ships; B is A, in another atlas. What resampling costs, and nothing else.
 - *remeshed*: B is A split and decimated to 10,000 vertices, as it stands. Maps by the nearest point of the surface.
