@@ -162,5 +162,8 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 def _apart(paths: list[Path], subjects: "list[Subject]") -> list[str]:
     """Names to show: those of the files, with their folders where they are the same."""
-    plain = [subject.name for subject in subjects]
-    return [name if plain.count(name) == 1 else str(path) for name, path in zip(plain, paths, strict=True)]
+    of: dict[str, set[Path]] = {}
+    for path, subject in zip(paths, subjects, strict=True):
+        of.setdefault(subject.name, set()).add(path.resolve())
+    pairs = zip(paths, subjects, strict=True)
+    return [subject.name if len(of[subject.name]) == 1 else str(path) for path, subject in pairs]

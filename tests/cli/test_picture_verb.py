@@ -108,6 +108,8 @@ def test_files_of_one_name_are_told_apart(run: Run, two: tuple[Path, Path], draw
     other.write_bytes(two[0].read_bytes())
     assert run("picture", two[0], other, two[1], "-o", two[0].with_name("out.png")).status == 0
     assert drawn.names == [str(two[0]), str(other), "b.ply"]
+    assert run("picture", two[0], two[0], "-o", two[0].with_name("out.png")).status == 0
+    assert drawn.names == ["a.ply", "a.ply"]
 
 
 def test_numbers_become_heat_on_one_scale(run: Run, two: tuple[Path, Path], drawn: Drawn) -> None:
