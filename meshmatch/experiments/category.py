@@ -111,7 +111,7 @@ def fit_all(model: Path, shapes: Mapping[str, Shape], config: FitConfig, tell: T
 def map_all(
     model: Path, shapes: Mapping[str, Shape], fits: Mapping[str, Fit], config: FitConfig, tell: Tell
 ) -> dict[Pair, VertexMap]:
-    """Maps of all ordered pairs, through fits that agree where the category lets them."""
+    """Maps of all ordered pairs, through fits that all agree on how the template stretches."""
     loaded = read_model(model)
     tell("agreeing")
     clean = [usable(shape).shape for shape in shapes.values()]

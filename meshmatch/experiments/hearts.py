@@ -37,7 +37,7 @@ from meshmatch.experiments.report import circumstances, explain, wide_console
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_shape import FitConfig
 from meshmatch.pipeline import read_model
-from meshmatch.render.picture import Panel, render_shapes
+from meshmatch.render.picture import Look, Panel, render_shapes
 from meshmatch.render.scales import label_colors
 from meshmatch.shapes.shape import Frame, Shape
 from meshmatch.templates.nodes import NodeConfig
@@ -129,7 +129,7 @@ def chamber_picture(
     for name in [name for name in shapes if name != first][:others]:
         carried = truth[first][maps[name, first], 1]
         panels.append(Panel(shapes[name], palette[carried], label=f"on {name}"))
-    render_shapes(panels, path)
+    render_shapes(panels, path, Look(up="z", front="-y"))
 
 
 def _frames(work: Path) -> dict[str, Frame]:

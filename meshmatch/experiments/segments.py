@@ -10,7 +10,8 @@ the area under its ROC curve, and its mean where the keypoint is right and where
 Files are turned every way. `--turns given` (the default) brings each shape to the axes of the first one with the turn
 of a cube that suits its keypoints best, so upright and facing the same way, as the benchmark's protocol gives it;
 `--turns searched` lets `meshmatch prepare --align rigid` find the orientation. The same shapes, in the same
-orientation, are matched by rigid alignment and the nearest vertex. Trained and measured on the same ten.
+orientation, are matched by rigid alignment and the nearest vertex. Trained and measured on the same ten. The keypoints
+of tables run round the legs one way on some and the other way on others: their truth holds up to a reflection only.
 """
 
 from __future__ import annotations

@@ -61,13 +61,12 @@ def agreed_fits(
     -------
     list of Fit
         Node vectors, points and vertex distances are new; residual and verdict stay those that each fit had alone.
-        As given if one of them is poor, for it has nothing to say about the others, or if nodes are not refined; also in
-        a category that was learned without correspondence: its shapes differ in stretch (hearts: 9 % worse).
+        As given if one of them is poor, for it has nothing to say about the others, or if nodes are not refined.
     """
     if any(fit.verdict == "poor" for fit in fits):
         return list(fits)
     config = config or FitConfig()
-    if config.refine != "nodes" or model.card.frame["orientation"] != "searched":
+    if config.refine != "nodes":
         return list(fits)
     system = node_system(model)
     scans = [_samples(shape, fit, config) for shape, fit in zip(shapes, fits, strict=True)]
