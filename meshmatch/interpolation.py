@@ -18,7 +18,7 @@ from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import Blend, Deviation, Way
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_shape import FitConfig, Partial, Refine
+from meshmatch.fitting.fit_config import FitConfig, Partial, Refine
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
 from meshmatch.maps.place import in_core_frame
 from meshmatch.maps.surface import Surface

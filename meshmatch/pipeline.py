@@ -16,7 +16,7 @@ from meshmatch.config import set_threads
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_shape import FitConfig, Partial, Refine
+from meshmatch.fitting.fit_config import FitConfig, Partial, Refine
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
 from meshmatch.fitting.landmarks import honour_pairs
 from meshmatch.maps.build import build_map

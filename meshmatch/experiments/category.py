@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from meshmatch.errors import InputError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_shape import FitConfig
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
 from meshmatch.maps.build import build_map
 from meshmatch.maps.vertex_map import VertexMap

@@ -35,7 +35,7 @@ from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.category import Pair, Tell, fit_all, load_category, map_all, nearest_all, trained
 from meshmatch.experiments.report import circumstances, explain, wide_console
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_shape import FitConfig
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.pipeline import read_model
 from meshmatch.render.picture import Look, Panel, render_shapes
 from meshmatch.render.scales import label_colors

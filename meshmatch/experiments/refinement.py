@@ -40,8 +40,9 @@ from meshmatch.experiments.protocols import load_set
 from meshmatch.experiments.report import circumstances, explain, wide_console
 from meshmatch.experiments.scores import evaluate_set
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_shape import FitConfig, node_system
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
+from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy, refine_code
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
 from meshmatch.fitting.scan import Scan

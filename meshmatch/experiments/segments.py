@@ -41,7 +41,7 @@ from meshmatch.experiments.category import (
     trained,
 )
 from meshmatch.experiments.report import circumstances, explain, wide_console
-from meshmatch.fitting.fit_shape import FitConfig
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.shapes.align import Align
 from meshmatch.shapes.files import save_shape

@@ -16,8 +16,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_shape import FitConfig, node_system, take_samples
-from meshmatch.fitting.nodes import NodeRefineConfig, add_landmarks, nearest_rotations, pair_terms
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_shape import node_system, take_samples
+from meshmatch.fitting.nodes import NodeRefineConfig, add_landmarks, between, nearest_rotations, pair_terms
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.shapes.shape import Shape
@@ -41,6 +42,14 @@ class AgreeConfig:
     scale: float = 0.05
     point_share: float = 0.1
     back_points: int = 8000
+
+    def suited(self, roughness: float) -> AgreeConfig:
+        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all points, a stiffer template."""
+        return replace(
+            self,
+            strain=between(self.strain, 5 * self.strain, roughness),
+            back_points=round(self.back_points * (1 + roughness)),
+        )
 
 
 def agreed_fits(
@@ -74,8 +83,15 @@ def agreed_fits(
     if landmarks is not None:
         local = [(at, fit.frame.apply(place)) for (at, place), fit in zip(landmarks, fits, strict=True)]
     parts = [fit.partial for fit in fits]
+    how = how or AgreeConfig()
     refined = agree(
-        system, scans, [fit.vectors for fit in fits], how or AgreeConfig(), config.nodes, local, parts
+        system,
+        scans,
+        [fit.vectors for fit in fits],
+        [how.suited(shape.roughness) for shape in shapes],
+        config.nodes,
+        local,
+        parts,
     )
     agreed = []
     for shape, fit, vectors in zip(shapes, fits, refined, strict=True):
@@ -87,6 +103,7 @@ def agreed_fits(
 
 def _samples(shape: Shape, fit: Fit, config: FitConfig) -> Scan:
     """The samples that the fit has seen, in its core frame."""
+    config = config.suited(shape.roughness)
     frame, scan = take_samples(shape, config.samples, np.random.default_rng(config.seed))
     return Scan(
         fit.frame.apply(frame.undo(scan.points)), scan.normals @ frame.rotation @ fit.frame.rotation.T
@@ -97,7 +114,7 @@ def agree(
     system: NodeSystem,
     scans: Sequence[Scan],
     vectors: Sequence[np.ndarray],
-    config: AgreeConfig,
+    configs: Sequence[AgreeConfig],
     nodes: NodeRefineConfig,
     landmarks: Sequence[Landmarks] | None = None,
     partial: Sequence[bool] | None = None,
@@ -108,6 +125,7 @@ def agree(
     ----------
     scans : samples of each shape in its core frame
     vectors : (K, 3) node vectors of each fit
+    configs : one for each fit; they take as many steps as the first
     nodes : how pairs of points are found and weighed
     landmarks : optional, for each shape template vertices (N,) and positions (N, 3) in its core frame
     partial : optional, for each shape whether it shows a part only
@@ -118,12 +136,13 @@ def agree(
         Better node vectors, one for each shape.
     """
     refined = list(vectors)
-    pairing = replace(nodes, point_share=config.point_share, back_points=config.back_points)
-    for _ in range(config.steps):
+    for _ in range(configs[0].steps):
         gradients = [system.deformation_gradient(each) for each in refined]
         common = mean_stretch(gradients)
         for number, (scan, F) in enumerate(zip(scans, gradients, strict=True)):
             one_sided = partial is not None and partial[number]
+            config = configs[number]
+            pairing = replace(nodes, point_share=config.point_share, back_points=config.back_points)
             weights, pulls = pair_terms(system, scan, refined[number], config.scale, pairing, one_sided)
             if landmarks is not None:
                 add_landmarks(weights, pulls, landmarks[number], nodes.landmark_weight)

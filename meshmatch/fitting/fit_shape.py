@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import FAIR_RESIDUAL, Fit, axis_name
-from meshmatch.fitting.latent import LatentRefineConfig, refine_code
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.latent import refine_code
 from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual, variants
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
 from meshmatch.fitting.orientation import (
@@ -38,51 +39,12 @@ from meshmatch.shapes.topology import open_edges
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
 
-Refine = Literal["none", "latent", "nodes"]
-Partial = Literal["auto", "yes", "no"]
-REFINEMENTS: tuple[Refine, ...] = ("none", "latent", "nodes")
 Progress = Callable[[str, float], None]
 _Laid = tuple[Frame, Scan, Candidate]
 
 # A fit of the whole that leaves this share of the template without surface may be one of a part; that is believed
 # if its residual is that much smaller. A mesh must be open for it, with a boundary of so many sqrt(area).
 _LEFT, _CLOSER, _OPEN = 0.06, 0.85, 0.3
-
-
-@dataclass(frozen=True)
-class FitConfig:
-    """How hard to look and how to refine.
-
-    samples : points drawn on the surface, of which coarse_samples see every orientation; hypotheses : voted
-    orientations, each tried with its flips; laid : of which this many are laid on with care; variants : readings
-    of the best from frames tilted by ``tilt`` degrees; finalists : readings that get ``screening`` node steps
-    before the best one gets them all; copies : turned copies that vote on the orientation; partial : whether the
-    shape may be a part of a whole, tried where a fit of the whole leaves template without surface ("auto"), always
-    or never.
-    """
-
-    refine: Refine = "nodes"
-    seed: int = 0
-    up: str | None = None
-    front: str | None = None
-    partial: Partial = "auto"
-    samples: int = 8000
-    coarse_samples: int = 2048
-    copies: int = 48
-    hypotheses: int = 2
-    laid: int = 3
-    variants: int = 12
-    tilt: float = 15.0
-    finalists: int = 4
-    screening: int = 4
-    nodes: NodeRefineConfig = field(default_factory=NodeRefineConfig)
-    latent: LatentRefineConfig = field(default_factory=LatentRefineConfig)
-
-    def __post_init__(self) -> None:
-        if self.refine not in REFINEMENTS:
-            raise OptionError(f"no refinement {self.refine!r}", f"choose one of {', '.join(REFINEMENTS)}")
-        if self.partial not in ("auto", "yes", "no"):
-            raise OptionError(f"partial cannot be {self.partial!r}", "choose auto, yes or no")
 
 
 @lru_cache(maxsize=4)
@@ -116,7 +78,7 @@ def fit_shape(
     OptionError
         An axis that is none, or up and front along one axis.
     """
-    config = config or FitConfig()
+    config = (config or FitConfig()).suited(shape.roughness)
     began = time.monotonic()
     tell = progress or (lambda what, share: None)
     rng = np.random.default_rng(config.seed)

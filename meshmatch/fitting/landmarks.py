@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_shape import FitConfig, fit_shape
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_shape import fit_shape
 from meshmatch.shapes.repair import Repaired
 from meshmatch.templates.template import Template
 

@@ -9,7 +9,7 @@ the scan but not stretch along it, which Chamfer and normals cannot see.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -35,6 +35,25 @@ class NodeRefineConfig:
     back_points: int = 4000
     damping: float = 1e-4
     landmark_weight: float = 0.05
+
+    def suited(self, roughness: float) -> NodeRefineConfig:
+        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`).
+
+        Noise does not tell across from along, and asks for the mean of many points rather than for the nearest: a wider
+        robust scale, a stiffer template, more points. Measured on bodies with noise of 1 % of the diagonal.
+        """
+        return replace(
+            self,
+            strain_last=between(self.strain_last, 10 * self.strain_last, roughness),
+            scale_last=between(self.scale_last, 2 * self.scale_last, roughness),
+            point_share=between(self.point_share, max(self.point_share, 1.0), roughness),
+            back_points=round(between(self.back_points, 5 * self.back_points, roughness)),
+        )
+
+
+def between(low: float, high: float, share: float) -> float:
+    """The number that lies at a ``share`` (0..1) of the way from one to another, by ratio."""
+    return low if low <= 0 else low * (high / low) ** share
 
 
 def refine_nodes(

@@ -75,6 +75,15 @@ def estimate_normals(points: Floats, invalid: NDArray[np.bool_] | None = None) -
     return normals
 
 
+def roughness(points: Floats, invalid: NDArray[np.bool_] | None = None) -> float:
+    """How noisy a cloud is beside its spacing, 0..1: about 0 for a clean one, 1 for noise of 1 % of the diagonal."""
+    valid = points if invalid is None else points[~invalid]
+    if len(valid) < 20:
+        return 0.0
+    part, _, index = _neighbourhoods(valid)
+    return _size(part, index)[1]
+
+
 def stray_points(points: Floats) -> NDArray[np.bool_]:
     """(V,) True for a point that lies three times further from its neighbours than these from theirs."""
     from scipy.spatial import cKDTree

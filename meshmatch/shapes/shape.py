@@ -150,6 +150,15 @@ class Shape:
         return float(self.vertex_areas.sum() if self.is_cloud else self.face_areas.sum())
 
     @cached_property
+    def roughness(self) -> float:
+        """How noisy a cloud is, 0..1 (see `cloud.roughness`); 0 for a mesh, whose faces say what lies where."""
+        if not self.is_cloud:
+            return 0.0
+        from meshmatch.shapes.cloud import roughness
+
+        return roughness(self.verts, self.invalid)
+
+    @cached_property
     def bounds(self) -> Floats:
         """(2, 3) lowest and highest corner of the box around the valid vertices."""
         verts = self.verts if self.invalid is None else self.verts[~self.invalid]

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.agree import AgreeConfig, agree, agreed_fits, mean_stretch
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_shape import FitConfig, node_system
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.nodes import NodeRefineConfig
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
@@ -71,20 +72,20 @@ def slid(system: NodeSystem, nodes: np.ndarray, turn: float) -> np.ndarray:
 def test_two_that_slid_apart_come_closer(system: NodeSystem, model: TrainedModel) -> None:
     scan, nodes = scan_of(system), model.template.nodes
     apart = [slid(system, nodes, 0.15), slid(system, nodes, -0.15)]
-    nearer = agree(system, [scan, scan], apart, AgreeConfig(steps=6, strain=0.01), NodeRefineConfig())
+    nearer = agree(system, [scan, scan], apart, [AgreeConfig(steps=6, strain=0.01)] * 2, NodeRefineConfig())
 
     def gap(pair: list[np.ndarray]) -> float:
         return float(np.linalg.norm(system.moved(pair[0]) - system.moved(pair[1]), axis=1).mean())
 
     assert gap(nearer) < 0.75 * gap(apart)
-    alone = agree(system, [scan], apart[:1], AgreeConfig(steps=6, strain=0.01), NodeRefineConfig())
+    alone = agree(system, [scan], apart[:1], [AgreeConfig(steps=6, strain=0.01)], NodeRefineConfig())
     assert gap([alone[0], apart[1]]) > gap(nearer)
 
 
 def test_two_that_are_equal_stay_so_and_the_same_twice(system: NodeSystem, model: TrainedModel) -> None:
     scan, start = scan_of(system), slid(system, model.template.nodes, 0.1)
-    first = agree(system, [scan, scan], [start, start], AgreeConfig(), NodeRefineConfig())
-    again = agree(system, [scan, scan], [start, start], AgreeConfig(), NodeRefineConfig())
+    first = agree(system, [scan, scan], [start, start], [AgreeConfig()] * 2, NodeRefineConfig())
+    again = agree(system, [scan, scan], [start, start], [AgreeConfig()] * 2, NodeRefineConfig())
     assert np.array_equal(first[0], first[1])
     assert np.array_equal(first[0], again[0])
 
@@ -96,7 +97,7 @@ def test_landmarks_hold(system: NodeSystem, model: TrainedModel) -> None:
     config = AgreeConfig(steps=3)
 
     def missed(known: object) -> float:
-        moved = system.moved(agree(system, [scan], [start], config, NodeRefineConfig(), known)[0])  # type: ignore[arg-type]
+        moved = system.moved(agree(system, [scan], [start], [config], NodeRefineConfig(), known)[0])  # type: ignore[arg-type]
         return float(np.linalg.norm(moved[at] - places, axis=1).max())
 
     assert missed([(at, places)]) < 0.25 * missed(None)

@@ -11,7 +11,8 @@ from meshmatch import pipeline
 from meshmatch.cli import main
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import FAIR_RESIDUAL, GOOD_RESIDUAL, Fit, axis_name
-from meshmatch.fitting.fit_shape import REFINEMENTS, FitConfig, Refine, fit_shape, take_samples
+from meshmatch.fitting.fit_config import REFINEMENTS, FitConfig, Refine
+from meshmatch.fitting.fit_shape import fit_shape, take_samples
 from meshmatch.fitting.landmarks import template_vertices
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.scan import Scan

@@ -11,7 +11,8 @@ import torch
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.fields.mls import KERNELS, Kernel, build_field
 from meshmatch.fitting.dense import dense_shape
-from meshmatch.fitting.fit_shape import REFINEMENTS, FitConfig, Refine, fit_shape, node_system
+from meshmatch.fitting.fit_config import REFINEMENTS, FitConfig, Refine
+from meshmatch.fitting.fit_shape import fit_shape, node_system
 from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy
 from meshmatch.fitting.scan import Scan
 from meshmatch.models.registry import built_in_folder

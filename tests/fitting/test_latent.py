@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshmatch.fitting.fit_shape import FitConfig, fit_shape
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_shape import fit_shape
 from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy, refine_code
 from meshmatch.fitting.scan import Scan
 from meshmatch.models.trained import TrainedModel

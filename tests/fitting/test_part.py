@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import OptionError
-from meshmatch.fitting.fit_shape import FitConfig, boundary_length, fit_shape, node_system
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_shape import boundary_length, fit_shape, node_system
 from meshmatch.fitting.network_fit import one_way_residual
 from meshmatch.fitting.part import SHARES, cost
 from meshmatch.fitting.scan import Scan

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fitting.fit_shape import FitConfig, fit_shape
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_shape import fit_shape
 from meshmatch.fitting.placing import placed, scan_frame
 from meshmatch.models.deformer import NetworkConfig
 from meshmatch.models.trained import TrainedModel

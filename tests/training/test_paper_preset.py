@@ -10,7 +10,8 @@ import pytest
 from meshmatch import pipeline
 from meshmatch.cli import main
 from meshmatch.fields.mls import build_field
-from meshmatch.fitting.fit_shape import FitConfig, fit_shape
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_shape import fit_shape
 from meshmatch.models.trained import TrainedModel, load_model
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
