@@ -63,6 +63,10 @@ def settle(system: NodeSystem, scan: Scan, candidate: Candidate, lay: Lay) -> tu
 
 
 def lonely_points(points: np.ndarray) -> np.ndarray:
-    """(P,) True where the nearest few points lie further away than is usual on the cloud."""
-    reach = cKDTree(points).query(points, min(_NEIGHBOURS + 1, len(points)))[0][:, -1]
-    return reach > _LONELY * np.median(reach)
+    """(P,) True where the nearest few points lie further away than is usual on the cloud.
+
+    Samples of a small cloud repeat its points; a point is no company to itself.
+    """
+    own, which = np.unique(points, axis=0, return_inverse=True)
+    reach = cKDTree(own).query(own, min(_NEIGHBOURS + 1, len(own)))[0][:, -1]
+    return np.asarray((reach > _LONELY * np.median(reach))[which.reshape(-1)])

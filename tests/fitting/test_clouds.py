@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from meshmatch.fitting.agree import AgreeConfig
 from meshmatch.fitting.fit import GOOD_RESIDUAL
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.network_fit import Candidate, two_way_residual
 from meshmatch.fitting.scan import Scan
@@ -122,3 +124,28 @@ def test_the_verdict_is_of_what_is_not_explained(system: NodeSystem) -> None:
         == judge(GOOD_RESIDUAL * 0.5, scan, system.verts)[0]
     )
     assert judge(0.02, scan, system.verts, allowance=0.03)[0] == judge(0.0, scan, system.verts)[0]
+
+
+def test_a_repeated_point_is_no_company(system: NodeSystem) -> None:
+    """A cloud of few points is drawn from again and again, its strays too."""
+    points = cloud_of(system, 300, strays=6).points
+    alone = lonely_points(points)
+    again = np.concatenate([points, points[::-1], points])
+    assert alone[-6:].all() and alone.mean() < 0.2
+    assert np.array_equal(lonely_points(again), np.concatenate([alone, alone[::-1], alone]))
+
+
+def test_noise_makes_a_cloud_rough_and_its_fit_stiff(system: NodeSystem) -> None:
+    points = sample_surface(Shape(system.verts, system.faces), 3000, np.random.default_rng(0)).points
+    noise = np.random.default_rng(1).standard_normal(points.shape)
+    none = np.empty((0, 3), np.int64)
+    clean, some, much = (Shape(points + size * noise, none).roughness for size in (0.0, 0.01, 0.03))
+    assert clean < 0.05 < some < much <= 1.0
+    assert Shape(system.verts, system.faces).roughness == 0.0
+    config = FitConfig()
+    assert config.suited(clean).nodes.strain_last == pytest.approx(config.nodes.strain_last, rel=0.15)
+    stiff = config.suited(1.0)
+    assert stiff.nodes.strain_last == pytest.approx(10 * config.nodes.strain_last)
+    assert stiff.nodes.scale_last > config.nodes.scale_last and stiff.samples > config.samples
+    assert config.suited(0.0) is config
+    assert AgreeConfig().suited(1.0).strain == pytest.approx(5 * AgreeConfig().strain)

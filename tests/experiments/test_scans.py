@@ -1,0 +1,35 @@
+"""Scans are registered, measured and drawn in the colours of the template's parts."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.experiments.scans import main, scan_panels
+from meshmatch.pipeline import read_model, register
+from meshmatch.render.scales import label_colors
+from meshmatch.shapes.files import load_shape
+
+DANCER = Path(__file__).parents[2] / "templates" / "samples" / "dancer.ply"
+
+
+def test_a_scan_wears_the_parts_of_the_template() -> None:
+    shape = load_shape(DANCER)
+    fit = register(shape, refine="none")
+    labels = np.asarray(read_model("human").template.labels)
+    scan, laid = scan_panels("one", shape, fit, labels)
+    assert (scan.label, laid.label) == ("one", fit.verdict)
+    assert np.array_equal(np.asarray(laid.colors, float), label_colors(labels))
+    worn = {tuple(color) for color in np.asarray(scan.colors, float).round(6).tolist()}
+    known = {tuple(color) for color in label_colors(labels).round(6).tolist()}
+    assert worn <= known and len(worn) == len(known)
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(DANCER), "-o", str(tmp_path / "new")]) == 0
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert record["scans"][DANCER.stem]["verdict"] == "good"
+    assert (tmp_path / "new" / "scans-1.png").stat().st_size > 10_000
+    assert main([str(tmp_path / "none.ply")]) == 1
+    assert "none.ply" in capsys.readouterr().err
