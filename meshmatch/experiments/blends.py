@@ -1,0 +1,105 @@
+"""What lies between two codes: ``python -m meshmatch.experiments.blends --models human,./trained-with-blend``.
+
+For pairs of a set, the codes that each network has for the two shapes are blended at a quarter, a half and three
+quarters, and decoded. Deviations from the volume and rigidity that the two ends have, blended (`Deviation`), say how
+true the shapes between are; the residual of the network's own fits says what the ends cost. All models see the same pairs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from meshmatch.config import set_threads
+from meshmatch.errors import MeshmatchError
+from meshmatch.experiments.bench import chosen_pairs
+from meshmatch.experiments.protocols import SET_NAMES, BenchSet, load_set
+from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.fitting.blend import Blend
+from meshmatch.fitting.fit import Fit
+from meshmatch.pipeline import read_model, register, usable
+
+TIMES = (0.25, 0.5, 0.75)
+
+
+def measure(bench: BenchSet, model: str, *, limit: int, seed: int) -> dict[str, Any]:
+    """Mean deviations between the ends of ``limit`` pairs, and the mean residual of the ends."""
+    loaded = read_model(model)
+    fits: dict[str, Fit] = {}
+    shapes = {}
+    rows = []
+    pairs = chosen_pairs(bench, limit)
+    for pair in track(pairs, model, console=Console(stderr=True)):
+        for name in pair:
+            if name not in fits:
+                shapes[name] = usable(bench.shape(name)).shape
+                fits[name] = register(shapes[name], model=model, refine="none", seed=seed)
+        blend = Blend(loaded, [fits[n] for n in pair], None, [shapes[n] for n in pair], "codes")
+        for time in TIMES:
+            found = blend.deviation(time, blend.vectors(time))
+            rows.append([found.volume, found.arap, found.template_volume, found.template_arap])
+    volume, arap, template_volume, template_arap = np.mean(rows, axis=0).tolist()
+    return {
+        "pairs": len(pairs),
+        "of": len(bench.pairs),
+        "volume": volume,
+        "arap": arap,
+        "template_volume": template_volume,
+        "template_arap": template_arap,
+        "residual": float(np.mean([fit.residual for fit in fits.values()])),
+    }
+
+
+def run(bench: BenchSet, models: Sequence[str], *, limit: int, seed: int) -> dict[str, Any]:
+    """Measure every model, print a table and a JSON line; the line's record is returned too."""
+    set_threads(1)
+    found = {model: measure(bench, model, limit=limit, seed=seed) for model in models}
+    table = Table(title=f"Between two codes, {bench.name}", title_justify="left")
+    table.add_column("model")
+    names = ("volume", "arap", "template_volume", "template_arap", "residual")
+    for name in ("pairs", *names):
+        table.add_column(name.replace("_", " "), justify="right")
+    for model, row in found.items():
+        table.add_row(Path(model).name, f"{row['pairs']} of {row['of']}", *(f"{row[n]:.4f}" for n in names))
+    wide_console().print(table)
+    whole = {
+        "benchmark": "blends",
+        **circumstances(threads=1, jobs=1),
+        "set": bench.name,
+        "times": list(TIMES),
+        "seed": seed,
+        "models": found,
+    }
+    print(json.dumps(whole), flush=True)
+    return whole
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run it; 0 when it ran, 1 when the data or the choice stopped it."""
+    parser = argparse.ArgumentParser("python -m meshmatch.experiments.blends", description=__doc__)
+    parser.add_argument("--models", default="human", help="names or folders, with commas; %(default)s")
+    parser.add_argument("--set", default="scape", choices=SET_NAMES)
+    parser.add_argument("--limit-pairs", type=int, default=30, metavar="N")
+    parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(words)
+    try:
+        bench = load_set(options.set, options.data)
+        run(bench, options.models.split(","), limit=options.limit_pairs, seed=options.seed)
+    except MeshmatchError as error:
+        explain(error)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
