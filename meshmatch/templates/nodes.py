@@ -24,7 +24,9 @@ from meshmatch.templates.support import poorly_supported
 
 Strategy = Literal["parts", "spectral", "geodesic", "uniform"]
 STRATEGIES: tuple[Strategy, ...] = ("parts", "spectral", "geodesic", "uniform")
-_GEODESIC_SHARE = 0.2
+# Of the diameter along the surface: how far apart what one node moves may be. Where parts lie so close that a vertex
+# is left without nodes, the next share is tried.
+_GEODESIC_SHARES = (0.2, 0.3, 0.45, 1.0)
 
 
 @dataclass(frozen=True)
@@ -102,10 +104,9 @@ def choose_nodes(
     if config.strategy == "spectral":
         return _spectral_nodes(shape, config, candidates, own, touched)
     if config.strategy == "geodesic":
-        allowed = _geodesic_allowed(shape, touched, own)
-    else:
-        assert labels is not None
-        allowed = _parts_allowed(shape, labels, touched, own)
+        return _geodesic_nodes(shape, config, candidates, own, touched)
+    assert labels is not None
+    allowed = _parts_allowed(shape, labels, touched, own)
     return _spread(shape, config, candidates[allowed] if allowed.any() else candidates)
 
 
@@ -130,6 +131,18 @@ def _spectral_nodes(shape: Shape, config: NodeConfig, candidates: np.ndarray, ow
             if clusters <= 2:
                 raise
         clusters = clusters * 4 // 5
+
+
+def _geodesic_nodes(shape: Shape, config: NodeConfig, candidates: np.ndarray, own, touched) -> np.ndarray:
+    """Nodes that move no two pieces of surface far apart along it."""
+    for share in _GEODESIC_SHARES:
+        allowed = _geodesic_allowed(shape, touched, own, share)
+        try:
+            return _spread(shape, config, candidates[allowed] if allowed.any() else candidates)
+        except TemplateError:
+            if share == _GEODESIC_SHARES[-1]:
+                raise
+    raise AssertionError("the last share returns or raises")
 
 
 def _complete(shape: Shape, config: NodeConfig, nodes: np.ndarray, candidates: np.ndarray) -> np.ndarray:
@@ -180,14 +193,14 @@ def edge_graph(shape: Shape) -> coo_matrix:
     ).tocsr()
 
 
-def _geodesic_allowed(shape: Shape, touched: list, own: np.ndarray) -> np.ndarray:
-    """Drop candidates that touch surface further than a fifth of the diameter along the surface."""
+def _geodesic_allowed(shape: Shape, touched: list, own: np.ndarray, share: float) -> np.ndarray:
+    """Drop candidates that touch surface further than a share of the diameter along the surface."""
     graph = edge_graph(shape)
     landmarks = farthest_points(shape.verts, 40)
     far = dijkstra(graph, indices=landmarks)
     diameter = far[np.isfinite(far)].max()
     owners, place = np.unique(own, return_inverse=True)
-    distance = dijkstra(graph, indices=owners, limit=_GEODESIC_SHARE * diameter)
+    distance = dijkstra(graph, indices=owners, limit=share * diameter)
     return np.array([np.isfinite(distance[place[i], hits]).all() for i, hits in enumerate(touched)])
 
 

@@ -122,9 +122,14 @@ def test_geodesic_rejection_keeps_a_node_off_the_other_plate() -> None:
     assert touching_both("geodesic") == 0
 
 
-def test_a_rejection_that_leaves_nothing_names_the_vertices() -> None:
+def test_a_rejection_that_leaves_nothing_becomes_milder_or_names_the_vertices(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fold, config = two_plates(0.1), NodeConfig(strategy="geodesic", K=60, radius=0.2, depth=0.0)
+    assert badly_held(fold.verts, choose_nodes(fold, config), 0.2) == []
+    monkeypatch.setattr("meshmatch.templates.nodes._GEODESIC_SHARES", (0.2,))
     with pytest.raises(TemplateError, match="vertices"):
-        choose_nodes(two_plates(0.1), NodeConfig(strategy="geodesic", K=60, radius=0.2, depth=0.0))
+        choose_nodes(fold, config)
 
 
 def test_parts_keep_a_node_off_a_part_that_does_not_border(ring: Shape) -> None:
