@@ -66,21 +66,24 @@ def trained(
     tell: Tell,
     nodes: NodeConfig | None = None,
     landmarks: str | None = None,
+    template: str | None = None,
 ) -> tuple[Path, dict[str, Any]]:
     """Prepare a folder and learn from it without correspondence; the model's folder, and how that went."""
     began = time.monotonic()
     tell("preparing")
     config = nodes or NodeConfig(strategy="geodesic", seed=seed)
-    made = prepare_folder(folder, work / "prepared", config, align=how, scale=scale, landmarks=landmarks)
+    made = prepare_folder(
+        folder, work / "prepared", config, template=template, align=how, scale=scale, landmarks=landmarks
+    )
     prepared = time.monotonic() - began
     plain = cloud_recipe()
     recipe = replace(
         plain, train=replace(plain.train, steps=steps, minutes=minutes, threads=threads, seed=seed)
     )
-    template = load_template(work / "prepared" / "template.safetensors")
+    laid = load_template(work / "prepared" / "template.safetensors")
     model = train_clouds(
-        template,
-        read_gathered(work / "prepared", template),
+        laid,
+        read_gathered(work / "prepared", laid),
         work / "model",
         recipe=recipe,
         name=folder.name,
@@ -88,9 +91,9 @@ def trained(
         progress=lambda now: tell(f"training: step {now.step} of {now.steps}"),
     )
     card = json.loads((model / "card.json").read_text(encoding="utf-8"))
-    source = next(note for note in made.notes if note.startswith("template: "))
+    notes = (note.removeprefix("template: ") for note in made.notes if note.startswith("template: "))
     return model, {
-        "template": source.removeprefix("template: ").split(",")[0],
+        "template": template or next(notes).split(",")[0],
         "prepare_seconds": round(prepared, 1),
         "training_minutes": card["training_minutes"],
         "steps": card["steps"],

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import InputError
-from meshmatch.experiments import hearts, segments
+from meshmatch.experiments import animals, hearts, segments
 from meshmatch.experiments.category import area_under_curve, load_category, nearest_all
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
@@ -101,6 +101,7 @@ def test_a_missing_folder_or_truth_is_told(tmp_path: Path, cube: Shape) -> None:
         (hearts.main, ["--data", "nowhere"]),
         (segments.main, ["--data", "nowhere"]),
         (segments.main, ["--classes", "lamp"]),
+        (animals.main, ["--data", "nowhere"]),
     ],
 )
 def test_what_cannot_be_is_told(main, words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -141,3 +142,47 @@ def test_segments_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[
     results = record["classes"]["plane"]["results"]
     assert results["rigid alignment, nearest vertex"]["arrived"] == 1.0
     assert results["200 steps on the code"]["pairs"] == 2
+
+
+def test_kinds_of_animals_and_their_errors_by_hand(cube: Shape) -> None:
+    assert [animals.kind_of(name) for name in ("fox-05", "Davis_cow_00000", "timthumb")] == [
+        "dog",
+        "cow",
+        "other",
+    ]
+    shapes = {"wolf": cube, "dog": cube, "x": cube}
+    truth = {name: np.arange(8) for name in shapes}
+    right, wrong = np.arange(8), np.arange(8)
+    wrong[0] = 4  # an edge away, of 1; the area is 6
+    maps = {("wolf", "dog"): wrong, ("dog", "x"): right, ("x", "dog"): right}
+    found = animals.animal_errors(shapes, truth, maps)
+    assert found["kinds"] == {"across": 0.0, "dog to dog": pytest.approx(100 / 8 / np.sqrt(6), abs=1e-3)}
+    assert found["lost"] == pytest.approx(1 / 24, abs=1e-3)
+    assert (found["pairs"], found["median_pair_x100"]) == (3, 0.0)
+
+
+@pytest.mark.parametrize("points", [0, 6])
+def test_animals_from_end_to_end(points: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    balls(tmp_path / "animal", ".landmarks.npy")
+    for file in (tmp_path / "animal").glob("*.npy"):
+        np.save(file, np.arange(162))
+    words = ["--data", tmp_path, "--template", "1", "--points", points, "--steps", "2", "--threads", "1"]
+    words += [
+        "--work",
+        tmp_path / "work",
+        "--minutes",
+        "1",
+        "--seed",
+        "0",
+        "--nodes",
+        "60",
+        "--radius",
+        "0.35",
+    ]
+    assert animals.main([str(word) for word in words]) == 0
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (record["training"]["template"], record["points"]) == ("1", points)
+    assert record["results"]["rigid alignment, nearest vertex"]["mean_x100"] < 12
+    assert record["results"]["nodes refined"]["pairs"] == 2
+    assert animals.main(["--data", str(tmp_path), "--template", "9"]) == 1
+    assert "no animal" in capsys.readouterr().err
