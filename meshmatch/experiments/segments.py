@@ -12,6 +12,8 @@ of a cube that suits its keypoints best, so upright and facing the same way, as 
 `--turns searched` lets `meshmatch prepare --align rigid` find the orientation. The same shapes, in the same
 orientation, are matched by rigid alignment and the nearest vertex. Trained and measured on the same ten. The keypoints
 of tables run round the legs one way on some and the other way on others: their truth holds up to a reflection only.
+Parts are drawn from keypoints: a vertex belongs to the nearest one. Labels of the target, fetched along the map, are
+compared with the source's own: intersection over union (IoU), by area, the mean over parts and pairs.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.config import set_threads
@@ -80,8 +83,10 @@ def keypoint_errors(
     maps: Mapping[Pair, tuple[np.ndarray, np.ndarray]],
 ) -> dict[str, Any]:
     """Errors of (index, confidence) maps at the keypoints, and what their confidence tells."""
-    errors, sure, means = [], [], {}
+    errors, sure, means, overlaps = [], [], {}, []
+    parts = {name: keypoint_parts(shape, keypoints[name]) for name, shape in shapes.items()}
     for (source, target), (index, confidence) in maps.items():
+        overlaps.append(mean_overlap(parts[target][index], parts[source], shapes[source].vertex_areas))
         shape, at = shapes[target], keypoints[source]
         apart = shape.verts[index[at]] - shape.verts[keypoints[target]]
         found = np.linalg.norm(apart, axis=1) / shape.diagonal
@@ -96,11 +101,26 @@ def keypoint_errors(
         "mean": round(float(error.mean()), 4),
         "median": round(float(np.median(error)), 4),
         "arrived": round(float(right.mean()), 4),
+        "iou": round(float(np.mean(overlaps)), 4),
         "worst_pair": [*worst, round(means[worst], 4)],
         "confidence_auc": _rounded(area_under_curve(confidence, right)),
         "confidence_right": _rounded(float(confidence[right].mean()) if right.any() else np.nan),
         "confidence_wrong": _rounded(float(confidence[~right].mean()) if (~right).any() else np.nan),
     }
+
+
+def keypoint_parts(shape: Shape, keypoints: np.ndarray) -> np.ndarray:
+    """(V,) the part of every vertex: the number of its nearest keypoint."""
+    return np.asarray(cKDTree(shape.verts[keypoints]).query(shape.verts)[1])
+
+
+def mean_overlap(found: np.ndarray, truth: np.ndarray, area: np.ndarray) -> float:
+    """Intersection over union of labels (V,) with true ones, by the area (V,) of vertices; the mean over true parts."""
+    shares = []
+    for part in np.unique(truth):
+        ours, theirs = found == part, truth == part
+        shares.append(area[ours & theirs].sum() / area[ours | theirs].sum())
+    return float(np.mean(shares))
 
 
 def _rounded(value: float) -> float | None:
@@ -192,6 +212,7 @@ def run(
         "mean",
         "median",
         f"within {RIGHT:g}",
+        "IoU",
         "AUC",
         "sure if right",
         "if wrong",
@@ -221,6 +242,7 @@ def run(
                 f"{each['mean']:.3f}",
                 f"{each['median']:.3f}",
                 f"{100 * each['arrived']:.1f} %",
+                f"{each['iou']:.2f}",
                 *("-" if value is None else f"{value:.2f}" for value in told),
             )
     wide_console().print(table)

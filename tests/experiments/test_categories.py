@@ -66,6 +66,17 @@ def test_errors_of_keypoints_by_hand(cube: Shape) -> None:
     assert perfect["confidence_auc"] is None and perfect["confidence_wrong"] is None
 
 
+def test_overlap_of_parts_by_hand() -> None:
+    truth, found = np.array([0, 0, 1, 1]), np.array([0, 1, 1, 1])
+    area = np.array([1.0, 1.0, 2.0, 0.0])
+    assert segments.mean_overlap(found, truth, area) == pytest.approx((1 / 2 + 2 / 3) / 2)
+    ball = icosphere(1)
+    at = np.array([ball.verts[:, 2].argmin(), ball.verts[:, 2].argmax()])
+    parts = segments.keypoint_parts(ball, at)
+    assert parts[at[0]] == 0 and parts[at[1]] == 1
+    assert (parts[ball.verts[:, 2] > 0.01] == 1).all()
+
+
 def test_shapes_are_stood_alike() -> None:
     ball = icosphere(1)
     verts = ball.verts * [1, 2, 3]
@@ -141,6 +152,7 @@ def test_segments_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
     results = record["classes"]["plane"]["results"]
     assert results["rigid alignment, nearest vertex"]["arrived"] == 1.0
+    assert 0.9 < results["rigid alignment, nearest vertex"]["iou"] <= 1.0
     assert results["200 steps on the code"]["pairs"] == 2
 
 
