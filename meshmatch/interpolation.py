@@ -24,7 +24,7 @@ from meshmatch.maps.place import in_core_frame
 from meshmatch.maps.surface import Surface
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
-from meshmatch.pipeline import Progress, as_shape, read_model, usable
+from meshmatch.pipeline import Progress, as_shape, read_model, refine_notes, usable
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
@@ -172,6 +172,7 @@ def interpolate(
     notes = tuple(
         f"{shape.name}: {note}" for shape, part in zip(shapes, clean, strict=True) for note in part.notes
     )
+    notes += refine_notes(loaded, refine)
     away = _distance(seen(1.0)[1], repaired[-1], fits[-1])
     times = tuple(blend.times.tolist())
     return Interpolation(steps, tuple(fits), times, chosen, away, time.monotonic() - began, notes)

@@ -16,7 +16,7 @@ from meshmatch.config import set_threads
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_config import FitConfig, Partial, Refine
+from meshmatch.fitting.fit_config import FitConfig, Partial, Refine, check_landmarks
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
 from meshmatch.fitting.landmarks import honour_pairs
 from meshmatch.maps.build import build_map
@@ -100,6 +100,8 @@ def match(
             f"landmarks are honoured by the refinement of nodes, not by {refine!r}",
             "leave out the landmarks, or choose nodes",
         )
+    if landmarks is not None:
+        check_landmarks(loaded)
     set_threads(1 if workers > 1 else workers)
     stop = threading.Event()
     names = _apart(shapes[0].name, shapes[1].name)
@@ -127,7 +129,15 @@ def match(
     notes = tuple(
         f"{shape.name}: {note}" for shape, part in zip(shapes, clean, strict=True) for note in part.notes
     )
+    notes += refine_notes(loaded, refine)
     return MatchResult(found, fits[0], fits[1], time.monotonic() - began, notes)
+
+
+def refine_notes(model: TrainedModel, refine: Refine) -> tuple[str, ...]:
+    """Words where another refinement is done than was asked for."""
+    if FitConfig(refine=refine).possible(model).refine == refine:
+        return ()
+    return (f"model {model.card.name} is pointwise and has no nodes: its code was refined instead",)
 
 
 def register(

@@ -188,6 +188,7 @@ def register(
 
             render_fit(loaded, fitted, drawing, rotation=fit.frame.rotation)
     notes = [f"{loaded.name}: {note}" for note in pipeline.usable(loaded).notes]
+    notes += pipeline.refine_notes(pipeline.read_model(model), refine)
     for note in notes:
         voice.say(note)
     voice.say(f"laid the template of {model} on {loaded.name}: {_fit_words(fit)}")

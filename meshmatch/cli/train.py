@@ -50,6 +50,13 @@ def train(
         Literal["default", "paper"],
         typer.Option(help="The recipe: what measured best, or the paper's network, losses and rates."),
     ] = "default",
+    field: Annotated[
+        Literal["mls", "rbf", "pointwise"],
+        typer.Option(
+            help="How a deformation is represented: by moving least squares or radial basis functions of nodes, or by a "
+            "network at every point, which is slow. --refine nodes means the code for the last."
+        ),
+    ] = "mls",
     start: Annotated[
         str | None,
         typer.Option(
@@ -146,7 +153,7 @@ def train(
         threads=threads,
         seed=seed,
     )
-    chosen = replace(chosen, train=settings)
+    chosen = replace(chosen, train=settings, network=replace(chosen.network, field=field))
     voice = Voice(quiet or not first)
     started = None
     if start is not None:

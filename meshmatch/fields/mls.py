@@ -13,63 +13,17 @@ basis), and the 4 x 4 moment matrices stay well conditioned.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
 import torch
 
 from meshmatch.errors import TemplateError
+from meshmatch.fields.field import Field
 from meshmatch.templates.support import MINIMUM_EIGENVALUE, support_pairs
 
 Kernel = Literal["cubic", "smooth"]
 KERNELS: tuple[Kernel, ...] = get_args(Kernel)
-
-
-@dataclass(frozen=True, eq=False)
-class Field:
-    """Shape functions of K nodes on P fixed points, sparse.
-
-    Attributes
-    ----------
-    phi : sparse CSR tensor (P, K)
-        Shape functions; each row sums to one.
-    gradient : sparse CSR tensor (3 P, K)
-        Row 3 p + k holds the derivative of the shape functions at point p along axis k (1 / length).
-    """
-
-    phi: torch.Tensor
-    gradient: torch.Tensor
-
-    @property
-    def P(self) -> int:
-        return int(self.phi.shape[0])
-
-    @property
-    def K(self) -> int:
-        return int(self.phi.shape[1])
-
-    def displacement(self, vectors: torch.Tensor) -> torch.Tensor:
-        """Displacement of the points: node vectors (B, K, 3) -> (B, P, 3)."""
-        return apply_shape_functions(self.phi, vectors)
-
-    def deformation_gradient(self, vectors: torch.Tensor) -> torch.Tensor:
-        """F = I + sum_i u_i (grad Phi_i)^T: node vectors (B, K, 3) -> (B, P, 3, 3), F[..., a, k] = dx'_a/dx_k."""
-        columns = apply_shape_functions(self.gradient, vectors).unflatten(1, (-1, 3))  # B P k a
-        return columns.transpose(-1, -2) + torch.eye(3, dtype=vectors.dtype, device=vectors.device)
-
-    def to(self, *args, **kwargs) -> Field:
-        return Field(self.phi.to(*args, **kwargs), self.gradient.to(*args, **kwargs))
-
-
-def apply_shape_functions(matrix: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """One matrix (R, K), sparse or dense, on a batch of node vectors (B, K, 3) -> (B, R, 3).
-
-    As a single product: a batched one with three columns is twenty times slower on a CPU.
-    """
-    B, K, _ = vectors.shape
-    flat = vectors.transpose(0, 1).reshape(K, B * 3)
-    return (matrix @ flat).unflatten(1, (B, 3)).transpose(0, 1)
 
 
 def kernel_weights(

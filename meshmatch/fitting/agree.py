@@ -70,11 +70,12 @@ def agreed_fits(
     -------
     list of Fit
         Node vectors, points and vertex distances are new; residual and verdict stay those that each fit had alone.
-        As given if one of them is poor, for it has nothing to say about the others, or if nodes are not refined.
+        As given if one of them is poor, for it has nothing to say about the others, or if nodes are not refined
+        (a pointwise model has none).
     """
     if any(fit.verdict == "poor" for fit in fits):
         return list(fits)
-    config = config or FitConfig()
+    config = (config or FitConfig()).possible(model)
     if config.refine != "nodes":
         return list(fits)
     system = node_system(model)

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_shape import node_system, take_samples
-from meshmatch.fitting.turning import FieldPath, Path, RotationBlend, polar
+from meshmatch.fitting.turning import FieldPath, Path, RotationBlend, StretchBlend, polar
 from meshmatch.shapes.shape import Frame, Shape
 
 if TYPE_CHECKING:
@@ -87,10 +87,16 @@ class Blend:
         self._keys = np.stack([fit.vectors for fit in fits])
         self._system = node_system(model)
         self._field = model.field(self._system.verts)
-        turning = FieldPath(self._system, list(self._keys), model.template.core)
-        self._stretches = turning.stretches
+        self._stretches = StretchBlend(
+            [polar(self._system.deformation_gradient(key))[1] for key in self._keys]
+        )
         if way == "field":
-            self._path: Path = turning
+            if not model.has_nodes:
+                raise OptionError(
+                    f"model {model.card.name} is pointwise: it has no nodes that could blend what the field does",
+                    "blend codes instead (--way codes), or use a model of another field",
+                )
+            self._path: Path = FieldPath(self._system, list(self._keys), model.template.core)
         elif way == "codes":
             if shapes is None or len(shapes) != len(fits):
                 raise OptionError("codes are those of shapes: give a shape for each fit")
@@ -126,7 +132,8 @@ class Blend:
 
     def turns(self, vectors: np.ndarray) -> np.ndarray:
         """How the field of a pose (K, 3) turns each template vertex: rotations (V, 3, 3)."""
-        F = self._field.deformation_gradient(torch.from_numpy(np.array(vectors)).float()[None])[0]
+        with torch.no_grad():
+            F = self._field.deformation_gradient(torch.from_numpy(np.array(vectors)).float()[None])[0]
         return polar(F.double().numpy())[0]
 
     def frame(self, time: float) -> Frame:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
@@ -28,5 +27,5 @@ def dense_shape(model: TrainedModel, fit: Fit) -> Shape:
             "use the model that made the fit",
         )
     verts = np.asarray(template.dense.verts)
-    moved = verts + (model.field(verts).phi.double() @ torch.from_numpy(np.array(fit.vectors))).numpy()
+    moved = verts + model.field(verts).displaced(fit.vectors)
     return Shape(fit.frame.undo(moved), template.dense.faces, template.name)

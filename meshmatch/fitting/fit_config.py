@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.nodes import NodeRefineConfig
+
+if TYPE_CHECKING:
+    from meshmatch.models.trained import TrainedModel
 
 Refine = Literal["none", "latent", "nodes"]
 Partial = Literal["auto", "yes", "no"]
@@ -49,10 +52,25 @@ class FitConfig:
         if self.partial not in ("auto", "yes", "no"):
             raise OptionError(f"partial cannot be {self.partial!r}", "choose auto, yes or no")
 
+    def possible(self, model: TrainedModel) -> FitConfig:
+        """The same for a model: where there are no nodes to refine (pointwise), the code is refined instead."""
+        if self.refine == "nodes" and not model.has_nodes:
+            return replace(self, refine="latent")
+        return self
+
     def suited(self, roughness: float) -> FitConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): more points, refined more stiffly."""
         if roughness <= 0:
             return self
         return replace(
             self, samples=round(self.samples * (1 + roughness)), nodes=self.nodes.suited(roughness)
+        )
+
+
+def check_landmarks(model: TrainedModel) -> None:
+    """Refuse known pairs for a model that has no nodes to hold them (`OptionError`)."""
+    if not model.has_nodes:
+        raise OptionError(
+            f"model {model.card.name} is pointwise: it has no nodes that landmarks could hold",
+            "leave out the landmarks, or use a model of another field",
         )

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import FAIR_RESIDUAL, Fit, axis_name
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_config import FitConfig, check_landmarks
 from meshmatch.fitting.latent import refine_code
 from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual, variants
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
@@ -76,9 +76,11 @@ def fit_shape(
     Raises
     ------
     OptionError
-        An axis that is none, or up and front along one axis.
+        An axis that is none, or up and front along one axis; landmarks for a model without nodes.
     """
-    config = (config or FitConfig()).suited(shape.roughness)
+    if landmarks is not None:
+        check_landmarks(model)
+    config = (config or FitConfig()).suited(shape.roughness).possible(model)
     began = time.monotonic()
     tell = progress or (lambda what, share: None)
     rng = np.random.default_rng(config.seed)

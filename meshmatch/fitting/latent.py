@@ -11,6 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from meshmatch.fields.energies import arap_energy, volume_energy
+from meshmatch.fields.field import PointField
 from meshmatch.fitting.scan import Scan
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import farthest_points
@@ -29,7 +30,7 @@ class LatentRefineConfig:
 
 
 class PaperEnergy:
-    """The paper's energy of node vectors: Chamfer distance to points drawn from a scan, volume, rigidity.
+    """The paper's energy of what a decoder answers: Chamfer distance to points drawn from a scan, volume, rigidity.
 
     Parameters
     ----------
@@ -47,14 +48,15 @@ class PaperEnergy:
         self._template = _on_template(model, min(config.points, model.template.shape.V))
 
     def __call__(self, vectors: torch.Tensor) -> torch.Tensor:
-        """Energy (a scalar tensor) of node vectors (1, K, 3) in the core frame."""
-        verts, phi, slopes = self._template
-        moved = verts + phi(vectors[0])
-        F = slopes(vectors[0]).unflatten(0, (-1, 3)).transpose(1, 2) + torch.eye(3)
+        """Energy (a scalar tensor) of rows (1, R, 3), such as node vectors, in the core frame."""
+        verts, field = self._template
+        moved = verts + field.displacement(vectors)[0]
+        chamfer = self.config.chamfer * _chamfer(moved, self.points, self._tree)
+        if not self.config.volume and not self.config.arap:
+            return chamfer
+        F = field.deformation_gradient(vectors)[0]
         return (
-            self.config.chamfer * _chamfer(moved, self.points, self._tree)
-            + self.config.volume * volume_energy(F).mean()
-            + self.config.arap * arap_energy(F).mean()
+            chamfer + self.config.volume * volume_energy(F).mean() + self.config.arap * arap_energy(F).mean()
         )
 
     def value(self, vectors: np.ndarray) -> float:
@@ -104,31 +106,12 @@ def refine_code(
     return best_vectors.double().numpy()
 
 
-class _Product(torch.autograd.Function):
-    """A sparse matrix times a dense one whose gradient uses a kept transpose: torch would sort a new one each time."""
-
-    @staticmethod
-    def forward(ctx, dense, matrix, transpose):
-        ctx.transpose = transpose
-        return matrix @ dense
-
-    @staticmethod
-    def backward(ctx, gradient):
-        return ctx.transpose @ gradient, None, None
-
-
 @lru_cache(maxsize=4)
-def _on_template(model: TrainedModel, P: int):
-    """Template points (P, 3), and functions from node vectors (K, 3) to displacements (P, 3) and slopes (3 P, 3)."""
+def _on_template(model: TrainedModel, P: int) -> tuple[torch.Tensor, PointField]:
+    """Template points (P, 3) and the field there."""
     verts = model.template.shape.verts
     verts = verts[farthest_points(verts, P)]
-    field = model.field(verts)
-
-    def applied(matrix: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
-        transpose = matrix.t().to_sparse_csr()
-        return lambda vectors: _Product.apply(vectors, matrix, transpose)
-
-    return torch.from_numpy(verts).float(), applied(field.phi), applied(field.gradient)
+    return torch.from_numpy(verts).float(), model.field(verts).for_descent()
 
 
 def _chamfer(moved: torch.Tensor, points: torch.Tensor, tree: cKDTree) -> torch.Tensor:

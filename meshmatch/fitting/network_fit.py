@@ -117,14 +117,12 @@ def variants(
     ``coarse`` scan (core frame, like ``scan``) tells which reading is right.
     """
     tilts = Rotation.from_rotvec(np.radians(degrees) * rng.standard_normal((count, 3))).as_matrix()
-    nodes = model.nodes.double().numpy()
     back = []
     for number, tilt in enumerate(tilts):
         size = min(_VARIANT_POINTS[number % len(_VARIANT_POINTS)], len(scan.points))
         cloud = scan.points[rng.choice(len(scan.points), size, replace=False)] @ tilt.T
         vectors = model(torch.from_numpy(cloud).float()[None])[0].double().numpy()
-        # A node at q moves to Q^T (q + u'), so its vector in the untilted frame is that minus q.
-        back.append((nodes + vectors) @ tilt - nodes)
+        back.append(model.turned(vectors, tilt))
     return [
         Candidate(candidate.rotation, candidate.centre, u, two_way_residual(system, coarse, u, 1))
         for u in back

@@ -5,16 +5,21 @@ normal matrix is sum_p (Phi_p^T Phi_p) (x) H_p. The products Phi_pi Phi_pj never
 one sparse matrix over node pairs: assembling costs about 6 V n^2 / 2 multiplications (n = 17 nodes in
 reach), a few milliseconds. Only nodes that meet at some template point share an entry; with the nodes in
 reverse Cuthill-McKee order these lie in a band, whose Cholesky takes a third of the dense one's time.
+Where every node reaches every point, keeping the products would take gigabytes: they are formed in each step, and the
+band is the whole matrix.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import torch
 from scipy.linalg import solveh_banded
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from meshmatch.fields.mls import Field
+from meshmatch.fields.field import Field, PointField
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 
@@ -24,13 +29,15 @@ _DIAGONAL = [0, 3, 5]
 
 
 class NodeSystem:
-    """Shape functions of a template, arranged for repeated least squares on its node vectors.
+    """A field on a template's vertices, arranged for repeated least squares on its node vectors.
+
+    With a field that is not linear it moves the template all the same, but there is nothing to `solve` for.
 
     Parameters
     ----------
     shape : Shape
         The template's mesh, template frame.
-    field : Field
+    field : PointField
         The model's field on the mesh's vertices.
     strain_points : int
         At how many of them, at most, strain is measured.
@@ -39,32 +46,46 @@ class NodeSystem:
     ----------
     verts : (V, 3) template vertices, template frame
     faces : (F, 3)
-    phi : sparse (V, K)
-    slopes : sparse (3 G, K), gradient of the shape functions at G strain points
+    linear : whether there are node vectors, and with them what follows
+    phi : (V, K), sparse or dense
+    slopes : (3 G, K), gradient of the shape functions at G strain points
     strain_points : (G,) the vertices that these are
     """
 
-    def __init__(self, shape: Shape, field: Field, strain_points: int = 1500) -> None:
+    phi: Any
+    slopes: Any
+
+    def __init__(self, shape: Shape, field: PointField, strain_points: int = 1500) -> None:
         self.verts = np.asarray(shape.verts)
         self.faces = np.asarray(shape.faces)
+        self.linear = field.linear
+        self.strain_points = farthest_points(self.verts, min(strain_points, len(self.verts)))
+        self._incidence = _vertex_faces(self.faces, len(self.verts))
+        self._field = field
+        if isinstance(field, Field):
+            self._compile(field)
+
+    def _compile(self, field: Field) -> None:
         self.K = field.K
         self.phi = _to_scipy(field.phi)
-        at = farthest_points(self.verts, min(strain_points, len(self.verts)))
-        rows = (3 * at[:, None] + np.arange(3)).reshape(-1)
-        self.strain_points = at
+        rows = (3 * self.strain_points[:, None] + np.arange(3)).reshape(-1)
         self.slopes = _to_scipy(field.gradient)[rows]
         row, column, self._pairs = _pair_products(self.phi)
         self._order = _band_order(row, column, self.K)
         self._band, self._place = _band_places(row, column, np.argsort(self._order))
-        self._strain_pairs = (self.slopes.T @ self.slopes).toarray()[row, column]
-        self._incidence = _vertex_faces(self.faces, len(self.verts))
+        strain_pairs = self.slopes.T @ self.slopes
+        if not isinstance(strain_pairs, np.ndarray):
+            strain_pairs = strain_pairs.toarray()
+        self._strain_pairs = strain_pairs[row, column]
 
     def moved(self, vectors: np.ndarray) -> np.ndarray:
-        """Template vertices (V, 3) under node vectors (K, 3)."""
-        return self.verts + self.phi @ vectors
+        """Template vertices (V, 3) under node vectors (K, 3), or whatever rows the field reads."""
+        return self.verts + (self.phi @ vectors if self.linear else self._field.displaced(vectors))
 
     def deformation_gradient(self, vectors: np.ndarray) -> np.ndarray:
         """F (G, 3, 3) at the strain points, F[g, a, k] = d x'_a / d x_k."""
+        if not self.linear:
+            return self._field.strain(vectors, self.strain_points)
         return (self.slopes @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3)
 
     def normals(self, moved: np.ndarray) -> np.ndarray:
@@ -117,16 +138,34 @@ class NodeSystem:
         return solved
 
 
-def _to_scipy(matrix) -> csr_matrix:
+def _to_scipy(matrix: torch.Tensor) -> Any:
+    """In float64: a sparse matrix, or a plain array where it is dense."""
+    if matrix.layout == torch.strided:
+        return matrix.double().numpy()
     return csr_matrix(
         (matrix.values().double().numpy(), matrix.col_indices().numpy(), matrix.crow_indices().numpy()),
         shape=tuple(matrix.shape),
     )
 
 
-def _pair_products(phi: csr_matrix) -> tuple[np.ndarray, np.ndarray, csr_matrix]:
+class _EveryPair:
+    """The matrix (pairs, V) of Phi_pi Phi_pj where all nodes meet everywhere, formed when it is multiplied."""
+
+    def __init__(self, phi: np.ndarray, row: np.ndarray, column: np.ndarray) -> None:
+        self._phi, self._at = phi, (row, column)
+
+    def __matmul__(self, weights: np.ndarray) -> np.ndarray:
+        """(V, N) -> (pairs, N)."""
+        columns = [(self._phi.T * weight) @ self._phi for weight in weights.T]
+        return np.stack([column[self._at] for column in columns], 1)
+
+
+def _pair_products(phi: Any) -> tuple[np.ndarray, np.ndarray, Any]:
     """Node pairs (i <= j) that meet somewhere, and the sparse matrix (pairs, V) of Phi_pi Phi_pj."""
     V, K = phi.shape
+    if isinstance(phi, np.ndarray):
+        row, column = np.triu_indices(K)
+        return row, column, _EveryPair(phi, row, column)
     counts = np.diff(phi.indptr)
     start = phi.indptr[:-1]
     # All ordered index pairs inside each row, rows side by side.

@@ -1,4 +1,4 @@
-"""Decoders: a shape code to one displacement vector per node."""
+"""Decoders: a shape code to the rows that a field reads, one displacement vector per node or the code itself."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from itertools import pairwise
 import torch
 from torch import nn
 
+from meshmatch.fields.pointwise import pack
 from meshmatch.models.layers import residual_mlp
 
 
@@ -46,3 +47,33 @@ class NodeDecoder(nn.Module):
         """code (B, D) -> node vectors (B, K, 3)."""
         hidden = self.from_code(code)[:, None] + self.from_node(self.nodes)  # B K width
         return 2 * torch.tanh(self.network(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
+
+
+class PointDecoder(nn.Module):
+    """The decoder of *3D-CODED* (ECCV 2018): [x, code] -> MLP shared over all points, 2 tanh at the end.
+
+    Layers are normalised within a point where the original normalises over a batch of points: with that, a point's
+    displacement would depend on all others, and its derivative be no deformation gradient. The answer to a code is the
+    code, for a field with `displacement` in it.
+    """
+
+    def __init__(self, code: int, width: int = 1024) -> None:
+        super().__init__()
+        self.from_code = nn.Linear(code, width)
+        self.from_point = nn.Linear(3, width, bias=False)
+        sizes = [width, width // 2, width // 4]
+        layers: list[nn.Module] = [nn.LayerNorm(width), nn.ReLU()]
+        for a, b in pairwise(sizes):
+            layers += [nn.Linear(a, b), nn.LayerNorm(b), nn.ReLU()]
+        last = nn.Linear(sizes[-1], 3)
+        nn.init.normal_(last.weight, std=2e-3)  # untrained it leaves its template almost at rest
+        nn.init.zeros_(last.bias)
+        self.network = nn.Sequential(*layers, last)
+
+    def forward(self, code: torch.Tensor) -> torch.Tensor:
+        """code (B, D) -> rows (B, R, 3)."""
+        return pack(code)
+
+    def displacement(self, points: torch.Tensor, code: torch.Tensor) -> torch.Tensor:
+        """points (B, P, 3), code (B, D) -> displacements (B, P, 3)."""
+        return 2 * torch.tanh(self.network(self.from_code(code)[:, None] + self.from_point(points)))

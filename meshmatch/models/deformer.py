@@ -1,4 +1,4 @@
-"""The network of a category: points in, node vectors of the template's field out.
+"""The network of a category: points in, the rows of the template's field out (node vectors; a code if pointwise).
 
 Frames. ``scan frame``: centroid 0, surface area 1, any rotation. ``core frame``: the scan turned and shifted
 so that the fitted template's core (a body's torso; the whole shape elsewhere) lies on the template's own.
@@ -9,12 +9,16 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import nn
 
 from meshmatch.errors import ModelError
-from meshmatch.fields.mls import apply_shape_functions
-from meshmatch.models.decoder import FlatDecoder, NodeDecoder
+from meshmatch.fields.choice import FIELDS, FieldName, has_nodes, lay_field
+from meshmatch.fields.field import PointField, apply_shape_functions
+from meshmatch.fields.mls import Kernel
+from meshmatch.fields.pointwise import TURN_ROWS, PointwiseField, code_rows, turned_rows
+from meshmatch.models.decoder import FlatDecoder, NodeDecoder, PointDecoder
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.models.layers import residual_mlp
 from meshmatch.models.neighbours import two_way_offsets
@@ -27,7 +31,10 @@ _LARGEST = {
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Sizes and choices of a deformer; saved in the model card."""
+    """Sizes and choices of a deformer; saved in the model card (those of before ``field`` have moving least squares).
+
+    A pointwise field has a decoder of its own, whatever ``decoder`` says.
+    """
 
     encoder: Literal["basis", "point"] = "basis"
     decoder: Literal["flat", "node"] = "flat"
@@ -39,11 +46,14 @@ class NetworkConfig:
     align_width: int = 512
     corrections: int = 3
     correct_width: int = 640
+    field: FieldName = "mls"
 
     def __post_init__(self) -> None:
         # A card may come from anywhere: bound what building the network allocates.
         if self.encoder not in ("basis", "point") or self.decoder not in ("flat", "node"):
             raise ModelError(f"no network of {self.encoder!r} and {self.decoder!r}", "update meshmatch")
+        if self.field not in FIELDS:
+            raise ModelError(f"no field {self.field!r}, only {', '.join(FIELDS)}", "update meshmatch")
         for name, most in _LARGEST.items():
             value = getattr(self, name)
             if type(value) is not int or not 0 <= value <= most:
@@ -79,7 +89,7 @@ class Deformer(nn.Module):
     ----------
     nodes : tensor (K, 3)
         Control nodes in the template frame.
-    anchors : tensor (A, 3), anchor_phi : tensor (A, K)
+    anchors : tensor (A, 3), anchor_phi : tensor (A, K), or None where the field has no nodes
         Points of the template where a correction looks at the scan, and the field's shape functions there.
     basis, align_basis : tensors (M, 3), (N, 3)
         Basis points of encoder and aligner; ignored (may be empty) where the config does not use them.
@@ -90,7 +100,7 @@ class Deformer(nn.Module):
         config: NetworkConfig,
         nodes: torch.Tensor,
         anchors: torch.Tensor,
-        anchor_phi: torch.Tensor,
+        anchor_phi: torch.Tensor | None,
         basis: torch.Tensor,
         align_basis: torch.Tensor,
     ) -> None:
@@ -99,7 +109,7 @@ class Deformer(nn.Module):
         K, A = len(nodes), len(anchors)
         self.nodes: torch.Tensor
         self.anchors: torch.Tensor
-        self.anchor_phi: torch.Tensor
+        self.anchor_phi: torch.Tensor | None
         self.register_buffer("nodes", nodes)
         self.register_buffer("anchors", anchors)
         self.register_buffer("anchor_phi", anchor_phi)
@@ -109,16 +119,38 @@ class Deformer(nn.Module):
             )
         else:
             self.encoder = PointEncoder(config.code)
-        if config.decoder == "flat":
-            self.decoder: FlatDecoder | NodeDecoder = FlatDecoder(config.code, config.width, 1, K)
+        self.decoder: FlatDecoder | NodeDecoder | PointDecoder
+        rows = K
+        if not has_nodes(config.field):
+            self.decoder, rows = PointDecoder(config.code, config.width), code_rows(config.code)
+        elif config.decoder == "flat":
+            self.decoder = FlatDecoder(config.code, config.width, 1, K)
         else:
             self.decoder = NodeDecoder(config.code, nodes, config.width)
         self.aligner = BasisEncoder(align_basis, config.align_width, 2, 9) if config.align_basis else None
-        self.corrector = residual_mlp(A * 10, config.correct_width, 1, 3 * K) if config.corrections else None
+        self.corrector = (
+            residual_mlp(A * 10, config.correct_width, 1, 3 * rows) if config.corrections else None
+        )
 
     @property
     def K(self) -> int:
         return len(self.nodes)
+
+    def field(self, points: np.ndarray, nodes: np.ndarray, radius: float, kernel: Kernel) -> PointField:
+        """The field that reads this network's rows, on points (P, 3) of the template's frame.
+
+        ``nodes`` (K, 3) are the template's, in their own precision.
+        """
+        motion = self.decoder.displacement if isinstance(self.decoder, PointDecoder) else None
+        return lay_field(self.config.field, points, nodes, radius, kernel, motion, self.config.code)
+
+    def turned(self, vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """Rows (R, 3) of the deformation whose moved points (rows) are those of ``vectors`` times ``turn`` (3, 3)."""
+        if isinstance(self.decoder, PointDecoder):
+            return turned_rows(vectors, turn)
+        nodes = self.nodes.double().cpu().numpy()
+        # A node at q moves to Q^T (q + u), so its vector in the turned frame is that minus q.
+        return (nodes + vectors) @ turn - nodes
 
     def align(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Aligner features -> rotation R (B, 3, 3) and centre t (B, 3) of the core: scan = R core + t."""
@@ -129,16 +161,26 @@ class Deformer(nn.Module):
     def correct(self, vectors: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """One learned registration step.
 
-        vectors (B, K, 3) and scan points (B, P, 3), both in the core frame -> better vectors.
+        rows (B, R, 3) and scan points (B, P, 3), both in the core frame -> better rows.
         """
         assert self.corrector is not None
-        moved = apply_shape_functions(self.anchor_phi, vectors)  # B A 3
+        moved = self._at_anchors(vectors)  # B A 3
         seen = two_way_offsets(self.anchors + moved, points)
         features = torch.cat([seen[..., :6] * 10.0, seen[..., 6:], moved * 3.0], -1)
-        return vectors + 0.1 * self.corrector(features.flatten(1)).unflatten(-1, (-1, 3))
+        change = 0.1 * self.corrector(features.flatten(1)).unflatten(-1, (-1, 3))
+        if isinstance(self.decoder, PointDecoder):
+            change = nn.functional.pad(change, (0, 0, 0, TURN_ROWS))  # the code alone is learned
+        return vectors + change
+
+    def _at_anchors(self, vectors: torch.Tensor) -> torch.Tensor:
+        if isinstance(self.decoder, PointDecoder):
+            motion = self.decoder.displacement
+            return PointwiseField(self.anchors, self.anchors, motion, self.config.code).displacement(vectors)
+        assert self.anchor_phi is not None
+        return apply_shape_functions(self.anchor_phi, vectors)
 
     def forward(self, points: torch.Tensor) -> torch.Tensor:
-        """Scan points in the core frame (B, P, 3) -> node vectors (B, K, 3)."""
+        """Scan points in the core frame (B, P, 3) -> rows (B, R, 3): with nodes, their vectors (B, K, 3)."""
         vectors = self.decoder(self.encoder(self.encoder.features(points)))
         for _ in range(self.config.corrections):
             vectors = self.correct(vectors, points)

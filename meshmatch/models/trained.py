@@ -9,7 +9,9 @@ import numpy as np
 import torch
 
 from meshmatch.errors import ModelError
-from meshmatch.fields.mls import KERNELS, Field, build_field
+from meshmatch.fields.choice import has_nodes
+from meshmatch.fields.field import PointField
+from meshmatch.fields.mls import KERNELS
 from meshmatch.models.card import ModelCard
 from meshmatch.models.checkpoint import load_weights
 from meshmatch.models.deformer import Deformer, NetworkConfig
@@ -25,7 +27,7 @@ class TrainedModel:
     template: Template
     network: Deformer
 
-    def field(self, points: np.ndarray) -> Field:
+    def field(self, points: np.ndarray) -> PointField:
         """The field on points (P, 3) of the template's frame, with the kernel that the network was trained with.
 
         Raises
@@ -34,7 +36,12 @@ class TrainedModel:
             A point has too few nodes in reach.
         """
         nodes, radius = self.template.nodes, self.template.radius
-        return build_field(points, nodes, radius, self.card.field["kernel"])
+        return self.network.field(points, nodes, radius, self.card.field["kernel"])
+
+    @property
+    def has_nodes(self) -> bool:
+        """Whether its fits are node vectors, which can be solved for; a pointwise model has codes alone."""
+        return has_nodes(self.network.config.field)
 
 
 def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
@@ -43,7 +50,7 @@ def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
         config,
         nodes=torch.zeros(K, 3),
         anchors=torch.zeros(K, 3),
-        anchor_phi=torch.zeros(K, K),
+        anchor_phi=torch.zeros(K, K) if has_nodes(config.field) else None,
         basis=torch.zeros(config.basis, 3),
         align_basis=torch.zeros(max(config.align_basis, 1), 3),
     )

@@ -9,7 +9,8 @@ import torch
 from scipy.spatial import cKDTree
 
 from meshmatch.fields.energies import arap_energy, volume_energy
-from meshmatch.fields.mls import Kernel, apply_shape_functions, build_field
+from meshmatch.fields.field import PointField
+from meshmatch.fields.mls import Kernel
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.neighbours import every_pair
 from meshmatch.templates.template import Template
@@ -24,32 +25,28 @@ _ROBUST = 0.25  # distances far beyond it no longer pull harder, units of sqrt(a
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints(LossPoints):
-    """Template points with unit normals (M, 3), and the template's known points (L, 3), landmark_phi (L, K)."""
+    """Template points with unit normals (M, 3), and the template's known points (L, 3) with the field there."""
 
     normals: torch.Tensor
     landmarks: torch.Tensor
-    landmark_phi: torch.Tensor
-
-    def to(self, device: torch.device) -> SurfacePoints:
-        return SurfacePoints(*(value.to(device) for value in vars(self).values()))
+    landmark_field: PointField
 
 
 def build_surface_points(
-    template: Template, kernel: Kernel, landmarks: np.ndarray, count: int = 1200
+    template: Template, kernel: Kernel, model: Deformer, landmarks: np.ndarray, count: int = 1200
 ) -> SurfacePoints:
     """Evenly spread template vertices with what the objective needs of them."""
     chosen = loss_vertices(template, count)
     at = np.concatenate([chosen, landmarks]).astype(np.int64)
     verts = template.shape.verts[at]
-    field = build_field(verts, template.nodes, template.radius, kernel)
-    phi, M = field.phi.to_dense(), len(chosen)
+    field = model.field(verts, template.nodes, template.radius, kernel).for_training()
+    M = len(chosen)
     return SurfacePoints(
         torch.from_numpy(verts[:M]).float(),
-        phi[:M],
-        field.gradient.to_dense()[: 3 * M],
+        field.part(0, M),
         torch.from_numpy(template.shape.vertex_normals[chosen]).float(),
         torch.from_numpy(verts[M:]).float(),
-        phi[M:],
+        field.part(M, len(at)),
     )
 
 
@@ -124,7 +121,7 @@ def _energies(
     }
     known = ~batch.landmarks.isnan().any(-1)
     if config.landmarks and known.any():
-        placed = points.landmarks + apply_shape_functions(points.landmark_phi, vectors)
+        placed = points.landmarks + points.landmark_field.displacement(vectors)
         terms["landmarks"] = (
             config.landmarks * (placed[known] - batch.landmarks[known]).square().sum(-1).mean()
         )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from meshmatch.fields.energies import arap_energy, volume_energy
-from meshmatch.fields.mls import apply_shape_functions
+from meshmatch.fields.field import PointField
 from meshmatch.models.deformer import Deformer
 from meshmatch.training.datasets import Batch
 
@@ -33,29 +33,37 @@ class LossConfig:
 
 @dataclass(frozen=True, eq=False)
 class LossPoints:
-    """Dense shape functions on the supervised template points.
-
-    positions (M, 3), phi (M, K); gradient (3 G, K) on G of them, row 3 g + k the derivative along axis k.
-    """
+    """The supervised template points (M, 3) and the field there, with its gradient on G of them."""
 
     positions: torch.Tensor
-    phi: torch.Tensor
-    gradient: torch.Tensor
+    field: PointField
 
     def to(self, device: torch.device) -> LossPoints:
-        return LossPoints(*(value.to(device) for value in vars(self).values()))
+        return type(self)(*(value.to(device) for value in vars(self).values()))
 
     def moved(self, vectors: torch.Tensor) -> torch.Tensor:
-        return self.positions + apply_shape_functions(self.phi, vectors)
+        """What the decoder answers (B, R, 3) -> moved points (B, M, 3)."""
+        return self.positions + self.field.displacement(vectors)
 
     def deformation_gradient(self, vectors: torch.Tensor) -> torch.Tensor:
-        slopes = apply_shape_functions(self.gradient, vectors).unflatten(1, (-1, 3)).transpose(-1, -2)
-        return slopes + torch.eye(3, device=vectors.device)
+        """What the decoder answers (B, R, 3) -> F (B, G, 3, 3)."""
+        return self.field.deformation_gradient(vectors)
 
 
 def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Mean Euclidean distance of corresponding points."""
     return ((a - b).square().sum(-1) + 1e-8).sqrt().mean()
+
+
+def rigidity(points: LossPoints, vectors: torch.Tensor, config: LossConfig) -> dict[str, torch.Tensor]:
+    """Weighted volume and rigidity of what the decoder answers; nothing is computed for what has no weight."""
+    if not config.volume and not config.arap:
+        return {}
+    F = points.deformation_gradient(vectors)
+    return {
+        "volume": config.volume * volume_energy(F).mean(),
+        "arap": config.arap * arap_energy(F).mean(),
+    }
 
 
 def losses(
@@ -65,14 +73,12 @@ def losses(
     code = model.encoder(batch.encode_features)
     vectors = model.decoder(code)
     moved = points.moved(vectors)
-    F = points.deformation_gradient(vectors)
     fit = distance(moved, batch.targets)
     squared = (moved - batch.targets).square().sum(-1).mean()
     terms = {
         "reconstruction": config.reconstruction * (fit if config.robust else squared),
-        "volume": config.volume * volume_energy(F).mean(),
-        "arap": config.arap * arap_energy(F).mean(),
     }
+    terms |= rigidity(points, vectors, config)
     errors = {"error_code": fit.detach()}
     if config.blend:
         share = torch.rand(len(code), 1, generator=generator).to(code.device)
@@ -85,11 +91,11 @@ def losses(
         for _ in range(model.config.corrections):
             current = model.correct(current, scan)
             steps.append(distance(points.moved(current), batch.targets))
-            F = points.deformation_gradient(current)
-            steps.append(config.volume * volume_energy(F).mean() + config.arap * arap_energy(F).mean())
+            errors["error_corrected"] = steps[-1].detach()
+            stiff = list(rigidity(points, current, config).values())
+            steps += [stiff[0] + stiff[1]] if stiff else []
             current = current.detach()
         terms["correct"] = config.correct * torch.stack(steps).sum()
-        errors["error_corrected"] = steps[-2].detach()
     if model.aligner is not None:
         assert batch.align_features is not None and batch.align_rotation is not None
         assert batch.align_centre is not None

@@ -165,7 +165,7 @@ def train_model(
     model = build_deformer(template, source, recipe.network, recipe.scan, recipe.kernel, config.seed)
     if start is not None:
         take_weights(model, template, recipe, start)
-    points = build_loss_points(template, recipe.kernel)
+    points = build_loss_points(template, recipe.kernel, model)
     dataset = build_dataset(
         template, source, model, recipe.scan, config.shapes, config.scans_per_shape, config.seed, config.steps
     )

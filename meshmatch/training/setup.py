@@ -6,7 +6,9 @@ import numpy as np
 import torch
 
 from meshmatch.errors import TemplateError
-from meshmatch.fields.mls import Kernel, build_field
+from meshmatch.fields.choice import has_nodes, lay_field
+from meshmatch.fields.field import Field
+from meshmatch.fields.mls import Kernel
 from meshmatch.models.deformer import Deformer, NetworkConfig
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.template import Template
@@ -42,19 +44,31 @@ def anchor_vertices(template: Template, A: int) -> np.ndarray:
     return farthest_points(template.shape.verts, A)
 
 
+def lay_anchors(
+    template: Template, network: NetworkConfig, kernel: Kernel
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Anchors (A, 3) of the corrections and the shape functions there (A, K), None where the field has none."""
+    anchors = template.shape.verts[anchor_vertices(template, template.K)]
+    phi = None
+    if has_nodes(network.field):
+        field = lay_field(network.field, anchors, template.nodes, template.radius, kernel)
+        assert isinstance(field, Field)
+        phi = field.for_training().phi
+    return torch.from_numpy(anchors).float(), phi
+
+
 def build_deformer(
     template: Template, source: Source, network: NetworkConfig, scan: ScanConfig, kernel: Kernel, seed: int
 ) -> Deformer:
     """An untrained network for a template, its basis points laid where the source's shapes are."""
     torch.manual_seed(seed)
     nodes = torch.from_numpy(template.nodes).float()
-    anchors = template.shape.verts[anchor_vertices(template, template.K)]
-    anchor_phi = build_field(anchors, template.nodes, template.radius, kernel).phi.to_dense()
+    anchors, anchor_phi = lay_anchors(template, network, kernel)
     empty = torch.zeros(1, 3)
     basis = align_basis = empty
     if network.encoder == "basis" or network.align_basis:
         probe = NetworkConfig(align_width=8, width=8, depth=0, correct_width=8)
-        blank = Deformer(probe, nodes, torch.from_numpy(anchors).float(), anchor_phi, empty, empty)
+        blank = Deformer(probe, nodes, anchors, anchor_phi, empty, empty)
         data = build_dataset(template, source, blank, scan, shapes=48, scans_per_shape=2, seed=seed)
         generator = torch.Generator().manual_seed(seed)
         batch = data[0]
@@ -65,7 +79,7 @@ def build_deformer(
             ball = turned.norm(dim=-1, keepdim=True) * direction
             align_basis = fill_basis(ball, network.align_basis, generator)
     torch.manual_seed(seed)
-    return Deformer(network, nodes, torch.from_numpy(anchors).float(), anchor_phi, basis, align_basis)
+    return Deformer(network, nodes, anchors, anchor_phi, basis, align_basis)
 
 
 def loss_vertices(template: Template, M: int) -> np.ndarray:
@@ -103,10 +117,9 @@ def build_dataset(
 
 
 def build_loss_points(
-    template: Template, kernel: Kernel, supervised: int = 1000, strained: int = 400
+    template: Template, kernel: Kernel, model: Deformer, supervised: int = 1000, strained: int = 400
 ) -> LossPoints:
-    """Dense shape functions at the supervised vertices; their gradient at the first ``strained`` of them."""
+    """The model's field at the supervised vertices; its gradient at the first ``strained`` of them."""
     verts = template.shape.verts[loss_vertices(template, supervised)]
-    field = build_field(verts, template.nodes, template.radius, kernel)
-    gradient = field.gradient.to_dense()[: 3 * strained]
-    return LossPoints(torch.from_numpy(verts).float(), field.phi.to_dense(), gradient)
+    field = model.field(verts, template.nodes, template.radius, kernel)
+    return LossPoints(torch.from_numpy(verts).float(), field.for_training(strained))

@@ -9,7 +9,6 @@ from pathlib import Path
 import torch
 
 from meshmatch.errors import InputError, OutputError
-from meshmatch.fields.mls import build_field
 from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig
 from meshmatch.models.trained import TrainedModel
 from meshmatch.templates.gather import Gathered
@@ -20,7 +19,7 @@ from meshmatch.training.loop import Progress, TrainConfig, Trainer
 from meshmatch.training.losses import LossConfig
 from meshmatch.training.run import CHECKPOINT, Preset, Recipe, export, take_weights
 from meshmatch.training.scans import ScanConfig
-from meshmatch.training.setup import anchor_vertices, fill_basis
+from meshmatch.training.setup import fill_basis, lay_anchors
 
 _VALIDATION_SEED = 999_983
 
@@ -71,13 +70,10 @@ def build_cloud_deformer(template: Template, data: CloudDataset, recipe: Recipe,
         generator = torch.Generator().manual_seed(seed)
         drawn = replace(data, shapes=64, seed=seed + 1)[0]
         basis = fill_basis(drawn.points, recipe.network.basis, generator)
-    anchors = template.shape.verts[anchor_vertices(template, template.K)]
-    anchor_phi = build_field(anchors, template.nodes, template.radius, recipe.kernel).phi.to_dense()
+    anchors, anchor_phi = lay_anchors(template, recipe.network, recipe.kernel)
     nodes = torch.from_numpy(template.nodes).float()
     torch.manual_seed(seed)
-    return Deformer(
-        recipe.network, nodes, torch.from_numpy(anchors).float(), anchor_phi, basis, torch.zeros(1, 3)
-    )
+    return Deformer(recipe.network, nodes, anchors, anchor_phi, basis, torch.zeros(1, 3))
 
 
 def train_clouds(
@@ -120,7 +116,7 @@ def train_clouds(
     if start is not None:
         take_weights(model, template, recipe, start)
     dataset = replace(dataset, encoder=model.encoder)
-    points = build_surface_points(template, recipe.kernel, gathered.template_landmarks)
+    points = build_surface_points(template, recipe.kernel, model, gathered.template_landmarks)
     trainer = Trainer(model, points, config, chamfer_losses)
     if resume and checkpoint.is_file():
         trainer.load(checkpoint)

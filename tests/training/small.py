@@ -60,5 +60,5 @@ def small_data(
     return build_dataset(template, bent_eggs(template), model, scan, 4, 2, seed, length)
 
 
-def small_points(template: Template, kernel: Kernel = "smooth") -> LossPoints:
-    return build_loss_points(template, kernel)
+def small_points(template: Template, kernel: Kernel = "smooth", model: Deformer | None = None) -> LossPoints:
+    return build_loss_points(template, kernel, model or small_network(template))

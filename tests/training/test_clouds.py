@@ -157,14 +157,14 @@ def test_the_robust_function() -> None:
 def test_known_points_are_pulled_to_their_places(
     gathered: Gathered, template: Template, data: CloudDataset
 ) -> None:
-    points = build_surface_points(template, "smooth", gathered.template_landmarks, 60)
     model = build_cloud_deformer(template, data, SMALL, 0).eval()
+    points = build_surface_points(template, "smooth", model, gathered.template_landmarks, 60)
     batch = data[0]
     loss = LossConfig(blend=0.0, landmarks=2.0)
     terms = chamfer_losses(model, batch, points, loss, torch.Generator())
     with torch.no_grad():
         vectors = model.decoder(model.encoder(batch.encode_features))
-    placed = points.landmarks + points.landmark_phi @ vectors
+    placed = points.landmarks + points.landmark_field.displacement(vectors)
     apart = (placed - batch.landmarks).square().sum(-1)
     known = ~apart.isnan()
     assert 0 < int(known.sum()) < 4  # the egg without one pulls nothing
@@ -180,7 +180,7 @@ def test_known_points_are_pulled_to_their_places(
 
 def test_it_learns(gathered: Gathered, template: Template, data: CloudDataset) -> None:
     model = build_cloud_deformer(template, data, SMALL, 0)
-    points = build_surface_points(template, "smooth", gathered.template_landmarks, 150)
+    points = build_surface_points(template, "smooth", model, gathered.template_landmarks, 150)
     stretched = replace(data, encoder=model.encoder, length=150)
     held_out = replace(stretched, seed=99, shapes=6)[0]
     before = surface_error(model, held_out, points)

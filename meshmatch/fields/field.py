@@ -1,0 +1,159 @@
+"""What every representation of a deformation does on fixed points, and the two that are linear in node vectors.
+
+A decoder answers a code with *rows* (R, 3). For the linear representations (moving least squares, radial basis
+functions) these are the vectors of the nodes; for the pointwise one (`fields.pointwise`) they are the code itself. Who
+moves points needs to know neither: a field says where its points go and what the deformation gradient is there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+
+class PointField(Protocol):
+    """A representation on P fixed points.
+
+    ``linear``: displacements are linear in the rows, so that a fit can be solved for (`Field`).
+    """
+
+    @property
+    def linear(self) -> bool: ...
+
+    def displacement(self, rows: torch.Tensor) -> torch.Tensor:
+        """Rows (B, R, 3) -> displacements (B, P, 3)."""
+        ...
+
+    def deformation_gradient(self, rows: torch.Tensor) -> torch.Tensor:
+        """Rows (B, R, 3) -> F (B, G, 3, 3) on the first G points, all but after `for_training`."""
+        ...
+
+    def displaced(self, rows: np.ndarray) -> np.ndarray:
+        """The displacement of one answer (R, 3) in float64: (P, 3)."""
+        ...
+
+    def strain(self, rows: np.ndarray, at: np.ndarray) -> np.ndarray:
+        """F (N, 3, 3) of one answer (R, 3) at some of the points (N,), float64."""
+        ...
+
+    def for_training(self, strained: int | None = None) -> PointField:
+        """The same arranged for large batches; the gradient on the first ``strained`` points alone."""
+        ...
+
+    def for_descent(self) -> PointField:
+        """The same arranged for many steps with gradients of a single answer."""
+        ...
+
+    def part(self, start: int, stop: int) -> PointField:
+        """The same on the points from ``start`` to ``stop``; after `for_training`."""
+        ...
+
+    def to(self, *args, **kwargs) -> PointField: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """Shape functions of K nodes on P fixed points, sparse or dense.
+
+    Attributes
+    ----------
+    phi : tensor (P, K), sparse CSR or dense
+        Shape functions; with moving least squares each row sums to one.
+    gradient : tensor (3 P, K), likewise
+        Row 3 p + k holds the derivative of the shape functions at point p along axis k (1 / length).
+    """
+
+    phi: torch.Tensor
+    gradient: torch.Tensor
+
+    @property
+    def P(self) -> int:
+        return int(self.phi.shape[0])
+
+    @property
+    def K(self) -> int:
+        return int(self.phi.shape[1])
+
+    @property
+    def linear(self) -> bool:
+        return True
+
+    def displacement(self, rows: torch.Tensor) -> torch.Tensor:
+        """Displacement of the points: node vectors (B, K, 3) -> (B, P, 3)."""
+        return self._apply(self.phi, rows)
+
+    def deformation_gradient(self, rows: torch.Tensor) -> torch.Tensor:
+        """F = I + sum_i u_i (grad Phi_i)^T: node vectors (B, K, 3) -> (B, P, 3, 3), F[..., a, k] = dx'_a/dx_k."""
+        columns = self._apply(self.gradient, rows).unflatten(1, (-1, 3))  # B P k a
+        # At least float32: in bfloat16 the small difference from the identity would be lost.
+        kind = torch.promote_types(rows.dtype, torch.float32)
+        return columns.transpose(-1, -2) + torch.eye(3, dtype=kind, device=rows.device)
+
+    def displaced(self, rows: np.ndarray) -> np.ndarray:
+        return (self.phi.double() @ torch.from_numpy(np.array(rows))).numpy()
+
+    def strain(self, rows: np.ndarray, at: np.ndarray) -> np.ndarray:
+        slopes = (self.gradient.double() @ torch.from_numpy(np.array(rows))).unflatten(0, (-1, 3))
+        return slopes.transpose(1, 2).numpy()[at] + np.eye(3)
+
+    def for_training(self, strained: int | None = None) -> Field:
+        # Dense, for a large batch is one product: a sparse one would be slower.
+        rows = None if strained is None else 3 * strained
+        return Field(_dense(self.phi), _dense(self.gradient)[:rows])
+
+    def for_descent(self) -> Field:
+        if self.phi.layout == torch.strided:
+            return self
+        transposes = (self.phi.t().to_sparse_csr(), self.gradient.t().to_sparse_csr())
+        return _DescentField(self.phi, self.gradient, *transposes)
+
+    def part(self, start: int, stop: int) -> Field:
+        return Field(self.phi[start:stop], self.gradient[3 * start : 3 * stop])
+
+    def to(self, *args, **kwargs) -> Field:
+        return Field(self.phi.to(*args, **kwargs), self.gradient.to(*args, **kwargs))
+
+    def _apply(self, matrix: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        return apply_shape_functions(matrix, rows)
+
+
+@dataclass(frozen=True, eq=False)
+class _DescentField(Field):
+    """A sparse field that keeps its transposes: torch would sort new ones for each gradient. One answer at a time."""
+
+    phi_transpose: torch.Tensor
+    gradient_transpose: torch.Tensor
+
+    def _apply(self, matrix: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        transpose = self.phi_transpose if matrix is self.phi else self.gradient_transpose
+        return _Product.apply(rows[0], matrix, transpose)[None]
+
+
+class _Product(torch.autograd.Function):
+    """A sparse matrix times a dense one, whose gradient uses a kept transpose."""
+
+    @staticmethod
+    def forward(ctx, dense, matrix, transpose):
+        ctx.transpose = transpose
+        return matrix @ dense
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return ctx.transpose @ gradient, None, None
+
+
+def apply_shape_functions(matrix: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """One matrix (R, K), sparse or dense, on a batch of node vectors (B, K, 3) -> (B, R, 3).
+
+    As a single product: a batched one with three columns is twenty times slower on a CPU.
+    """
+    B, K, _ = vectors.shape
+    flat = vectors.transpose(0, 1).reshape(K, B * 3)
+    return (matrix @ flat).unflatten(1, (B, 3)).transpose(0, 1)
+
+
+def _dense(matrix: torch.Tensor) -> torch.Tensor:
+    return matrix if matrix.layout == torch.strided else matrix.to_dense()
