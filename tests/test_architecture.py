@@ -41,6 +41,7 @@ OWNERS = {
     "fast_simplification": {"shapes"},
     "meshmonk": {"experiments"},
     "platformdirs": {"models", "training", "experiments"},
+    "pyFM": {"experiments"},
     "pymeshlab": {"shapes"},
     "rich": {"experiments", "cli"},
     "robust_laplacian": {"templates", "maps"},
@@ -49,14 +50,15 @@ OWNERS = {
         *("shapes", "templates", "models", "training", "fitting", "maps", "transfer", "render"),
         "experiments",
     },
-    "torch": {"fields", "models", "training", "fitting"},
-    "trimesh": {"shapes"},
+    "torch": {"fields", "models", "training", "fitting", "experiments"},
+    "trimesh": {"shapes", "experiments"},
     "typer": {"cli"},
     "xatlas": {"transfer"},
 }
 DISTRIBUTIONS = {
     "PIL": "pillow",
     "fast_simplification": "fast-simplification",
+    "pyFM": "pyfmaps",
     "robust_laplacian": "robust-laplacian",
 }
 HEAVY = ("torch", "trimesh", "pymeshlab", "scipy", "safetensors")

@@ -16,12 +16,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +31,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.config import set_threads
 from meshmatch.errors import MeshmatchError
+from meshmatch.experiments.adapters import viscoelastic
 from meshmatch.experiments.category import Pair, Tell, fit_all, load_category, map_all, nearest_all, trained
 from meshmatch.experiments.report import circumstances, explain, wide_console
 from meshmatch.fitting.fit import Fit
@@ -71,41 +71,19 @@ def meshmonk_maps(
     template: Template, shapes: Mapping[str, Shape], frames: Mapping[str, Frame], tell: Tell
 ) -> dict[Pair, np.ndarray] | None:
     """Maps through meshmonk's registrations of the template; None where it is not installed."""
-    try:
-        import meshmonk
-    except ImportError:
+    if find_spec("meshmonk") is None:
         return None
-    unit = 100.0  # its defaults are for faces in millimetres
     ours = template.shape
-    faces = ours.faces.astype(np.int32)
-    floating = np.concatenate([unit * ours.verts, ours.vertex_normals], 1).astype(np.float32)
     places = {}
     for name, shape in shapes.items():
         tell(f"meshmonk: {name}")
-        there = unit * frames[name].apply(shape.verts)
         turned = shape.vertex_normals @ frames[name].rotation.T
-        with _silent():
-            found = meshmonk.nonrigid_register(
-                floating_features=floating,
-                target_features=np.concatenate([there, turned], 1).astype(np.float32),
-                floating_faces=faces,
-                target_faces=shape.faces.astype(np.int32),
-            )
-        places[name] = frames[name].undo(np.asarray(found.aligned_vertices, float) / unit)
+        found = viscoelastic(
+            (ours.verts, ours.vertex_normals, ours.faces),
+            (frames[name].apply(shape.verts), turned, shape.faces),
+        )
+        places[name] = frames[name].undo(found)
     return through(places, shapes)
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """No words on stderr: the library writes a line there for every vertex that is not manifold."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
 
 
 def through(places: Mapping[str, np.ndarray], shapes: Mapping[str, Shape]) -> dict[Pair, np.ndarray]:
