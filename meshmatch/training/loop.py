@@ -183,22 +183,7 @@ class Trainer:
         summed = 0
         self.model.train()
         for batch in loader:
-            seed = config.seed * 7919 + self.step * self.world + self.rank
-            generator = torch.Generator().manual_seed(seed)
-            torch.manual_seed(
-                seed + 1
-            )  # dropout draws from the global stream: a resumed run must meet the same
-            for group in self.optimiser.param_groups:
-                group["lr"] = learning_rate(self.step, config)
-            with torch.autocast(self.device.type, torch.bfloat16, enabled=config.bf16):
-                terms = self.objective(self.model, batch.to(self.device), self.points, config.loss, generator)
-            self.optimiser.zero_grad(set_to_none=True)
-            terms["total"].backward()
-            self._share_gradients()
-            torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
-            self.optimiser.step()
-            self.step += 1
-            self._update_average()
+            terms = self.iterate(batch)
             for name, value in terms.items():
                 sums[name] = sums.get(name, torch.zeros(())) + value.detach().cpu()
             summed += 1
@@ -221,6 +206,35 @@ class Trainer:
         if checkpoint is not None:
             self.save(checkpoint)
         self.model.eval()
+
+    def iterate(self, batch) -> dict[str, torch.Tensor]:
+        """One step of training on a batch; returns its losses. The model must be in training mode."""
+        config = self.config
+        seed = config.seed * 7919 + self.step * self.world + self.rank
+        generator = torch.Generator().manual_seed(seed)
+        # Dropout draws from the global stream: a resumed run must meet the same.
+        torch.manual_seed(seed + 1)
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate(self.step, config)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=config.bf16):
+            terms = self.objective(self.model, batch.to(self.device), self.points, config.loss, generator)
+        self.optimiser.zero_grad(set_to_none=True)
+        terms["total"].backward()
+        self._share_gradients()
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
+        self.optimiser.step()
+        self.step += 1
+        self._update_average()
+        return terms
+
+    def wait(self) -> None:
+        """Until a GPU has done what it was asked: it works on while Python does, and clocks must not."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+
+    def device_peak(self) -> int | None:
+        """Most bytes that tensors ever took on the GPU; None without one."""
+        return torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None
 
     def _share_gradients(self) -> None:
         if self.world > 1:
