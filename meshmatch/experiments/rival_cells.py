@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -124,21 +125,25 @@ Cells = dict[str, dict[str, dict[str, Any]]]
 def print_cells(cells: Cells, rivals: Sequence[Rival], console: Console | None = None) -> None:
     """A row for each rival on each set, skipped ones among them."""
     console = console or wide_console()
-    table = Table(title=f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})", title_justify="left")
-    table.add_column("set")
-    table.add_column("rival")
+    table = Table(
+        title=f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})",
+        title_justify="left",
+        box=SIMPLE_HEAD,
+    )
+    table.add_column("set", no_wrap=True)
+    table.add_column("rival", no_wrap=True)
     for name in (
         "pairs",
         "failed",
         "mean",
         "median",
-        f"over {LOST_CM:g} cm",
+        f"over {LOST_CM:g}",
         "flips",
-        "s a fit",
-        "s a pair",
+        "fit s",
+        "pair s",
         "trained",
     ):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     skipped: dict[str, list[str]] = {}
     for number, (name, row) in enumerate(cells.items()):
         if number:
@@ -170,7 +175,7 @@ def _seconds(scores: Mapping[str, Any], name: str) -> str:
 
 
 def draw_cells(cells: Cells, rivals: Sequence[Rival], path: Path) -> None:
-    """Mean errors as bars, with medians as ticks, a group for each set."""
+    """Mean errors as bars, with medians as ticks, a group for each set; where pairs failed a bar may run off the axis."""
     groups: dict[str, list[Bar]] = {}
     for name, row in cells.items():
         shown = [(rival, row[rival.name]) for rival in rivals if "scores" in row[rival.name]]
@@ -183,6 +188,7 @@ def draw_cells(cells: Cells, rivals: Sequence[Rival], path: Path) -> None:
         if shown:
             scores = shown[0][1]["scores"]
             groups[f"{name}: {scores['pairs']} of {shown[0][1]['of']} pairs"] = bars
-    draw_bars(
-        groups, path, "mean geodesic error, cm (target scaled to 1.9 square metres of skin); tick: median"
-    )
+    whole = [bar for bars in groups.values() for bar in bars if "failed" not in bar.words]
+    longest = max((max(bar.value, bar.mark or 0.0) for bar in whole), default=0.0)
+    axis = "mean geodesic error, cm (target scaled to 1.9 square metres of skin); tick: median"
+    draw_bars(groups, path, axis, 1.1 * longest or None)

@@ -94,7 +94,7 @@ def _ours(options: argparse.Namespace) -> list[Rival]:
     minutes, model = _card(options.model)
     refined, plain = (PipelineMatcher(options.model, how, options.seed) for how in ("nodes", "none"))
     return [
-        Rival("ours-none", "ours, network alone", plain, "", minutes, model),
+        Rival("ours-none", "ours, unrefined", plain, "", minutes, model),
         Rival("ours", "ours, refined", refined, "", minutes, model),
     ]
 
@@ -107,7 +107,7 @@ def _card(name: str | Path) -> tuple[float, str]:
 
 
 _MAKERS: dict[str, Callable[[argparse.Namespace], list[Rival]]] = {
-    "rigid": lambda given: [Rival("rigid", "rigid, nearest vertex", RigidMatcher(given.seed))],
+    "rigid": lambda given: [Rival("rigid", "rigid, nearest", RigidMatcher(given.seed))],
     "zoomout": lambda given: _needs("pyFM", Rival("zoomout", "ZoomOut (pyfmaps)", ZoomOutMatcher())),
     "nricp": lambda given: _needs(
         "trimesh", Rival("nricp", "nricp (trimesh)", NricpMatcher(seed=given.seed))

@@ -41,6 +41,7 @@ class ZoomOutMatcher:
 
     Meshes of more than ``faces`` triangles are thinned to that first. Source vertices keep their exact place in the
     spectrum; targets are the vertices nearest to the thinned mesh's, so large targets cost about half an edge there.
+    ``first`` and the weight of orientation were the best of seven choices on seven pairs of the benchmark.
     """
 
     faces: int = 10_000

@@ -49,8 +49,8 @@ class Schedule:
     minutes: float = 60.0
     shapes: int = 16
     points: int = 1024
-    targets: int = 512
-    rate: float = 5e-4
+    targets: int = 256
+    rate: float = 1e-3
     warm_up: int = 200
     decay: float = 0.5
     seed: int = 0

@@ -35,7 +35,9 @@ class Bar:
     mark: float | None = None
 
 
-def draw_bars(groups: Mapping[str, Sequence[Bar]], path: str | Path, axis: str) -> None:
+def draw_bars(
+    groups: Mapping[str, Sequence[Bar]], path: str | Path, axis: str, limit: float | None = None
+) -> None:
     """Draw groups of bars into a PNG, all on one axis from 0.
 
     Parameters
@@ -46,6 +48,8 @@ def draw_bars(groups: Mapping[str, Sequence[Bar]], path: str | Path, axis: str) 
         Ends in .png.
     axis
         What the lengths are, with the unit.
+    limit
+        Right end of the axis, above 0: a longer bar is drawn broken off there. By default the largest number.
 
     Raises
     ------
@@ -64,7 +68,9 @@ def draw_bars(groups: Mapping[str, Sequence[Bar]], path: str | Path, axis: str) 
     numbers += [bar.mark for bars in groups.values() for bar in bars if bar.mark is not None]
     if not np.isfinite(numbers).all() or min(numbers) < 0:
         raise OptionError("a bar needs a number of 0 or more")
-    image = _picture(groups, max(numbers), axis)
+    if limit is not None and not (np.isfinite(limit) and limit > 0):
+        raise OptionError(f"an axis cannot end at {limit:g}")
+    image = _picture(groups, max(numbers) if limit is None else limit, axis)
     with replace_on_success(path) as temporary:
         image.save(temporary, format="PNG", optimize=True)
 
@@ -83,7 +89,7 @@ def _picture(groups: Mapping[str, Sequence[Bar]], most: float, axis: str) -> Ima
     bottom = (height - _FOOT) * _FINE
 
     def place(value: float) -> float:
-        return left + (right - left) * value / most
+        return left + (right - left) * min(value / most, 1.0)
 
     stride = nice_step(most, 6)
     for value in np.arange(0.0, most + 1e-6 * stride, stride):
@@ -95,25 +101,31 @@ def _picture(groups: Mapping[str, Sequence[Bar]], most: float, axis: str) -> Ima
         heading = (12 * _FINE, y + 0.6 * _TITLE * _FINE)
         words, fits = fitting(title, 1.1 * size, image.width - 24 * _FINE)
         box = draw.textbbox(heading, words, font=font(fits), anchor="lm")
-        draw.rectangle((box[0] - 4 * _FINE, box[1], box[2] + 4 * _FINE, box[3]), fill="white")
+        draw.rectangle((0, box[1], box[2] + 4 * _FINE, box[3]), fill="white")
         draw.text(heading, words, fill=_INK, font=font(fits), anchor="lm")
         y += _TITLE * _FINE
         for bar in bars:
-            _draw(draw, bar, y, left, place, image.width)
+            _draw(draw, bar, y, left, place, image.width, bar.value > most)
             y += _LINE * _FINE
-    draw.line([(left, 8 * _FINE), (left, bottom)], fill=_INK, width=_FINE)
+        draw.line([(left, y - len(bars) * _LINE * _FINE), (left, y)], fill=_INK, width=_FINE)
     foot = (image.width / 2, (height - 14) * _FINE)
     draw.text(foot, readable(axis), fill=_INK, font=font(size), anchor="mb")
     return image.resize((_WIDTH, height), Image.Resampling.LANCZOS)
 
 
-def _draw(draw: ImageDraw.ImageDraw, bar: Bar, y: float, left: float, place, width: int) -> None:
+def _draw(
+    draw: ImageDraw.ImageDraw, bar: Bar, y: float, left: float, place, width: int, broken: bool
+) -> None:
     size, middle, half = _SIZE * _FINE, y + 0.5 * _LINE * _FINE, 0.34 * _LINE * _FINE
     name, fits = fitting(bar.name, size, left - 22 * _FINE)
     draw.text((left - 10 * _FINE, middle), name, fill=_INK, font=font(fits), anchor="rm")
     end = place(bar.value)
     draw.rectangle((left, middle - half, end, middle + half), fill=_OWN if bar.strong else _BAR)
-    if bar.mark is not None:
+    if broken:
+        for gap in (14 * _FINE, 24 * _FINE):
+            slash = [(end - gap - 4 * _FINE, middle + half), (end - gap + 4 * _FINE, middle - half)]
+            draw.line(slash, fill="white", width=4 * _FINE)
+    elif bar.mark is not None:
         at = place(bar.mark)
         draw.line([(at, middle - half), (at, middle + half)], fill=_INK, width=2 * _FINE)
         end = max(end, at)
