@@ -34,6 +34,18 @@ def test_bars_are_as_long_as_their_numbers(tmp_path: Path) -> None:
     assert len(read(tmp_path / "b.png")) > one + 3 * 20
 
 
+def test_a_bar_beyond_the_axis_is_broken_off(tmp_path: Path) -> None:
+    long, short = Bar("a", 400.0, "400", True), Bar("b", 20.0, "20", True)
+    draw_bars({"one": [long, short]}, tmp_path / "a.png", "cm", limit=20.0)
+    draw_bars({"one": [Bar("a", 20.0, "400", True), short]}, tmp_path / "b.png", "cm", limit=20.0)
+    broken, whole = (strong_pixels(tmp_path / name) for name in ("a.png", "b.png"))
+    changed = broken != whole
+    assert changed.sum() > 10 and (broken[changed] < whole[changed]).all()
+    assert whole.max() - 40 < broken[changed].max()
+    with pytest.raises(OptionError, match="axis"):
+        draw_bars({"one": [long]}, tmp_path / "c.png", "cm", limit=0.0)
+
+
 def test_long_names_stay_in_the_picture(tmp_path: Path) -> None:
     draw_bars({"x" * 300: [Bar("name " * 40, 0.0, "words " * 40, True)]}, tmp_path / "a.png", "é ü")
     pixels = read(tmp_path / "a.png")
