@@ -112,16 +112,15 @@ def test_a_tilted_reading_is_turned_back(model: TrainedModel, system: NodeSystem
     first = torch.from_numpy(scan.points[:200]).float()
 
     class Follower(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.nodes = nodes
-
         def forward(self, points: torch.Tensor) -> torch.Tensor:
             # the points are the first ones, turned and in another order: their moments tell the turn
             U, _, Vh = torch.linalg.svd(
                 _moment(points[0]).double() @ torch.linalg.inv(_moment(first).double())
             )
             return ((U @ Vh).float() @ nodes.T).T[None] - nodes
+
+        def turned(self, vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
+            return model.network.turned(vectors, turn)
 
     def _moment(points: torch.Tensor) -> torch.Tensor:
         # third-order moments turn like vectors: three of them make a frame
