@@ -16,7 +16,7 @@ from meshmatch.fitting.fit import FAIR_RESIDUAL, Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig, check_landmarks
 from meshmatch.fitting.latent import refine_code
 from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual, variants
-from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
+from meshmatch.fitting.nodes import refine_nodes
 from meshmatch.fitting.orientation import (
     Hypothesis,
     axis_vector,
@@ -27,6 +27,7 @@ from meshmatch.fitting.orientation import (
 )
 from meshmatch.fitting.part import cost, fit_part
 from meshmatch.fitting.placing import placed, scan_frame
+from meshmatch.fitting.readings import Judge, choose, lying
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.settle import settle
 from meshmatch.fitting.system import NodeSystem
@@ -253,25 +254,28 @@ def _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell
         vectors = refine_code(model, local, config.latent, rng, lambda k, n: tell("refinement", k / n))
         return Candidate(best.rotation, best.centre, vectors, two_way_residual(system, local, vectors))
 
-    def fitted(candidate: Candidate, nodes: NodeRefineConfig, report=None) -> Candidate:
+    # A few steps tell which readings the surface agrees with; the prior of the full run stays the network's.
+    screen = replace(config.nodes, steps=config.screening)
+
+    def fitted(candidate: Candidate, whole: bool) -> Candidate:
         local = scan.turned(candidate.rotation, candidate.centre)
         fixed = None
         if landmarks is not None:
             fixed = (landmarks[0], (frame.apply(landmarks[1]) - candidate.centre) @ candidate.rotation)
-        vectors = refine_nodes(system, local, candidate.vectors, nodes, fixed, progress=report)
+        vectors = refine_nodes(system, local, candidate.vectors, config.nodes if whole else screen, fixed)
         return Candidate(
             candidate.rotation, candidate.centre, vectors, two_way_residual(system, local, vectors)
         )
 
-    # A few steps tell which reading the surface agrees with; the prior of the full run stays the network's.
-    screen = replace(config.nodes, steps=config.screening)
-    finalists = candidates[: config.finalists]
-    scores = []
-    for number, candidate in enumerate(finalists):
-        scores.append(fitted(candidate, screen).residual)
-        tell("refinement", 0.6 * (number + 1) / len(finalists))
-    chosen = finalists[int(np.argmin(scores))]
-    return fitted(chosen, config.nodes, lambda k, n: tell("refinement", 0.6 + 0.4 * k / n))
+    judge = Judge(system, scan)
+    return choose(
+        candidates,
+        config.finalists,
+        fitted,
+        lambda found: judge.score(scan.turned(found.rotation, found.centre), found),
+        lambda found: lying(system, found),
+        lambda share: tell("refinement", share),
+    )
 
 
 def boundary_length(shape: Shape) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 from meshmatch.fitting.network_fit import Candidate, lay_on, one_way_residual, variants
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
 from meshmatch.fitting.orientation import Hypothesis
+from meshmatch.fitting.readings import Judge, choose, lying
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
 
@@ -27,6 +28,7 @@ _SHARE_COST = (
 )
 _LAID, _READ, _FINALISTS = 8, 2, 5
 _COARSE = 2048
+_Sized = tuple[float, Candidate]  # visible share, and a fit to the scan of that size
 
 
 def fit_part(
@@ -83,17 +85,28 @@ def fit_part(
         _, share, best = careful[0]
         return 1 / np.sqrt(share), scans[share], best
 
-    def fitted(share: float, candidate: Candidate, steps: int) -> Candidate:
-        local = scans[share].turned(candidate.rotation, candidate.centre)
-        config = replace(nodes, steps=steps)
-        vectors = refine_nodes(system, local, candidate.vectors, config, one_sided=True)
-        return replace(candidate, vectors=vectors, residual=one_way_residual(system, local, vectors))
+    judge = Judge(system, scan)
 
-    finalists = careful[:_FINALISTS]
-    costs = [cost(fitted(share, candidate, screening).residual, share) for _, share, candidate in finalists]
-    _, share, chosen = finalists[int(np.argmin(costs))]
-    tell(0.9)
-    return float(1 / np.sqrt(share)), scans[share], fitted(share, chosen, nodes.steps)
+    def fitted(reading: _Sized, whole: bool) -> _Sized:
+        share, candidate = reading
+        local = scans[share].turned(candidate.rotation, candidate.centre)
+        config = nodes if whole else replace(nodes, steps=screening)
+        vectors = refine_nodes(system, local, candidate.vectors, config, one_sided=True)
+        return share, replace(candidate, vectors=vectors, residual=one_way_residual(system, local, vectors))
+
+    def score(reading: _Sized) -> float:
+        share, candidate = reading
+        return cost(judge.score(scans[share].turned(candidate.rotation, candidate.centre), candidate), share)
+
+    share, chosen = choose(
+        [(share, candidate) for _, share, candidate in careful],
+        _FINALISTS,
+        fitted,
+        score,
+        lambda reading: lying(system, reading[1]) / np.sqrt(reading[0]),
+        lambda done: tell(0.6 + 0.4 * done),
+    )
+    return float(1 / np.sqrt(share)), scans[share], chosen
 
 
 def _laid(model, system, scan, guess, rng, **how) -> Candidate:

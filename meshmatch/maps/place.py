@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.surface import Footpoints, Surface
@@ -19,6 +20,10 @@ _TEAR, _STRETCH = 0.06, 3.0
 # A piece between tears is believed if it has this share of the surface.
 _BELIEVED = 0.06
 _ROUNDS, _FILL_STEPS = 3, 120
+# Of a cloud, the share of its points that are neighbours of one where noise is 1 % of the diagonal, and how many at
+# least and at most.
+_NEAR, _FEW_MANY = 0.005, (9, 64)
+_CHUNK = 16_384  # points at a time
 
 
 @lru_cache(maxsize=4)
@@ -27,15 +32,20 @@ def place(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndar
 
     The closest point in space jumps to another limb where two of them touch. Neighbours on the shape that
     belong far apart on the template reveal it: small pieces cut out by such tears ask again, knowing where
-    their surroundings belong.
+    their surroundings belong. Points of a cloud have no such edges, and noise carries them across: each asks
+    again, knowing the median of its neighbours.
     """
     points, normals = in_core_frame(shape, fit)
     template_normals = vertex_normals(fit.points, fit.faces)
     foot = Surface(fit.points, fit.faces, template_normals).query(points, normals, workers)
     resting = at_footpoints(foot, fit.faces, fit.resting)
-    if shape.is_cloud:
-        return foot, resting
     knowing = Surface(fit.points, fit.faces, template_normals, fit.resting)
+    if shape.is_cloud:
+        near = neighbours(points, shape.roughness)
+        for _ in range(_ROUNDS):
+            foot = knowing.query(points, normals, workers, medians(resting, near))
+            resting = at_footpoints(foot, fit.faces, fit.resting)
+        return foot, resting
     edges = edges_of(shape.faces).vertices
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     for _ in range(_ROUNDS):
@@ -51,6 +61,21 @@ def place(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndar
         for name in ("vertex", "face", "barycentric", "distance"):
             getattr(foot, name)[ask] = getattr(again, name)
     return foot, resting
+
+
+def neighbours(points: np.ndarray, roughness: float) -> np.ndarray:
+    """(V, k) the nearest points of each of a cloud, itself first: more of them where noise is large (`Shape.roughness`)."""
+    k = int(np.clip(_NEAR * roughness * len(points), *_FEW_MANY))
+    return np.asarray(cKDTree(points).query(points, min(k, len(points)))[1])
+
+
+def medians(values: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Median (V, D), coordinate by coordinate, of values (V, D) over neighbours (V, k)."""
+    found = np.empty_like(values)
+    for low in range(0, len(values), _CHUNK):
+        part = slice(low, low + _CHUNK)
+        found[part] = np.median(values[near[part]], axis=1)
+    return found
 
 
 def small_pieces(edges: np.ndarray, length: np.ndarray, resting: np.ndarray, area: np.ndarray) -> np.ndarray:
