@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.fitting.scan import Scan, with_normals
+from meshmatch.fitting.scan import PAIR_WEIGHT, Scan, with_normals
 from meshmatch.fitting.system import NodeSystem
 
 
@@ -110,8 +110,8 @@ def pair_terms(
     moved = system.moved(vectors)
     normals = system.normals(moved)
     V = len(moved)
-    seen = with_normals(moved, normals)
-    to_scan = scan.tree.query(seen)[1]
+    seen = with_normals(moved, normals, PAIR_WEIGHT)
+    to_scan = scan.pair_tree.query(seen)[1]
     area = vertex_areas(moved, system.faces)
     forward = area / area.sum() * robust_weight(moved - scan.points[to_scan], scale)
     forward *= (normals * scan.normals[to_scan]).sum(1) > config.normal_cosine
@@ -119,7 +119,7 @@ def pair_terms(
         forward *= np.linalg.norm(moved - scan.points[to_scan], axis=1) < 3 * scale
 
     pick = np.arange(0, len(scan.points), max(1, len(scan.points) // config.back_points))
-    to_template = cKDTree(seen).query(with_normals(scan.points[pick], scan.normals[pick]))[1]
+    to_template = cKDTree(seen).query(with_normals(scan.points[pick], scan.normals[pick], PAIR_WEIGHT))[1]
     back = robust_weight(moved[to_template] - scan.points[pick], scale) / len(pick)
     back *= (normals[to_template] * scan.normals[pick]).sum(1) > config.normal_cosine
 

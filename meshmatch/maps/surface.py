@@ -11,8 +11,9 @@ from scipy.spatial import cKDTree
 
 from meshmatch.shapes.shape import squared_lengths
 
-# How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area).
-NORMAL_WEIGHT = 0.15
+# How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area): enough to tell
+# the sides of a thin wall. More would drag points along the surface to where it bends the same way.
+NORMAL_WEIGHT = 0.02
 # How much a distance on the resting template counts beside one in space.
 RESTING_WEIGHT = 0.4
 # Queries at a time: what belongs to them then stays in the processor's cache.
