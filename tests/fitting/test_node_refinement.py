@@ -16,7 +16,7 @@ from meshmatch.fitting.nodes import (
     robust_weight,
     vertex_areas,
 )
-from meshmatch.fitting.scan import Scan, with_normals
+from meshmatch.fitting.scan import PAIR_WEIGHT, Scan, with_normals
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
@@ -76,7 +76,8 @@ def test_pairs_are_those_of_a_plain_loop(system: NodeSystem) -> None:
     weights, pulls = pair_terms(system, scan, vectors, 0.08, config)
 
     normals = system.normals(system.verts)
-    seen, there = with_normals(system.verts, normals), with_normals(scan.points, scan.normals)
+    seen = with_normals(system.verts, normals, PAIR_WEIGHT)
+    there = with_normals(scan.points, scan.normals, PAIR_WEIGHT)
     area = vertex_areas(system.verts, system.faces)
     pairs = []
     for v in range(len(seen)):
