@@ -4,6 +4,7 @@ import json
 import signal
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image
 
 from meshmatch import pipeline
 from meshmatch.errors import InputError, OutputError
+from meshmatch.fields.mls import build_field
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
@@ -430,7 +432,8 @@ def test_register_in_full_resolution(
     )
     moved = replace(fit(sphere), template_hash=template.hash, vectors=np.tile([0.0, 0.0, 5.0], (42, 1)))
     monkeypatch.setattr(pipeline, "register", lambda *_, **__: moved)
-    model = TrainedModel(small_card(), template, None)  # type: ignore[arg-type]
+    network = SimpleNamespace(field=build_field)
+    model = TrainedModel(small_card(), template, network)  # type: ignore[arg-type]
     monkeypatch.setattr(pipeline, "read_model", lambda name: model)
     output = two[0].with_name("fitted.ply")
     answer = run("register", two[0], "-o", output, "--dense", "--json")
