@@ -432,7 +432,7 @@ def test_register_in_full_resolution(
     )
     moved = replace(fit(sphere), template_hash=template.hash, vectors=np.tile([0.0, 0.0, 5.0], (42, 1)))
     monkeypatch.setattr(pipeline, "register", lambda *_, **__: moved)
-    network = SimpleNamespace(field=build_field)
+    network = SimpleNamespace(field=build_field, config=SimpleNamespace(field="mls"))
     model = TrainedModel(small_card(), template, network)  # type: ignore[arg-type]
     monkeypatch.setattr(pipeline, "read_model", lambda name: model)
     output = two[0].with_name("fitted.ply")
