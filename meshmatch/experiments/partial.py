@@ -28,6 +28,7 @@ from rich.table import Table
 from meshmatch.config import set_threads
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.bench import chosen_pairs
+from meshmatch.experiments.category import area_under_curve
 from meshmatch.experiments.distances import TruthDistances, default_folder
 from meshmatch.experiments.protocols import SET_NAMES, BenchSet, load_set
 from meshmatch.experiments.report import circumstances, explain, wide_console
@@ -67,19 +68,6 @@ def seen_faces(shape: Shape, centres: np.ndarray, direction: np.ndarray) -> NDAr
     lifted = (centres + 1e-4 * shape.diagonal * shape.face_normals).astype(np.float32)
     towards = np.broadcast_to(direction.astype(np.float32), lifted.shape)
     return np.asarray(facing & ~scene.blocked(lifted, towards, 2 * shape.diagonal))
-
-
-def area_under_curve(confidence: np.ndarray, right: np.ndarray) -> float:
-    """Chance (0..1) that a right answer (bool, (N,)) has the higher confidence than a wrong one; ties count half."""
-    order = np.argsort(confidence, kind="stable")
-    first = np.unique(confidence[order], return_index=True)[1]
-    last = np.append(first[1:], len(order))
-    rank = np.repeat(0.5 * (first + last - 1), last - first)  # mean rank of equal ones
-    mine = right[order]
-    hits, misses = int(mine.sum()), int((~mine).sum())
-    if not hits or not misses:
-        return float("nan")
-    return float((rank[mine].sum() - hits * (hits - 1) / 2) / (hits * misses))
 
 
 def run_set(

@@ -8,7 +8,6 @@ the scan but not stretch along it, which Chamfer and normals cannot see.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,7 +62,6 @@ def refine_nodes(
     config: NodeRefineConfig,
     landmarks: tuple[np.ndarray, np.ndarray] | None = None,
     one_sided: bool = False,
-    progress: Callable[[int, int], None] | None = None,
 ) -> np.ndarray:
     """Fit node vectors (K, 3) to a scan in the core frame; returns better node vectors.
 
@@ -85,8 +83,6 @@ def refine_nodes(
         targets = nearest_rotations(system.deformation_gradient(vectors), start) @ start
         share = 1.0 / len(targets)
         vectors = system.solve(weights, pulls, strain * share, targets, config.damping / system.K, vectors)
-        if progress is not None:
-            progress(step + 1, config.steps)
     return vectors
 
 

@@ -17,7 +17,7 @@ from meshmatch.fitting.network_fit import Candidate
 from meshmatch.fitting.scan import Scan, with_normals
 from meshmatch.fitting.system import NodeSystem
 
-# Neighbours on the scan are torn apart where they belong this much further apart on the resting template (units of
+# Neighbours on a shape are torn apart where they belong this much further apart on the resting template (units of
 # sqrt(area)) than they are, stretched by this factor.
 _TEAR, _STRETCH = 0.06, 3.0
 _NEIGHBOURS = 6
@@ -40,10 +40,9 @@ class Judge:
         )[1]
         self._from = np.repeat(np.arange(len(index)), index.shape[1] - 1)
         self._to = index[:, 1:].reshape(-1)
-        self._length = np.linalg.norm(scan.points[self._from] - scan.points[self._to], axis=1)
 
     def score(self, scan: Scan, candidate: Candidate) -> float:
-        """Residual of a candidate and what it tears; ``scan`` holds the same samples in the candidate's core frame."""
+        """Residual of a candidate and what it tears; ``scan`` holds the same samples in its core frame and size."""
         return candidate.residual + _TORN_COST * self.torn(scan, candidate.vectors)
 
     def torn(self, scan: Scan, vectors: np.ndarray) -> float:
@@ -51,8 +50,13 @@ class Judge:
         moved = self._system.moved(vectors)
         tree = cKDTree(with_normals(moved, self._system.normals(moved)))
         belongs = self._system.verts[tree.query(with_normals(scan.points, scan.normals))[1]]
-        jump = np.linalg.norm(belongs[self._from] - belongs[self._to], axis=1)
-        return float((jump > _TEAR + _STRETCH * self._length).mean())
+        length = np.linalg.norm(scan.points[self._from] - scan.points[self._to], axis=1)
+        return float(torn(belongs[self._from], belongs[self._to], length).mean())
+
+
+def torn(here: np.ndarray, there: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """(N,) whether places of the resting template (N, 3) are much further apart than their points, by lengths (N,)."""
+    return np.asarray(np.linalg.norm(here - there, axis=1) >= _TEAR + _STRETCH * length)
 
 
 def choose(

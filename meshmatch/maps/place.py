@@ -10,13 +10,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.readings import torn
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.topology import edges_of
 
-# An edge is torn where its ends belong this much further apart on the resting template (units of sqrt(area))
-# than they are, stretched by this factor.
-_TEAR, _STRETCH = 0.06, 3.0
 # A piece between tears is believed if it has this share of the surface.
 _BELIEVED = 0.06
 _ROUNDS, _FILL_STEPS = 3, 120
@@ -89,8 +87,7 @@ def small_pieces(edges: np.ndarray, length: np.ndarray, resting: np.ndarray, are
     area : (V,) around each vertex; lengths are in units of the square root of the whole
     """
     V = len(resting)
-    jump = np.linalg.norm(resting[edges[:, 0]] - resting[edges[:, 1]], axis=1)
-    whole = jump < _TEAR + _STRETCH * length
+    whole = ~torn(resting[edges[:, 0]], resting[edges[:, 1]], length)
     if whole.all():
         return np.zeros(V, bool)
     kept = edges[whole]

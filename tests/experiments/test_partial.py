@@ -7,29 +7,13 @@ import numpy as np
 import pytest
 
 from meshmatch.experiments import partial
-from meshmatch.experiments.partial import area_under_curve, main, part_of, seen_faces
+from meshmatch.experiments.partial import main, part_of, seen_faces
 from meshmatch.experiments.protocols import load_set
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Frame, Shape
 from tests.conftest import icosphere
 from tests.experiments.small_bench import build, truth
-
-
-def test_the_area_under_the_curve_by_hand() -> None:
-    right = np.array([True, True, False, False])
-    assert area_under_curve(np.array([0.9, 0.8, 0.2, 0.1]), right) == 1.0
-    assert area_under_curve(np.array([0.1, 0.2, 0.8, 0.9]), right) == 0.0
-    assert area_under_curve(np.array([0.5, 0.5, 0.5, 0.5]), right) == 0.5
-    assert area_under_curve(np.array([0.9, 0.3, 0.5, 0.1]), right) == 0.75
-    assert np.isnan(area_under_curve(np.ones(3), np.ones(3, bool)))
-
-
-def test_the_area_is_the_share_of_ordered_pairs() -> None:
-    rng = np.random.default_rng(0)
-    confidence, right = rng.integers(0, 6, 80) / 5, rng.random(80) < 0.4
-    a, b = confidence[right][:, None], confidence[~right]
-    assert area_under_curve(confidence, right) == pytest.approx((a > b).mean() + 0.5 * (a == b).mean())
 
 
 def test_a_camera_sees_what_faces_it_and_is_not_hidden() -> None:

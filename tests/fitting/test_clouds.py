@@ -1,13 +1,16 @@
 """Clouds: a first fit settles their scale and their stray points, and the verdict forgives them their noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from meshmatch.fitting.agree import AgreeConfig
+from meshmatch.fitting.agree import AgreeConfig, agreed_fits
 from meshmatch.fitting.fit import GOOD_RESIDUAL
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import node_system
+from meshmatch.fitting.fit_shape import fit_shape, node_system
 from meshmatch.fitting.network_fit import Candidate, two_way_residual
+from meshmatch.fitting.nodes import pair_terms, refine_nodes
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.settle import lonely_points, settle
 from meshmatch.fitting.system import NodeSystem
@@ -149,3 +152,37 @@ def test_noise_makes_a_cloud_rough_and_its_fit_stiff(system: NodeSystem) -> None
     assert stiff.nodes.scale_last > config.nodes.scale_last and stiff.samples > config.samples
     assert config.suited(0.0) is config
     assert AgreeConfig().suited(1.0).strain == pytest.approx(5 * AgreeConfig().strain)
+
+
+def test_fits_of_rough_clouds_are_suited_to_them(system: NodeSystem, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a cloud's roughness asks for reaches the refinement, alone and where two agree."""
+    rng = np.random.default_rng(0)
+    points = sample_surface(Shape(system.verts, system.faces), 900, rng).points
+    clouds = [
+        Shape(points + size * rng.standard_normal(points.shape), np.empty((0, 3), np.int64))
+        for size in (0.0, 0.04)
+    ]
+    asked: list[float] = []
+    paired: list[int] = []
+
+    def refined(system, scan, vectors, config, fixed):
+        asked.append(config.strain_last)
+        return refine_nodes(system, scan, vectors, config, fixed)
+
+    def pairs(system, scan, vectors, scale, config, one_sided):
+        paired.append(config.back_points)
+        return pair_terms(system, scan, vectors, scale, config, one_sided)
+
+    monkeypatch.setattr("meshmatch.fitting.fit_shape.refine_nodes", refined)
+    config = FitConfig(partial="no", variants=2, finalists=1, laid=1)
+    fits = []
+    for cloud in clouds:
+        asked.clear()
+        fits.append(replace(fit_shape(egg_model(), cloud, config), verdict="good"))
+        expected = config.nodes.strain_last * 10**cloud.roughness
+        assert asked and asked == pytest.approx([expected] * len(asked))
+    assert clouds[1].roughness > clouds[0].roughness + 0.3
+    monkeypatch.setattr("meshmatch.fitting.agree.pair_terms", pairs)
+    how = AgreeConfig(steps=1, back_points=100)
+    agreed_fits(egg_model(), clouds, fits, config, how=how)
+    assert paired == [round(100 * (1 + cloud.roughness)) for cloud in clouds]

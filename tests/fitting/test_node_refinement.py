@@ -201,16 +201,7 @@ def test_of_a_part_only_what_is_near_it_is_pulled(system: NodeSystem, scan: Scan
     assert np.array_equal(part[~far], whole[~far])
 
 
-def test_progress_is_told_for_every_step(system: NodeSystem, scan: Scan) -> None:
-    told: list[tuple[int, int]] = []
-    refine_nodes(
-        system,
-        scan,
-        np.zeros((system.K, 3)),
-        replace(CONFIG, steps=3),
-        progress=lambda *now: told.append(now),
-    )
-    assert told == [(1, 3), (2, 3), (3, 3)]
+def test_no_steps_change_nothing(system: NodeSystem, scan: Scan) -> None:
     assert np.array_equal(
         refine_nodes(system, scan, np.ones((system.K, 3)), replace(CONFIG, steps=0)), np.ones((system.K, 3))
     )
