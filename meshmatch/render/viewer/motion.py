@@ -15,7 +15,7 @@ from meshmatch.outputs import replace_on_success
 from meshmatch.render.colors import CLAY
 from meshmatch.render.viewer.drawn import MOST, draw
 from meshmatch.render.viewer.packing import pack, small_integers, to_bytes, to_shorts, to_signed_bytes
-from meshmatch.render.viewer.page import _text, assemble, check_page
+from meshmatch.render.viewer.page import assemble, check_page, plain_text
 from meshmatch.shapes.doubles import seams
 from meshmatch.shapes.shape import Floats, Shape
 
@@ -83,11 +83,13 @@ def write_motion(
     }
     table, packed = pack(arrays)
     words: dict[str, Any] = {
-        "title": _text(title),
+        "title": plain_text(title),
         "note": part.note or f"{first.V:,} vertices",
         "times": [round(float(time), 9) for time in times],
         "met": [
-            [float(time), _text(name)] for time, name in (met or {}).items() if times[0] <= time <= times[-1]
+            [float(time), plain_text(name)]
+            for time, name in (met or {}).items()
+            if times[0] <= time <= times[-1]
         ],
         "cloud": len(faces) == 0,
         "low": (-extent / edge / 2).round(6).tolist(),

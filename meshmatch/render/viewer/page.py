@@ -111,7 +111,7 @@ def write_page(
     words |= {"look": None, "own": False} if looks is None else looks.words
     words |= {
         "verdict": there.verdict,
-        "reasons": [_text(reason) for reason in there.reasons],
+        "reasons": [plain_text(reason) for reason in there.reasons],
         "confidence": [round(float(found.confidence.mean()), 4) for found in maps],
         "ramp": Scale(0.0, 1.0, reverse=True).colors(np.linspace(0, 1, 9)).round(4).tolist(),
         "version": __version__,
@@ -148,7 +148,7 @@ def _words(shape: Shape, name: str, part: Drawn, box: Box) -> dict[str, Any]:
     scale = box.size / box.edge
     extent = np.ptp(part.verts[part.used] @ box.rotation.T, axis=0) * scale
     return {
-        "name": _text(name),
+        "name": plain_text(name),
         "vertices": shape.V,
         "faces": shape.F,
         "cloud": len(part.faces) == 0,
@@ -159,7 +159,7 @@ def _words(shape: Shape, name: str, part: Drawn, box: Box) -> dict[str, Any]:
     }
 
 
-def _text(value: str) -> str:
+def plain_text(value: str) -> str:
     """A name of any bytes as text that UTF-8 can hold, without what would turn or break the words around it."""
     return _UNSEEMLY.sub("\ufffd", value.encode("utf-8", "replace").decode("utf-8"))
 
@@ -185,7 +185,7 @@ def assemble(name: str, scripts: Sequence[str], words: dict[str, Any], packed: s
     )
     parts = {
         "policy": policy,
-        "title": html.escape(_text(title)),
+        "title": html.escape(plain_text(title)),
         "style": style,
         "library": library,
         "program": program,
