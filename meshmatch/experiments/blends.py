@@ -2,7 +2,8 @@
 
 For pairs of a set, the codes that each network has for the two shapes are blended at a quarter, a half and three
 quarters, and decoded. Deviations from the volume and rigidity that the two ends have, blended (`Deviation`), say how
-true the shapes between are; the residual of the network's own fits says what the ends cost. All models see the same pairs.
+true the shapes between are; the residual of the network's own fits says what the ends cost. All models see the same
+pairs. ``--ways codes,field`` measures the program's other way to blend beside it, which needs no training for it.
 """
 
 from __future__ import annotations
@@ -20,56 +21,69 @@ from rich.progress import track
 from rich.table import Table
 
 from meshmatch.config import set_threads
-from meshmatch.errors import MeshmatchError
+from meshmatch.errors import MeshmatchError, OptionError
 from meshmatch.experiments.bench import chosen_pairs
 from meshmatch.experiments.protocols import SET_NAMES, BenchSet, load_set
 from meshmatch.experiments.report import circumstances, explain, wide_console
-from meshmatch.fitting.blend import Blend
+from meshmatch.fitting.blend import WAYS, Blend, Way
 from meshmatch.fitting.fit import Fit
 from meshmatch.pipeline import read_model, register, usable
 
 TIMES = (0.25, 0.5, 0.75)
+DEVIATIONS = ("volume", "arap", "template_volume", "template_arap")
 
 
-def measure(bench: BenchSet, model: str, *, limit: int, seed: int) -> dict[str, Any]:
-    """Mean deviations between the ends of ``limit`` pairs, and the mean residual of the ends."""
+def measure(
+    bench: BenchSet, model: str, *, limit: int, seed: int, ways: Sequence[Way] = ("codes",)
+) -> dict[Way, dict[str, Any]]:
+    """By way: mean deviations between the ends of ``limit`` pairs, also at each time; the mean residual of the ends."""
     loaded = read_model(model)
     fits: dict[str, Fit] = {}
     shapes = {}
-    rows = []
+    rows: dict[Way, list[list[list[float]]]] = {way: [] for way in ways}
     pairs = chosen_pairs(bench, limit)
     for pair in track(pairs, model, console=Console(stderr=True)):
         for name in pair:
             if name not in fits:
                 shapes[name] = usable(bench.shape(name)).shape
                 fits[name] = register(shapes[name], model=model, refine="none", seed=seed)
-        blend = Blend(loaded, [fits[n] for n in pair], None, [shapes[n] for n in pair], "codes")
-        for time in TIMES:
-            found = blend.deviation(time, blend.vectors(time))
-            rows.append([found.volume, found.arap, found.template_volume, found.template_arap])
-    volume, arap, template_volume, template_arap = np.mean(rows, axis=0).tolist()
-    return {
-        "pairs": len(pairs),
-        "of": len(bench.pairs),
-        "volume": volume,
-        "arap": arap,
-        "template_volume": template_volume,
-        "template_arap": template_arap,
-        "residual": float(np.mean([fit.residual for fit in fits.values()])),
-    }
+        for way in ways:
+            blend = Blend(loaded, [fits[n] for n in pair], None, [shapes[n] for n in pair], way)
+            found = [blend.deviation(time, blend.vectors(time)) for time in TIMES]
+            rows[way].append([[getattr(each, name) for name in DEVIATIONS] for each in found])
+    residual = float(np.mean([fit.residual for fit in fits.values()]))
+    answers = {}
+    for way in ways:
+        means = np.mean(rows[way], axis=0)  # times, deviations
+        answers[way] = {
+            "pairs": len(pairs),
+            "of": len(bench.pairs),
+            **dict(zip(DEVIATIONS, means.mean(0).tolist(), strict=True)),
+            "residual": residual,
+            "at": {
+                str(time): dict(zip(DEVIATIONS, row, strict=True))
+                for time, row in zip(TIMES, means.tolist(), strict=True)
+            },
+        }
+    return answers
 
 
-def run(bench: BenchSet, models: Sequence[str], *, limit: int, seed: int) -> dict[str, Any]:
+def run(
+    bench: BenchSet, models: Sequence[str], *, limit: int, seed: int, ways: Sequence[Way] = ("codes",)
+) -> dict[str, Any]:
     """Measure every model, print a table and a JSON line; the line's record is returned too."""
     set_threads(1)
-    found = {model: measure(bench, model, limit=limit, seed=seed) for model in models}
-    table = Table(title=f"Between two codes, {bench.name}", title_justify="left")
-    table.add_column("model")
-    names = ("volume", "arap", "template_volume", "template_arap", "residual")
+    found = {model: measure(bench, model, limit=limit, seed=seed, ways=ways) for model in models}
+    table = Table(title=f"Between two shapes, {bench.name}", title_justify="left")
+    for name in ("model", "blended"):
+        table.add_column(name)
+    names = (*DEVIATIONS, "residual")
     for name in ("pairs", *names):
         table.add_column(name.replace("_", " "), justify="right")
-    for model, row in found.items():
-        table.add_row(Path(model).name, f"{row['pairs']} of {row['of']}", *(f"{row[n]:.4f}" for n in names))
+    for model, answers in found.items():
+        for way, row in answers.items():
+            pairs = f"{row['pairs']} of {row['of']}"
+            table.add_row(Path(model).name, way, pairs, *(f"{row[n]:.4f}" for n in names))
     wide_console().print(table)
     whole = {
         "benchmark": "blends",
@@ -83,18 +97,30 @@ def run(bench: BenchSet, models: Sequence[str], *, limit: int, seed: int) -> dic
     return whole
 
 
+def known_ways(words: str) -> list[Way]:
+    """Ways with commas; `OptionError` where one is none."""
+    named = {str(way): way for way in WAYS}
+    asked = list(dict.fromkeys(words.split(",")))
+    for word in asked:
+        if word not in named:
+            raise OptionError(f"no way {word!r} to blend", f"choose from {', '.join(WAYS)}")
+    return [named[word] for word in asked]
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Run it; 0 when it ran, 1 when the data or the choice stopped it."""
     parser = argparse.ArgumentParser("python -m meshmatch.experiments.blends", description=__doc__)
     parser.add_argument("--models", default="human", help="names or folders, with commas; %(default)s")
+    parser.add_argument("--ways", default="codes", help=f"some of {', '.join(WAYS)}; %(default)s")
     parser.add_argument("--set", default="scape", choices=SET_NAMES)
     parser.add_argument("--limit-pairs", type=int, default=30, metavar="N")
     parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(words)
     try:
+        ways = known_ways(options.ways)
         bench = load_set(options.set, options.data)
-        run(bench, options.models.split(","), limit=options.limit_pairs, seed=options.seed)
+        run(bench, options.models.split(","), limit=options.limit_pairs, seed=options.seed, ways=ways)
     except MeshmatchError as error:
         explain(error)
         return 1
