@@ -187,7 +187,7 @@ def viscoelastic(floating: Parts, target: Parts) -> np.ndarray:
 class CodedMatcher:
     """3D-CODED: a model with a pointwise decoder, its code refined by the Chamfer distance alone.
 
-    ``model`` is a folder of `meshmatch train --field pointwise` whose losses had no regulariser.
+    ``model`` is a folder that `meshmatch.experiments.coded` wrote: its losses had no constraint.
     """
 
     model: str

@@ -8,7 +8,7 @@ or whose model is not given, is skipped, and the table says so.
 - zoomout: pyfmaps, HKS and WKS, ZoomOut from 30 to 120 eigenfunctions; meshes thinned to 10,000 triangles.
 - nricp: trimesh's non-rigid ICP, source onto target from the rigid alignment; the source thinned to 5,000 triangles.
 - meshmonk: viscoelastic registration, source onto target from the rigid alignment; both thinned to 20,000 triangles.
-- coded: 3D-CODED, a model of `meshmatch train --field pointwise` without regularisers (``--coded``), its code searched
+- coded: 3D-CODED, trained by `meshmatch.experiments.coded` without constraints (``--coded``), its code searched
   by the Chamfer distance.
 - transmatch: a transformer trained by `meshmatch.experiments.transmatch` (``--transmatch``), not refined.
 - ours: this project, refined and not.
@@ -71,7 +71,7 @@ def _needs(package: str, rival: Rival) -> list[Rival]:
 
 def _coded(options: argparse.Namespace) -> list[Rival]:
     if options.coded is None:
-        how = "give --coded MODEL, made by meshmatch train --field pointwise"
+        how = "give --coded MODEL, made by python -m meshmatch.experiments.coded"
         return [Rival("coded", "3D-CODED", None, how)]
     minutes, model = _card(options.coded)
     matcher = CodedMatcher(str(options.coded), options.coded_steps, options.seed)
