@@ -34,7 +34,7 @@ def prepare(
         Literal["none", "near", "rigid"] | None,
         typer.Option(
             help="How shapes are turned to the template, now and when fitted: as they are given, a little, or "
-            "from any orientation. If not given: none where they are registered, else rigid."
+            "from any orientation. If not given: near where they are registered and stand alike, else rigid."
         ),
     ] = None,
     scale: Annotated[

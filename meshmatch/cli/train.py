@@ -134,13 +134,15 @@ def train(
     check_writable(picture)
     from meshmatch.models.card import check_name
     from meshmatch.training import run
+    from meshmatch.training.few import few_recipe, frame_of_few
     from meshmatch.training.unsupervised import cloud_recipe
 
     label = check_name(name or output.resolve().name)
     clouds = shapes is not None and (unsupervised or not _registered(shapes))
     if unsupervised and shapes is None:
         raise OptionError("--unsupervised learns from a folder of shapes", "name it with --shapes")
-    chosen = cloud_recipe(preset) if clouds else run.recipe(preset)
+    few = None if shapes is None or clouds or preset != "default" else frame_of_few(shapes)
+    chosen = cloud_recipe(preset) if clouds else run.recipe(preset) if few is None else few_recipe()
     preset_train = chosen.train
     settings = replace(
         preset_train,
@@ -175,7 +177,7 @@ def train(
         return _done(folder, label, voice, json and first, picture)
     if shapes is not None:
         made = run.read_template(shapes / "template.safetensors")
-        source, count = run.folder_source(shapes, made)
+        source, count = run.folder_source(shapes, made, warped=few is not None)
         data = f"{count} registered shapes of {shapes.resolve().name}"
         kind = category or shapes.resolve().name
     else:
@@ -204,6 +206,7 @@ def train(
             licence=licence,
             start=started,
             resume=not fresh,
+            frame=few,
             progress=show,
         )
     _done(folder, label, voice, json and first, picture)

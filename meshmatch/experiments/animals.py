@@ -2,17 +2,15 @@
 
 The benchmark's animals (cats, dogs, cows, hippos, horses) stand in different poses and are turned every way. One is
 the template; a model is trained on all of them without correspondence, or, with ``--points N``, with N known points on
-each. Then every ordered pair is matched, and every landmark counts. The error is the Euclidean distance on the target
-between the matched and the true point, in units of sqrt(area), times 100. Beside it: rigid alignment and the nearest
-vertex. Animals are trained and measured on the same shapes: a registration of a collection.
+each. Then every ordered pair is matched (or some, evenly spread: ``--limit-pairs``), and every landmark counts. The
+error is the Euclidean distance on the target between the matched and the true point, in units of sqrt(area), times 100.
+Beside it: rigid alignment and the nearest vertex. Animals are trained and measured on the same shapes: a registration
+of a collection.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Mapping
@@ -21,16 +19,25 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from meshmatch.config import set_threads
-from meshmatch.errors import InputError, MeshmatchError
-from meshmatch.experiments.category import Pair, fit_all, load_category, map_all, nearest_all, trained
-from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.errors import InputError
+from meshmatch.experiments.category import (
+    Pair,
+    Training,
+    fit_all,
+    load_category,
+    map_all,
+    nearest_all,
+    options_of_training,
+    spread_pairs,
+    trained,
+    training_of,
+)
+from meshmatch.experiments.report import columns, publish, status_of
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig
 
 TRUTH = ".landmarks.npy"
 RIGHT = 0.15
@@ -78,114 +85,77 @@ def known_points(truth: Mapping[str, np.ndarray], shapes: Mapping[str, Shape], t
     return {name: ids[at] for name, ids in truth.items()}
 
 
-def run(
-    *,
-    data: Path,
-    template: str,
-    points: int,
-    minutes: float,
-    steps: int,
-    threads: int,
-    seed: int,
-    nodes: int,
-    radius: float,
-    work: Path,
-) -> dict[str, Any]:
+def run(training: Training, *, data: Path, template: str, points: int, limit: int | None) -> dict[str, Any]:
     """Train, match, measure, print a table and a JSON line; the line's record is returned too."""
-    set_threads(threads)
+    set_threads(training.threads)
     shapes, truth = load_category(data / "animal", TRUTH)
     if template not in shapes:
         raise InputError(f"there is no animal {template!r}", f"choose from {', '.join(shapes)}")
+    pairs = spread_pairs(shapes, limit)
     landmarks = None
     if points:
-        (work / "points").mkdir(parents=True, exist_ok=True)
+        place = training.work / "points"
+        place.mkdir(parents=True, exist_ok=True)
         for name, ids in known_points(truth, shapes, template, points).items():
-            np.save(work / "points" / f"{name}.npy", ids.astype(np.int64))
-        landmarks = str(work / "points")
+            np.save(place / f"{name}.npy", ids.astype(np.int64))
+        landmarks = str(place)
     results: dict[str, dict[str, Any]] = {}
     with Console(stderr=True).status("animals") as status:
-        nearest = {
-            pair: index for pair, (index, _) in nearest_all(shapes, "rigid", "area", status.update).items()
-        }
-        results["rigid alignment, nearest vertex"] = animal_errors(shapes, truth, nearest)
+        tell = status.update
+        nearest = nearest_all(shapes, "rigid", "area", tell, pairs)
+        found = {pair: index for pair, (index, _) in nearest.items()}
+        results["rigid alignment, nearest vertex"] = animal_errors(shapes, truth, found)
         model, how = trained(
             data / "animal",
-            work,
-            minutes=minutes,
-            steps=steps,
+            training,
             how="rigid",
             scale="area",
-            threads=threads,
-            seed=seed,
-            tell=status.update,
-            nodes=NodeConfig(strategy="geodesic", K=nodes, radius=radius, seed=seed),
+            tell=tell,
+            strategy="geodesic",
             landmarks=landmarks,
             template=template,
         )
-        for config, label in (
-            (FitConfig(seed=seed, refine="none", partial="no"), "network alone"),
-            (FitConfig(seed=seed, partial="no"), "nodes refined"),
+        for label, config in (
+            ("network alone", FitConfig(seed=training.seed, refine="none", partial="no")),
+            ("nodes refined", FitConfig(seed=training.seed, partial="no")),
         ):
             began = time.monotonic()
-            fits = fit_all(model, shapes, config, status.update)
-            found = map_all(model, shapes, fits, config, status.update)
-            results[label] = animal_errors(shapes, truth, {pair: each.index for pair, each in found.items()})
+            fits = fit_all(model, shapes, config, tell)
+            maps = map_all(model, shapes, fits, config, tell, pairs)
+            found = {pair: each.index for pair, each in maps.items()}
+            results[label] = animal_errors(shapes, truth, found)
             results[label]["seconds"] = round(time.monotonic() - began, 1)
             results[label]["verdicts"] = {name: fit.verdict for name, fit in fits.items()}
-    table = Table(title="Animals: Euclidean error x 100 / sqrt(area), all pairs", title_justify="left")
     kinds = list(results["nodes refined"]["kinds"])
-    for name in ("method", "mean", "median pair", "lost", *kinds):
-        table.add_column(name, justify="left" if name == "method" else "right")
-    for name, each in results.items():
+    title = "Animals: Euclidean error x 100 / sqrt(area)"
+    table = columns(title, ["method"], ["pairs", "mean", "median pair", "lost", *kinds])
+    for label, each in results.items():
         numbers = f"{each['mean_x100']:.1f}", f"{each['median_pair_x100']:.1f}", f"{100 * each['lost']:.0f} %"
-        table.add_row(name, *numbers, *(f"{each['kinds'][kind]:.1f}" for kind in kinds))
-    wide_console().print(table)
-    whole = {
-        "benchmark": "animals",
-        **circumstances(threads=threads, jobs=1),
-        "seed": seed,
-        "points": points,
-        "training": how,
-        "results": results,
-    }
-    print(json.dumps(whole), flush=True)
-    return whole
+        kinded = (f"{each['kinds'][kind]:.1f}" for kind in kinds)
+        table.add_row(label, str(each["pairs"]), *numbers, *kinded)
+    record = {"seed": training.seed, "points": points, "training": how, "results": results}
+    return publish("animals", table, record, threads=training.threads)
 
 
 def main(words: list[str] | None = None) -> int:
     """Run the benchmark; 0 when it ran, 1 when the data stopped it."""
-    parser = argparse.ArgumentParser("python -m meshmatch.experiments.animals", description=__doc__)
-    parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
+    parser = options_of_training("animals", __doc__, minutes=15, steps=2000, nodes=320, radius=0.13)
     parser.add_argument("--template", default="dog_alph", help="which animal; %(default)s")
     parser.add_argument("--points", type=int, default=0, help="known points on each animal; %(default)s")
-    parser.add_argument("--minutes", type=float, default=15.0, help="of training at most")
-    parser.add_argument("--steps", type=int, default=2000, help="of training")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--nodes", type=int, default=320, help="of the template")
-    parser.add_argument("--radius", type=float, default=0.13, help="of a node, units of sqrt(area)")
-    parser.add_argument("--work", type=Path, help="keep the prepared folder and the model here")
+    parser.add_argument("--limit-pairs", type=int, metavar="N", help="N of the pairs, evenly spread")
     options = parser.parse_args(words)
-    if options.steps < 1 or options.minutes <= 0 or options.threads < 1 or options.points < 0:
-        parser.error("steps and threads of 1 or more, minutes above 0 and points of 0 or more are needed")
-    try:
-        with tempfile.TemporaryDirectory() as temporary:
-            run(
+    if options.points < 0 or (options.limit_pairs or 1) < 1:
+        parser.error("points of 0 or more and a pair or more are needed")
+    with training_of(parser, options) as training:
+        return status_of(
+            lambda: run(
+                training,
                 data=options.data,
                 template=options.template,
                 points=options.points,
-                minutes=options.minutes,
-                steps=options.steps,
-                threads=options.threads,
-                seed=options.seed,
-                nodes=options.nodes,
-                radius=options.radius,
-                work=options.work or Path(temporary),
+                limit=options.limit_pairs,
             )
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+        )
 
 
 if __name__ == "__main__":

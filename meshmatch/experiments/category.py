@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -26,13 +29,68 @@ from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.gather import Scale, read_gathered, unit_frame
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.nodes import NodeConfig, Strategy
 from meshmatch.templates.prepare import prepare_folder
 from meshmatch.templates.template import load_template
+from meshmatch.training.few import few_recipe, frame_of_few
+from meshmatch.training.loop import Progress
+from meshmatch.training.run import folder_source, train_model
 from meshmatch.training.unsupervised import cloud_recipe, train_clouds
 
 Pair = tuple[str, str]
 Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Training:
+    """How a benchmark learns: minutes and steps at most, nodes of the template and their radius (units of sqrt(area)),
+    and the folder in which the prepared shapes and the model are kept."""
+
+    work: Path
+    minutes: float
+    steps: int
+    threads: int
+    seed: int
+    nodes: int
+    radius: float
+
+    def inside(self, name: str) -> Training:
+        """The same in a folder of this one's."""
+        return replace(self, work=self.work / name)
+
+
+def options_of_training(
+    program: str, words: str | None, *, minutes: float, steps: int, nodes: int, radius: float
+) -> argparse.ArgumentParser:
+    """The options that all of these benchmarks have, with their defaults."""
+    parser = argparse.ArgumentParser(
+        f"python -m meshmatch.experiments.{program}",
+        description=words,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
+    parser.add_argument("--minutes", type=float, default=minutes, help="of training at most: %(default)s")
+    parser.add_argument("--steps", type=int, default=steps, help="of training: %(default)s")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--nodes", type=int, default=nodes, help="of the template: %(default)s")
+    parser.add_argument(
+        "--radius", type=float, default=radius, help="of a node, units of sqrt(area): %(default)s"
+    )
+    parser.add_argument(
+        "--work", type=Path, help="keep what was prepared and trained here, and go on from it"
+    )
+    return parser
+
+
+@contextmanager
+def training_of(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Iterator[Training]:
+    """What was asked for; where no folder was, one that is there for the time."""
+    if options.steps < 1 or options.minutes <= 0 or options.threads < 1 or options.seed < 0:
+        parser.error("steps and threads of 1 or more, minutes above 0 and a seed of 0 or more are needed")
+    with tempfile.TemporaryDirectory() as temporary:
+        names = ("minutes", "steps", "threads", "seed", "nodes", "radius")
+        yield Training(options.work or Path(temporary), **{name: getattr(options, name) for name in names})
 
 
 def load_category(folder: Path, ending: str) -> tuple[dict[str, Shape], dict[str, np.ndarray]]:
@@ -55,41 +113,45 @@ def load_category(folder: Path, ending: str) -> tuple[dict[str, Shape], dict[str
 
 def trained(
     folder: Path,
-    work: Path,
+    training: Training,
     *,
-    minutes: float,
-    steps: int,
     how: Align,
     scale: Scale,
-    threads: int,
-    seed: int,
     tell: Tell,
-    nodes: NodeConfig | None = None,
+    strategy: Strategy = "uniform",
+    depth: float = 0.03,
     landmarks: str | None = None,
     template: str | None = None,
 ) -> tuple[Path, dict[str, Any]]:
-    """Prepare a folder and learn from it without correspondence; the model's folder, and how that went."""
+    """Prepare a folder and learn from it as `meshmatch train` does; the model's folder, and how that went."""
     began = time.monotonic()
     tell("preparing")
-    config = nodes or NodeConfig(strategy="geodesic", seed=seed)
+    work = training.work
+    config = NodeConfig(strategy, training.nodes, training.radius, depth, seed=training.seed)
     made = prepare_folder(
         folder, work / "prepared", config, template=template, align=how, scale=scale, landmarks=landmarks
     )
     prepared = time.monotonic() - began
-    plain = cloud_recipe()
-    recipe = replace(
-        plain, train=replace(plain.train, steps=steps, minutes=minutes, threads=threads, seed=seed)
-    )
+    few = frame_of_few(work / "prepared")
+    plain = cloud_recipe() if few is None else few_recipe()
+    asked = {name: getattr(training, name) for name in ("steps", "minutes", "threads", "seed")}
+    recipe = replace(plain, train=replace(plain.train, **asked))
     laid = load_template(work / "prepared" / "template.safetensors")
-    model = train_clouds(
-        laid,
-        read_gathered(work / "prepared", laid),
-        work / "model",
-        recipe=recipe,
-        name=folder.name,
-        category=folder.name,
-        progress=lambda now: tell(f"training: step {now.step} of {now.steps}"),
-    )
+    name = folder.name
+
+    def progress(now: Progress) -> None:
+        tell(f"training: step {now.step} of {now.steps}")
+
+    if few is None:
+        gathered = read_gathered(work / "prepared", laid)
+        model = train_clouds(
+            laid, gathered, work / "model", recipe=recipe, name=name, category=name, progress=progress
+        )
+    else:
+        source, _ = folder_source(work / "prepared", laid, warped=True)
+        model = train_model(
+            laid, source, work / "model", recipe=recipe, name=name, frame=few, progress=progress
+        )
     card = json.loads((model / "card.json").read_text(encoding="utf-8"))
     notes = (note.removeprefix("template: ") for note in made.notes if note.startswith("template: "))
     return model, {
@@ -111,16 +173,29 @@ def fit_all(model: Path, shapes: Mapping[str, Shape], config: FitConfig, tell: T
     return fits
 
 
+def spread_pairs(shapes: Mapping[str, Shape], limit: int | None = None) -> list[Pair]:
+    """All ordered pairs, or so many of them, evenly spread."""
+    every = list(permutations(shapes, 2))
+    if limit is None or limit >= len(every):
+        return every
+    return [every[k] for k in np.linspace(0, len(every) - 1, limit).astype(int)]
+
+
 def map_all(
-    model: Path, shapes: Mapping[str, Shape], fits: Mapping[str, Fit], config: FitConfig, tell: Tell
+    model: Path,
+    shapes: Mapping[str, Shape],
+    fits: Mapping[str, Fit],
+    config: FitConfig,
+    tell: Tell,
+    pairs: Sequence[Pair] | None = None,
 ) -> dict[Pair, VertexMap]:
-    """Maps of all ordered pairs, through fits that all agree on how the template stretches."""
+    """Maps of all ordered pairs, or of some, through fits that all agree on how the template stretches."""
     loaded = read_model(model)
     tell("agreeing")
     clean = [usable(shape).shape for shape in shapes.values()]
     agreed = dict(zip(shapes, agreed_fits(loaded, clean, list(fits.values()), config), strict=True))
     maps = {}
-    for source, target in permutations(shapes, 2):
+    for source, target in pairs or spread_pairs(shapes):
         tell(f"mapping {source} to {target}")
         maps[source, target] = build_map(
             usable(shapes[source]), agreed[source], usable(shapes[target]), agreed[target]
@@ -129,9 +204,10 @@ def map_all(
 
 
 def nearest_all(
-    shapes: Mapping[str, Shape], how: Align, scale: Scale, tell: Tell
+    shapes: Mapping[str, Shape], how: Align, scale: Scale, tell: Tell, pairs: Sequence[Pair] | None = None
 ) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
-    """For all ordered pairs rigid alignment and the nearest vertex: index (V_src,) and a confidence from the distance.
+    """For all ordered pairs, or for some, rigid alignment and the nearest vertex: index (V_src,) and a confidence from
+    the distance.
 
     The source is scaled and centred like the target, and turned to it as ``how`` says.
     """
@@ -143,7 +219,7 @@ def nearest_all(
         places[name] = frames[name].apply(shape.verts)
     trees = {name: cKDTree(points) for name, points in places.items()}
     found = {}
-    for source, target in permutations(shapes, 2):
+    for source, target in pairs or spread_pairs(shapes):
         tell(f"aligning {source} to {target}")
         best = align(seen[source], seen[target], how)[0]
         moved = (places[source] - best.centre) @ best.rotation

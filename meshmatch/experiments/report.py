@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import datetime
+import json
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,36 @@ def print_table(sets: Sequence[SetScores], worst: int = 5, console: Console | No
 def wide_console() -> Console:
     """Stdout for a table: a pipe has no width of its own, and rich would fold the table to 80 columns."""
     return Console(width=None if os.isatty(1) else 120, highlight=False)
+
+
+def columns(title: str, left: Sequence[str], right: Sequence[str]) -> Table:
+    """An empty table: columns of words, then of numbers."""
+    table = Table(title=title, title_justify="left")
+    for name in left:
+        table.add_column(name)
+    for name in right:
+        table.add_column(name, justify="right")
+    return table
+
+
+def publish(
+    benchmark: str, table: Table, record: Mapping[str, Any], *, threads: int, jobs: int = 1
+) -> dict[str, Any]:
+    """Print a benchmark's table and, last, its JSON line; the line's record, circumstances in it, is returned."""
+    wide_console().print(table)
+    whole = {"benchmark": benchmark, **circumstances(threads, jobs), **record}
+    print(json.dumps(whole), flush=True)
+    return whole
+
+
+def status_of(work: Callable[[], object]) -> int:
+    """0 when a benchmark ran; 1, with words on stderr, when the data or a choice stopped it."""
+    try:
+        work()
+    except MeshmatchError as error:
+        explain(error)
+        return 1
+    return 0
 
 
 def explain(error: MeshmatchError) -> None:

@@ -13,43 +13,52 @@ of a cube that suits its keypoints best, so upright and facing the same way, as 
 orientation, are matched by rigid alignment and the nearest vertex. Trained and measured on the same ten. The keypoints
 of tables run round the legs one way on some and the other way on others: their truth holds up to a reflection only.
 Parts are drawn from keypoints: a vertex belongs to the nearest one. Labels of the target, fetched along the map, are
-compared with the source's own: intersection over union (IoU), by area, the mean over parts and pairs.
+compared with the source's own: intersection over union (IoU), by area, the mean over parts and pairs. Of tables the
+legs are counted (three, four or eight): a leg can have no counterpart where the other table has another number of
+them, and the confidence of legs is compared between such pairs and the others.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
-from scipy.spatial import cKDTree
+from rich.status import Status
 from scipy.spatial.transform import Rotation
 
 from meshmatch.config import set_threads
-from meshmatch.errors import MeshmatchError, OptionError
+from meshmatch.errors import OptionError
 from meshmatch.experiments.category import (
     Pair,
+    Training,
     area_under_curve,
     fit_all,
     load_category,
     map_all,
     nearest_all,
+    options_of_training,
     trained,
+    training_of,
 )
-from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.experiments.keypoint_parts import (
+    carried_picture,
+    keypoint_parts,
+    leg_confidence,
+    mean_overlap,
+    rounded,
+    table_legs,
+)
+from meshmatch.experiments.report import columns, publish, status_of
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.latent import LatentRefineConfig
+from meshmatch.render.picture import Look
 from meshmatch.shapes.align import Align
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig
 
 CLASSES = ("table", "plane", "chair")
 KEYPOINTS = ".keypoints.npy"
@@ -57,6 +66,12 @@ RIGHT = 0.1
 """Share of the target's diagonal within which a keypoint has arrived."""
 
 Turns = Literal["given", "searched"]
+
+_LOOKS = {
+    "table": Look(up="-z", front="-y", turn=25, tilt=-20),
+    "plane": Look(up="z", front="-x", turn=-40, tilt=40),
+    "chair": Look(up="y", front="-x", turn=35, tilt=15),
+}
 
 
 def stood_alike(shapes: Mapping[str, Shape], keypoints: Mapping[str, np.ndarray]) -> dict[str, Shape]:
@@ -103,45 +118,16 @@ def keypoint_errors(
         "arrived": round(float(right.mean()), 4),
         "iou": round(float(np.mean(overlaps)), 4),
         "worst_pair": [*worst, round(means[worst], 4)],
-        "confidence_auc": _rounded(area_under_curve(confidence, right)),
-        "confidence_right": _rounded(float(confidence[right].mean()) if right.any() else np.nan),
-        "confidence_wrong": _rounded(float(confidence[~right].mean()) if (~right).any() else np.nan),
+        "confidence_auc": rounded(area_under_curve(confidence, right)),
+        "confidence_right": rounded(float(confidence[right].mean()) if right.any() else np.nan),
+        "confidence_wrong": rounded(float(confidence[~right].mean()) if (~right).any() else np.nan),
     }
 
 
-def keypoint_parts(shape: Shape, keypoints: np.ndarray) -> np.ndarray:
-    """(V,) the part of every vertex: the number of its nearest keypoint."""
-    return np.asarray(cKDTree(shape.verts[keypoints]).query(shape.verts)[1])
-
-
-def mean_overlap(found: np.ndarray, truth: np.ndarray, area: np.ndarray) -> float:
-    """Intersection over union of labels (V,) with true ones, by the area (V,) of vertices; the mean over true parts."""
-    shares = []
-    for part in np.unique(truth):
-        ours, theirs = found == part, truth == part
-        shares.append(area[ours & theirs].sum() / area[ours | theirs].sum())
-    return float(np.mean(shares))
-
-
-def _rounded(value: float) -> float | None:
-    return round(value, 4) if np.isfinite(value) else None
-
-
 def measure(
-    name: str,
-    data: Path,
-    work: Path,
-    *,
-    turns: Turns,
-    minutes: float,
-    steps: int,
-    threads: int,
-    seed: int,
-    nodes: int,
-    radius: float,
-    status: Any,
+    name: str, data: Path, training: Training, turns: Turns, pictures: Path | None, status: Status
 ) -> dict[str, Any]:
-    """Train on one class, match all its pairs, and the same by rigid alignment."""
+    """Train on one class, match all its pairs, and the same by rigid alignment; draw labels as they are carried."""
 
     def tell(what: str) -> None:
         status.update(f"{name}: {what}")
@@ -150,92 +136,57 @@ def measure(
     how: Align = "rigid"
     if turns == "given":
         shapes, how = stood_alike(shapes, keypoints), "none"
-    folder = work / name
-    (folder / "shapes").mkdir(parents=True, exist_ok=True)
+    folder = training.work / "shapes"
+    folder.mkdir(parents=True, exist_ok=True)
     for key, shape in shapes.items():
-        save_shape(folder / "shapes" / f"{key}.ply", shape)
-    results: dict[str, Any] = {
-        "rigid alignment, nearest vertex": keypoint_errors(
-            shapes, keypoints, nearest_all(shapes, how, "sphere", tell)
-        )
-    }
-    model, went = trained(
-        folder / "shapes",
-        folder,
-        minutes=minutes,
-        steps=steps,
-        how=how,
-        scale="sphere",
-        threads=threads,
-        seed=seed,
-        tell=tell,
-        nodes=NodeConfig(strategy="uniform", K=nodes, radius=radius, seed=seed),
-    )
+        save_shape(folder / f"{key}.ply", shape)
+    legs = {}
+    if name == "table":
+        legs = {key: table_legs(shape, keypoints[key]) for key, shape in shapes.items()}
+    answers = nearest_all(shapes, how, "sphere", tell)
+    results: dict[str, Any] = {"rigid alignment, nearest vertex": keypoint_errors(shapes, keypoints, answers)}
+    model, went = trained(folder, training, how=how, scale="sphere", tell=tell)
     for label, config in (
-        ("network alone", FitConfig(seed=seed, refine="none", partial="no")),
+        ("network alone", FitConfig(seed=training.seed, refine="none", partial="no")),
         (
             "200 steps on the code",
-            FitConfig(seed=seed, refine="latent", latent=LatentRefineConfig(steps=200)),
+            FitConfig(seed=training.seed, refine="latent", latent=LatentRefineConfig(steps=200)),
         ),
-        ("nodes refined", FitConfig(seed=seed, partial="no")),
+        ("nodes refined", FitConfig(seed=training.seed, partial="no")),
     ):
         fits = fit_all(model, shapes, config, tell)
         maps = map_all(model, shapes, fits, config, tell)
         answers = {pair: (found.index, found.confidence) for pair, found in maps.items()}
         results[label] = keypoint_errors(shapes, keypoints, answers)
         results[label]["verdicts"] = sorted(fit.verdict for fit in fits.values())
+        if legs:
+            results[label] |= leg_confidence(legs, answers)
+    if pictures is not None:
+        first = Path(went["template"]).stem
+        parts = keypoint_parts(shapes[first], keypoints[first])
+        carried_picture(shapes, parts, answers, first, pictures / f"segments-{name}.png", _LOOKS[name])
     return {"training": went, "results": results}
 
 
 def run(
-    classes: Sequence[str],
-    *,
-    data: Path,
-    turns: Turns,
-    minutes: float,
-    steps: int,
-    threads: int,
-    seed: int,
-    nodes: int,
-    radius: float,
-    work: Path,
+    classes: Sequence[str], training: Training, *, data: Path, turns: Turns, pictures: Path | None
 ) -> dict[str, Any]:
     """Measure the classes, print a table and a JSON line; the line's record is returned too."""
     if strangers := [name for name in classes if name not in CLASSES]:
         raise OptionError(f"there is no class '{strangers[0]}'", f"choose from {', '.join(CLASSES)}")
-    set_threads(threads)
-    console = Console(stderr=True)
-    table = Table(title=f"Keypoints, orientation {turns}: error / diagonal, all pairs", title_justify="left")
-    for name in (
-        "class",
-        "method",
-        "mean",
-        "median",
-        f"within {RIGHT:g}",
-        "IoU",
-        "AUC",
-        "sure if right",
-        "if wrong",
-    ):
-        table.add_column(name, justify="left" if name in ("class", "method") else "right")
+    set_threads(training.threads)
+    numbers = ["mean", "median", f"within {RIGHT:g}", "IoU", "AUC", "sure if right", "if wrong"]
+    told = [*numbers, "AUC of legs", "sure if as many", "if not"]
+    title = f"Keypoints, orientation {turns}: error / diagonal, all pairs"
+    table = columns(title, ["class", "method"], told if "table" in classes else numbers)
     records = {}
     for name in classes:
-        with console.status(name) as status:
-            records[name] = measure(
-                name,
-                data,
-                work,
-                turns=turns,
-                minutes=minutes,
-                steps=steps,
-                threads=threads,
-                seed=seed,
-                nodes=nodes,
-                radius=radius,
-                status=status,
-            )
+        with Console(stderr=True).status(name) as status:
+            records[name] = measure(name, data, training.inside(name), turns, pictures, status)
         for number, (label, each) in enumerate(records[name]["results"].items()):
-            told = (each["confidence_auc"], each["confidence_right"], each["confidence_wrong"])
+            sure = [each[f"confidence_{key}"] for key in ("auc", "right", "wrong")]
+            if "table" in classes:
+                sure += [each.get(f"legs_{key}") for key in ("auc", "alike", "unlike")]
             table.add_row(
                 name if number == 0 else "",
                 label,
@@ -243,54 +194,29 @@ def run(
                 f"{each['median']:.3f}",
                 f"{100 * each['arrived']:.1f} %",
                 f"{each['iou']:.2f}",
-                *("-" if value is None else f"{value:.2f}" for value in told),
+                *("-" if value is None else f"{value:.2f}" for value in sure),
             )
-    wide_console().print(table)
-    whole = {
-        "benchmark": "segments",
-        **circumstances(threads=threads, jobs=1),
-        "seed": seed,
-        "turns": turns,
-        "classes": records,
-    }
-    print(json.dumps(whole), flush=True)
-    return whole
+    record = {"seed": training.seed, "turns": turns, "classes": records}
+    return publish("segments", table, record, threads=training.threads)
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run the benchmark; 0 when it ran, 1 when the data or the choice stopped it."""
-    parser = argparse.ArgumentParser("python -m meshmatch.experiments.segments", description=__doc__)
+    parser = options_of_training("segments", __doc__, minutes=10, steps=2000, nodes=320, radius=0.2)
     parser.add_argument("--classes", default=",".join(CLASSES), help="%(default)s")
     parser.add_argument("--turns", choices=("given", "searched"), default="given")
-    parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
-    parser.add_argument("--minutes", type=float, default=10.0, help="of training at most, for each class")
-    parser.add_argument("--steps", type=int, default=2000, help="of training")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--nodes", type=int, default=320, help="of the template")
-    parser.add_argument("--radius", type=float, default=0.2, help="of a node, units of sqrt(area)")
-    parser.add_argument("--work", type=Path, help="keep the prepared folders and the models here")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw labels as they are carried")
     options = parser.parse_args(words)
-    if options.steps < 1 or options.minutes <= 0 or options.threads < 1 or options.seed < 0:
-        parser.error("steps and threads of 1 or more, minutes above 0 and a seed of 0 or more are needed")
-    try:
-        with tempfile.TemporaryDirectory() as temporary:
-            run(
+    with training_of(parser, options) as training:
+        return status_of(
+            lambda: run(
                 options.classes.split(","),
+                training,
                 data=options.data,
                 turns=options.turns,
-                minutes=options.minutes,
-                steps=options.steps,
-                threads=options.threads,
-                seed=options.seed,
-                nodes=options.nodes,
-                radius=options.radius,
-                work=options.work or Path(temporary),
+                pictures=options.pictures,
             )
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+        )
 
 
 if __name__ == "__main__":

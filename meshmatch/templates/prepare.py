@@ -13,7 +13,7 @@ from safetensors.numpy import load_file, save_file
 
 from meshmatch.errors import InputError, MeshmatchError, OutputError
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.align import Align
+from meshmatch.shapes.align import Align, rigid_motion
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -35,6 +35,10 @@ from meshmatch.templates.template import Template, save_template
 
 MINIMUM_FACES = 50
 MINIMUM_POINTS = 100
+FEW = 100
+"""Fewer registered shapes than this are learned by a network that finds no orientation: the card says it."""
+
+_ALIKE = 30.0  # degrees: registered shapes that are turned less stand alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +82,8 @@ def prepare_folder(
         A shape of the folder, by its name, or any file. By default the first mesh where all are registered, else the
         shape that lies nearest to all others.
     align : {"none", "near", "rigid"}, optional
-        How shapes are turned to the template; by default "none" where they are registered, else "rigid".
+        How shapes are turned to the template; by default "rigid". Of registered ones correspondence says whether
+        they stand alike, which is "near"; of `FEW` or more it is not asked, which is "none".
     scale : {"area", "sphere"}
         Which size of every shape is made that of the template.
     landmarks : folder or suffix, optional
@@ -125,7 +130,9 @@ def prepare_folder(
     low = _low(first, faces)
     stack = _registered(first, found, first.kept_vertex[low[0]], notes)
     registered = len(stack) > 0
-    how: Align = align or ("none" if registered else "rigid")
+    how: Align = align or (
+        _turned(stack, first.original.verts[first.kept_vertex[low[0]]]) if registered else "rigid"
+    )
     name = folder.resolve().name
     made = make_template(first.shape, name, config, source=f"{first.original.name} of {folder.name}", low=low)
     gathered, frames, far = gather(
@@ -269,6 +276,14 @@ def _registered(first: Repaired, found: list[Repaired], vertices: np.ndarray, no
     chosen = np.stack(whole)
     # Centred before the numbers become short: a scan in a surveyor's coordinates would lose its digits.
     return (chosen - chosen.mean(1, keepdims=True)).astype(np.float32)
+
+
+def _turned(stack: np.ndarray, like: np.ndarray) -> Align:
+    """How few registered shapes (N, V, 3) are turned to the template's vertices (V, 3)."""
+    if len(stack) >= FEW:
+        return "none"
+    cosines = [(np.trace(rigid_motion(like, verts.astype(np.float64))[0]) - 1) / 2 for verts in stack]
+    return "near" if min(cosines) > np.cos(np.radians(_ALIKE)) else "rigid"
 
 
 def read_registered(folder: str | Path, template: Template) -> np.ndarray:

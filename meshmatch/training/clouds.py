@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from meshmatch.fields.field import Field
 from meshmatch.fields.mls import build_field
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.templates.gather import Gathered
+from meshmatch.training.datasets import Source, registered_source
 from meshmatch.training.scans import ScanConfig, small_rotations
 
 _SIDE = 4  # nodes of the lattice along each axis
@@ -67,18 +69,46 @@ def build_warp(gathered: Gathered) -> Warp | None:
         return None
     known = np.nan_to_num(gathered.landmarks)
     everything = np.concatenate([gathered.points.reshape(-1, 3), known.reshape(-1, 3)]).astype(np.float64)
-    low, high = everything.min(0), everything.max(0)
-    middle, half = 0.5 * (low + high), 0.55 * float((high - low).max())
-    ticks = np.linspace(-half, half, _SIDE)
-    lattice = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3) + middle
-    field = build_field(everything, lattice, _REACH * float(ticks[1] - ticks[0]), "smooth")
+    field = _lattice_field(everything)
     phi = field.phi.to_dense()
     gradient = field.gradient.to_dense()[: 3 * N * P].reshape(N, P, 3, -1)
     return Warp(
         phi[: N * P].reshape(N, P, -1),
         gradient,
-        phi[N * P :].reshape(N, gathered.landmarks.shape[1], len(lattice)),
+        phi[N * P :].reshape(N, gathered.landmarks.shape[1], field.K),
     )
+
+
+def _lattice_field(points: np.ndarray) -> Field:
+    """The field of a coarse lattice around all points (N, 3), at them."""
+    low, high = points.min(0), points.max(0)
+    middle, half = 0.5 * (low + high), 0.55 * float((high - low).max())
+    ticks = np.linspace(-half, half, _SIDE)
+    lattice = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3) + middle
+    return build_field(points, lattice, _REACH * float(ticks[1] - ticks[0]), "smooth")
+
+
+def warped_source(shapes: torch.Tensor, change: CloudConfig | None = None) -> Source:
+    """Registered shapes (N, V, 3), drawn with replacement and smoothly deformed; all stand alike, in any unit.
+
+    So many that no change is needed (see `build_warp`) are drawn as they are.
+    """
+    change = change or CloudConfig()
+    N, V, _ = shapes.shape
+    if N * V > _LARGEST or change.warp <= 0:
+        return registered_source(shapes)
+    shapes = shapes - shapes.mean(1, keepdim=True)
+    shapes = 0.3 * shapes / shapes.flatten(1).std(1)[:, None, None]  # about area 1
+    phi = _lattice_field(shapes.reshape(-1, 3).double().numpy()).phi.to_dense().reshape(N, V, -1)
+
+    def draw(count: int, generator: torch.Generator) -> torch.Tensor:
+        which = torch.randint(N, (count,), generator=generator)
+        size = change.warp * torch.rand(count, 1, 1, generator=generator)
+        size = size * (torch.rand(count, 1, 1, generator=generator) >= change.plain)
+        vectors = size * torch.randn(count, phi.shape[2], 3, generator=generator)
+        return shapes[which] + phi[which] @ vectors
+
+    return draw
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig
 from meshmatch.models.trained import TrainedModel
 from meshmatch.templates.prepare import read_registered
 from meshmatch.templates.template import Template, load_template
+from meshmatch.training.clouds import warped_source
 from meshmatch.training.datasets import Source, body_source, registered_source
 from meshmatch.training.human_template import restrict
 from meshmatch.training.loop import Progress, TrainConfig, Trainer
@@ -122,10 +123,10 @@ def cached_rig(identities: int, seed: int, progress: Callable[[int, int], None] 
     return rig
 
 
-def folder_source(folder: str | Path, template: Template) -> tuple[Source, int]:
-    """Registered shapes of a prepared folder, and how many there are."""
+def folder_source(folder: str | Path, template: Template, warped: bool = False) -> tuple[Source, int]:
+    """Registered shapes of a prepared folder, and how many there are; ``warped``: smoothly deformed when drawn."""
     shapes = torch.from_numpy(read_registered(folder, template))
-    return registered_source(shapes), len(shapes)
+    return (warped_source if warped else registered_source)(shapes), len(shapes)
 
 
 def train_model(
@@ -140,10 +141,12 @@ def train_model(
     licence: str = "",
     start: TrainedModel | None = None,
     resume: bool = True,
+    frame: dict[str, str] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Path:
     """Train, or go on training, and write a model folder.
 
+    ``frame`` is the card's, by default that of a network that finds the orientation.
     ``output`` receives ``checkpoint/last.safetensors`` on the way and, at every stop, ``template.safetensors``,
     ``weights.safetensors`` and last ``card.json``. ``start`` gives the first weights; it must have the same
     template and network.
@@ -181,7 +184,9 @@ def train_model(
     trainer.close()
     if trainer.rank == 0:
         score = validation_error(_averaged(trainer), held_out, points)
-        export(trainer, template, output, recipe, name, category, data, licence, score, start=start)
+        export(
+            trainer, template, output, recipe, name, category, data, licence, score, start=start, frame=frame
+        )
     return output
 
 

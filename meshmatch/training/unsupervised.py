@@ -9,12 +9,13 @@ from pathlib import Path
 import torch
 
 from meshmatch.errors import InputError, OutputError
-from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig
+from meshmatch.models.deformer import PAPER, Deformer
 from meshmatch.models.trained import TrainedModel
 from meshmatch.templates.gather import Gathered
 from meshmatch.templates.template import Template
 from meshmatch.training.chamfer import SurfacePoints, build_surface_points, chamfer_losses
 from meshmatch.training.clouds import CloudBatch, CloudConfig, CloudDataset, build_warp
+from meshmatch.training.few import few_recipe
 from meshmatch.training.loop import Progress, TrainConfig, Trainer
 from meshmatch.training.losses import LossConfig
 from meshmatch.training.run import CHECKPOINT, Preset, Recipe, export, take_weights
@@ -35,14 +36,9 @@ def cloud_recipe(preset: Preset = "default") -> Recipe:
             steps=4000, shapes=8, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=loss, workers=0
         )
         return Recipe(PAPER, train, ScanConfig(points=1024, noise=0.0, scale=0.0), "cubic")
-    network = NetworkConfig(
-        code=128, width=256, depth=1, basis=384, align_basis=0, corrections=2, correct_width=256
-    )
+    few = few_recipe()
     loss = LossConfig(volume=1e-4, arap=1e-3, blend=1e-4)
-    train = TrainConfig(
-        steps=3000, shapes=8, scans_per_shape=1, decay=0.5, warm_up=100, average=0.99, loss=loss, workers=0
-    )
-    return Recipe(network, train, ScanConfig(points=1024), "smooth")
+    return replace(few, train=replace(few.train, loss=loss))
 
 
 def build_cloud_dataset(

@@ -75,6 +75,35 @@ def test_from_a_folder_to_a_map(run: Run, eggs: Path, tmp_path: Path) -> None:
     assert np.load(tmp_path / "map.npy").shape == (162,)
 
 
+def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path) -> None:
+    """A small network that finds no orientation: the card says how shapes are turned."""
+    folder = tmp_path / "eggs"
+    folder.mkdir()
+    ball = icosphere(2)
+    for n in range(3):
+        save_shape(folder / f"egg{n}.ply", Shape(ball.verts * [0.8, 1.4 + 0.1 * n, 1.0], ball.faces))
+    answer = run("prepare", folder, "-o", tmp_path / "out", *FEW[:-1], "--json")
+    assert json.loads(answer.out)["align"] == "near"
+    words = ("--steps", "3", "--seed", "2")
+    assert run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", *words).status == 0
+    card = read_card(tmp_path / "mine" / "card.json")
+    assert card.frame == {"orientation": "near", "scale": "area"}
+    assert (card.data, card.network["align_basis"], card.recipe["train"]["seed"]) == (
+        "3 registered shapes of out",
+        0,
+        2,
+    )
+    answer = run(
+        *("match", folder / "egg0.ply", folder / "egg1.ply", "-o", tmp_path / "map.npy"),
+        *("--model", tmp_path / "mine", "-q"),
+    )
+    assert answer.status == 0, answer.err
+    assert np.load(tmp_path / "map.npy").shape == (162,)
+    words = ("--steps", "1", "--preset", "paper", "-q")
+    assert run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "papers", *words).status == 0
+    assert read_card(tmp_path / "papers" / "card.json").frame["orientation"] == "searched"
+
+
 @pytest.mark.parametrize(("registered", "words"), [(True, ["--unsupervised"]), (False, [])])
 def test_known_points_and_preset_reach_the_training(
     run: Run, eggs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, registered: bool, words: list[str]

@@ -8,10 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import InputError
-from meshmatch.experiments import animals, hearts, segments
-from meshmatch.experiments.category import area_under_curve, load_category, nearest_all
+from meshmatch.experiments import animals, heart_truth, hearts, keypoint_parts, segments
+from meshmatch.experiments.category import area_under_curve, load_category, nearest_all, spread_pairs
 from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import make_template
+from meshmatch.templates.nodes import NodeConfig
 from tests.conftest import icosphere
 
 
@@ -36,12 +39,15 @@ def test_errors_of_hearts_by_hand(cube: Shape) -> None:
     truth["b"][0, 0] = 99  # vertex 7 of a has no partner
     shapes = {"a": cube, "b": other}
     right = np.arange(8)[::-1]
-    found = hearts.heart_errors(shapes, truth, {("a", "b"): right})
-    assert (found["mean_x100"], found["right_chamber"]) == (0.0, 1.0)
+    found = heart_truth.heart_errors(shapes, truth, {("a", "b"): right})
+    assert (found["mean_x100"], found["right_chamber"], found["unseen_x100"]) == (0.0, 1.0, None)
     wrong = right.copy()
     wrong[0] = right[4]  # from x = 0 to x = 1: one edge, and the other chamber
     wrong[7] = 0  # does not count
-    found = hearts.heart_errors(shapes, truth, {("a", "b"): wrong})
+    found = heart_truth.heart_errors(shapes, truth, {("a", "b"): wrong, ("b", "a"): right}, ["a"])
+    assert found["unseen_pairs"] == 0  # of two shapes that are both unseen
+    found = heart_truth.heart_errors(shapes, truth, {("a", "b"): wrong}, ["b", "a"])
+    assert found["unseen_x100"] == found["mean_x100"]
     assert found["mean_x100"] == pytest.approx(100 / 7 / np.sqrt(6), abs=1e-3)
     assert found["right_chamber"] == pytest.approx(6 / 7, abs=1e-3)
     assert found["worst_pair"] == ["a", "b"]
@@ -49,8 +55,33 @@ def test_errors_of_hearts_by_hand(cube: Shape) -> None:
 
 def test_maps_through_registered_vertices(cube: Shape) -> None:
     other = Shape(cube.verts[::-1] + 5, 7 - cube.faces)
-    maps = hearts.through({"a": cube.verts, "b": cube.verts + 5}, {"a": cube, "b": other})
+    maps = heart_truth.through({"a": cube.verts, "b": cube.verts + 5}, {"a": cube, "b": other})
     assert np.array_equal(maps["a", "b"], np.arange(8)[::-1])
+
+
+def test_hearts_are_registered_by_what_both_kept() -> None:
+    """A ball, and the same stretched, moved and of other triangles: every second vertex is known of both."""
+    ball, other = icosphere(2), icosphere(3)
+
+    def bent(verts: np.ndarray) -> np.ndarray:
+        return 50 * (verts * [1, 1.3, 0.8] + 0.2 * verts[:, [1, 2, 0]] ** 2) + 7
+
+    ids = np.arange(ball.V)
+    theirs = 1000 + np.arange(other.V)
+    theirs[: ball.V : 2] = ids[::2]  # subdivision keeps the vertices and adds others behind them
+    assert np.allclose(other.verts[: ball.V], ball.verts)
+    found = heart_truth.registered(ball, ids, Shape(bent(other.verts), other.faces), theirs)
+    apart = np.linalg.norm(found - bent(ball.verts), axis=1)
+    assert apart[::2].max() < 1e-6
+    assert apart.max() < 1.0  # of a ball of diameter 100
+
+
+def test_pairs_are_spread_evenly(cube: Shape) -> None:
+    shapes = dict.fromkeys("abcd", cube)
+    assert len(spread_pairs(shapes)) == len(spread_pairs(shapes, 99)) == 12
+    some = spread_pairs(shapes, 4)
+    assert [pair[0] for pair in some] == list("abcd")
+    assert all(a != b for a, b in some)
 
 
 def test_errors_of_keypoints_by_hand(cube: Shape) -> None:
@@ -69,12 +100,45 @@ def test_errors_of_keypoints_by_hand(cube: Shape) -> None:
 def test_overlap_of_parts_by_hand() -> None:
     truth, found = np.array([0, 0, 1, 1]), np.array([0, 1, 1, 1])
     area = np.array([1.0, 1.0, 2.0, 0.0])
-    assert segments.mean_overlap(found, truth, area) == pytest.approx((1 / 2 + 2 / 3) / 2)
+    assert keypoint_parts.mean_overlap(found, truth, area) == pytest.approx((1 / 2 + 2 / 3) / 2)
     ball = icosphere(1)
     at = np.array([ball.verts[:, 2].argmin(), ball.verts[:, 2].argmax()])
-    parts = segments.keypoint_parts(ball, at)
+    parts = keypoint_parts.keypoint_parts(ball, at)
     assert parts[at[0]] == 0 and parts[at[1]] == 1
     assert (parts[ball.verts[:, 2] > 0.01] == 1).all()
+
+
+def legged(count: int) -> tuple[Shape, np.ndarray]:
+    """A plate of vertices at height 0 with strips of 22 vertices down to -1; its keypoints as a table's."""
+    parts = [np.array([[x, y, 0.0] for x in range(4) for y in range(4)])]
+    faces = [np.array([[0, 1, 4]])]
+    for leg in range(count):
+        heights = np.linspace(-0.05, -1, 11)
+        strip = np.array([[leg + 0.1 * side, 0, z] for z in heights for side in (0, 1)])
+        first = 16 + 22 * leg
+        steps = [[first + k, first + k + 1, first + k + 2] for k in range(20)]
+        parts.append(strip)
+        faces.append(np.array(steps))
+    shape = Shape(np.concatenate(parts), np.concatenate(faces))
+    keys = np.zeros(18, int)
+    for n, (top, foot) in enumerate(((4, 5), (6, 7), (8, 9), (10, 11))):
+        keys[top], keys[foot] = 16 + 22 * (n % count), 16 + 22 * (n % count) + 21
+    return shape, keys
+
+
+def test_legs_are_counted_and_their_confidence_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keypoint_parts, "_SMALLEST", 9)
+    legs = {name: keypoint_parts.table_legs(*legged(count)) for name, count in (("a", 3), ("b", 3), ("c", 5))}
+    assert [legs[name].max() + 1 for name in "abc"] == [3, 3, 5]
+    assert (legs["a"][:16] == -1).all() and legs["a"][-1] == 2
+    maps = {}
+    for source, target in (("a", "b"), ("b", "a"), ("a", "c")):
+        sure = np.full(len(legs[source]), 0.9 if target != "c" else 0.2)
+        maps[source, target] = (np.zeros(len(sure), int), sure)
+    found = keypoint_parts.leg_confidence(legs, maps)
+    assert found == {"legs_auc": 1.0, "legs_alike": 0.9, "legs_unlike": 0.2}
+    alone = keypoint_parts.leg_confidence(legs, {("a", "b"): maps["a", "b"]})
+    assert alone["legs_auc"] is None and alone["legs_unlike"] is None
 
 
 def test_shapes_are_stood_alike() -> None:
@@ -120,11 +184,11 @@ def test_what_cannot_be_is_told(main, words: list[str], capsys: pytest.CaptureFi
     assert "error:" in capsys.readouterr().err
 
 
-def balls(folder: Path, ending: str) -> None:
-    """Two stretched balls with the same vertices, and what is true of them."""
+def balls(folder: Path, ending: str, count: int = 2) -> None:
+    """A few stretched balls with the same vertices, and what is true of them."""
     ball = icosphere(2)
-    folder.mkdir(parents=True)
-    for n in range(2):
+    folder.mkdir(parents=True, exist_ok=True)
+    for n in range(count):
         save_shape(folder / f"{n}.ply", Shape(ball.verts * [1, 1.2 + 0.1 * n, 1.5], ball.faces))
         truth = (
             np.arange(0, 160, 20) if "key" in ending else np.stack([np.arange(162), np.arange(162) % 2], 1)
@@ -132,28 +196,69 @@ def balls(folder: Path, ending: str) -> None:
         np.save(folder / f"{n}{ending}", truth)
 
 
-def test_hearts_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    balls(tmp_path / "heart", ".truth.npy")
+def test_hearts_from_end_to_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    balls(tmp_path / "heart", ".truth.npy", 3)
+    monkeypatch.setattr(hearts, "find_spec", lambda name: None)
+    drawn = []
+    monkeypatch.setattr(heart_truth, "render_shapes", lambda panels, path, look: drawn.append(len(panels)))
     words = ["--data", tmp_path, "--steps", "2", "--threads", "1", "--work", tmp_path / "work"]
-    words += ["--nodes", "60", "--radius", "0.35", "--minutes", "1", "--seed", "0"]
-    assert hearts.main([str(word) for word in words]) == 0
+    words += ["--nodes", "60", "--radius", "0.35", "--minutes", "1", "--seed", "0", "--unseen", "1"]
+    assert hearts.main([*map(str, words), "--picture", str(tmp_path / "hearts.png")]) == 0
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert record["training"]["steps"] == 2
+    assert record["training"]["registered"]["steps"] == record["training"]["unregistered"]["steps"] == 2
     assert record["results"]["rigid alignment, nearest vertex"]["mean_x100"] < 10
-    assert record["results"]["network, nodes refined"]["pairs"] == 2
+    assert record["results"]["unregistered, nodes refined"]["pairs"] == 6
+    assert record["results"]["registered, nodes refined"]["unseen_x100"] is None
+    assert "meshmonk" not in record["results"]
+    assert len(record["unseen"]) == 1 and record["template"] not in record["unseen"]
+    learned = json.loads((tmp_path / "work" / "registered" / "prepared" / "prepared.json").read_text())
+    assert learned["registered"] and len(learned["names"]) == 2
+    assert drawn == [3]
     assert {"date", "commit", "machine"} <= record.keys()
+    assert hearts.main(["--data", str(tmp_path), "--ways", "guessed"]) == 1
+    assert "no way 'guessed'" in capsys.readouterr().err
 
 
-def test_segments_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_registrations_of_a_rival_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    balls(tmp_path, ".truth.npy")
+    shapes, _ = load_category(tmp_path, ".truth.npy")
+    template = make_template(shapes["0"], "ball", NodeConfig("uniform", 60, 0.35))
+    frames = {name: sqrt_area_frame(shape) for name, shape in shapes.items()}
+    asked = []
+
+    def register(floating, target):
+        asked.append(len(target[0]))
+        return floating[0]
+
+    monkeypatch.setattr(hearts, "find_spec", lambda name: "there")
+    monkeypatch.setattr(hearts, "viscoelastic", register)
+    for _ in range(2):
+        maps = hearts.meshmonk_maps(template, shapes, frames, tmp_path / "kept", lambda what: None)
+        assert maps is not None and np.array_equal(maps["0", "1"], np.arange(162))
+    assert asked == [162, 162]
+
+
+def test_segments_from_end_to_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    monkeypatch.setattr(
+        keypoint_parts, "render_shapes", lambda panels, path, look: drawn.append((panels, path))
+    )
     balls(tmp_path / "plane", ".keypoints.npy")
     words = ["--data", tmp_path, "--classes", "plane", "--steps", "2", "--threads", "1", "--minutes", "1"]
-    words += ["--nodes", "60", "--radius", "0.35"]
+    words += ["--nodes", "60", "--radius", "0.35", "--pictures", tmp_path]
     assert segments.main([*map(str, words), "--work", str(tmp_path / "work"), "--turns", "given"]) == 0
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
     results = record["classes"]["plane"]["results"]
     assert results["rigid alignment, nearest vertex"]["arrived"] == 1.0
     assert 0.9 < results["rigid alignment, nearest vertex"]["iou"] <= 1.0
     assert results["200 steps on the code"]["pairs"] == 2
+    assert "legs_auc" not in results["200 steps on the code"]
+    [(panels, path)] = drawn
+    assert len(panels) == 2 and path == tmp_path / "segments-plane.png"
 
 
 def test_kinds_of_animals_and_their_errors_by_hand(cube: Shape) -> None:
@@ -190,11 +295,13 @@ def test_animals_from_end_to_end(points: int, tmp_path: Path, capsys: pytest.Cap
         "60",
         "--radius",
         "0.35",
+        "--limit-pairs",
+        "1",
     ]
     assert animals.main([str(word) for word in words]) == 0
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert (record["training"]["template"], record["points"]) == ("1", points)
     assert record["results"]["rigid alignment, nearest vertex"]["mean_x100"] < 12
-    assert record["results"]["nodes refined"]["pairs"] == 2
+    assert record["results"]["nodes refined"]["pairs"] == 1
     assert animals.main(["--data", str(tmp_path), "--template", "9"]) == 1
     assert "no animal" in capsys.readouterr().err

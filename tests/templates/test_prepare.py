@@ -10,9 +10,11 @@ from safetensors.numpy import load_file
 from meshmatch.errors import InputError, OutputError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates import prepare
 from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.prepare import prepare_folder, read_registered
 from meshmatch.templates.template import load_template
+from meshmatch.training.few import frame_of_few
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.3)
 FAR = np.array([1e6, -3e5, 2e4])  # a surveyor's coordinates
@@ -171,3 +173,20 @@ def test_a_folder_of_another_template_or_none_is_refused(folder: Path, tmp_path:
     with pytest.raises(InputError, match="not a prepared folder"):
         read_registered(tmp_path / "out", made.template)
     assert load_file(tmp_path / "other" / "shapes.safetensors")["verts"].shape[0] == 3
+
+
+def test_correspondence_says_whether_registered_shapes_stand_alike(
+    folder: Path, sphere: Shape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert prepare_folder(folder, tmp_path / "alike", FEW).align == "near"
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    save_shape(folder / "egg3.obj", Shape(egg(sphere, 2) @ quarter.T, sphere.faces))
+    made = prepare_folder(folder, tmp_path / "turned", FEW)
+    assert (len(made.shapes), made.align) == (4, "rigid")
+    assert frame_of_few(tmp_path / "turned") == {"orientation": "rigid", "scale": "area"}
+    assert prepare_folder(folder, tmp_path / "given", FEW, align="none").align == "none"
+    assert frame_of_few(tmp_path / "nowhere") is None
+    monkeypatch.setattr(prepare, "FEW", 4)
+    assert prepare_folder(folder, tmp_path / "many", FEW).align == "none"
+    monkeypatch.setattr("meshmatch.training.few.FEW", 4)
+    assert frame_of_few(tmp_path / "many") is None

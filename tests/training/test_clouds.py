@@ -12,7 +12,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.gather import Gathered
 from meshmatch.templates.template import Template
 from meshmatch.training.chamfer import build_surface_points, chamfer, chamfer_losses, robust
-from meshmatch.training.clouds import CloudConfig, CloudDataset, build_warp, turned_normals
+from meshmatch.training.clouds import CloudConfig, CloudDataset, build_warp, turned_normals, warped_source
 from meshmatch.training.loop import TrainConfig, Trainer
 from meshmatch.training.losses import LossConfig
 from meshmatch.training.run import Recipe
@@ -187,3 +187,22 @@ def test_it_learns(gathered: Gathered, template: Template, data: CloudDataset) -
     trainer = Trainer(model, points, replace(SMALL.train, steps=150, rate=3e-3), chamfer_losses)
     trainer.run(stretched)
     assert surface_error(model, held_out, points) < 0.9 * before
+
+
+def test_few_registered_shapes_are_deformed_at_every_drawing(template: Template) -> None:
+    verts = torch.from_numpy(np.array(template.shape.verts)).float()
+    shapes = torch.stack([verts, verts * torch.tensor([1.0, 1.2, 1.0])])
+    generator = torch.Generator().manual_seed(0)
+    drawn = warped_source(100 + 20 * shapes, CloudConfig(warp=0.1, plain=0.5))(64, generator)
+    centred = shapes - shapes.mean(1, keepdim=True)
+    own = 0.3 * centred / centred.flatten(1).std(1)[:, None, None]
+    apart = (drawn[:, None] - own[None]).norm(dim=-1).mean(-1).min(1).values
+    assert 0.3 < float((apart < 1e-5).float().mean()) < 0.7  # plain ones, of both shapes, in one size
+    assert 0.01 < float(apart.max()) < 0.2
+    # smooth: neighbours move together
+    ends = torch.from_numpy(np.array(template.shape.faces[:, :2]))
+    moved = drawn[int(apart.argmax())] - own[0]
+    step = (moved[ends[:, 0]] - moved[ends[:, 1]]).norm(dim=1).mean()
+    assert float(step) < 0.5 * float(moved.norm(dim=1).mean())
+    plain = warped_source(shapes, CloudConfig(warp=0.0))(3, generator)
+    assert any(torch.allclose(plain[0], each) for each in centred)
