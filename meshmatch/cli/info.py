@@ -46,11 +46,12 @@ def _reader(file: Path) -> Callable[[Path], Record]:
 
 def _is_list(file: Path) -> bool:
     """A .npy of one axis is a map, one of two is a cloud."""
-    import numpy as np
+    from meshmatch.errors import InputError
+    from meshmatch.shapes.arrays import existing, read_npy
 
     try:
-        return np.load(file, mmap_mode="r", allow_pickle=False).ndim == 1
-    except (OSError, ValueError, EOFError):
+        return read_npy(existing(file, "")).ndim == 1
+    except InputError:
         return False  # whatever is wrong with it, the reader of shapes says it well
 
 

@@ -24,14 +24,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.maps.mat_file import read_mat
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
 from meshmatch.outputs import replace_on_success
+from meshmatch.shapes.arrays import read_npy, read_npz
 from meshmatch.shapes.shape import Shape
 
 CSV_COLUMNS = ("source_vertex", "target_vertex", "face", "w0", "w1", "w2", "confidence")
 _ARRAYS = ("index", "face", "barycentric", "confidence")
 _WORDS = ("source", "target", "verdict", "source_hash", "target_hash")
 _COUNTS = ("source_vertices", "target_vertices")
+_KNOWN = (*_ARRAYS, *_WORDS, *_COUNTS, "reasons")
 _FORMAT = "meshmatch map 1"
 
 
@@ -86,7 +89,8 @@ def load_map(path: str | Path, source: Shape | None = None, target: Shape | None
     try:
         found = _FORMATS[suffix][1](path)
     except MeshmatchError as error:
-        raise InputError(f"{path.name}: {error.message}", error.hint) from error
+        told = error.message.removeprefix(path.name).lstrip()
+        raise InputError(f"{path.name}: {told}", error.hint) from error
     except Exception as error:  # every format's library has its own family of errors for damaged files
         raise InputError(
             f"{path.name} does not hold a map that can be read: {error}",
@@ -152,8 +156,7 @@ def _record(m: VertexMap) -> dict[str, Any]:
 def _from_record(record: dict[str, Any]) -> VertexMap:
     if "index" not in record:
         raise InputError("there is no 'index' in it", f"a map holds an array 'index': {DIRECTION}")
-    known = (*_ARRAYS, *_WORDS, *_COUNTS, "reasons")
-    return VertexMap(**{"source": "", "target": "", **{k: v for k, v in record.items() if k in known}})
+    return VertexMap(**{"source": "", "target": "", **{k: v for k, v in record.items() if k in _KNOWN}})
 
 
 def _bare(index: NDArray[Any]) -> VertexMap:
@@ -169,8 +172,7 @@ def _write_npy(path: Path, m: VertexMap) -> None:
 
 
 def _read_npy(path: Path) -> VertexMap:
-    with path.open("rb") as file:
-        return _bare(np.load(file, allow_pickle=False))
+    return _bare(read_npy(path))
 
 
 def _write_txt(path: Path, m: VertexMap) -> None:
@@ -189,8 +191,9 @@ def _write_npz(path: Path, m: VertexMap) -> None:
 
 
 def _read_npz(path: Path) -> VertexMap:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-        record: dict[str, Any] = {name: archive[name] for name in archive.files}
+    record: dict[str, Any] = dict(read_npz(path, _KNOWN))
+    if not record:
+        raise InputError(f"it holds none of {', '.join(_ARRAYS)}", f"'index' is needed: {DIRECTION}")
     for name in _WORDS:
         record[name] = str(record.get(name, "")) or ("unknown" if name == "verdict" else "")
     for name in _COUNTS:
@@ -256,18 +259,16 @@ def _write_mat(path: Path, m: VertexMap) -> None:
 
 
 def _read_mat(path: Path) -> VertexMap:
-    from scipy.io import loadmat
-
-    with path.open("rb") as file:
-        record: dict[str, Any] = {k: v for k, v in loadmat(file).items() if not k.startswith("__")}
+    record: dict[str, Any] = dict(read_mat(path.read_bytes(), _KNOWN))
     for name in ("index", "face", "confidence"):
         if name in record:
             record[name] = np.ravel(record[name])
     for name in _WORDS:
-        record[name] = "".join(np.ravel(record.get(name, ""))) or ("unknown" if name == "verdict" else "")
+        record[name] = str(record.get(name, "")) or ("unknown" if name == "verdict" else "")
     for name in _COUNTS:
         record[name] = int(np.ravel(record.get(name, UNKNOWN))[0])
-    record["reasons"] = tuple("".join(np.ravel(cell)) for cell in np.ravel(record.get("reasons", ())))
+    reasons = record.get("reasons", ())
+    record["reasons"] = tuple(reasons) if isinstance(reasons, list) else ()
     return _from_record(record)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
+from meshmatch.shapes.arrays import read_npy
 
 _PAIRS = "one pair a line: a vertex of the source, then a vertex of the target, counted from 0"
 _POINTS = "one vertex a line, counted from 0"
@@ -61,8 +62,8 @@ def _table(path: Path, columns: int, hint: str) -> NDArray[np.int64]:
 
 
 def _from_npy(path: Path) -> NDArray[np.int64]:
-    array = np.load(path, allow_pickle=False)
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iu":
+    array = read_npy(path)
+    if array.dtype.kind not in "iu":
         raise ValueError("its numbers are not whole")
     return array.astype(np.int64)
 
@@ -82,4 +83,7 @@ def _from_text(path: Path) -> NDArray[np.int64]:
         words_allowed = False
         if rows and len(rows[-1]) != len(rows[0]):
             raise ValueError(f"line {number} has {len(rows[-1])} numbers, the first has {len(rows[0])}")
-    return np.array(rows, np.int64)
+    try:
+        return np.array(rows, np.int64)
+    except OverflowError:
+        raise ValueError("a number is too large to be a vertex") from None

@@ -15,6 +15,7 @@ from safetensors.numpy import load_file, save_file
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.align import ALIGNS, Align, Oriented, align, residual
+from meshmatch.shapes.arrays import read_npy
 from meshmatch.shapes.normalise import sqrt_area_frame, unit_sphere_frame
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.sampling import sample_surface
@@ -221,15 +222,16 @@ def read_known(file: Path, clean: Repaired) -> np.ndarray:
     """
     try:
         if file.suffix == ".npy":
-            values = np.load(file, allow_pickle=False)
+            values = read_npy(file)
         else:
             values = np.loadtxt(file, delimiter="," if "," in file.read_text(encoding="utf-8") else None)
         values = np.asarray(values)
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError) as error:
         raise InputError(f"cannot read the landmarks {file.name}", "numbers, one point a line") from error
     if values.ndim == 2 and values.shape[1] == 3 and values.dtype.kind in "fiu":
         return values.astype(np.float64)
-    if values.ndim != 1 or not len(values) or not np.array_equal(values, np.round(values)):
+    whole = values.dtype.kind in "fiu" and values.ndim == 1
+    if not whole or not len(values) or not np.array_equal(values, np.round(values)):
         raise InputError(
             f"{file.name} holds no landmarks",
             "either one vertex a line (-1: missing), or x, y and z of a place on each line",

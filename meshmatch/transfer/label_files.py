@@ -22,8 +22,8 @@ from typing import Any, Literal
 import numpy as np
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.arrays import existing, read_npy
 from meshmatch.shapes.shape import Ints, Shape
-from meshmatch.transfer.arrays import existing, read_npy
 
 On = Literal["vertices", "faces"]
 Label = int | str

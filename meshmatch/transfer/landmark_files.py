@@ -24,8 +24,8 @@ import numpy as np
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.pairs import load_points
+from meshmatch.shapes.arrays import existing
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.arrays import existing
 from meshmatch.transfer.landmarks import Landmarks, at_faces, at_points, at_vertices, joined
 
 COLUMNS = ("name", "vertex", "x", "y", "z", "face", "w0", "w1", "w2", "confidence")

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.arrays import existing, read_npy
 from meshmatch.shapes.shape import Floats, Shape
-from meshmatch.transfer.arrays import existing, read_npy
 
 _HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy or .csv"
 
@@ -80,7 +80,7 @@ def _read_csv(path: Path) -> Values:
         table = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
     except ValueError as error:
         raise InputError(f"{path.name}: {error}", _HINT) from error
-    table = table.reshape(len(rows), -1)
+    table = table.reshape(len(rows), widths.pop() if widths else 0)
     if names and names[0].lower() == "vertex":
         if not np.array_equal(table[:, 0], np.arange(len(table))):
             raise InputError(f"{path.name}: its rows are not the vertices 0, 1, 2, ... in order", "sort it")

@@ -22,8 +22,8 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.arrays import existing, read_npz
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.arrays import existing, read_npz
 
 _FORMAT = "meshmatch skin weights 1"
 _KEYS = ("format", "names", "joints", "weights")

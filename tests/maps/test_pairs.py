@@ -52,6 +52,7 @@ def test_points_from_text(tmp_path: Path) -> None:
         ("1.5 2\n2.5 3\n", "line 2"),
         ("nose toe\nhand foot\n", "line 2"),
         ("1 -2\n", "-2"),
+        ("1 99999999999999999999\n", "too large"),
     ],
 )
 def test_what_is_no_list_of_pairs(tmp_path: Path, text: str, told: str) -> None:

@@ -542,7 +542,7 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 
 def test_npy_is_never_unpickled(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([{"a": 1}] * 3, object), allow_pickle=True)
-    with pytest.raises(InputError, match="not hold an array of numbers"):
+    with pytest.raises(InputError, match="Python objects"):
         load_shape(tmp_path / "a.npy")
 
 
@@ -567,12 +567,12 @@ def test_npy_header_that_claims_a_billion_points(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros((100, 3)))
     data = (tmp_path / "a.npy").read_bytes()
     tracemalloc.start()
-    with pytest.raises(InputError, match="not a whole npy file"):
+    with pytest.raises(InputError, match="promises 23999999976 bytes"):
         load(tmp_path, "b.npy", data.replace(b"(100, 3)", b"(999999999, 3)").replace(b"      \n", b"\n", 1))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 5e6
-    with pytest.raises(InputError, match="not a whole npy file"):
+    with pytest.raises(InputError, match="could only read 299"):
         load(tmp_path, "c.npy", data[:-1])
 
 

@@ -68,6 +68,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
         lambda path: path.write_text("vertex,v\n" + "".join(f"{41 - k},1\n" for k in range(42))),
         "in order",
     ),
+    "a header alone": ("a.csv", lambda path: path.write_text("vertex,v\n"), "has 0 rows"),
     "not text": ("a.csv", lambda path: path.write_bytes(b"\xff\xfe\x00"), "not a csv"),
     "damaged": ("a.npy", lambda path: path.write_bytes(b"nonsense"), "is no npy file"),
     "a suffix": ("a.mat", lambda path: path.write_text("x"), "not read from '.mat'"),

@@ -23,13 +23,19 @@ _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
+MOST_CORNERS = 200_000_000
+"""Vertices of a scene, and corners of its faces. One mesh may stand in it a thousand times, so that a small file can
+promise any number.
+"""
+NONSENSE = (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError, OverflowError)
+"""What a description that is not as it should be can cause."""
 
 
 def read(path: Path, data: bytes) -> Raw:
     """All triangles and points of the scene, one primitive after the other, parents before children."""
     try:
         return Document(path, data).scene()
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except NONSENSE as error:
         raise damaged(path.name, f"its scene makes no sense ({type(error).__name__}: {error})") from error
 
 
@@ -80,7 +86,15 @@ class Document:
         verts: list[NDArray[np.float64]] = []
         faces: list[NDArray[np.int64]] = []
         colors: list[NDArray[np.float64] | None] = []
+        total = 0
         for node, primitive in self.primitives():
+            total += self.count(primitive["attributes"]["POSITION"])
+            total += self.count(primitive["indices"]) if "indices" in primitive else 0
+            if total > MOST_CORNERS:
+                raise InputError(
+                    f"the scene of {self.name} has over {MOST_CORNERS} vertices and corners of faces",
+                    "export it with fewer copies of its meshes",
+                )
             own = self._placed(self.nodes[node], node, primitive)
             triangles = self.triangles(primitive, len(own))
             if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
@@ -119,7 +133,8 @@ class Document:
             node, parent = stack.pop()
             if node in self.world:
                 raise damaged(self.name, f"node {node} hangs from two places")
-            self.world[node] = parent @ _local(self.nodes[node])
+            with np.errstate(all="ignore"):  # what is not finite is judged with the positions
+                self.world[node] = parent @ _local(self.nodes[node])
             order.append(node)
             stack += [(child, self.world[node]) for child in reversed(self.nodes[node].get("children", []))]
         return order
@@ -190,7 +205,7 @@ class Document:
             view = self.json["bufferViews"][accessor["bufferView"]]
             values = self._view(view, accessor.get("byteOffset", 0), count, width, kind)
         else:  # zeros, then filled sparsely
-            bound = sum(b.get("byteLength", 0) for b in self.json.get("buffers", []))
+            bound = sum(len(self._buffer(k)) for k in range(len(self.json.get("buffers", []))))
             if not 0 <= count <= max(bound, 1):
                 raise damaged(self.name, f"it promises {count} values that it does not hold")
             values = np.zeros((count, width), kind)

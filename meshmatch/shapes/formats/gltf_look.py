@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from meshmatch.errors import InputError
 from meshmatch.shapes.appearance import Alpha, Appearance, Material, Wrap, no_coordinates
 from meshmatch.shapes.formats import damaged
-from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf import NONSENSE, Document
 from meshmatch.shapes.images import ImageReader, Pixels
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -30,7 +30,7 @@ def read_look(path: Path, data: bytes, reader: ImageReader, picture: Pixels | No
     """
     try:
         return _Look(Document(path, data), reader, picture).scene()
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except NONSENSE as error:
         raise damaged(path.name, f"its materials make no sense ({type(error).__name__}: {error})") from error
 
 
@@ -47,7 +47,7 @@ def read_coordinates(path: Path, data: bytes) -> NDArray[np.float64] | None:
             if len(faces):
                 parts.append(document.accessor(attributes["TEXCOORD_0"])[faces])
         return np.concatenate(parts)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except NONSENSE as error:
         raise damaged(path.name, f"its texture coordinates make no sense ({error})") from error
 
 
@@ -160,8 +160,9 @@ class _Look:
             return uv
         # Counter-clockwise with v down, as the extension's words and its example have it (its listing does not).
         angle = float(transform.get("rotation", 0.0))
-        u, v = (uv * np.array(transform.get("scale", (1.0, 1.0)), np.float64)).T
-        turned = np.stack(
-            [np.cos(angle) * u + np.sin(angle) * v, np.cos(angle) * v - np.sin(angle) * u], axis=1
-        )
+        with np.errstate(all="ignore"):  # what is not finite is refused by the appearance
+            u, v = (uv * np.array(transform.get("scale", (1.0, 1.0)), np.float64)).T
+            turned = np.stack(
+                [np.cos(angle) * u + np.sin(angle) * v, np.cos(angle) * v - np.sin(angle) * u], axis=1
+            )
         return np.asarray(turned + np.array(transform.get("offset", (0.0, 0.0)), np.float64))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import damaged
-from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf import NONSENSE, Document
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ def read_skin(path: Path, data: bytes) -> Skin:
     """
     try:
         return _skin(Document(path, data))
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except NONSENSE as error:
         raise damaged(path.name, f"its skin makes no sense ({type(error).__name__}: {error})") from error
 
 
@@ -71,13 +71,16 @@ def _skin(document: Document) -> Skin:
             for k in range(8):
                 if f"JOINTS_{k}" not in attributes:
                     break
-                index = document.accessor(attributes[f"JOINTS_{k}"], whole=True).astype(np.int64)
+                numbers = document.accessor(attributes[f"JOINTS_{k}"], whole=True)
                 amount = document.accessor(attributes[f"WEIGHTS_{k}"])
-                if index.shape != (V, 4) or amount.shape != (V, 4):
+                if numbers.shape != (V, 4) or amount.shape != (V, 4):
                     raise ValueError("joints or weights are not four for each vertex")
                 row, column = np.nonzero(np.isfinite(amount) & (amount > 0))
+                used = numbers[row, column]
+                if not ((used >= 0) & (used < len(own))).all():
+                    raise ValueError(f"a vertex names a joint that is none of the {len(own)}")
                 vertices.append(seen + row)
-                joints.append(own[index[row, column]])
+                joints.append(own[used.astype(np.int64)])
                 weights.append(amount[row, column])
         else:
             joint: int | None = number

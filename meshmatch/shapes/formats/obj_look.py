@@ -109,7 +109,10 @@ def _coordinates(name: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[n
         width = int(min(counts.min(), 2))
         pairs[:, :width] = columns(numbers(name, text), counts, 0, width)
     if b"/" in faces_text:
-        index = numbers(name, behind_slash(faces_text)).astype(np.int64)
+        values = numbers(name, behind_slash(faces_text))
+        if not (np.abs(values) < 2**53).all():
+            raise damaged(name, "a face names a texture coordinate that is not a number")
+        index = values.astype(np.int64)
     else:
         index = np.zeros(int(sizes.sum()), np.int64)
     if (index < 0).any():  # from the last one before the face backwards

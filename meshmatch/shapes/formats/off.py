@@ -26,7 +26,7 @@ def read(path: Path, data: bytes) -> Raw:
     body = text[header.end() :]
     if body.lstrip()[:6] == b"BINARY":
         raise InputError(f"{name} is a binary off file", "convert it to ply")
-    head = re.match(rb"\s*(\d+)\s+(\d+)(?:[ \t]+\d+)?", body)
+    head = re.match(rb"\s*(\d{1,15})\s+(\d{1,15})(?!\d)(?:[ \t]+\d+)?", body)
     if not head:
         raise damaged(name, "the header does not say how many vertices and faces there are")
     V, F = int(head.group(1)), int(head.group(2))

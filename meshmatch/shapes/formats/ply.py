@@ -18,6 +18,7 @@ _TYPES = {
     "double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8",
 }  # fmt: skip
 _FACE_LISTS = ("vertex_indices", "vertex_index")
+_NUMBERS = ("x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a")
 
 
 def read(path: Path, data: bytes) -> Raw:
@@ -33,6 +34,7 @@ def read(path: Path, data: bytes) -> Raw:
     for element in elements[: max(wanted) + 1]:
         if not element.properties:
             continue  # rows of nothing, however many
+        _check_kinds(name, element)
         stream.check(element)
         table = stream.element(element)
         if element.name == "vertex":
@@ -46,9 +48,10 @@ def read(path: Path, data: bytes) -> Raw:
             lists = next((table[key] for key in _FACE_LISTS if key in table), None)
             if lists is not None:
                 faces = fan(*lists)
-        elif element.name == "tristrips" and element.properties:
+        elif element.name == "tristrips":
             faces = _strips(table[element.properties[0].name][0])
-    assert verts is not None
+    if verts is None:
+        raise InputError(f"{name}: the vertices have no x, y and z", "is it a mesh or a point cloud at all?")
     return Raw(verts, faces, colors)
 
 
@@ -146,6 +149,16 @@ def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int]:
     if order == "":
         raise damaged(name, "the header names no format")
     return order, elements, start
+
+
+def _check_kinds(name: str, element: Element) -> None:
+    """Refuse a list where a number is needed, and the other way round."""
+    for place, p in enumerate(element.properties):
+        lists = {"face": p.name in _FACE_LISTS, "tristrips": place == 0}.get(element.name, False)
+        number = element.name == "vertex" and p.name in _NUMBERS
+        if (number and p.count_kind) or (lists and not p.count_kind):
+            what = "lists" if p.count_kind else "numbers"
+            raise damaged(name, f"its header makes {what} of {p.name} of the element {element.name}")
 
 
 def _strips(lists: NDArray[np.int64]) -> NDArray[np.int64]:

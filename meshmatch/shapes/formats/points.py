@@ -2,11 +2,11 @@
 
 import re
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 
 from meshmatch.errors import InputError
+from meshmatch.shapes.arrays import read_npy as read_array
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged
 from meshmatch.shapes.formats.text import columns, numbers, words_per_line
 from meshmatch.shapes.shape import Shape
@@ -34,16 +34,8 @@ def read_xyz(path: Path, data: bytes) -> Raw:
 def read_npy(path: Path, data: bytes) -> Raw:
     """An array (N, 3) of points, or (N, 6) with normals, which are ignored."""
     name = path.name
-    try:
-        # mapped, not loaded: a header that promises more than the file holds allocates nothing
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError, SyntaxError, TypeError, TokenError) as error:
-        if "Python objects" in str(error) or "pickle" in str(error):
-            raise InputError(
-                f"{name} does not hold an array of numbers", "save points as an (N, 3) array"
-            ) from error
-        raise damaged(name, "it is not a whole npy file") from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+    array = read_array(path)
+    if array.dtype.kind not in "fiu":
         raise InputError(f"{name} does not hold an array of numbers", "save points as an (N, 3) array")
     if array.ndim != 2 or array.shape[1] not in (3, 6):
         raise InputError(

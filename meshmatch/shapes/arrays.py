@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 import zipfile
-import zlib
 from collections.abc import Iterable
 from pathlib import Path
-from tokenize import TokenError
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -17,7 +17,7 @@ from meshmatch.errors import InputError
 
 # Uncompressed bytes of one array in an npz file; a million vertices with 120 dense weights fit.
 LARGEST = 1 << 30
-_DAMAGED = (ValueError, OSError, EOFError, SyntaxError, TypeError, TokenError, KeyError, zlib.error)
+_LAST_LETTER = 0x10FFFF
 
 
 def read_npy(path: Path) -> NDArray[Any]:
@@ -28,16 +28,18 @@ def read_npy(path: Path) -> NDArray[Any]:
     InputError
         The file is damaged, or holds objects.
     """
-    with path.open("rb") as file:
-        if file.read(2) not in (b"\x93N", b"PK"):  # numpy takes anything else for a pickle
-            raise InputError(f"{path.name} is no npy file", "does the suffix fit the content?")
     try:
-        # mapped, not loaded: a header that promises more than the file holds allocates nothing
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-        if not isinstance(array, np.ndarray):
-            raise ValueError("it holds several arrays")
-        return np.array(array)
-    except _DAMAGED as error:
+        with path.open("rb") as file:
+            start = file.read(2)
+            if start == b"PK":
+                raise ValueError("it holds several arrays, as an npz does")
+            if start != b"\x93N":
+                raise InputError(f"{path.name} is no npy file", "does the suffix fit the content?")
+            file.seek(0)
+            return _array(file, path.name, path.stat().st_size)
+    except InputError:
+        raise
+    except Exception as error:  # a damaged header can break Python's parser and NumPy in a dozen ways
         raise _not_arrays(path, error) from error
 
 
@@ -54,27 +56,38 @@ def read_npz(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(path) as archive:
             there = set(archive.namelist())
             for name in names:
-                if f"{name}.npy" in there:
-                    found[name] = _member(archive, f"{name}.npy")
-    except (*_DAMAGED, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
+                member = f"{name}.npy"
+                if member in there:
+                    with archive.open(member) as file:
+                        found[name] = _array(file, member, min(archive.getinfo(member).file_size, LARGEST))
+    except Exception as error:  # as above, and the zip around it
         raise _not_arrays(path, error) from error
     return found
 
 
-def _member(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    with archive.open(name) as file:
+def _array(file: IO[bytes], name: str, most: int) -> NDArray[Any]:
+    """The array of an open npy file, if it promises no more than `most` bytes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of headers as Python 2 wrote them
         version = npy_format.read_magic(file)
         if version not in ((1, 0), (2, 0), (3, 0)):
             raise ValueError(f"{name} is of an unknown version")
         read = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
         shape, _, kind = read(file)
-        size = int(kind.itemsize)
-        for axis in shape:
-            size *= int(axis)
-        if not 0 <= size <= min(archive.getinfo(name).file_size, LARGEST):
+        if kind.hasobject:
+            raise ValueError("objects are a pickle")
+        # An item counts, also one of no bytes: so many of them would fill a list.
+        size = math.prod((max(int(kind.itemsize), 1), *(int(axis) for axis in shape)))
+        if min(shape, default=0) < 0 or size > most:
             raise ValueError(f"{name} promises {size} bytes")
-    with archive.open(name) as file:
-        return np.asarray(npy_format.read_array(file, allow_pickle=False))
+        file.seek(0)
+        array = np.asarray(npy_format.read_array(file, allow_pickle=False))
+    if array.dtype.kind == "U" and array.size:
+        letters = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("=")).reshape(-1)
+        codes = letters.view(np.uint32)
+        if ((codes > _LAST_LETTER) | ((codes >= 0xD800) & (codes < 0xE000))).any():  # the latter are halves
+            raise ValueError(f"{name} holds letters that do not exist")
+    return array
 
 
 def _not_arrays(path: Path, error: Exception) -> InputError:
@@ -86,9 +99,13 @@ def _not_arrays(path: Path, error: Exception) -> InputError:
 
 
 def existing(path: Path, what: str) -> Path:
-    """The path, if a file that is not empty is there; `InputError` otherwise."""
+    """The path, if a file that is not empty is there and may be read; `InputError` otherwise."""
     if not path.is_file():
         raise InputError(f"there is no file {path}" if not path.exists() else f"{path} is not a file", what)
     if path.stat().st_size == 0:
         raise InputError(f"{path.name} is empty", what)
+    try:
+        path.open("rb").close()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}", what) from error
     return path

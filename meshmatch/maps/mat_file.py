@@ -1,0 +1,124 @@
+"""Reading MATLAB's MAT-files of level 5 (``-v6``, ``-v7``): numbers, text, and cells of text.
+
+Specification: MathWorks, *MAT-File Format*, level 5. Our own, because the usual reader trusts sizes that a damaged
+file states, and then reads memory that is not its own.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.errors import InputError
+
+Value = NDArray[np.generic] | str | list[str]
+"""Numbers in the array's own shape; the letters of a text, row by row; the texts of a cell array."""
+
+LARGEST = 1 << 30  # bytes of one variable, unpacked
+_HEADER = 128
+_MATRIX, _COMPRESSED = 14, 15
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_LETTERS = {16: "utf-8", 17: "utf-16", 18: "utf-32"}
+_CELL, _CHAR, _SMALLEST_NUMBER, _LARGEST_NUMBER = 1, 4, 6, 15  # classes of arrays
+_HINT = "save it with -v7, or as .csv"
+
+
+def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
+    """Those of the named variables that the file holds and that are numbers, text, or cells of text.
+
+    Raises
+    ------
+    InputError
+        It is no MAT-file of level 5, is damaged, or a variable is larger than `LARGEST`.
+    """
+    if data[:4] == b"\x89HDF" or data[:10] == b"MATLAB 7.3":
+        raise InputError("it is a MAT-file of version 7.3", _HINT)
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
+    if order is None:
+        raise InputError("it is no MAT-file of version 5 to 7", _HINT)
+    wanted, found = set(names), {}
+    try:
+        for kind, body in _elements(data[_HEADER:], order):
+            if kind == _COMPRESSED:
+                kind, body = next(_elements(_unpacked(body), order))
+            if kind != _MATRIX:
+                continue
+            name, value = _matrix(body, order)
+            if name in wanted and value is not None:
+                found[name] = value
+    except (ValueError, StopIteration, zlib.error) as error:
+        raise InputError(f"it is damaged: {error or 'something is missing in it'}", _HINT) from error
+    return found
+
+
+def _unpacked(body: bytes) -> bytes:
+    stream = zlib.decompressobj()
+    out = stream.decompress(body, LARGEST)
+    if stream.unconsumed_tail:
+        raise ValueError(f"a variable of more than {LARGEST} bytes")
+    return out
+
+
+def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Kind and bytes of all elements, one after the other; none is longer than what is there."""
+    at = 0
+    while at + 8 <= len(data):
+        kind, size = (int(n) for n in np.frombuffer(data, f"{order}u4", 2, at))
+        if kind >> 16:  # a small one: its size and its data are where else kind and size are
+            kind, size, start, end = kind & 0xFFFF, kind >> 16, at + 4, at + 8
+            if size > 4:
+                raise ValueError("a small element of more than 4 bytes")
+        else:
+            start = at + 8
+            end = start + size + (0 if kind == _COMPRESSED else -size % 8)
+        if start + size > len(data):
+            raise ValueError(f"it promises {size} bytes where {len(data) - start} are left")
+        yield kind, data[start : start + size]
+        at = end
+    if any(data[at:]):
+        raise ValueError("it ends in the middle of a tag")
+
+
+def _matrix(body: bytes, order: str, inside: bool = False) -> tuple[str, Value | None]:
+    """Name and value of an array; None if it is none of those that are read."""
+    parts = _elements(body, order)
+    flags = np.frombuffer(next(parts)[1], f"{order}u4")
+    shape = [int(n) for n in np.frombuffer(next(parts)[1], f"{order}i4")]
+    name = next(parts)[1].decode("latin-1")
+    kind = int(flags[0]) & 0xFF if len(flags) else 0
+    if min(shape, default=-1) < 0 or len(shape) > 32:
+        raise ValueError(f"an array of {shape}")
+    count = math.prod(shape)
+    if kind == _CELL and not inside:
+        texts = [_matrix(inner, order, True)[1] for _, inner in parts]
+        if len(texts) != count:
+            raise ValueError(f"a cell array of {len(texts)} instead of {count}")
+        return name, [text for text in texts if isinstance(text, str)]
+    if kind == _CHAR:
+        return name, _text(*next(parts, (2, b"")), shape, order)
+    if not _SMALLEST_NUMBER <= kind <= _LARGEST_NUMBER:
+        return name, None
+    stored, numbers = next(parts)
+    if stored not in _NUMBERS:
+        raise ValueError(f"numbers of an unknown kind {stored}")
+    values = np.frombuffer(numbers, order + _NUMBERS[stored])
+    if len(values) != count:
+        raise ValueError(f"{len(values)} numbers for an array of {shape}")
+    return name, values.reshape(shape, order="F").astype(values.dtype.newbyteorder("="))
+
+
+def _text(stored: int, letters: bytes, shape: list[int], order: str) -> str:
+    """Text row by row; MATLAB keeps it column by column."""
+    if stored in _LETTERS:
+        coding = _LETTERS[stored] + ("" if stored == 16 else "-le" if order == "<" else "-be")
+        text = letters.decode(coding)
+    elif stored in (1, 2):
+        text = letters.decode("latin-1")
+    else:
+        text = letters.decode("utf-16-le" if order == "<" else "utf-16-be")
+    rows = shape[0] if shape else 1
+    return "".join(text[row::rows] for row in range(min(rows, len(text)))) if rows > 1 else text

@@ -1,0 +1,160 @@
+"""Files that are damaged on purpose: one line of error each, no warning, no crash, no memory."""
+
+import base64
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import InputError
+from meshmatch.shapes import load_shape
+from meshmatch.shapes.appearance import find_appearance
+from meshmatch.shapes.arrays import read_npy
+from meshmatch.shapes.formats import gltf
+from meshmatch.shapes.formats.gltf_skin import read_skin
+from tests.transfer.skinned import write_skinned_glb
+
+
+def refused(path: Path, content: bytes, words: str) -> None:
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words) as told:
+        load_shape(path)
+    assert "\n" not in told.value.message
+
+
+def ply(*lines: str, body: str = "0 0 0\n1 0 0\n0 1 0\n") -> bytes:
+    return "\n".join(["ply", "format ascii 1.0", *lines, "end_header", body]).encode()
+
+
+XYZ = [f"property float {axis}" for axis in "xyz"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (ply("element vertex 3"), "no x, y and z"),
+        (ply("element vertex 3", "property list uchar float x", *XYZ[1:]), "lists of x"),
+        (ply("element vertex 3", *XYZ, "property list uchar uchar red"), "lists of red"),
+        (
+            ply("element vertex 3", *XYZ, "element face 1", "property int vertex_indices"),
+            "numbers of vertex_indices",
+        ),
+        (ply("element vertex 3", *XYZ, "element tristrips 1", "property int strip"), "numbers of strip"),
+    ],
+)
+def test_ply_lists_where_numbers_belong(tmp_path: Path, content: bytes, words: str) -> None:
+    refused(tmp_path / "a.ply", content, words)
+
+
+def test_ply_other_elements_may_be_anything(tmp_path: Path) -> None:
+    """Only what is read has to be as it is read."""
+    lines = ["element vertex 3", *XYZ, "element edge 1", "property int a", "element face 1"]
+    content = ply(*lines, "property list uchar int vertex_indices", body="0 0 0 1 0 0 0 1 0\n7\n3 0 1 2\n")
+    (tmp_path / "a.ply").write_bytes(content)
+    assert load_shape(tmp_path / "a.ply").faces.tolist() == [[0, 1, 2]]
+
+
+def test_off_with_a_number_of_thousands_of_digits(tmp_path: Path) -> None:
+    refused(tmp_path / "a.off", b"OFF\n" + b"9" * 5000 + b" 1 0\n", "does not say how many")
+    refused(tmp_path / "a.off", b"OFF\n1 " + b"9" * 5000 + b" 0\n", "does not say how many")
+
+
+def test_obj_with_texture_coordinates_that_are_no_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/99999999999999999999 3/1\n")
+    with pytest.raises(InputError, match="texture coordinate"):
+        find_appearance(path, load_shape(path))
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        (b"{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999999999999, 3), }", "promises"),
+        (b"{'descr': '<f8', 'fortran_order': False, 'shape': (-1, 3), }", "promises"),
+        (b"{'descr': '<U0', 'fortran_order': False, 'shape': (999999999,), }", "promises"),
+        (b"{'descr': '<f8', 'fortran_order': False, 'shape': (4L, 3), }", "promises"),
+        (b"{'descr': '<f8', ''' 'fortran_order': False}", "can be read"),
+        (b"(" * 3000, "can be read"),
+    ],
+)
+def test_npy_headers(tmp_path: Path, header: bytes, words: str) -> None:
+    content = b"\x93NUMPY\x01\x00" + len(header + b"\n").to_bytes(2, "little") + header + b"\n"
+    refused(tmp_path / "a.npy", content, words)
+
+
+@pytest.mark.parametrize("code", [0x110000, 0xD800])
+def test_npy_with_letters_that_do_not_exist(tmp_path: Path, code: int) -> None:
+    np.save(tmp_path / "a.npy", np.array(["ab", "cd"]))
+    content = bytearray((tmp_path / "a.npy").read_bytes())
+    content[-4:] = code.to_bytes(4, "little")
+    (tmp_path / "a.npy").write_bytes(content)
+    with pytest.raises(InputError, match="letters"):
+        read_npy(tmp_path / "a.npy")
+
+
+def broken(tmp_path: Path, *changes: tuple[tuple[str | int, ...], object]) -> Path:
+    """The skinned glb of the tests as a gltf, with other values at places of its description."""
+    write_skinned_glb(tmp_path / "whole.glb")
+    data = (tmp_path / "whole.glb").read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    words = json.loads(data[20 : 20 + size])
+    body = base64.b64encode(data[28 + size :]).decode()
+    words["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{body}"
+    for place, value in changes:
+        inner = words
+        for key in place[:-1]:
+            inner = inner[key]
+        inner[place[-1]] = value
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps(words))
+    return path
+
+
+def test_gltf_counts_that_are_no_numbers(tmp_path: Path) -> None:
+    path = broken(tmp_path, (("accessors", 0, "count"), float("inf")))
+    with pytest.raises(InputError, match="makes no sense"):
+        load_shape(path)
+    with pytest.raises(InputError, match="makes no sense"):
+        read_skin(path, path.read_bytes())
+
+
+@pytest.mark.parametrize("key", ["translation", "rotation", "scale"])
+@pytest.mark.parametrize("value", [float("nan"), 1e308])
+def test_gltf_nodes_that_stand_nowhere(tmp_path: Path, key: str, value: float) -> None:
+    """Warnings are errors here: none is told, whoever reads the file."""
+    four = 4 if key == "rotation" else 3
+    path = broken(tmp_path, (("nodes", 0, key), [value] * four), (("nodes", 4, key), [value] * four))
+    shape = load_shape(path)
+    assert shape.V == 10
+    find_appearance(path, shape)
+    read_skin(path, path.read_bytes())
+
+
+def test_a_skin_that_names_a_joint_it_does_not_have(tmp_path: Path) -> None:
+    """Joints as floats, of which one is below 0: counted from the end it would be another joint."""
+    path = broken(tmp_path, (("accessors", 2, "componentType"), 5122))
+    assert len(read_skin(path, path.read_bytes()).joint) == 8
+    path = broken(tmp_path, (("skins", 0, "joints"), [1]))
+    with pytest.raises(InputError, match="none of the 1"):
+        read_skin(path, path.read_bytes())
+
+
+def test_gltf_with_a_buffer_that_claims_a_terabyte(tmp_path: Path) -> None:
+    """An accessor without a view is all zeros, of as many as it says: bounded by what is there."""
+    path = broken(
+        tmp_path,
+        (("buffers", 0, "byteLength"), 10**12),
+        (("accessors", 4), {"componentType": 5126, "type": "VEC3", "count": 10**8}),
+    )
+    with pytest.raises(InputError, match="promises 100000000 values"):
+        load_shape(path)
+
+
+def test_gltf_of_one_mesh_a_thousand_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copies = [{"mesh": 0}] * 1000
+    path = broken(tmp_path, (("nodes",), copies), (("scenes", 0, "nodes"), list(range(1000))))
+    assert load_shape(path).V == 4000
+    monkeypatch.setattr(gltf, "MOST_CORNERS", 9_000)
+    with pytest.raises(InputError, match="over 9000 vertices"):
+        load_shape(path)
