@@ -15,6 +15,7 @@ from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import FAIR_RESIDUAL, Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig, check_landmarks
 from meshmatch.fitting.latent import refine_code
+from meshmatch.fitting.mirror import mirror_of
 from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual, variants
 from meshmatch.fitting.nodes import refine_nodes
 from meshmatch.fitting.orientation import (
@@ -27,7 +28,7 @@ from meshmatch.fitting.orientation import (
 )
 from meshmatch.fitting.part import cost, fit_part
 from meshmatch.fitting.placing import placed, scan_frame
-from meshmatch.fitting.readings import Judge, choose, lying
+from meshmatch.fitting.readings import Judge, averaged, choose, lying
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.settle import settle
 from meshmatch.fitting.system import NodeSystem
@@ -196,7 +197,8 @@ def _readings(model, system, scan, coarse, candidates, config, rng) -> list[Cand
     """The candidates and tilted readings of the best one, best first on the coarse scan."""
     best = candidates[0]
     here, near = (part.turned(best.rotation, best.centre) for part in (scan, coarse))
-    pool = variants(model.network, system, here, near, best, rng, config.variants, config.tilt)
+    mirror = mirror_of(model)
+    pool = variants(model.network, system, here, near, best, rng, config.variants, config.tilt, mirror)
     for other in candidates:
         there = coarse.turned(other.rotation, other.centre)
         residual = two_way_residual(system, there, other.vectors, 1)
@@ -258,6 +260,8 @@ def _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell
     screen = replace(config.nodes, steps=config.screening)
 
     def fitted(candidate: Candidate, whole: bool) -> Candidate:
+        if whole:
+            candidate = averaged(system, candidate, candidates)
         local = scan.turned(candidate.rotation, candidate.centre)
         fixed = None
         if landmarks is not None:

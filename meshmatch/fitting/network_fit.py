@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from meshmatch.fitting.mirror import Mirror
 from meshmatch.fitting.scan import Scan, with_normals
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.models.deformer import Deformer
@@ -110,19 +111,28 @@ def variants(
     rng: np.random.Generator,
     count: int,
     degrees: float,
+    mirror: Mirror | None = None,
 ) -> list[Candidate]:
     """Other readings of a hard pose: predictions from randomly tilted core frames, turned back.
 
     Where a limb could be one or the other, tilts and thinner samples tip the network either way, and the residual on the
-    ``coarse`` scan (core frame, like ``scan``) tells which reading is right.
+    ``coarse`` scan (core frame, like ``scan``) tells which reading is right. With a ``mirror``, as many again are of the
+    mirrored scan.
     """
     tilts = Rotation.from_rotvec(np.radians(degrees) * rng.standard_normal((count, 3))).as_matrix()
-    back = []
-    for number, tilt in enumerate(tilts):
-        size = min(_VARIANT_POINTS[number % len(_VARIANT_POINTS)], len(scan.points))
-        cloud = scan.points[rng.choice(len(scan.points), size, replace=False)] @ tilt.T
-        vectors = model(torch.from_numpy(cloud).float()[None])[0].double().numpy()
-        back.append(model.turned(vectors, tilt))
+
+    def read(points: np.ndarray) -> list[np.ndarray]:
+        back = []
+        for number, tilt in enumerate(tilts):
+            size = min(_VARIANT_POINTS[number % len(_VARIANT_POINTS)], len(points))
+            cloud = points[rng.choice(len(points), size, replace=False)] @ tilt.T
+            vectors = model(torch.from_numpy(cloud).float()[None])[0].double().numpy()
+            back.append(model.turned(vectors, tilt))
+        return back
+
+    back = read(scan.points)
+    if mirror is not None:
+        back += [mirror.vectors(vectors) for vectors in read(mirror.scan(scan).points)]
     return [
         Candidate(candidate.rotation, candidate.centre, u, two_way_residual(system, coarse, u, 1))
         for u in back

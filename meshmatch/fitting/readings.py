@@ -8,6 +8,7 @@ and judged by both.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -24,8 +25,10 @@ _NEIGHBOURS = 6
 _TORN_COST = 0.1  # residual that a map torn everywhere is worse by
 # Readings differ where this share of the template's vertices lies that far apart.
 _SHARE, _FAR = 0.02, 0.1
+# So near are readings that say the same, of which this many at most are averaged.
+_NEAR, _ALIKE = 0.05, 8
 # How many readings unlike the finalists are tried too, and among how many they are sought.
-_STRANGERS, _POOL = 3, 12
+_STRANGERS, _POOL = 3, 24
 
 Reading = TypeVar("Reading")
 
@@ -106,6 +109,20 @@ def lying(system: NodeSystem, candidate: Candidate) -> np.ndarray:
     return system.moved(candidate.vectors) @ candidate.rotation.T + candidate.centre
 
 
-def differ(here: np.ndarray, there: np.ndarray) -> bool:
+def differ(here: np.ndarray, there: np.ndarray, far: float = _FAR) -> bool:
     """Whether two readings lay parts of the template (V, 3) at different places."""
-    return bool((np.linalg.norm(here - there, axis=1) > _FAR).mean() > _SHARE)
+    return bool((np.linalg.norm(here - there, axis=1) > far).mean() > _SHARE)
+
+
+def averaged(system: NodeSystem, chosen: Candidate, readings: Sequence[Candidate]) -> Candidate:
+    """A reading with the mean node vectors of those of one core frame that say the same; readings best first.
+
+    Each reading errs in its own way, and its stretch is what the refinement holds on to.
+    """
+    here = system.moved(chosen.vectors)
+    alike = [
+        other.vectors
+        for other in readings
+        if other.rotation is chosen.rotation and not differ(here, system.moved(other.vectors), _NEAR)
+    ]
+    return replace(chosen, vectors=np.mean(alike[:_ALIKE], axis=0)) if alike else chosen

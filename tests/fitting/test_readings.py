@@ -7,7 +7,7 @@ import pytest
 
 from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.network_fit import Candidate
-from meshmatch.fitting.readings import Judge, choose, differ, lying
+from meshmatch.fitting.readings import Judge, averaged, choose, differ, lying
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.shapes.shape import Shape
@@ -91,3 +91,12 @@ def test_readings_alike_cost_one_refinement(system: NodeSystem) -> None:
     best = choose(candidates, 4, fitted, lambda c: c.residual, lambda c: lying(system, c))
     assert best.residual == 0.03
     assert calls == {False: 4, True: 1}
+
+
+def test_readings_that_say_the_same_are_averaged_and_others_are_not(system: NodeSystem) -> None:
+    near = [replace(still(system), vectors=np.full((system.K, 3), size)) for size in (0.0, 0.01, 0.02)]
+    elsewhere = replace(near[1], rotation=np.eye(3))  # another frame, though an equal one
+    far = folded(system)
+    mean = averaged(system, near[0], [*near, elsewhere, far])
+    assert np.allclose(mean.vectors, 0.01)
+    assert averaged(system, far, near) is far

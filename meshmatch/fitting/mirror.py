@@ -1,0 +1,71 @@
+"""A second look through a mirror: where a category's template is symmetric, so is every question about a shape.
+
+The network has no symmetry built in, so it may read a raised left arm and miss a right one. Asked about the mirrored
+scan, its answer mirrored back is another reading of the same pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from meshmatch.errors import TemplateError
+from meshmatch.fields.field import Field
+from meshmatch.fitting.scan import Scan
+
+if TYPE_CHECKING:
+    from meshmatch.models.trained import TrainedModel
+
+# Left and right are exchanged in the template frame, where bodies face along z and stand along y.
+_FLIP = np.array([-1.0, 1.0, 1.0])
+# Every mirrored vertex of a symmetric template is this near to another one (units of sqrt(area)).
+_SYMMETRIC = 0.01
+_RIDGE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Mirror:
+    """The plane x = 0 of a symmetric template.
+
+    Parameters
+    ----------
+    exchange : (K, K)
+        Takes node vectors to those that move the template as these move its mirror image, up to the flip.
+    """
+
+    exchange: np.ndarray
+
+    def scan(self, scan: Scan) -> Scan:
+        """Samples of the mirrored shape; both in the core frame."""
+        return Scan(scan.points * _FLIP, scan.normals * _FLIP)
+
+    def vectors(self, vectors: np.ndarray) -> np.ndarray:
+        """Node vectors (K, 3) of the mirrored deformation: x moves to M f(M x) where f moved it before."""
+        return self.exchange @ vectors * _FLIP
+
+
+@lru_cache(maxsize=4)
+def mirror_of(model: TrainedModel) -> Mirror | None:
+    """The mirror of a model's template; None where it is not symmetric, or its field has no nodes."""
+    template = model.template
+    verts = np.asarray(template.shape.verts)
+    apart = cKDTree(np.asarray(template.dense.verts)).query(verts * _FLIP)[0]
+    if not model.has_nodes or apart.max() > _SYMMETRIC:
+        return None
+    try:
+        here, there = model.field(verts), model.field(verts * _FLIP)
+    except TemplateError:  # the mirrored side has too few nodes
+        return None
+    assert isinstance(here, Field) and isinstance(there, Field)
+    phi, across = _dense(here.phi), _dense(there.phi)
+    square = phi.T @ phi
+    square += _RIDGE * np.trace(square) / len(square) * np.eye(len(square))
+    return Mirror(np.linalg.solve(square, phi.T @ across))
+
+
+def _dense(phi: Any) -> np.ndarray:
+    return np.asarray(phi.to_dense() if hasattr(phi, "to_dense") else phi, dtype=float)
