@@ -1,59 +1,67 @@
-"""Cells of a table as files, so that a run that was stopped goes on with the next one."""
+"""What was measured, as files: a run that was stopped goes on with what is missing.
+
+Each file answers one question, and says which: what was asked is kept beside the answer, and a file that answers
+another question is not taken for this one's.
+"""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from meshmatch.errors import InputError, OptionError
-from meshmatch.experiments.iterations import Cell, Setting
 from meshmatch.outputs import replace_on_success
 
-_SETTING = "setting.json"
 
-
-def read_cell(folder: Path, cell: Cell) -> dict[str, Any]:
-    """What is known of a cell; empty before it was measured.
+def recall(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What a file answers; None where there is no file.
 
     Raises
     ------
     InputError
         The file is damaged.
+    OptionError
+        It answers another question.
     """
-    path = folder / f"{cell.name}.json"
     if not path.is_file():
-        return {}
+        return None
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path} is damaged", "delete it: the cell is then measured again") from error
-    if not isinstance(found, dict):
-        raise InputError(f"{path} holds no cell", "delete it: the cell is then measured again")
-    return found
+        before = found["asked"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{path} is no cell of this benchmark", "remove it to measure again") from error
+    if before != _plain(asked):
+        raise OptionError(
+            f"{path} was measured with other choices ({_difference(before, _plain(asked))})",
+            "choose another folder with --output, or remove it",
+        )
+    return dict(found)
 
 
-def keep(folder: Path, cell: Cell, **parts: Any) -> None:
-    """Add to what is known of a cell."""
-    record = read_cell(folder, cell) | {"field": cell.field, "constraint": cell.constraint} | parts
-    with replace_on_success(folder / f"{cell.name}.json") as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-
-
-def claim(folder: Path, setting: Setting) -> None:
-    """Make the folder, or see that its cells were measured as these will be.
-
-    Raises
-    ------
-    OptionError
-        They were not.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    path, words = folder / _SETTING, json.loads(json.dumps(asdict(setting)))
-    if path.is_file():
-        if json.loads(path.read_text(encoding="utf-8")) != words:
-            raise OptionError(f"{folder} holds cells of another setting", "choose another --output")
-        return
+def keep(path: Path, asked: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
+    """Write an answer with its question, and return both."""
+    record = _plain({"asked": asked, **found})
+    path.parent.mkdir(parents=True, exist_ok=True)
     with replace_on_success(path) as temporary:
-        temporary.write_text(json.dumps(words, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return record
+
+
+def once(path: Path, asked: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
+    """What a file answers; it is measured and written where there is none."""
+    found = recall(path, asked)
+    return keep(path, asked, measure()) if found is None else found
+
+
+def _plain(value: Mapping[str, Any]) -> dict[str, Any]:
+    """As JSON gives it back: tuples are lists."""
+    return dict(json.loads(json.dumps(value)))
+
+
+def _difference(before: Any, now: Mapping[str, Any]) -> str:
+    keys = {*before, *now} if isinstance(before, dict) else set(now)
+    return ", ".join(
+        sorted(key for key in keys if not isinstance(before, dict) or before.get(key) != now.get(key))
+    )

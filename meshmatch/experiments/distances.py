@@ -82,6 +82,12 @@ class TruthDistances:
             matrix.flush()
             del matrix
 
+    def of(self, landmarks: NDArray[np.integer]) -> NDArray[np.float16]:
+        """Distances (N, V) from some landmarks, given by their numbers (N,), to all vertices."""
+        self.prepare()
+        matrix = np.load(self.path, mmap_mode="r", allow_pickle=False)
+        return np.array(matrix[self.row_of_landmark[landmarks]])
+
     def errors(self, predictions: Sequence[NDArray[np.integer]]) -> list[NDArray[np.float32]]:
         """Errors ``(N,)`` of each prediction ``(N,)``: the distance from landmark k to vertex
         ``prediction[k]``.

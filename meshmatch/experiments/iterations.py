@@ -1,8 +1,4 @@
-"""Iterations of training under the clock: several cells taking turns in one process, and each one's memory.
-
-A cell is a representation of the deformation and the constraints with which it is trained; everything else is the same
-for all: data, encoder, batch, template.
-"""
+"""Iterations of training under the clock: several cells taking turns in one process, and each one's memory."""
 
 from __future__ import annotations
 
@@ -13,96 +9,32 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from meshmatch.config import set_threads
-from meshmatch.fields.choice import FieldName
-from meshmatch.templates.template import Template
-from meshmatch.training.datasets import Source
+from meshmatch.experiments.cell_training import fewer
+from meshmatch.experiments.cells import Cell, Setting
 from meshmatch.training.loop import Trainer
-from meshmatch.training.run import Preset, Recipe, folder_source, human_source, read_template, recipe
 from meshmatch.training.setup import build_dataset, build_deformer, build_loss_points
 
-CONSTRAINTS = ("none", "vol+arap", "vol+arap+Z")
 _BATCHES = 2
 
 
-@dataclass(frozen=True)
-class Cell:
-    """A representation, and one of `CONSTRAINTS`."""
-
-    field: FieldName
-    constraint: str
-
-    @property
-    def name(self) -> str:
-        """Of its files."""
-        return f"{self.field}-{self.constraint.replace('+', '-')}"
-
-
-@dataclass(frozen=True)
-class Setting:
-    """What all cells share; plain values, so that a process of its own can be told.
-
-    ``shapes``: a folder that `meshmatch prepare` made; None for generated bodies on ``template``. ``batch``: shapes in a
-    batch, None for the preset's. ``width``, ``code``: of the network, None for the preset's.
-    """
-
-    preset: Preset = "paper"
-    template: str = "human-T"
-    shapes: str | None = None
-    identities: int = 4096
-    batch: int | None = None
-    code: int | None = None
-    width: int | None = None
-    threads: int = 1
-    seed: int = 0
-
-    def material(self) -> tuple[Template, Source]:
-        """The template, and what draws shapes."""
-        if self.shapes is None:
-            made = read_template(self.template)
-            return made, human_source(made, self.identities, self.seed)
-        made = read_template(Path(self.shapes) / "template.safetensors")
-        return made, folder_source(self.shapes, made)[0]
-
-    def recipe(self, cell: Cell) -> Recipe:
-        """The preset's recipe with the cell's representation; constraints that it does not have weigh nothing."""
-        chosen = recipe(self.preset)
-        loss = chosen.train.loss
-        if cell.constraint == "none":
-            loss = replace(loss, volume=0.0, arap=0.0)
-        if cell.constraint != "vol+arap+Z":
-            loss = replace(loss, blend=0.0)
-        network = replace(
-            chosen.network,
-            field=cell.field,
-            code=self.code or chosen.network.code,
-            width=self.width or chosen.network.width,
-        )
-        train = replace(
-            chosen.train,
-            loss=loss,
-            shapes=self.batch or chosen.train.shapes,
-            threads=self.threads,
-            seed=self.seed,
-        )
-        return replace(chosen, network=network, train=train)
-
-
-def built(setting: Setting, cell: Cell, template: Template, source: Source) -> tuple[Trainer, list[Any]]:
+def built(setting: Setting, cell: Cell) -> tuple[Trainer, list[Any]]:
     """A trainer at its first step, and batches for it."""
-    chosen = setting.recipe(cell)
+    chosen, template, source = setting.recipe(cell), setting.template(cell), setting.sources(cell.pose)[0]
     train = chosen.train
     model = build_deformer(template, source, chosen.network, chosen.scan, chosen.kernel, train.seed)
-    trainer = Trainer(model, build_loss_points(template, chosen.kernel, model), train)
+    points = build_loss_points(template, chosen.kernel, model, strained=setting.strained)
+    trainer = Trainer(model, fewer(points, cell.supervised), train)
     data = build_dataset(
         template, source, model, chosen.scan, train.shapes, train.scans_per_shape, train.seed, _BATCHES
     )
     trainer.model.train()
-    return trainer, [data[number].to(trainer.device) for number in range(_BATCHES)]
+    batches = [data[number].to(trainer.device) for number in range(_BATCHES)]
+    return trainer, [replace(each, targets=each.targets[:, : cell.supervised]) for each in batches]
 
 
 def timed(
@@ -114,8 +46,7 @@ def timed(
     another cell, so that what else the machine does disturbs all alike. One round before the first does not count.
     """
     set_threads(setting.threads)
-    template, source = setting.material()
-    ready = [(cell, *built(setting, cell, template, source)) for cell in cells]
+    ready = [(cell, *built(setting, cell)) for cell in cells]
     wall: dict[str, list[float]] = {cell.name: [] for cell in cells}
     cpu: dict[str, list[float]] = {cell.name: [] for cell in cells}
     for turn in range(-1, rounds):
@@ -156,7 +87,7 @@ def memory(setting: Setting, cell: Cell, iterations: int = 3) -> dict[str, Any]:
 
 def _grown(setting: Setting, cell: Cell, iterations: int) -> tuple[float, str]:
     set_threads(setting.threads)
-    trainer, batches = built(setting, cell, *setting.material())
+    trainer, batches = built(setting, cell)
     before = _resident()
     _forget_peak()
     for number in range(iterations):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,14 +12,13 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from meshmatch.errors import InputError, OptionError
 from meshmatch.experiments.bench import Matcher, run_set
+from meshmatch.experiments.cell_files import keep, recall
 from meshmatch.experiments.distances import default_folder
 from meshmatch.experiments.protocols import BenchSet, Pair
 from meshmatch.experiments.report import circumstances, wide_console
 from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.geodesics import GEODESIC
-from meshmatch.outputs import replace_on_success
 from meshmatch.render.bars import Bar, draw_bars
 
 
@@ -82,40 +80,22 @@ def measured(
         "settings": {key: str(value) for key, value in vars(rival.matcher).items()},
         "model": rival.model,
     }
-    if path.is_file():
-        return _read(path, asked)
-    if late:
-        return None
+    before = recall(path, asked)
+    if before is not None or late:
+        return before
     began = time.perf_counter()
     kept = cache or default_folder()
     run = run_set(bench, rival.matcher, pairs=pairs, cache=kept, jobs=jobs, threads=threads, console=console)
     record = run.as_dict()
     record.pop("fits")
     found = {
-        "asked": asked,
         **circumstances(threads, jobs),
         "of": len(bench.pairs),
         "training_minutes": rival.minutes,
         "seconds": round(time.perf_counter() - began, 1),
         "scores": record,
     }
-    with replace_on_success(path) as temporary:
-        temporary.write_text(json.dumps(found) + "\n", encoding="utf-8")
-    return found
-
-
-def _read(path: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        same, _ = found["asked"] == asked, found["scores"]["mean_cm"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{path} is no cell of this benchmark", "remove it to measure again") from error
-    if not same:
-        raise OptionError(
-            f"{path} was measured with other pairs, settings or weights",
-            "choose another folder with --output, or remove it",
-        )
-    return found
+    return keep(path, asked, found)
 
 
 Cells = dict[str, dict[str, dict[str, Any]]]
