@@ -33,7 +33,15 @@ TEMPLATE = "human-T"
 
 
 def coded_recipe(
-    steps: int, minutes: float | None, points: int, width: int, *, bf16: bool, threads: int, seed: int
+    steps: int,
+    minutes: float | None,
+    shapes: int,
+    points: int,
+    width: int,
+    *,
+    bf16: bool,
+    threads: int,
+    seed: int,
 ) -> Recipe:
     """The preset `paper`, pointwise and without constraints; scans as rough as those of the other learned rival.
 
@@ -48,6 +56,7 @@ def coded_recipe(
         steps=steps,
         decay=0.5,
         minutes=minutes,
+        shapes=shapes,
         workers=0,
         bf16=bf16,
         threads=threads,
@@ -69,6 +78,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=1500, help="of the whole training: %(default)s")
     parser.add_argument("--minutes", type=float, help="of this run at most; the same command goes on")
     parser.add_argument("--identities", type=int, default=1024, help="people that bodies are blended from")
+    parser.add_argument("--shapes", type=int, default=8, help="in a batch: %(default)s")
     parser.add_argument("--points", type=int, default=512, help="of a scan in training: %(default)s")
     parser.add_argument("--width", type=int, default=512, help="of the decoder: %(default)s")
     parser.add_argument("--bf16", action="store_true", help="bfloat16 arithmetic")
@@ -82,6 +92,7 @@ def main(words: Sequence[str] | None = None) -> int:
         chosen = coded_recipe(
             options.steps,
             options.minutes,
+            options.shapes,
             options.points,
             options.width,
             bf16=options.bf16,

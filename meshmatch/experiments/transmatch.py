@@ -191,12 +191,20 @@ def main(words: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--steps", type=int, default=Schedule.steps, help="of training at most")
     parser.add_argument("--identities", type=int, default=1024, help="people that bodies are blended from")
+    parser.add_argument("--shapes", type=int, default=Schedule.shapes, help="in a batch: %(default)s")
+    parser.add_argument("--points", type=int, default=Schedule.points, help="of a scan: %(default)s")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(words)
     console = Console(stderr=True)
     try:
-        schedule = Schedule(steps=options.steps, minutes=options.minutes, seed=options.seed)
+        schedule = Schedule(
+            steps=options.steps,
+            minutes=options.minutes,
+            shapes=options.shapes,
+            points=options.points,
+            seed=options.seed,
+        )
         set_threads(max(1, options.threads))
         template = load_template(bundled_folder() / "human" / "human-T.safetensors")
         source = human_source(template, options.identities, options.seed)

@@ -13,7 +13,7 @@ from tests.training.small import bent_eggs, egg_template
 
 
 def test_the_recipe_is_pointwise_and_free() -> None:
-    chosen = coded_recipe(7, 2.5, 96, 64, bf16=True, threads=1, seed=3)
+    chosen = coded_recipe(7, 2.5, 5, 96, 64, bf16=True, threads=1, seed=3)
     loss = chosen.train.loss
     assert (loss.volume, loss.arap, loss.blend, loss.robust) == (0, 0, 0, False)
     assert (chosen.network.field, chosen.network.encoder, chosen.network.width) == ("pointwise", "point", 64)
@@ -23,6 +23,7 @@ def test_the_recipe_is_pointwise_and_free() -> None:
         3,
         True,
     )
+    assert chosen.train.shapes == 5
     assert chosen.scan.upright and chosen.scan.points == 96 and chosen.scan.partial == 0
 
 
@@ -39,14 +40,14 @@ def test_the_command(
     monkeypatch.setattr(coded, "read_template", lambda name: egg_template())
     folder = tmp_path / "egg"
     words = ["-o", str(folder), "--steps", "2", "--points", "96", "--width", "16", "--identities", "64"]
-    words += ["--threads", "1", "--seed", "3"]
+    words += ["--shapes", "4", "--threads", "1", "--seed", "3"]
     assert main([*words, "--minutes", "1e-9"]) == 0
     first = json.loads(capsys.readouterr().out)
     assert first["steps"] == 1 and asked == [64, 3]
     assert main([*words, "--minutes", "1", "--bf16"]) == 0
     whole = json.loads(capsys.readouterr().out)
     assert whole["steps"] == 2 and whole["train"]["seed"] == 3 and whole["train"]["bf16"] is True
-    assert whole["network"]["width"] == 16 and whole["scan"]["points"] == 96
+    assert whole["network"]["width"] == 16 and whole["train"]["shapes"] == 4 and whole["scan"]["points"] == 96
     assert {"date", "commit", "machine", "minutes", "distance"} <= whole.keys()
     model = read_model(str(folder))
     assert not model.has_nodes and model.network.aligner is None

@@ -136,10 +136,11 @@ def test_the_command(
     monkeypatch.setattr(transmatch, "human_source", eggs)
     monkeypatch.setattr(transmatch, "load_template", lambda path: egg_template())
     words = ["-o", str(tmp_path / "t"), "--minutes", "1", "--steps", "1", "--threads", "1", "--seed", "3"]
-    assert main([*words, "--identities", "64"]) == 0
+    assert main([*words, "--identities", "64", "--shapes", "3", "--points", "80"]) == 0
     record = json.loads(capsys.readouterr().out)
     assert asked == [64, 3]
     assert record["steps"] == 1 and record["schedule"]["seed"] == 3 and record["network"]["width"] == 192
+    assert (record["schedule"]["shapes"], record["schedule"]["points"]) == (3, 80)
     assert {"date", "commit", "machine", "minutes", "distance"} <= record.keys()
     assert main(["-o", str(tmp_path), "--minutes", "0"]) == 1
     assert "minutes above 0" in " ".join(capsys.readouterr().err.split())
