@@ -28,7 +28,7 @@ SUPERVISED = (50, 100, 1000)
 CODED = replace(BASE, field="pointwise", constraint="none")
 """3D-CODED as a cell."""
 
-VIEWS = ("table4", "table7", "figure8", "table5", "table6", "figure9", "figure10", "figure6")
+VIEWS = ("table4", "table5", "figure9", "figure10", "figure8", "table7", "table6", "figure6")
 """In the order in which their cells are trained."""
 
 

@@ -54,7 +54,7 @@ def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
     missing = [cell.name for cell in here.cells if cell not in known.trained]
     if missing and options.minutes:
         out.print(f"Not measured: {', '.join(missing)}", soft_wrap=True)
-    drawn = draw_views(known, here.views, here.sets, words, options.pictures or options.output)
+    drawn = draw_views(known, here.views, here.sets, options.pictures or options.output)
     for path in drawn:
         console.print(f"wrote {path}", highlight=False)
     record = {

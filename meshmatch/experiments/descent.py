@@ -28,7 +28,7 @@ from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
-CODE_STEPS = (0, 10, 30, 100, 300, 1000)
+CODE_STEPS = (0, 10, 30, 100, 300)
 NODE_STEPS = (0, 1, 2, 4, 7, 10)
 
 
