@@ -82,7 +82,9 @@ def losses(
     errors = {"error_code": fit.detach()}
     if config.blend:
         share = torch.rand(len(code), 1, generator=generator).to(code.device)
-        F = points.deformation_gradient(model.decoder(share * code + (1 - share) * code.roll(1, 0)))
+        # Half a batch apart: scans of one shape stand side by side, and between these there is nothing to learn.
+        other = code.roll(max(1, len(code) // 2), 0)
+        F = points.deformation_gradient(model.decoder(share * code + (1 - share) * other))
         terms["blend"] = config.blend * (volume_energy(F).mean() + arap_energy(F).mean())
     if model.corrector is not None:
         scan = batch.points[:, : config.correct_points]

@@ -123,6 +123,30 @@ def test_blends_come_from_the_generator(egg: Template, points: LossPoints) -> No
     assert a == b != c
 
 
+def test_blends_are_of_different_shapes(egg: Template, points: LossPoints) -> None:
+    """Two scans of each of three shapes, codes that name the shape: no blend is of one shape alone."""
+    model = small_network(egg, POINTS, UPRIGHT)
+    batch = small_data(egg, model, UPRIGHT)[0]
+    batch = replace(
+        batch, points=batch.points[:1].expand(6, -1, -1), targets=batch.targets[:1].expand(6, -1, -1)
+    )
+    seen: list[torch.Tensor] = []
+
+    class Names(torch.nn.Module):
+        def forward(self, features: torch.Tensor) -> torch.Tensor:
+            return torch.eye(3).repeat_interleave(2, 0)
+
+    class Listener(torch.nn.Module):
+        def forward(self, code: torch.Tensor) -> torch.Tensor:
+            seen.append(code)
+            return torch.zeros(len(code), egg.K, 3)
+
+    model.encoder, model.decoder = Names(), Listener()  # type: ignore[assignment]
+    terms(model, batch, points, LossConfig(blend=1.0))
+    blended = seen[1]
+    assert torch.allclose(blended.sum(1), torch.ones(6)) and ((blended > 0).sum(1) == 2).all()
+
+
 def test_the_aligner_errs_by_nothing_when_it_is_right(egg: Template, points: LossPoints) -> None:
     model = small_network(egg)
     batch = small_data(egg, model)[0]
