@@ -113,7 +113,8 @@ def _whole(model, shape, frame, scan, config, landmarks, rng, tell) -> _Laid:
     if config.refine == "nodes":
         candidates = _readings(model, system, scan, coarse, candidates, config, rng)
     tell("orientation", 1.0)
-    return frame, scan, _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell)
+    rough = shape.roughness
+    return frame, scan, _refine(model, system, scan, frame, candidates, config, landmarks, rough, rng, tell)
 
 
 def _part(model, frame, scan, config, tell) -> _Laid:
@@ -247,7 +248,7 @@ def _hypotheses(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypo
     return obeying or forced_frames(up, front)
 
 
-def _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell) -> Candidate:
+def _refine(model, system, scan, frame, candidates, config, landmarks, rough, rng, tell) -> Candidate:
     if config.refine == "none":
         return candidates[0]
     if config.refine == "latent":
@@ -271,7 +272,7 @@ def _refine(model, system, scan, frame, candidates, config, landmarks, rng, tell
             candidate.rotation, candidate.centre, vectors, two_way_residual(system, local, vectors)
         )
 
-    judge = Judge(system, scan)
+    judge = Judge(system, scan, rough)
     return choose(
         candidates,
         config.finalists,

@@ -23,6 +23,7 @@ from meshmatch.fitting.system import NodeSystem
 _TEAR, _STRETCH = 0.06, 3.0
 _NEIGHBOURS = 6
 _TORN_COST = 0.1  # residual that a map torn everywhere is worse by
+_CAP = 0.1  # beyond it a distance says no more
 # Readings differ where this share of the template's vertices lies that far apart.
 _SHARE, _FAR = 0.02, 0.1
 # So near are readings that say the same, of which this many at most are averaged.
@@ -34,10 +35,14 @@ Reading = TypeVar("Reading")
 
 
 class Judge:
-    """Scores fits of one scan: the lower the better."""
+    """Scores fits of one scan: the lower the better.
 
-    def __init__(self, system: NodeSystem, scan: Scan) -> None:
-        self._system = system
+    ``roughness`` (0..1, see `Shape.roughness`) of a cloud: normals estimated from noise say little, and squares tell a
+    limb that lies beside its points from one whose points scatter about it.
+    """
+
+    def __init__(self, system: NodeSystem, scan: Scan, roughness: float = 0.0) -> None:
+        self._system, self._roughness = system, roughness
         index = scan.tree.query(
             with_normals(scan.points, scan.normals), min(_NEIGHBOURS + 1, len(scan.points))
         )[1]
@@ -46,7 +51,18 @@ class Judge:
 
     def score(self, scan: Scan, candidate: Candidate) -> float:
         """Residual of a candidate and what it tears; ``scan`` holds the same samples in its core frame and size."""
-        return candidate.residual + _TORN_COST * self.torn(scan, candidate.vectors)
+        residual, rough = candidate.residual, self._roughness
+        if rough > 0:
+            residual += rough * (self.scatter(scan, candidate.vectors) - residual)
+        return residual + _TORN_COST * self.torn(scan, candidate.vectors)
+
+    def scatter(self, scan: Scan, vectors: np.ndarray) -> float:
+        """Root of the mean squared distance of nearest points, both ways, normals left out (units of sqrt(area))."""
+        moved = self._system.moved(vectors)
+        forward = cKDTree(scan.points).query(moved, distance_upper_bound=_CAP)[0]
+        back = cKDTree(moved).query(scan.points, distance_upper_bound=_CAP)[0]
+        squares = [np.square(np.minimum(apart, _CAP)).mean() for apart in (forward, back)]
+        return float(np.sqrt(0.5 * (squares[0] + squares[1])))
 
     def torn(self, scan: Scan, vectors: np.ndarray) -> float:
         """Share (0..1) of neighbours on the scan that belong far apart on the template."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from meshmatch.fields.field import Field
 from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.mirror import Mirror, mirror_of
 from meshmatch.fitting.network_fit import Candidate, variants
@@ -46,7 +47,9 @@ def test_the_mirrored_deformation_moves_the_mirrored_template_to_the_mirror_imag
     vectors = 0.5 * gentle_vectors(human)
     moved = system.moved(mirror.vectors(vectors))
     # an oracle without the solve: the field itself, asked at the mirrored vertices
-    across = human.field(system.verts * FLIP).for_training().phi.to_dense().double().numpy()
+    over = human.field(system.verts * FLIP)
+    assert isinstance(over, Field)
+    across = over.for_training().phi.to_dense().double().numpy()
     wanted = (system.verts * FLIP + across @ vectors) * FLIP
     assert np.abs(moved - system.verts).max() > 0.01
     assert np.abs(moved - wanted).max() < 2e-3

@@ -100,3 +100,18 @@ def test_readings_that_say_the_same_are_averaged_and_others_are_not(system: Node
     mean = averaged(system, near[0], [*near, elsewhere, far])
     assert np.allclose(mean.vectors, 0.01)
     assert averaged(system, far, near) is far
+
+
+def test_of_a_rough_cloud_positions_alone_are_judged_and_squares(system: NodeSystem, scan: Scan) -> None:
+    shifted = replace(still(system), vectors=np.full((system.K, 3), [0.02, 0, 0]))
+    apart = np.linalg.norm(system.verts[:, None] + [0.02, 0, 0] - scan.points, axis=2)
+    wanted = np.sqrt(0.5 * np.square(apart.min(1)).mean() + 0.5 * np.square(apart.min(0)).mean())
+    rough, smooth, half = (Judge(system, scan, share) for share in (1.0, 0.0, 0.5))
+    assert rough.scatter(scan, shifted.vectors) == pytest.approx(wanted)
+    torn = 0.1 * rough.torn(scan, shifted.vectors)
+    assert rough.score(scan, shifted) == pytest.approx(wanted + torn)
+    assert smooth.score(scan, shifted) == pytest.approx(0.03 + torn)
+    assert half.score(scan, shifted) == pytest.approx(0.5 * (0.03 + wanted) + torn)
+    # a template out of reach: every distance counts as the cap
+    away = replace(still(system), vectors=np.full((system.K, 3), 3.0))
+    assert rough.scatter(scan, away.vectors) == pytest.approx(0.1)
