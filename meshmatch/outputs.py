@@ -10,6 +10,13 @@ from pathlib import Path
 from meshmatch.errors import OutputError
 
 
+def plain_text(text: str) -> str:
+    """Text that every file can hold. What is no letter, such as a byte of a file's name that is not UTF-8, becomes
+    U+FFFD.
+    """
+    return text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+
+
 @contextmanager
 def replace_on_success(path: str | Path) -> Iterator[Path]:
     """Give a temporary path beside `path`, and rename it to `path` when the block ends well.
@@ -30,7 +37,8 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
         raise OutputError(
             f"cannot write {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}"
         )
-    temporary = folder / f".{path.stem[:80]}.{secrets.token_hex(4)}{path.suffix}"
+    # A name has 255 bytes at most, and a letter up to 4 of them.
+    temporary = folder / f".{path.stem[:40]}.{secrets.token_hex(4)}{path.suffix}"
     try:
         temporary.touch(exist_ok=False)  # tells now, not after minutes of work
         mode = temporary.stat().st_mode  # some writers make files that only their owner may read
@@ -74,7 +82,7 @@ def folder_on_success(path: str | Path) -> Iterator[Path]:
         raise OutputError(
             f"cannot make {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}"
         )
-    temporary = folder / f".{path.name[:80]}.{secrets.token_hex(4)}"
+    temporary = folder / f".{path.name[:40]}.{secrets.token_hex(4)}"
     try:
         temporary.mkdir()
     except OSError as error:

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from meshmatch.outputs import plain_text
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -65,7 +67,7 @@ class Voice:
 
         color = {"error": "bold red", "warning": "bold yellow", "hint": "dim"}.get(label, "bold")
         words = Text(f"{label}: ", style=color) if label else Text()
-        _console().print(words.append(text, style="default"), soft_wrap=True, highlight=False)
+        _console().print(words.append(plain_text(text), style="default"), soft_wrap=True, highlight=False)
 
 
 def _console() -> "Console":
@@ -76,7 +78,12 @@ def _console() -> "Console":
 
 def print_json(record: Mapping[str, Any]) -> None:
     """One JSON object on one line of stdout."""
-    sys.stdout.write(json.dumps(record, ensure_ascii=False) + "\n")
+    line = json.dumps(record, ensure_ascii=False)
+    try:
+        line.encode(sys.stdout.encoding or "utf-8")
+    except UnicodeEncodeError:  # a terminal without these letters, or a file's name that is not UTF-8
+        line = json.dumps(record)
+    sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
 
@@ -85,5 +92,6 @@ def print_rows(rows: Sequence[Sequence[str]]) -> None:
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     for row in rows:
         line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        sys.stdout.write(line.rstrip() + "\n")
+        coding = sys.stdout.encoding or "utf-8"
+        sys.stdout.write(line.rstrip().encode(coding, "backslashreplace").decode(coding) + "\n")
     sys.stdout.flush()

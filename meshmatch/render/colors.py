@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.shapes.light import to_linear, to_srgb
+from meshmatch.shapes.palette import oklab_to_linear
 from meshmatch.shapes.shape import Shape
 
 FloatArray = NDArray[np.float64]
@@ -37,24 +38,3 @@ def position_colors(shape: Shape, rotation: FloatArray | None = None) -> FloatAr
     chroma = 0.125
     lab = np.stack([lightness, chroma * np.cos(hue), chroma * np.sin(hue)], axis=1)
     return np.asarray(to_srgb(oklab_to_linear(lab)))
-
-
-def oklab_to_linear(lab: FloatArray) -> FloatArray:
-    """Light (N, 3) of colours (N, 3) in Oklab, where equal steps look equal (Ottosson 2020)."""
-    roots = lab @ np.array(
-        [
-            [1.0, 1.0, 1.0],
-            [0.3963377774, -0.1055613458, -0.0894841775],
-            [0.2158037573, -0.0638541728, -1.291485548],
-        ]
-    )
-    return np.asarray(
-        roots**3
-        @ np.array(
-            [
-                [4.0767416621, -1.2684380046, -0.0041960863],
-                [-3.3077115913, 2.6097574011, -0.7034186147],
-                [0.2309699292, -0.3413193965, 1.7076147010],
-            ]
-        )
-    )

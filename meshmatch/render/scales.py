@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.errors import OptionError
 from meshmatch.render.colors import oklab_to_linear, to_srgb
+from meshmatch.shapes.palette import UNKNOWN, label_colors
 
 FloatArray = NDArray[np.float64]
 
-UNKNOWN = (0.62, 0.64, 0.67)
-"""What has no value."""
+__all__ = ["UNKNOWN", "Scale", "Swatches", "label_colors", "label_swatches", "nice_step"]
 
 # Lightness, chroma, hue in degrees (Oklab). Lightness alone orders them, so a grey print can be read too.
 _HEAT = (
@@ -171,17 +171,6 @@ class Swatches:
     names: tuple[str, ...]
     colors: tuple[tuple[float, float, float], ...]
     title: str = ""
-
-
-def label_colors(labels: ArrayLike) -> FloatArray:
-    """Written colours (N, 3) of labels (N,): the same for the same label always, and neighbours far apart."""
-    number = np.asarray(labels, dtype=np.int64)
-    # Hue by the golden angle; three rings of lightness, so that many labels stay apart.
-    hue = np.radians(28.0 + 137.50776 * (number % 1000))
-    light = np.array([0.68, 0.80, 0.55])[number % 3]
-    chroma = np.array([0.145, 0.115, 0.12])[number % 3]
-    lab = np.stack([light, chroma * np.cos(hue), chroma * np.sin(hue)], axis=-1)
-    return np.where((number >= 0)[..., None], to_srgb(oklab_to_linear(lab)), UNKNOWN)
 
 
 def label_swatches(labels: ArrayLike, names: Sequence[str] = (), most: int = 24) -> Swatches:

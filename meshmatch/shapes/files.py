@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.errors import InputError, OptionError
-from meshmatch.outputs import replace_on_success
+from meshmatch.outputs import plain_text, replace_on_success
 from meshmatch.shapes.formats import Raw, gltf, gltf_out, obj, off, ply, points, stl
 from meshmatch.shapes.shape import Shape
 
@@ -61,7 +61,7 @@ def load_shape(path: str | Path) -> Shape:
     data = read_bytes(path)
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
         raw = _READERS[suffix](path, data)
-    return _shape(path.name, raw)
+    return _shape(plain_text(path.name), raw)
 
 
 def read_bytes(path: Path) -> bytes:

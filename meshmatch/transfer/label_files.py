@@ -22,7 +22,9 @@ from typing import Any, Literal
 import numpy as np
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.outputs import plain_text
 from meshmatch.shapes.arrays import existing, read_npy
+from meshmatch.shapes.palette import label_colors
 from meshmatch.shapes.shape import Ints, Shape
 
 On = Literal["vertices", "faces"]
@@ -149,7 +151,8 @@ def _labels(name: str, values: list[Any], on: On) -> Labels:
                 raise InputError(
                     f"{name}: {raw} is no label", "numbers between labels go with transfer-color"
                 )
-            cells.append(None if raw is None or raw == "" else " ".join(str(raw).split()))  # one line each
+            word = plain_text(" ".join(str(raw).split()))  # one line each
+            cells.append(None if raw is None or raw == "" else word)
     names = tuple(sorted({cell for cell in cells if cell is not None}))
     place = {label: k for k, label in enumerate(names)}
     codes = np.array([-1 if cell is None else place[cell] for cell in cells], np.int64)
@@ -287,7 +290,8 @@ def _write_ply(path: Path, labels: Labels, shape: Shape) -> None:
         )
     used = np.array(numbers, np.int32)
     comments = [f"label {k} {name}" for k, name in enumerate(labels.names)] if labels.are_words else []
-    colors = np.rint(255 * label_colors(len(labels.names))).astype(np.uint8)[labels.codes]
+    known = [k if name not in ("", -1) else -1 for k, name in enumerate(labels.names)]
+    colors = np.rint(255 * label_colors(known)).astype(np.uint8)[labels.codes]
     columns: dict[str, Any] = {"label": used[labels.codes]}
     columns |= {channel: colors[:, k] for k, channel in enumerate(("red", "green", "blue"))}
     plain = Shape(shape.verts, shape.faces, shape.name, None, shape.invalid)
@@ -295,11 +299,3 @@ def _write_ply(path: Path, labels: Labels, shape: Shape) -> None:
         ply.write(path, plain, vertex=columns, comments=comments)
     else:
         ply.write(path, plain, face=columns, comments=comments)
-
-
-def label_colors(count: int) -> np.ndarray:
-    """(count, 3) colours in 0..1 that are easily told apart: hues in steps of the golden ratio."""
-    hue = (0.07 + np.arange(count) * 0.6180339887) % 1.0
-    light = 0.55 + 0.25 * (np.arange(count) % 3 - 1) * 0.8
-    wave = np.abs((hue[:, None] * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1
-    return np.asarray(light[:, None] + 0.35 * (np.clip(wave, 0, 1) - 0.5))

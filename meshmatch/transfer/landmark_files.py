@@ -24,6 +24,7 @@ import numpy as np
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.pairs import load_points
+from meshmatch.outputs import plain_text
 from meshmatch.shapes.arrays import existing
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.landmarks import Landmarks, at_faces, at_points, at_vertices, joined
@@ -170,7 +171,7 @@ def _named(name: str, value: Any, number: int) -> _Entry:
 
 def _entry(record: dict[str, Any], number: int) -> _Entry:
     words = "".join(c if c.isprintable() else " " for c in str(record.get("name") or number))
-    name = " ".join(words.split())
+    name = plain_text(" ".join(words.split()))
     face, weights = record.get("face"), record.get("barycentric")
     if face is not None and face != -1 and weights is not None:
         return _Entry(name, face=_whole(face, name), weights=_three(weights, name))

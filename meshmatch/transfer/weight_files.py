@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.outputs import plain_text
 from meshmatch.shapes.arrays import existing, read_npz
 from meshmatch.shapes.shape import Shape
 
@@ -88,7 +89,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 def _from_record(name: str, record: dict[str, Any], shape: Shape) -> SkinWeights:
     weights = _table(name, "weights", record["weights"], np.float64)
     if "names" in record:
-        names = tuple(str(word) for word in np.ravel(np.asarray(record["names"], np.str_)))
+        names = tuple(plain_text(str(word)) for word in np.ravel(np.asarray(record["names"], np.str_)))
     else:
         count = weights.shape[1] if "joints" not in record else int(np.max(record["joints"], initial=-1)) + 1
         names = tuple(f"joint {k}" for k in range(max(min(count, 1 << 20), 1)))

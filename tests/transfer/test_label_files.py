@@ -9,13 +9,13 @@ import pytest
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.palette import UNKNOWN, label_colors
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.label_files import (
     LABEL_SUFFIXES,
     Label,
     Labels,
     On,
-    label_colors,
     load_labels,
     named,
     save_labels,
@@ -60,7 +60,7 @@ def test_a_ply_has_labels_and_colours(tmp_path: Path, on: On, words: bool) -> No
     assert ("comment label 2 Fuß" in head) is words
     if on == "vertices":
         assert shape.colors is not None
-        expected = label_colors(3)[given.codes]
+        expected = label_colors([0, 1, 2])[given.codes]
         assert np.abs(shape.colors[:, :3] - expected).max() < 0.5 / 255 + 1e-9
 
 
@@ -74,11 +74,23 @@ def test_labels_in_a_ply_are_the_numbers_themselves(tmp_path: Path) -> None:
     assert np.array_equal(np.ravel(values), cells(given))
 
 
-def test_colours_of_labels_differ() -> None:
-    colors = label_colors(20)
-    assert ((colors >= 0) & (colors <= 1)).all()
-    apart = np.linalg.norm(colors[:, None] - colors, axis=2) + 9 * np.eye(20)
-    assert apart.min() > 0.05
+@pytest.mark.parametrize("names", [("arm", ""), (3, -1)])
+def test_no_label_is_grey_in_a_ply_as_in_pictures(tmp_path: Path, names: tuple[Label, ...]) -> None:
+    save_labels(tmp_path / "l.ply", Labels(np.arange(SHAPE.V) % 2, names, "vertices"), SHAPE)
+    colors = load_shape(tmp_path / "l.ply").colors
+    assert colors is not None
+    assert np.abs(colors[1::2, :3] - UNKNOWN).max() < 0.5 / 255 + 1e-9
+    assert np.abs(colors[::2, :3] - label_colors([0])).max() < 0.5 / 255 + 1e-9
+
+
+@pytest.mark.parametrize("suffix", LABEL_SUFFIXES)
+def test_words_and_names_that_are_no_text(tmp_path: Path, suffix: str) -> None:
+    """Half a letter out of JSON, and a file's name that is not UTF-8: written with a stand-in."""
+    (tmp_path / "in.json").write_text(json.dumps(["arm", "\ud800"] * (SHAPE.V // 2)))
+    given = load_labels(tmp_path / "in.json", SHAPE)
+    save_labels(tmp_path / f"l{suffix}", given, SHAPE)
+    if suffix != ".ply":
+        assert cells(load_labels(tmp_path / f"l{suffix}", SHAPE))[:2] == ["arm", "\ufffd"]
 
 
 READABLE: dict[str, tuple[str, str]] = {

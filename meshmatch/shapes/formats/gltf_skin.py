@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
+from meshmatch.outputs import plain_text
 from meshmatch.shapes.formats import damaged
 from meshmatch.shapes.formats.gltf import NONSENSE, Document
 
@@ -93,7 +94,8 @@ def _skin(document: Document) -> Skin:
         seen += V
     if not vertices:
         raise InputError(f"{document.name} has a skin, but no vertex hangs from it", "was it exported so?")
-    names = _apart([str(document.nodes[node].get("name") or f"joint {node}") for node in nodes])
+    labels = [document.nodes[node].get("name") or f"joint {node}" for node in nodes]
+    names = _apart([plain_text(str(label)) for label in labels])
     return Skin(seen, np.concatenate(vertices), np.concatenate(joints), np.concatenate(weights), names)
 
 

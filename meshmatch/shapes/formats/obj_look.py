@@ -83,7 +83,7 @@ def read_look(
 
 
 def _words(text: bytes, lines: NDArray[np.int64]) -> list[tuple[str, int]]:
-    names = [re.split(r"\s#", row.decode("utf-8", "replace"))[0].strip() for row in text.split(b"\n")]
+    names = [re.split(r"\s#", row.decode("utf-8", "surrogateescape"))[0].strip() for row in text.split(b"\n")]
     return list(zip(names, lines.tolist(), strict=False))
 
 
@@ -163,7 +163,7 @@ def _beside(folder: Path, name: str) -> Path | None:
 def _parse(file: Path) -> dict[str, _Entry]:
     entries: dict[str, _Entry] = {}
     entry = _Entry()
-    for line in joined_lines(file.read_bytes()).decode("utf-8", "replace").splitlines():
+    for line in joined_lines(file.read_bytes()).decode("utf-8", "surrogateescape").splitlines():
         word, rest = (*line.split(None, 1), "", "")[:2]
         word, rest = word.lower(), rest.strip()
         if word.startswith("#"):

@@ -22,7 +22,7 @@ def write_textured(path: Path, mesh: Textured, mtl: str, material: str) -> None:
     lines.append(f"usemtl {material}")
     table = np.stack([mesh.faces, index.reshape(-1, 3)], axis=2).reshape(-1, 6) + 1
     lines += [f"f {a}/{p} {b}/{q} {c}/{r}" for a, p, b, q, c, r in table.tolist()]
-    path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    path.write_text("\n".join([*lines, ""]), encoding="utf-8", errors="surrogateescape")
 
 
 def write_material(path: Path, material: str, image: str, mesh: Textured) -> None:
@@ -31,4 +31,4 @@ def write_material(path: Path, material: str, image: str, mesh: Textured) -> Non
     lines.append(f"map_Kd {image}")
     if mesh.alpha != "opaque":
         lines.append(f"map_d {image}")
-    path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    path.write_text("\n".join([*lines, ""]), encoding="utf-8", errors="surrogateescape")

@@ -1,0 +1,85 @@
+"""Names that are not ASCII, not UTF-8, or as long as a name may be; and a terminal that cannot show them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from meshmatch.outputs import folder_on_success, replace_on_success
+from meshmatch.shapes.appearance import load_appearance
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+from tests.cli.conftest import Run
+
+BAD = os.fsdecode(b"b\xff.ply")
+
+
+@pytest.fixture
+def odd(tmp_path: Path, cube: Shape) -> Path:
+    """A folder in which a cube has a name that is not UTF-8; skipped where the file system refuses it."""
+    try:
+        save_shape(tmp_path / BAD, cube)
+    except OSError:
+        pytest.skip("this file system takes UTF-8 names alone")
+    np.savetxt(tmp_path / "map.txt", np.arange(8), fmt="%d")
+    np.savetxt(tmp_path / "labels.txt", np.arange(8) % 2, fmt="%d")
+    return tmp_path
+
+
+@pytest.mark.parametrize("suffix", [".json", ".csv", ".ply", ".npy", ".txt"])
+def test_a_name_that_is_not_utf_8(run: Run, odd: Path, suffix: str) -> None:
+    words = (odd / BAD, odd / BAD, "--map", odd / "map.txt", "--labels", odd / "labels.txt")
+    output = odd / os.fsdecode(b"o\xff" + suffix.encode())
+    answer = run("transfer-labels", *words, "-o", output)
+    assert answer.status == 0, answer.err
+    assert output.is_file()
+
+
+@pytest.mark.parametrize("flag", [[], ["--json"]])
+@pytest.mark.parametrize("coding", ["ascii", "latin-1", "utf-8:strict"])
+def test_a_terminal_without_the_letters(odd: Path, coding: str, flag: list[str]) -> None:
+    """In a process of its own, whose stdout has another encoding."""
+    (odd / "ü人.ply").write_bytes((odd / BAD).read_bytes())
+    for name in ("ü人.ply", BAD):
+        done = subprocess.run(
+            [sys.executable, "-m", "meshmatch", "info", name, *flag],
+            cwd=odd,
+            env={**os.environ, "PYTHONIOENCODING": coding},
+            capture_output=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        text = done.stdout.decode(coding.partition(":")[0])
+        if flag and name != BAD:
+            assert json.loads(text)["file"] == name
+        assert ("vertices" in text) and text.endswith("\n")
+
+
+def test_names_as_long_as_a_name_may_be(tmp_path: Path) -> None:
+    """255 bytes, of which each letter takes four: the temporary name must not be longer."""
+    name = "😀" * 62
+    with replace_on_success(tmp_path / f"{name}.json") as temporary:
+        temporary.write_text("x")
+    with folder_on_success(tmp_path / name) as folder:
+        (folder / "x").touch()
+    assert sorted(os.listdir(tmp_path)) == [name, f"{name}.json"]
+
+
+def test_an_mtl_whose_images_have_names_in_latin_1(tmp_path: Path) -> None:
+    """Old programs write names as bytes of their own; the file has the same bytes."""
+    image = tmp_path / os.fsdecode(b"H\xe4ut.png")
+    try:
+        Image.fromarray(np.full((2, 2, 3), 200, np.uint8)).save(image)
+    except OSError:
+        pytest.skip("this file system takes UTF-8 names alone")
+    (tmp_path / "a.mtl").write_bytes(b"newmtl K\xf6rper\nmap_Kd H\xe4ut.png\n")
+    (tmp_path / "a.obj").write_bytes(
+        b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl K\xf6rper\nf 1/1 2/2 3/3\n"
+    )
+    found = load_appearance(tmp_path / "a.obj", load_shape(tmp_path / "a.obj"))
+    assert found.textured
