@@ -14,8 +14,8 @@ these alone have a column of their own. Here training has seen the truth of six.
 ``unregistered``: all ten as they are, without correspondence. Trained and measured on the same ten: a registration of a
 collection, not a test of what a model knows of hearts it never saw. It has seen no truth.
 
-Beside them: rigid alignment and the nearest vertex; and meshmonk (Apache-2.0), where it is installed (`pip install
-meshmonk`): its viscoelastic registration of the template of ``unregistered``, from the same alignment, with its defaults.
+``meshmonk``: a rival's way (Apache-2.0, `pip install meshmonk`): its viscoelastic registration of the same template,
+from the same alignment, with its defaults. Beside them all: rigid alignment and the nearest vertex.
 """
 
 from __future__ import annotations
@@ -49,21 +49,21 @@ from meshmatch.experiments.category import (
 from meshmatch.experiments.heart_truth import chamber_picture, heart_errors, save_registered, through
 from meshmatch.experiments.report import columns, publish, status_of
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.pipeline import read_model, usable
+from meshmatch.pipeline import usable
 from meshmatch.shapes.shape import Frame, Shape
 from meshmatch.templates.gather import most_typical
+from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.prepare import prepare_folder
 from meshmatch.templates.template import Template
 
 TRUTH = ".truth.npy"
-WAYS = ("registered", "unregistered")
+WAYS = ("meshmonk", "unregistered", "registered")
 
 
 def meshmonk_maps(
     template: Template, shapes: Mapping[str, Shape], frames: Mapping[str, Frame], kept: Path, tell: Tell
-) -> dict[Pair, np.ndarray] | None:
-    """Maps through meshmonk's registrations of the template, a minute each, kept as files; None if not installed."""
-    if find_spec("meshmonk") is None:
-        return None
+) -> dict[Pair, np.ndarray]:
+    """Maps through meshmonk's registrations of the template, a minute each, kept as files."""
     ours = template.shape
     kept.mkdir(parents=True, exist_ok=True)
     places = {}
@@ -114,6 +114,16 @@ def run(
         nearest = {pair: index for pair, (index, _) in nearest_all(shapes, "near", "area", tell).items()}
         results["rigid alignment, nearest vertex"] = heart_errors(shapes, truth, nearest, strange)
         for way in ways:
+            if way == "meshmonk":
+                if find_spec("meshmonk") is None:
+                    console.print("meshmonk is not installed: its row is left out")
+                    continue
+                nodes = NodeConfig("uniform", training.nodes, training.radius, 0.01, seed=training.seed)
+                place = training.work / "meshmonk"
+                made = prepare_folder(data / "heart", place, nodes, template=template, align="near")
+                maps = meshmonk_maps(made.template, shapes, prepared_frames(place), place / "fits", tell)
+                results["meshmonk"] = heart_errors(shapes, truth, maps, strange)
+                continue
             folder, here = data / "heart", training.inside(way)
             if way == "registered":
                 folder = here.work / "shapes"
@@ -124,11 +134,6 @@ def run(
                 folder, here, how="near", scale="area", tell=tell, depth=0.01, template=template
             )
             trainings[way] = how
-            if way == "unregistered":
-                laid, frames = read_model(model).template, prepared_frames(here.work / "prepared")
-                monk = meshmonk_maps(laid, shapes, frames, training.work / "meshmonk", tell)
-                if monk is not None:
-                    results["meshmonk"] = heart_errors(shapes, truth, monk, strange)
             for refine in ("none", "nodes"):
                 began = time.monotonic()
                 config = FitConfig(seed=training.seed, refine=refine, partial="no")
@@ -145,9 +150,7 @@ def run(
         alone = "-" if each["unseen_x100"] is None else f"{each['unseen_x100']:.2f}"
         shares = f"{each['worst_pair_x100']:.2f}", f"{100 * each['right_chamber']:.1f} %", alone
         table.add_row(label, f"{each['mean_x100']:.2f}", *shares)
-    if "unregistered" in ways and "meshmonk" not in results:
-        console.print("meshmonk is not installed: its row is left out")
-    if picture is not None:
+    if picture is not None and maps:
         chamber_picture(shapes, truth, maps, template, picture)
         console.print(f"wrote {picture}")
     record = {

@@ -211,7 +211,7 @@ def test_hearts_from_end_to_end(
     assert record["results"]["rigid alignment, nearest vertex"]["mean_x100"] < 10
     assert record["results"]["unregistered, nodes refined"]["pairs"] == 6
     assert record["results"]["registered, nodes refined"]["unseen_x100"] is None
-    assert "meshmonk" not in record["results"]
+    assert "meshmonk" not in record["results"]  # where it is not installed
     assert len(record["unseen"]) == 1 and record["template"] not in record["unseen"]
     learned = json.loads((tmp_path / "work" / "registered" / "prepared" / "prepared.json").read_text())
     assert learned["registered"] and len(learned["names"]) == 2
@@ -232,11 +232,10 @@ def test_registrations_of_a_rival_are_kept(tmp_path: Path, monkeypatch: pytest.M
         asked.append(len(target[0]))
         return floating[0]
 
-    monkeypatch.setattr(hearts, "find_spec", lambda name: "there")
     monkeypatch.setattr(hearts, "viscoelastic", register)
     for _ in range(2):
         maps = hearts.meshmonk_maps(template, shapes, frames, tmp_path / "kept", lambda what: None)
-        assert maps is not None and np.array_equal(maps["0", "1"], np.arange(162))
+        assert np.array_equal(maps["0", "1"], np.arange(162))
     assert asked == [162, 162]
 
 
