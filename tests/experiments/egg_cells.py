@@ -1,0 +1,44 @@
+"""Cells of eggs: a prepared folder, and a recipe that costs nothing."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from meshmatch.cli import main as meshmatch
+from meshmatch.experiments import cells, pool
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import make_template
+from meshmatch.templates.nodes import NodeConfig
+from tests.conftest import icosphere
+from tests.training.small import NETWORK, bent_eggs
+
+TINY = replace(
+    cells.SMALL,
+    network=replace(NETWORK, align_basis=0, corrections=0),
+    train=replace(cells.SMALL.train, shapes=4),
+    scan=replace(cells.SMALL.scan, points=64),
+)
+
+
+def prepare_eggs(root: Path) -> Path:
+    """Six registered eggs, ready to learn from."""
+    (root / "eggs").mkdir()
+    ball = icosphere(3)  # as many vertices as the most nodes, and more
+    egg = Shape(ball.verts * [0.8, 1.5, 1.0], ball.faces, "egg")
+    drawn = bent_eggs(make_template(egg, "egg", NodeConfig("uniform", 36, 0.45)))
+    for seed in range(6):
+        verts = drawn(1, torch.Generator().manual_seed(seed))[0].double().numpy()
+        save_shape(root / "eggs" / f"egg{seed}.ply", Shape(verts, ball.faces, "egg"))
+    nodes = ["--nodes", "36", "--radius", "0.5", "--strategy", "uniform", "-q"]
+    assert meshmatch(["prepare", str(root / "eggs"), "-o", str(root / "prepared"), *nodes]) == 0
+    return root / "prepared"
+
+
+def make_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The preset "small" becomes tiny."""
+    monkeypatch.setattr(cells, "SMALL", TINY)
+    monkeypatch.setattr(pool, "HELD_OUT", 5)
+    monkeypatch.setattr(pool, "_drawn", pool._drawn.__wrapped__)

@@ -1,0 +1,187 @@
+"""Cells: what they differ in, what they learn from, how they are trained and timed."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from meshmatch.errors import TemplateError
+from meshmatch.experiments import cell_training
+from meshmatch.experiments.ablation_cells import CODED, TABLE4, VIEWS, all_cells, cells_of
+from meshmatch.experiments.cell_training import fewer, is_trained, new_network, train_cell
+from meshmatch.experiments.cells import BASE, CONSTRAINTS, Cell, Setting
+from meshmatch.experiments.iterations import built, memory, timed
+from meshmatch.experiments.pool import SCANS, pool_of
+from meshmatch.fields.choice import FIELDS
+from meshmatch.models.trained import load_model
+from meshmatch.training.setup import build_loss_points
+from tests.experiments.egg_cells import make_small, prepare_eggs
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return prepare_eggs(tmp_path_factory.mktemp("eggs"))
+
+
+@pytest.fixture
+def setting(prepared: Path, monkeypatch: pytest.MonkeyPatch) -> Setting:
+    make_small(monkeypatch)
+    return Setting(folder=str(prepared), batch=3)
+
+
+def test_every_view_looks_at_the_same_cells() -> None:
+    cells = all_cells(VIEWS)
+    assert len(cells) == len(set(cells)) == 33
+    assert cells[0] == BASE
+    assert len({cell.name for cell in cells}) == 33
+    assert BASE.name == "base"
+    assert Cell(field="rbf", constraint="vol+arap", seed=2).name == "field-rbf.constraint-vol-arap.seed-2"
+    for view in VIEWS:
+        assert BASE in cells_of(view)
+    # all but table 4's cells and the repetitions differ from the base in one thing, or in two of a table
+    for cell in cells:
+        apart = [each.name for each in fields(cell) if getattr(cell, each.name) != getattr(BASE, each.name)]
+        assert len(apart) <= 2
+    again = all_cells(["table4", "figure9"], 3, cells_of("table4"))
+    assert len(again) == 9 + 3 + 18
+    assert [cell.seed for cell in again[:12]] == [0] * 12
+
+
+def test_cells_differ_in_representation_and_constraints_alone() -> None:
+    setting = Setting(preset="paper", batch=5, width=40, code=9, threads=2)
+    for field in FIELDS:
+        none, arap, vol, both, every = (setting.recipe(Cell(field, each, seed=3)) for each in CONSTRAINTS)
+        assert none.network == both.network == every.network
+        assert (none.network.field, none.network.width, none.network.code) == (field, 40, 9)
+        assert [r.train.loss.volume for r in (none, arap, vol, both, every)] == [0, 0, 5e-3, 5e-3, 5e-3]
+        assert [r.train.loss.arap for r in (none, arap, vol, both, every)] == [0, 1e-2, 0, 1e-2, 1e-2]
+        assert [r.train.loss.blend for r in (none, arap, vol, both, every)] == [0, 0, 0, 0, 5e-3]
+        assert (none.train.shapes, none.train.threads, none.train.seed) == (5, 2, 3)
+    assert Setting(preset="paper").recipe(BASE).train.shapes == 16
+    assert Setting(preset="default").recipe(BASE).network.encoder == "basis"
+    for preset in ("small", "default", "paper"):
+        chosen = Setting(preset=preset).recipe(replace(BASE, kernel="cubic"))  # type: ignore[arg-type]
+        assert chosen.kernel == "cubic"
+        assert chosen.network.align_basis == chosen.network.corrections == 0
+        assert not chosen.scan.upright
+
+
+def test_where_a_rule_leaves_too_few_nodes_all_are_taken() -> None:
+    setting = Setting()
+    assert setting.rule(BASE) == "parts"
+    assert setting.template(BASE).K == 300
+    assert setting.template(BASE).radius == pytest.approx(0.13)
+    wide = replace(BASE, nodes=100, radius=0.5)
+    assert setting.rule(wide) == "uniform"
+    assert setting.template(wide).K == 100
+    with pytest.raises(TemplateError):
+        setting.template(replace(BASE, nodes=4, radius=0.01))
+    assert setting.template(replace(BASE, pose="A")).name == "human-A"
+
+
+def test_a_pool_is_drawn_once_and_some_of_it_is_held_out(setting: Setting) -> None:
+    drawn = pool_of(setting, "T", 7)
+    assert drawn.targets.shape == (7 * SCANS, 642, 3)
+    assert drawn.features.shape[:2] == (7 * SCANS, 24)
+    assert len(drawn.held_out.targets) == 5
+    again = pool_of(setting, "T", 7)
+    assert torch.equal(drawn.features, again.features)
+    network = new_network(BASE, setting, drawn)
+    other = new_network(replace(BASE, seed=1), setting, drawn)
+    assert torch.equal(network.encoder.basis, drawn.basis)
+    assert torch.equal(other.encoder.basis, drawn.basis)
+    # What a batch's features say is what the encoder would say of a scan.
+    batch = drawn.batch(3, 6, 2, 0, network.encoder)
+    first = drawn.targets[: 2 * SCANS]
+    for target in batch.targets:
+        assert any(torch.equal(target, each) for each in first)
+    assert torch.equal(batch.targets, drawn.batch(3, 6, 2, 0, network.encoder).targets)
+    assert not torch.equal(batch.targets, drawn.batch(4, 6, 2, 0, network.encoder).targets)
+    assert not torch.equal(batch.targets, drawn.batch(3, 6, 2, 1, network.encoder).targets)
+
+
+def test_a_network_that_reads_points_gets_points(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
+    paper = replace(setting, preset="paper", code=16, width=32)
+    drawn = pool_of(paper, "T", 2)
+    assert drawn.features.shape == (2 * SCANS, 0, 3)
+    network = new_network(BASE, paper, drawn)
+    batch = drawn.batch(0, 2, 2, 0, network.encoder)
+    assert torch.equal(batch.encode_features, network.encoder.features(batch.points))
+    assert batch.points.shape == (2, 3000, 3)
+
+
+def test_held_out_eggs_are_not_in_the_pool(setting: Setting) -> None:
+    ours, unseen = (source(30, torch.Generator().manual_seed(0)) for source in setting.sources("T"))
+    apart = torch.cdist(ours.flatten(1), unseen.flatten(1))
+    assert apart.min() > 1e-3
+
+
+@pytest.mark.parametrize("cell", [BASE, CODED, replace(BASE, supervised=50), replace(BASE, field="rbf")])
+def test_a_cell_is_trained_into_a_model(
+    cell: Cell, setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = pool_of(setting, "T", 3)
+    monkeypatch.setattr(cell_training, "pool_of", lambda *_: small)
+    found = train_cell(cell, setting, 0.005, tmp_path / "model")
+    assert found["steps"] >= 1
+    assert found["seconds"] >= 0.3
+    assert 0 < found["held_out_cm"] < 200
+    assert (found["nodes"], found["rule"]) == (300, "parts")
+    model = load_model(tmp_path / "model")
+    assert model.network.config.field == cell.field
+    assert model.card.steps == found["steps"]
+    assert is_trained(tmp_path / "model", found)
+    assert not is_trained(tmp_path / "model", found | {"model": "0"})
+    assert not is_trained(tmp_path, found)
+
+
+def test_longer_training_is_better(setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = pool_of(setting, "T", 4)
+    monkeypatch.setattr(cell_training, "pool_of", lambda *_: small)
+    none = replace(BASE, constraint="none")
+    seen = small.batch(0, 12, 4, 0, new_network(none, setting, small).encoder)
+    small = replace(small, held_out=seen)
+    short, long = (train_cell(none, setting, m, tmp_path / str(m))["held_out_cm"] for m in (1e-5, 0.03))
+    assert long < short
+
+
+def test_fewer_supervised_points_are_regularised_everywhere(setting: Setting) -> None:
+    drawn = pool_of(setting, "T", 2)
+    network = new_network(BASE, setting, drawn)
+    points = build_loss_points(setting.template(BASE), "smooth", network)
+    few = fewer(points, 50)
+    vectors = torch.randn(2, 300, 3, generator=torch.Generator().manual_seed(0)) * 0.1
+    assert torch.allclose(few.moved(vectors), points.moved(vectors)[:, :50], atol=1e-6)
+    assert torch.equal(few.deformation_gradient(vectors), points.deformation_gradient(vectors))
+    assert fewer(points, 1000) is points
+
+
+def test_cells_take_turns(setting: Setting) -> None:
+    cells = [replace(BASE, field=field) for field in FIELDS]
+    heard: list[int] = []
+    found = timed(setting, cells, 2, heard.append)
+    assert heard == [0, 1, 2]
+    assert set(found) == {"base", "field-rbf", "field-pointwise"}
+    for record in found.values():
+        assert len(record["ms_all"]) == record["rounds"] == 2
+        assert min(record["ms_all"]) <= record["ms"] <= max(record["ms_all"])
+        assert record["cpu_ms"] > 0
+
+
+def test_a_cell_without_constraints_has_no_terms_of_them(setting: Setting) -> None:
+    trainer, batches = built(setting, CODED)
+    assert set(trainer.iterate(batches[0])) == {"total", "reconstruction", "error_code"}
+    trainer, batches = built(setting, replace(BASE, field="pointwise"))
+    assert {"volume", "arap", "blend"} < set(trainer.iterate(batches[0]))
+    assert trainer.step == 1
+
+
+def test_memory_is_that_of_the_iterations(prepared: Path) -> None:
+    # In a process of its own, which knows nothing of a smaller recipe.
+    setting = Setting(folder=str(prepared), batch=2, code=16, width=32)
+    cell = replace(BASE, field="pointwise", constraint=TABLE4[1])
+    found = memory(replace(setting, batch=30), cell, 1)
+    assert "resident set" in found["how"] or "GPU" in found["how"]
+    # 30 x 642 points, layers of 32, 16 and 8 numbers, in float32, are 4 MB and more with what gradients keep
+    assert found["megabytes"] > 4
