@@ -22,17 +22,22 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
     """Give a temporary path beside `path`, and rename it to `path` when the block ends well.
 
     The temporary name keeps the suffix, so writers that choose a format by it still do. On any exception,
-    Ctrl-C included, the temporary file is removed and whatever was at `path` before is untouched.
+    Ctrl-C included, the temporary file is removed and whatever was at `path` before is untouched. Where `path` is a
+    link, what it leads to is replaced, and the link stays.
 
     Raises
     ------
     OutputError
-        The folder is missing or cannot be written, `path` is a folder, or the disk refuses the write.
+        The folder is missing or cannot be written, `path` is a folder or write-protected, or the disk refuses the
+        write.
     """
     path = Path(path)
-    folder = path.parent
+    final = Path(os.path.realpath(path)) if path.is_symlink() else path
+    folder = final.parent
     if path.is_dir():
         raise OutputError(f"cannot write {path}: it is a folder", "give the name of a file")
+    if final.exists() and not os.access(final, os.W_OK):
+        raise OutputError(f"cannot write {path}: it is write-protected", "choose another name with -o")
     if not folder.is_dir():
         raise OutputError(
             f"cannot write {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}"
@@ -49,7 +54,7 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.chmod(mode)
-        os.replace(temporary, path)
+        os.replace(temporary, final)
     except OSError as error:
         if error.filename in (None, str(temporary), temporary):
             raise OutputError(
@@ -73,6 +78,7 @@ def folder_on_success(path: str | Path) -> Iterator[Path]:
         `path` is a file or holds something, its folder is missing or cannot be written, or the disk refuses.
     """
     path = Path(path)
+    path = Path(os.path.realpath(path)) if path.is_symlink() else path
     folder = path.parent
     if path.exists() and not path.is_dir():
         raise OutputError(f"cannot make the folder {path}: it is a file", "choose another name")

@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         status = INTERRUPTED
     if status == INTERRUPTED:
-        _tell("interrupted", "nothing was written")
+        _tell("interrupted", "no file is half-written")
     return status
 
 

@@ -1,5 +1,6 @@
 """Output files, claimed before the work begins."""
 
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,15 +21,14 @@ def claimed(path: Path | None) -> Iterator[Path | None]:
 
 def check_apart(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
     """Refuse an output that would replace an input, or another output (`OptionError`)."""
-    taken = {path.resolve(): "is an input of this command" for path in inputs if path is not None}
+    taken = {os.path.realpath(path): "is an input of this command" for path in inputs if path is not None}
     for path in outputs:
         if path is None:
             continue
-        if path.resolve() in taken:
-            raise OptionError(
-                f"cannot write {path}: it {taken[path.resolve()]}", "choose another name for the output"
-            )
-        taken[path.resolve()] = "is an output of this command already"
+        real = os.path.realpath(path)  # Path.resolve refuses links that lead in a circle
+        if real in taken:
+            raise OptionError(f"cannot write {path}: it {taken[real]}", "choose another name for the output")
+        taken[real] = "is an output of this command already"
 
 
 def check_png(path: Path | None) -> None:

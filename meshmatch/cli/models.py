@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.voice import Voice, print_json, print_rows
+from meshmatch.cli.voice import Voice, print_json, print_rows, print_text
 
 models = typer.Typer(
     help="List, show, add, remove and verify trained models.", no_args_is_help=True, rich_markup_mode=None
@@ -59,7 +59,7 @@ def show(name: Name) -> None:
     from meshmatch.models.registry import CARD, locate_model
     from meshmatch.models.registry import read_card as read
 
-    typer.echo(card_to_json(read(locate_model(name) / CARD)), nl=False)
+    print_text(card_to_json(read(locate_model(name) / CARD)))
 
 
 @models.command()
@@ -116,7 +116,7 @@ def verify(
         else:
             checked.append({"name": name, "sha256": card.weights_sha256, "problem": ""})
             if not json:
-                typer.echo(f"{name}: ok, sha256 {card.weights_sha256}")
+                print_text(f"{name}: ok, sha256 {card.weights_sha256}\n")
     if json:
         print_json({"models": checked})
     wrong = sum(model["sha256"] is None for model in checked)

@@ -1,5 +1,6 @@
 """``meshmatch picture``."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -162,8 +163,8 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 def _apart(paths: list[Path], subjects: "list[Subject]") -> list[str]:
     """Names to show: those of the files, with their folders where they are the same."""
-    of: dict[str, set[Path]] = {}
+    of: dict[str, set[str]] = {}
     for path, subject in zip(paths, subjects, strict=True):
-        of.setdefault(subject.name, set()).add(path.resolve())
+        of.setdefault(subject.name, set()).add(os.path.realpath(path))
     pairs = zip(paths, subjects, strict=True)
     return [subject.name if len(of[subject.name]) == 1 else str(path) for path, subject in pairs]

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from meshmatch.errors import OutputError
 from meshmatch.outputs import plain_text
 
 if TYPE_CHECKING:
@@ -80,18 +81,38 @@ def print_json(record: Mapping[str, Any]) -> None:
     """One JSON object on one line of stdout."""
     line = json.dumps(record, ensure_ascii=False)
     try:
-        line.encode(sys.stdout.encoding or "utf-8")
+        line.encode(_coding())
     except UnicodeEncodeError:  # a terminal without these letters, or a file's name that is not UTF-8
         line = json.dumps(record)
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
+    print_text(line + "\n")
 
 
 def print_rows(rows: Sequence[Sequence[str]]) -> None:
     """Text on stdout, one row a line, columns flush."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    for row in rows:
-        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        coding = sys.stdout.encoding or "utf-8"
-        sys.stdout.write(line.rstrip().encode(coding, "backslashreplace").decode(coding) + "\n")
-    sys.stdout.flush()
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    print_text("".join(line.rstrip() + "\n" for line in lines))
+
+
+def print_text(text: str) -> None:
+    """Text on stdout; letters that it cannot show as their numbers.
+
+    Raises
+    ------
+    OutputError
+        Stdout is closed, or the disk behind it is full.
+    """
+    coding = _coding()
+    try:
+        if sys.stdout is None:
+            raise OSError(9, "it is closed")
+        sys.stdout.write(text.encode(coding, "backslashreplace").decode(coding))
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise  # whoever read it has read enough
+    except OSError as error:
+        raise OutputError(f"cannot write to stdout: {error.strerror}", "is the disk full?") from error
+
+
+def _coding() -> str:
+    return getattr(sys.stdout, "encoding", None) or "utf-8"

@@ -75,7 +75,13 @@ def read_bytes(path: Path) -> bytes:
     if path.is_dir():
         raise InputError(f"{path} is a folder, not a file", "name one mesh or point cloud")
     if not path.exists():
+        if path.is_symlink():
+            raise InputError(
+                f"{path} is a link to a file that is not there", "mend the link, or name the file"
+            )
         raise InputError(f"there is no file {path}", _similar(path))
+    if not path.is_file():
+        raise InputError(f"{path} is no ordinary file", "save what comes out of it, and name that file")
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -71,7 +71,7 @@ def test_ctrl_c_is_one_line_and_130(run: Run, monkeypatch: pytest.MonkeyPatch) -
     fail(KeyboardInterrupt(), monkeypatch)
     answer = run("info", "a.ply")
     assert answer.status == 130
-    assert answer.err.splitlines() == ["interrupted: nothing was written"]
+    assert answer.err.splitlines() == ["interrupted: no file is half-written"]
 
 
 def test_ctrl_c_before_the_verb_is_the_same(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,7 +80,7 @@ def test_ctrl_c_before_the_verb_is_the_same(run: Run, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr("meshmatch.cli.boundary._run", loading)
     answer = run("info", "a.ply")
-    assert (answer.status, answer.err) == (130, "interrupted: nothing was written\n")
+    assert (answer.status, answer.err) == (130, "interrupted: no file is half-written\n")
 
 
 def test_a_bug_keeps_its_traceback(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -341,7 +341,7 @@ def test_a_real_ctrl_c_in_the_long_work(
     finally:
         signal.signal(signal.SIGINT, before)
     assert answer.status == 130
-    assert answer.err.splitlines() == ["interrupted: nothing was written"]
+    assert answer.err.splitlines() == ["interrupted: no file is half-written"]
     assert sorted(path.name for path in two[0].parent.iterdir()) == ["a.ply", "b.ply"]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from meshmatch.errors import OutputError
 from meshmatch.outputs import folder_on_success, replace_on_success
 from meshmatch.shapes.appearance import load_appearance
 from meshmatch.shapes.files import load_shape, save_shape
@@ -58,6 +59,71 @@ def test_a_terminal_without_the_letters(odd: Path, coding: str, flag: list[str])
         if flag and name != BAD:
             assert json.loads(text)["file"] == name
         assert ("vertices" in text) and text.endswith("\n")
+
+
+def test_an_output_that_is_a_link_keeps_the_link(tmp_path: Path) -> None:
+    """To a file, to nothing yet, to a folder; a circle leads nowhere, and is replaced."""
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "real.txt").write_text("old")
+    (tmp_path / "a.txt").symlink_to("far/real.txt")
+    (tmp_path / "b.txt").symlink_to("far/new.txt")
+    for name, real in (("a.txt", "real.txt"), ("b.txt", "new.txt")):
+        with replace_on_success(tmp_path / name) as temporary:
+            temporary.write_text("new")
+        assert (tmp_path / name).is_symlink()
+        assert (tmp_path / "far" / real).read_text() == "new"
+    (tmp_path / "c.txt").symlink_to("nowhere/new.txt")
+    with pytest.raises(OutputError, match="there is no folder"), replace_on_success(tmp_path / "c.txt"):
+        pass
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "d").symlink_to("empty")
+    with folder_on_success(tmp_path / "d") as folder:
+        (folder / "x").touch()
+    assert (tmp_path / "d").is_symlink()
+    assert os.listdir(tmp_path / "empty") == ["x"]
+
+
+def test_a_file_that_is_write_protected_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.txt").write_text("mine")
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: Path(path).name != "a.txt"
+    )  # root may write everywhere
+    with pytest.raises(OutputError, match="write-protected"), replace_on_success(tmp_path / "a.txt"):
+        pass
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize(
+    ("name", "told"), [("loop.ply", "a link to a file"), ("pipe.ply", "no ordinary file")]
+)
+def test_inputs_that_are_no_files(run: Run, tmp_path: Path, name: str, told: str) -> None:
+    (tmp_path / "loop.ply").symlink_to("loop.ply")
+    os.mkfifo(tmp_path / "pipe.ply")  # nobody ever writes into it
+    answer = run("info", tmp_path / name)
+    assert (answer.status, answer.out) == (1, "")
+    assert told in answer.err
+    labels = ("--labels", tmp_path / "x.txt", "-o", tmp_path / "loop.ply")
+    assert run("transfer-labels", tmp_path / name, tmp_path / name, *labels).status == 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+@pytest.mark.parametrize(
+    "words", [["info", "a.ply"], ["info", "a.ply", "--json"], ["models", "show", "human"]]
+)
+def test_a_full_disk_behind_stdout_is_told(tmp_path: Path, cube: Shape, words: list[str]) -> None:
+    save_shape(tmp_path / "a.ply", cube)
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "meshmatch", *words],
+            cwd=tmp_path,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[0] == "error: cannot write to stdout: No space left on device"
+    assert "Traceback" not in done.stderr
 
 
 def test_names_as_long_as_a_name_may_be(tmp_path: Path) -> None:
