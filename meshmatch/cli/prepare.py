@@ -83,11 +83,9 @@ def prepare(
     from meshmatch.errors import OptionError
     from meshmatch.render.fitted import nodes_panel
     from meshmatch.render.picture import render_shapes
-    from meshmatch.shapes.files import load_shape
-    from meshmatch.shapes.repair import repair
     from meshmatch.templates.make import low_resolution, make_template
     from meshmatch.templates.nodes import NodeConfig
-    from meshmatch.templates.prepare import prepare_folder
+    from meshmatch.templates.prepare import prepare_folder, template_shape
     from meshmatch.templates.template import save_template
 
     voice = Voice(quiet)
@@ -120,7 +118,7 @@ def prepare(
     else:
         from meshmatch.maps.pairs import load_points
 
-        clean = repair(load_shape(shapes))
+        clean = template_shape(shapes)
         parts = None if labels is None else _repaired_labels(load_points(labels), clean, labels)
         bundle = make_template(
             clean.shape,

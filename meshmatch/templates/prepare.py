@@ -13,7 +13,7 @@ from safetensors.numpy import load_file, save_file
 
 from meshmatch.errors import InputError, MeshmatchError, OutputError
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.align import Align, rigid_motion
+from meshmatch.shapes.align import Align
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -31,14 +31,11 @@ from meshmatch.templates.gather import (
 )
 from meshmatch.templates.make import LOW_FACES, low_resolution, make_template
 from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.registered import registered_stack, same_faces, turned
 from meshmatch.templates.template import Template, save_template
 
 MINIMUM_FACES = 50
 MINIMUM_POINTS = 100
-FEW = 100
-"""Fewer registered shapes than this are learned by a network that finds no orientation: the card says it."""
-
-_ALIKE = 30.0  # degrees: registered shapes that are turned less stand alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,10 +125,10 @@ def prepare_folder(
         raise InputError(f"no shape in {folder} could be used", notes[0])
     first, own = _template_shape(folder, template, found, scale, align, config.seed, notes)
     low = _low(first, faces)
-    stack = _registered(first, found, first.kept_vertex[low[0]], notes)
+    stack = registered_stack(first, found, first.kept_vertex[low[0]], notes)
     registered = len(stack) > 0
     how: Align = align or (
-        _turned(stack, first.original.verts[first.kept_vertex[low[0]]]) if registered else "rigid"
+        turned(stack, first.original.verts[first.kept_vertex[low[0]]]) if registered else "rigid"
     )
     name = folder.resolve().name
     made = make_template(first.shape, name, config, source=f"{first.original.name} of {folder.name}", low=low)
@@ -178,6 +175,16 @@ def prepare_folder(
     return Prepared(made, stack, names, tuple(notes), how, gathered.landmarks.shape[1])
 
 
+def template_shape(path: str | Path) -> Repaired:
+    """The shape of a file, repaired, if a template can be made of it; `InputError` otherwise."""
+    try:
+        return _enough(repair(load_shape(path)))
+    except InputError as error:
+        if Path(path).name in error.message:
+            raise
+        raise InputError(f"{Path(path).name} cannot be a template: {error.message}", error.hint) from error
+
+
 def _template_shape(
     folder: Path,
     wanted: str | Path | None,
@@ -197,9 +204,9 @@ def _template_shape(
         for number, clean in enumerate(found if same else ()):
             if clean.original.name == path.name:
                 return clean, number
-        return _enough(repair(load_shape(path))), None
+        return template_shape(path), None
     number = next((k for k, clean in enumerate(found) if not clean.shape.is_cloud), 0)
-    if len(found) > 1 and not _same_faces(found[number], found):
+    if len(found) > 1 and not same_faces(found[number], found):
         number = most_typical(found, how or "rigid", scale, seed)
         notes.append(f"template: {found[number].original.name}, which lies nearest to all others on average")
     else:
@@ -247,43 +254,12 @@ def _enough(clean: Repaired) -> Repaired:
     """The same shape, if there is enough of it to learn from; `InputError` otherwise."""
     shape = clean.shape
     if shape.is_cloud and shape.V < MINIMUM_POINTS:
-        raise InputError(f"it has only {shape.V} points", f"at least {MINIMUM_POINTS} are needed")
+        points = "point" if shape.V == 1 else "points"
+        raise InputError(f"it has only {shape.V} {points}", f"at least {MINIMUM_POINTS} are needed")
     if not shape.is_cloud and shape.F < MINIMUM_FACES:
         raise InputError(f"it has only {shape.F} usable triangles", f"at least {MINIMUM_FACES} are needed")
     sqrt_area_frame(shape)
     return clean
-
-
-def _same_faces(like: Repaired, found: list[Repaired]) -> bool:
-    """Whether all files have one file's vertex count and triangles."""
-    first = like.original
-    return not first.is_cloud and all(
-        clean.original.V == first.V and np.array_equal(clean.original.faces, first.faces) for clean in found
-    )
-
-
-def _registered(first: Repaired, found: list[Repaired], vertices: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Vertices (N, V, 3) of the shapes that share the first one's connectivity; N = 0 unless all of them do."""
-    whole = []
-    for clean in found if _same_faces(first, found) else ():
-        invalid = clean.original.invalid
-        if invalid is None or not invalid[vertices].any():
-            whole.append(clean.original.verts[vertices])
-        else:
-            notes.append(f"{clean.original.name}: not among the registered shapes, vertices lack a position")
-    if len(whole) < 2:
-        return np.zeros((0, len(vertices), 3), np.float32)
-    chosen = np.stack(whole)
-    # Centred before the numbers become short: a scan in a surveyor's coordinates would lose its digits.
-    return (chosen - chosen.mean(1, keepdims=True)).astype(np.float32)
-
-
-def _turned(stack: np.ndarray, like: np.ndarray) -> Align:
-    """How few registered shapes (N, V, 3) are turned to the template's vertices (V, 3)."""
-    if len(stack) >= FEW:
-        return "none"
-    cosines = [(np.trace(rigid_motion(like, verts.astype(np.float64))[0]) - 1) / 2 for verts in stack]
-    return "near" if min(cosines) > np.cos(np.radians(_ALIKE)) else "rigid"
 
 
 def read_registered(folder: str | Path, template: Template) -> np.ndarray:

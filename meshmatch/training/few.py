@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from meshmatch.models.deformer import NetworkConfig
-from meshmatch.templates.prepare import FEW
+from meshmatch.templates.registered import FEW
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import LossConfig
 from meshmatch.training.run import Recipe

@@ -140,7 +140,13 @@ def test_known_points_and_preset_reach_the_training(
         (["prepare", "eggs", "-o", "out", "--landmarks", ".nothing"], "has landmarks"),
         (["prepare", "eggs", "-o", "out", "--template", "egg9"], "egg9"),
         (["prepare", "eggs", "-o", "out", "--template", "needle.ply", *FEW], "nothing like the template"),
+        (["prepare", "eggs", "-o", "out", "--template", "bad/three.npy"], "three.npy cannot be a template"),
+        (["prepare", "eggs", "-o", "out", "--template", "bad/same.npy"], "it has only 1 point"),
+        (["prepare", "eggs", "-o", "out", "--template", "bad/line.npy"], "on no surface"),
         (["prepare", "bad", "-o", "out"], "no shape in bad could be used"),
+        (["prepare", "bad/three.npy", "-o", "out"], "three.npy cannot be a template: it has only 3 points"),
+        (["prepare", "bad/same.npy", "-o", "out"], "same.npy cannot be a template: it has only 1 point"),
+        (["prepare", "bad/line.npy", "-o", "out"], "on no surface"),
         (["train", "-o", "mine", "--unsupervised"], "--unsupervised learns from a folder"),
         (["train", "-o", "mine", "--shapes", "alone"], "one shape is too few"),
     ],
@@ -154,6 +160,8 @@ def test_what_cannot_be_is_told_in_a_line_and_a_hint(
     Path("bad").mkdir()
     np.save("bad/three.npy", np.eye(3))
     np.save("bad/same.npy", np.ones((400, 3)))
+    if any("line" in word for word in words):
+        np.save("bad/line.npy", np.linspace([0, 0, 0], [1, 0, 0], 400))
     if "alone" in words:
         Path("one").mkdir()
         np.save("one/cloud.npy", ball.verts)

@@ -10,7 +10,7 @@ from safetensors.numpy import load_file
 from meshmatch.errors import InputError, OutputError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates import prepare
+from meshmatch.templates import registered
 from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.prepare import prepare_folder, read_registered
 from meshmatch.templates.template import load_template
@@ -186,7 +186,7 @@ def test_correspondence_says_whether_registered_shapes_stand_alike(
     assert frame_of_few(tmp_path / "turned") == {"orientation": "rigid", "scale": "area"}
     assert prepare_folder(folder, tmp_path / "given", FEW, align="none").align == "none"
     assert frame_of_few(tmp_path / "nowhere") is None
-    monkeypatch.setattr(prepare, "FEW", 4)
+    monkeypatch.setattr(registered, "FEW", 4)
     assert prepare_folder(folder, tmp_path / "many", FEW).align == "none"
     monkeypatch.setattr("meshmatch.training.few.FEW", 4)
     assert frame_of_few(tmp_path / "many") is None
