@@ -77,7 +77,7 @@ def transfer_color(
     voice = Voice(quiet)
     with carrying.output_file(request, output, [values]) as temporary:
         a, b = load_shape(source), load_shape(target)
-        given = colors.of_file(source, a) if values is None else load_values(values, a)
+        given = colors.of_shape(a) if values is None else load_values(values, a)
         columns = 1 if given.numbers.ndim == 1 else given.numbers.shape[1]
         empty = None if blank is None else parse_blank(blank, columns)
         if empty is not None and values is None and not ((empty >= 0) & (empty <= 1)).all():

@@ -27,7 +27,7 @@ class Shape:
     name : str
         For people: usually the file's name without its folder.
     colors : (V, 4) float64, optional
-        Red, green, blue, alpha in 0..1.
+        Red, green, blue as screens show them (sRGB), and alpha, in 0..1; whatever the file has.
     invalid : (V,) bool, optional
         True for a vertex whose position in the file was not a number. Such a vertex keeps its place in the
         order (the map answers for it too) but its `verts` row is only a stand-in, and faces that touch it

@@ -1,7 +1,4 @@
-"""Vertex colours: mixed as light, written as each format has them.
-
-Files of shapes write colours as screens do (sRGB), glTF alone writes amounts of light.
-"""
+"""Vertex colours: mixed as light. A `Shape` has them as screens show them (sRGB), whatever its file has."""
 
 from __future__ import annotations
 
@@ -17,11 +14,10 @@ from meshmatch.transfer.value_files import Values, save_values
 
 CHANNELS = ("red", "green", "blue", "alpha")
 _SHAPES, _TABLES = (".ply", ".glb", ".obj", ".off"), (".npy", ".csv")
-_GLTF = (".glb", ".gltf")
 
 
-def of_file(path: Path, shape: Shape) -> Values:
-    """Light (V, 4) of the vertices of a shape that was read from `path`, alpha last.
+def of_shape(shape: Shape) -> Values:
+    """Light (V, 4) of the vertices of a shape, alpha last.
 
     Raises
     ------
@@ -33,11 +29,11 @@ def of_file(path: Path, shape: Shape) -> Values:
             f"{shape.name} has no vertex colours",
             "give numbers with --values, or carry its texture: meshmatch transfer-texture",
         )
-    return Values(np.array(shape.colors) if path.suffix.lower() in _GLTF else light(shape.colors), CHANNELS)
+    return Values(light(shape.colors), CHANNELS)
 
 
 def light(colors: Floats) -> Floats:
-    """Light of colours (..., 3 or 4) as files have them; alpha is left as it is."""
+    """Light of colours (..., 3 or 4) as screens show them; alpha is left as it is."""
     return np.concatenate([to_linear(colors[..., :3]), colors[..., 3:]], axis=-1)
 
 
@@ -58,5 +54,4 @@ def save(path: Path, shape: Shape, amounts: Floats) -> None:
     if path.suffix.lower() in _TABLES:
         save_values(path, Values(seen, CHANNELS), shape)
         return
-    written = amounts if path.suffix.lower() in _GLTF else seen
-    save_shape(path, Shape(shape.verts, shape.faces, shape.name, written, shape.invalid))
+    save_shape(path, Shape(shape.verts, shape.faces, shape.name, seen, shape.invalid))

@@ -368,8 +368,22 @@ def test_gltf_colours_sparse_and_strided_data(tmp_path: Path) -> None:
     parts = [rows, colours, np.array([2, 0, 0, 0], np.uint8), np.array([[4, 5, 6]], np.float32)]
     shape = gltf(tmp_path, "a.glb", document, *parts)
     np.testing.assert_allclose(shape.verts, [*TRIANGLE, [0, 0, 0], [0, 0, 0], [4, 5, 6]])
-    expected = [[1, 0, 0, 1], [0, 0.2, 0, 1], [0, 0, 0, 0], *[[1, 1, 1, 1]] * 3]
-    np.testing.assert_allclose(shape.colors, expected)
+    # a fifth of the light (linear in glTF) looks like 0.4845 (IEC 61966-2-1)
+    expected = [[1, 0, 0, 1], [0, 0.484529, 0, 1], [0, 0, 0, 0], *[[1, 1, 1, 1]] * 3]
+    np.testing.assert_allclose(shape.colors, expected, atol=1e-6)
+
+
+def test_colours_of_a_glb_are_light(tmp_path: Path, cube: Shape) -> None:
+    """A middle grey (0.5 on a screen) is 0.214 of the light: in the file, to the eyes of another program, and back."""
+    import trimesh
+
+    save_shape(tmp_path / "a.ply", Shape(cube.verts, cube.faces, "a", np.tile([0.5, 0.5, 0.5, 0.25], (8, 1))))
+    save_shape(tmp_path / "a.glb", load_shape(tmp_path / "a.ply"))
+    back = load_shape(tmp_path / "a.glb").colors
+    np.testing.assert_allclose(back, load_shape(tmp_path / "a.ply").colors, atol=1e-6)
+    scene = trimesh.load(tmp_path / "a.glb", process=False)
+    theirs = next(iter(scene.geometry.values())).visual.vertex_colors / 255.0
+    np.testing.assert_allclose(theirs[0], [0.2159, 0.2159, 0.2159, 0.251], atol=0.004)
 
 
 ONE = {"nodes": [{"mesh": 0}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}

@@ -15,7 +15,7 @@ from meshmatch.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Raw:
-    """What a file says, unchecked: positions (V, 3), maybe NaN; faces (F, 3), colours (V, 4) in 0..1."""
+    """What a file says, unchecked: positions (V, 3), maybe NaN; faces (F, 3), sRGB colours (V, 4) in 0..1."""
 
     verts: NDArray[np.float64]
     faces: NDArray[np.int64]

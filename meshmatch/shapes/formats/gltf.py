@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged
+from meshmatch.shapes.light import to_srgb
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -108,6 +109,7 @@ class Document:
         if any(color is not None for color in colors):
             white = [np.ones((len(own), 4)) for own in verts]
             painted = np.vstack([w if c is None else c for c, w in zip(colors, white, strict=True)])
+            painted[:, :3] = to_srgb(painted[:, :3])
         return Raw(np.vstack(verts), np.vstack([NO_FACES, *faces]), painted)
 
     def primitives(self) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -185,6 +187,7 @@ class Document:
         return np.stack([np.where(odd, b, a), np.where(odd, a, b), c], axis=1)
 
     def colors(self, primitive: dict[str, Any]) -> NDArray[np.float64] | None:
+        """(V, 4) light and alpha of a primitive's vertices: `COLOR_0` is linear (section 3.9.2)."""
         if "COLOR_0" not in primitive["attributes"]:
             return None
         values = self.accessor(primitive["attributes"]["COLOR_0"])

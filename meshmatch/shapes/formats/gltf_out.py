@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.shapes.formats.textured import Textured, split_at_seams
+from meshmatch.shapes.light import to_linear
 from meshmatch.shapes.shape import Shape
 
 _POINTS, _TRIANGLES = 0, 4
@@ -53,7 +54,8 @@ def write(path: Path, shape: Shape) -> None:
     buffer = _Buffer()
     attributes = {"POSITION": buffer.array(shape.verts.astype("<f4"), "VEC3")}
     if shape.colors is not None:
-        attributes["COLOR_0"] = buffer.array(shape.colors.astype("<f4"), "VEC4")
+        light = np.concatenate([to_linear(shape.colors[:, :3]), shape.colors[:, 3:]], axis=1)
+        attributes["COLOR_0"] = buffer.array(light.astype("<f4"), "VEC4")
     primitive: dict[str, Any] = {"attributes": attributes, "mode": _POINTS if shape.is_cloud else _TRIANGLES}
     if not shape.is_cloud:
         primitive["indices"] = buffer.array(shape.faces.astype("<u4").reshape(-1), "SCALAR", _INDICES)
