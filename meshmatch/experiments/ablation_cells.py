@@ -77,11 +77,14 @@ class Known:
     memory: Mapping[str, dict[str, Any]]
     descent: dict[str, Any] | None = None
 
-    def error(self, cell: Cell, where: str, method: str = "code") -> list[float]:
-        """Mean errors in cm of a cell and its repetitions with other seeds; ``where`` is a set, or "held out"."""
+    def error(self, cell: Cell, where: str, method: str = "code", what: str = "mean_cm") -> list[float]:
+        """Errors in cm of a cell and its repetitions with other seeds; ``where`` is a set, or "held out".
+
+        ``what`` is "mean_cm", or on a set "median_cm".
+        """
         alike = sorted((each for each in self.trained if replace(each, seed=0) == cell), key=lambda c: c.seed)
         if where == "held out":
             records = [self.trained[each].get("held_out_cm") for each in alike]
         else:
-            records = [self.errors.get((each, where, method), {}).get("mean_cm") for each in alike]
+            records = [self.errors.get((each, where, method), {}).get(what) for each in alike]
         return [record for record in records if record is not None]

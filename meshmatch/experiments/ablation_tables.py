@@ -77,7 +77,7 @@ def number(values: Sequence[float]) -> str:
 def drawn(
     title: str, heads: Sequence[str], rows: Sequence[Row], known: Known, sets: Sequence[str], nodes: bool
 ) -> Table:
-    """A table: steps, held-out error, error on each set with the paper's beside it, and after refining nodes."""
+    """A table: steps, held-out error, mean and median on each set beside the paper's mean, and after refining nodes."""
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     for head in heads:
         table.add_column(head, no_wrap=True)
@@ -85,6 +85,7 @@ def drawn(
         table.add_column(head, justify="right")
     for name in sets:
         table.add_column(name, justify="right", no_wrap=True)
+        table.add_column("median", justify="right")
         if name in _PAPER_SETS:
             table.add_column("paper", justify="right", style="dim")
         if nodes:
@@ -97,7 +98,9 @@ def drawn(
             continue
         cells += [str(record.get("steps", "-")), number(known.error(row.cell, "held out"))]
         for name in sets:
-            cells.append(number(known.error(row.cell, name, row.method)))
+            cells += [
+                number(known.error(row.cell, name, row.method, what)) for what in ("mean_cm", "median_cm")
+            ]
             if name in _PAPER_SETS:
                 cells.append("" if row.paper is None else f"{row.paper[_PAPER_SETS.index(name)]:.1f}")
             if nodes:

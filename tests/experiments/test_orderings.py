@@ -88,7 +88,10 @@ def test_tables_show_what_is_there(capsys: pytest.CaptureFixture[str]) -> None:
     }
     trained[replace(BASE, nodes=2700, radius=0.5)] = {"skipped": "no nodes"}
     del trained[cells[3]]
-    errors = {(cell, "scape-pcn", "code"): {"mean_cm": 50.0 + k} for k, cell in enumerate(cells)}
+    errors = {
+        (cell, "scape-pcn", "code"): {"mean_cm": 50.0 + k, "median_cm": 30.0 + k}
+        for k, cell in enumerate(cells)
+    }
     errors[BASE, "scape-pcn", "nodes"] = {"mean_cm": 44.44}
     times = {cell.name: time(123.4) for cell in cells[:9]}
     found = Known(trained, errors, times, {"base": {"megabytes": 77.7}})
@@ -99,7 +102,7 @@ def test_tables_show_what_is_there(capsys: pytest.CaptureFixture[str]) -> None:
         assert "a budget" in out
         assert view.replace("table", "Table ") in out
         if view == "table4":
-            for words in ("10.00", "50.00", "44.44", "6.6", "123.4", "78", "4098.3", "338.7", "-"):
+            for words in ("10.00", "50.00", "30.00", "44.44", "6.6", "123.4", "78", "4098.3", "338.7", "-"):
                 assert words in out
         if view == "table6":
             assert "uniform" in out

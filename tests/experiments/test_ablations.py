@@ -1,0 +1,188 @@
+"""The command on eggs: a table, figures and a line; a run that goes on; every option."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from meshmatch.experiments import ablation_run, cell_errors, pool
+from meshmatch.experiments.ablations import main
+from meshmatch.experiments.cell_errors import Measure
+from meshmatch.fitting.fit_config import FitConfig
+from tests.experiments.egg_cells import make_small, prepare_eggs
+from tests.experiments.small_bench import build
+from tests.fitting.eggs import egg_model, write_model
+
+LINE = {"steps": [0, 10], "seconds": [0.0, 0.2], "errors_cm": [[3.0, 5.0], [2.0, 3.0]]}
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("ablations")
+    prepare_eggs(root)
+    build(root / "bench")
+    write_model(egg_model(), root / "egg")
+    return root
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    """How often something is measured, with everything made small."""
+    make_small(monkeypatch)
+    drawn = pool._drawn
+    monkeypatch.setattr(pool, "_drawn", lambda setting, pose, shapes: drawn(setting, pose, 4))
+    quick = partial(FitConfig, samples=300, coarse_samples=60, laid=1)
+    monkeypatch.setattr(cell_errors, "FitConfig", quick)
+    monkeypatch.setattr(ablation_run, "Measure", partial(Measure, landmarks=20, samples=300, code_points=200))
+    monkeypatch.setattr(ablation_run, "BODIES", 2)
+    monkeypatch.setattr(ablation_run, "LINES", [])
+    counted = {"train_cell": 0, "errors_of": 0, "timed": 0, "memory": 0, "oriented": 0}
+    monkeypatch.setattr(ablation_run, "memory", lambda *_: {"megabytes": 1.5, "how": "guessed"})
+    monkeypatch.setattr(ablation_run, "descend", lambda *_: {"ours": LINE})
+
+    def count(name: str) -> None:
+        real = getattr(ablation_run, name)
+
+        def call(*given, **named):
+            counted[name] += 1
+            return real(*given, **named)
+
+        monkeypatch.setattr(ablation_run, name, call)
+
+    for name in counted:
+        count(name)
+    return counted
+
+
+def line(capsys: pytest.CaptureFixture[str]) -> tuple[str, dict]:
+    out = capsys.readouterr().out
+    return out, json.loads(out.splitlines()[-1])
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    """What was told on stderr, which a narrow terminal folds."""
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_a_run_is_tables_figures_and_a_line_and_goes_on(
+    places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        "--output",
+        str(tmp_path / "out"),
+        "--folder",
+        str(places / "prepared"),
+        "--model",
+        str(places / "egg"),
+    ]
+    words += [
+        "--data",
+        str(places / "bench"),
+        "--cache",
+        str(tmp_path / "cache"),
+        "--sets",
+        "scape,faust",
+    ]
+    words += ["--minutes", "0.0005", "--code-steps", "2", "--shapes", "2", "--batch", "3", "--threads", "1"]
+    words += ["--preset", "small", "--identities", "16", "--code", "16", "--width", "32", "--rounds", "1"]
+    few = [*words, "--tables", "", "--figures", "10"]
+    assert main(few) == 0
+    assert calls == {"train_cell": 3, "errors_of": 6, "timed": 0, "memory": 0, "oriented": 4}
+    out, record = line(capsys)
+    assert "0.0005 CPU min of training a cell, preset small, 2 steps on the code" in out
+    assert set(record["cells"]) == {"base", "supervised-100", "supervised-50"}
+    assert {"base scape chamfer", "base scape none", "supervised-50 faust code"} <= record["errors"].keys()
+    assert (tmp_path / "out" / "figure-10.png").is_file()
+
+    assert main(few) == 0  # everything is there
+    assert calls["train_cell"] == 3
+    assert calls["errors_of"] == 6
+    (tmp_path / "out" / "supervised-50" / "trained.json").unlink()
+    (tmp_path / "out" / "supervised-50" / "error-scape-code.json").unlink()
+    (tmp_path / "out" / "supervised-50" / "error-faust-code.json").unlink()
+    assert main([*few, "--show", "--pictures", str(tmp_path / "pictures")]) == 0
+    out, record = line(capsys)
+    assert calls["train_cell"] == 3
+    assert "Not measured: supervised-50" in out
+    assert set(record["cells"]) == {"base", "supervised-100"}
+    assert (tmp_path / "pictures" / "figure-10.png").is_file()
+    assert main(few) == 0
+    assert calls["train_cell"] == 4
+    capsys.readouterr()
+
+    assert main([*few[:-1], "9", "--minutes", "0.0004"]) == 1  # cells of another budget
+    assert "other choices (minutes)" in said(capsys)
+    assert main([*few, "--code-steps", "3"]) == 1
+    assert "other choices (measure)" in said(capsys)
+
+
+def test_table_4_has_costs_without_training(
+    places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--output", str(tmp_path / "out"), "--folder", str(places / "prepared"), "--minutes", "0"]
+    words += ["--sets", "", "--rounds", "1", "--tables", "4", "--figures", "6", "--batch", "2"]
+    assert main(words) == 0
+    assert calls == {"train_cell": 0, "errors_of": 0, "timed": 1, "memory": 9, "oriented": 0}
+    out, record = line(capsys)
+    assert "cost of a training iteration" in out
+    assert "errors in cm" not in out
+    assert len(record["times"]) == len(record["memory"]) == 9
+    assert record["figure6"] is None
+    assert main([*words, "--show"]) == 0
+    assert calls["timed"] == 1
+    out, shown = line(capsys)
+    assert shown["times"] == record["times"]
+    assert main([*words[:-2], "--rounds", "0"]) == 0
+    assert line(capsys)[1]["times"] == {}
+
+
+def test_all_cells_of_two_seeds(
+    places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        "--output",
+        str(tmp_path),
+        "--folder",
+        str(places / "prepared"),
+        "--minutes",
+        "1e-6",
+        "--sets",
+        "",
+    ]
+    words += ["--batch", "2", "--seeds", "2", "--tables", "5", "--figures", "6", "--rounds", "0"]
+    assert main(words) == 0
+    assert calls["train_cell"] == 6 + 4
+    out, record = line(capsys)
+    assert "Table 5, errors in cm" in out
+    assert "±" in out
+    assert "field-pointwise.constraint-none.seed-1" in record["cells"]
+    assert record["figure6"]["lines"] == {"ours": LINE}
+    for claim in record["claims"]:
+        assert claim["words"] in out
+    assert any(claim["holds"] is not None for claim in record["claims"])
+    assert {path.name for path in tmp_path.glob("*.png")} == {"table-5.png", "figure-6.png"}
+
+    # A cell whose model is gone can be shown, but not measured on more.
+    (tmp_path / "base" / "model" / "card.json").unlink()
+    more = ["--sets", "scape", "--data", str(places / "bench"), "--model", str(places / "egg")]
+    assert main([*words, *more]) == 1
+    assert "has lost its model" in said(capsys)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--minutes", "-1"], ["--rounds", "-1"], ["--seeds", "0"], ["--code-steps", "0"], ["--shapes", "1"]],
+)
+def test_choices_that_cannot_be(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--output", str(tmp_path), *words])
+    assert "needed" in said(capsys)
+
+
+@pytest.mark.parametrize("words", [["--tables", "8"], ["--figures", "x"]])
+def test_views_that_are_not_there(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--output", str(tmp_path), "--sets", "", *words]) == 1
+    assert "choose from table4" in said(capsys)
