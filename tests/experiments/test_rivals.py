@@ -183,7 +183,7 @@ def test_a_part_says_so_and_is_not_taken_for_another(
     assert "2 of 6" in text and "Not all pairs were measured" in text
     assert record["limit_pairs"] == 2
     assert main([*words, "--sets", "faust"]) == 1
-    assert "other pairs" in " ".join(capsys.readouterr().err.split())
+    assert "other choices (pairs)" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_damaged_cell_is_told(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
