@@ -139,6 +139,7 @@ def prepare(
         f"wrote {output}: a template of {bundle.shape.V} vertices and {bundle.K} nodes"
         + (f", {registered} registered shapes" if registered else "")
         + (f", {len(names)} shapes without correspondence" if found and not registered else "")
+        + (f", {found['landmarks']} known points" if found.get("landmarks") else "")
         + f"; look at {picture}"
     )
     if json:

@@ -157,6 +157,8 @@ def train(
     )
     chosen = replace(chosen, train=settings, network=replace(chosen.network, field=field))
     voice = Voice(quiet or not first)
+    if not fresh and (output / "checkpoint" / run.CHECKPOINT).is_file():
+        voice.say(f"going on from the checkpoint in {output}; --fresh starts anew")
     started = None
     if start is not None:
         from meshmatch.models.trained import load_model
@@ -255,13 +257,16 @@ def _without_correspondence(
 
 
 def _done(folder: Path, label: str, voice: Voice, json: bool, picture: Path | None) -> None:
+    from meshmatch.models.registry import CARD, read_card
+
+    if voice.quiet and not json:
+        return  # or one of several processes, which has not written the card
+    card = read_card(folder / CARD)
     voice.say(
-        f"wrote model {label} to {folder}; use it with --model {folder}, or add it: meshmatch models add {folder}"
+        f"wrote model {label} to {folder} after step {card.steps}; use it with --model {folder}, or add it: "
+        f"meshmatch models add {folder}"
     )
     if json:
-        from meshmatch.models.registry import CARD, read_card
-
-        card = read_card(folder / CARD)
         print_json(
             {
                 "output": str(folder),

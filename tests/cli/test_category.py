@@ -1,14 +1,16 @@
 """From a folder without correspondence to a map, through the program's only door."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from meshmatch.models.card import read_card
+from meshmatch.models.card import read_card, write_card
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
 from meshmatch.training.loop import Progress
 from tests.cli.conftest import Run
 from tests.conftest import icosphere
@@ -85,7 +87,11 @@ def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path) -> None:
     answer = run("prepare", folder, "-o", tmp_path / "out", *FEW[:-1], "--json")
     assert json.loads(answer.out)["align"] == "near"
     words = ("--steps", "3", "--seed", "2")
-    assert run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", *words).status == 0
+    answer = run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", *words)
+    assert answer.status == 0 and "after step 3;" in answer.err
+    assert "going on" not in answer.err
+    again = run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", *words)
+    assert "going on from the checkpoint" in again.err
     card = read_card(tmp_path / "mine" / "card.json")
     assert card.frame == {"orientation": "near", "scale": "area"}
     assert (card.data, card.network["align_basis"], card.recipe["train"]["seed"]) == (
@@ -113,13 +119,16 @@ def test_known_points_and_preset_reach_the_training(
     def stub(template, gathered, output, **rest):
         called.update(rest, known=gathered.landmarks.shape, output=output)
         rest["progress"](Progress(1, 1, 1e-3, 1.0, {"total": 0.5}))
+        card = read_card(bundled_folder() / "models" / "human" / "card.json")
+        write_card(replace(card, name=rest["name"]), Path(output) / "card.json")
         return output
 
     monkeypatch.setattr("meshmatch.training.unsupervised.train_clouds", stub)
     if registered:
         (eggs / "egg1.ply").unlink()
     prepared = ("--landmarks", ".tip.npy", "--template", "egg2")
-    assert run("prepare", eggs, "-o", tmp_path / "out", *FEW, *prepared).status == 0
+    answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1], *prepared)
+    assert answer.status == 0 and "1 known points" in answer.err
     answer = run(
         *("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", "--preset", "paper", *words),
         *("--category", "egg", "--licence", "CC0", "--seed", "4", "--fresh"),
