@@ -54,6 +54,21 @@ class Run:
         self.benches = [] if options.show else [load_set(name, options.data) for name in self.sets]
         self._subjects: dict[str, list[Subject]] = {}
 
+    def now(self) -> list[Cell]:
+        """The cells that this run is to measure.
+
+        Raises
+        ------
+        OptionError
+            A name that no cell of the views has.
+        """
+        names = [name for name in self.options.cells.split(",") if name]
+        there = {cell.name: cell for cell in self.cells}
+        for name in names:
+            if name not in there:
+                raise OptionError(f"these views have no cell {name!r}", f"they have {', '.join(there)}")
+        return [there[name] for name in names] or self.cells
+
     def asked(self, cell: Cell, **more: Any) -> dict[str, Any]:
         """The question that a cell's file answers."""
         return {"cell": asdict(cell), "setting": asdict(self.setting), **more}

@@ -39,7 +39,7 @@ def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
     """Measure what is missing, print tables and orderings, draw figures, and a JSON line; its record is returned too."""
     here = Run(options, console)
     if options.minutes and not options.show:
-        for cell in here.cells:
+        for cell in here.now():
             here.measure_errors(cell, here.train(cell))
     known = here.known()
     words = budget(here, known)
@@ -110,6 +110,12 @@ def options_of(words: Sequence[str] | None) -> argparse.Namespace:
         help="of training a cell; 0 trains none, table 4 then has its cost alone",
     )
     add("--seeds", type=int, default=1, help="trainings of each cell of table 4")
+    add(
+        "--cells",
+        default="",
+        metavar="NAMES",
+        help="measure these alone, and show what is there of the others",
+    )
     add("--rounds", type=int, default=5, help="iterations of table 4's cells under the clock; 0 for none")
     add("--sets", default=f"shrec19,{CLOUD_SET}", help="on which errors are measured; may be empty")
     add(

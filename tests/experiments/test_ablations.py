@@ -87,6 +87,13 @@ def test_a_run_is_tables_figures_and_a_line_and_goes_on(
     words += ["--minutes", "0.0005", "--code-steps", "2", "--shapes", "2", "--batch", "3", "--threads", "1"]
     words += ["--preset", "small", "--identities", "16", "--code", "16", "--width", "32", "--rounds", "1"]
     few = [*words, "--tables", "", "--figures", "10"]
+    assert main([*few, "--cells", "supervised-100"]) == 0
+    assert calls["train_cell"] == 1
+    out, record = line(capsys)
+    assert "Not measured: base, supervised-50" in out
+    assert set(record["cells"]) == {"supervised-100"}
+    assert main([*few, "--cells", "base,seed-7"]) == 1
+    assert "no cell 'seed-7'" in said(capsys)
     assert main(few) == 0
     assert calls == {"train_cell": 3, "errors_of": 6, "timed": 0, "memory": 0, "oriented": 4}
     out, record = line(capsys)
