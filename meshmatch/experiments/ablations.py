@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.table import Table
 
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.ablation_cells import Known
@@ -33,6 +34,7 @@ from meshmatch.experiments.cells import PRESETS
 from meshmatch.experiments.orderings import Claim, claims
 from meshmatch.experiments.protocols import CLOUD_SET
 from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.outputs import replace_on_success
 
 
 def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
@@ -44,13 +46,17 @@ def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
     known = here.known()
     words = budget(here, known)
     out = wide_console()
-    for view in here.views:
-        for table in TABLES[view](known, here.sets, words) if view in TABLES else ():
-            out.print(table)
+    shown = [view for view in here.views if view in TABLES]
+    tables = [table for view in shown for table in TABLES[view](known, here.sets, words)]
+    for table in tables:
+        out.print(table)
     found = claims(known, here.sets)
-    for claim in found:
-        out.print(said(claim), soft_wrap=True)
-    out.print(f"Budget: {words}", soft_wrap=True)
+    told = [said(claim) for claim in found]
+    for sentence in [*told, f"Budget: {words}"]:
+        out.print(sentence, soft_wrap=True)
+    if options.markdown is not None:
+        with replace_on_success(options.markdown) as temporary:
+            temporary.write_text(as_markdown(tables, told), encoding="utf-8")
     missing = [cell.name for cell in here.cells if cell not in known.trained]
     if missing and options.minutes:
         out.print(f"Not measured: {', '.join(missing)}", soft_wrap=True)
@@ -74,6 +80,16 @@ def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
     }
     print(json.dumps(record), flush=True)
     return record
+
+
+def as_markdown(tables: Sequence[Table], sentences: Sequence[str]) -> str:
+    """The tables, each under its title, and the sentences as a list: lines for docs/results.md."""
+    lines = []
+    for table in tables:
+        columns = [[str(column.header), *map(str, column.cells)] for column in table.columns]
+        rows = [f"| {' | '.join(row)} |" for row in zip(*columns, strict=True)]
+        lines += [f"{table.title}", "", rows[0], "|---" * len(columns) + "|", *rows[1:], ""]
+    return "\n".join([*lines, *(f"- {sentence}" for sentence in sentences), ""])
 
 
 def said(claim: Claim) -> str:
@@ -136,6 +152,7 @@ def options_of(words: Sequence[str] | None) -> argparse.Namespace:
     add("--model", default="human", help="which says the orientation of a set's shapes: %(default)s")
     add("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
     add("--cache", type=Path, help="folder of kept geodesic distances")
+    add("--markdown", type=Path, metavar="FILE", help="the tables and orderings again, for docs/results.md")
     add("--pictures", type=Path, metavar="FOLDER", help="of the figures; by default the output folder")
     add("--show", action="store_true", help="measure nothing, show what is there")
     options = parser.parse_args(words)

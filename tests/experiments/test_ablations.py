@@ -136,8 +136,14 @@ def test_table_4_has_costs_without_training(
     assert "errors in cm" not in out
     assert len(record["times"]) == len(record["memory"]) == 9
     assert record["figure6"] is None
-    assert main([*words, "--show"]) == 0
+    assert main([*words, "--show", "--markdown", str(tmp_path / "table.md")]) == 0
     assert calls["timed"] == 1
+    written = (tmp_path / "table.md").read_text(encoding="utf-8")
+    head, rule, first = written.split("\n")[2:5]
+    assert head.startswith("| constraint | field | CPU ms |")
+    assert rule.count("---") == head.count("|") - 1 == first.count("|") - 1
+    assert first.startswith("| none | mls |")
+    assert "\n- not measured: held out: " in written
     out, shown = line(capsys)
     assert shown["times"] == record["times"]
     assert main([*words[:-2], "--rounds", "0"]) == 0
