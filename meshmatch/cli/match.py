@@ -134,7 +134,9 @@ def register(
     seed: options.Seed = 0,
     strict: options.Strict = False,
     json: options.Json = False,
-    threads: options.Threads = 2,
+    threads: Annotated[
+        int, typer.Option(min=1, help="How many threads to use; more than 1 may change the last bits.")
+    ] = 1,
     quiet: options.Quiet = False,
 ) -> None:
     """Lay the model's template on one shape.

@@ -112,6 +112,9 @@ def picture(
 
     A PNG without a GPU, a display or OpenGL. Textures and colours of the files are shown where there are any.
     """
+    from meshmatch.config import set_threads
+
+    set_threads(1)  # sums in another order would differ in their last bits
     from meshmatch.cli import scenes
     from meshmatch.errors import OptionError
     from meshmatch.outputs import replace_on_success

@@ -469,3 +469,5 @@ def test_threads_are_set(
     # match runs its two fits side by side, one thread each, and spends the rest on the map
     assert asked == ([1] if verb == "match" else [4])
     assert verb == "register" or stub.called["workers"] == 4
+    run(verb, *words)  # sums in another order would differ in their last bits: nobody gets that unasked
+    assert asked[-1] == 1
