@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -80,16 +80,19 @@ class Run:
     def train(self, cell: Cell) -> dict[str, Any]:
         """How its training went; {"skipped": why} where nodes cannot be laid."""
         path, model = self.place(cell) / "trained.json", self.place(cell) / "model"
+        steps = 0 if by_time(cell) else int(self.train(BASE)["steps"])
+        budget: dict[str, Any] = {"steps": steps} if steps else {"minutes": self.options.minutes}
 
         def measured() -> dict[str, Any]:
-            self.console.print(f"training {cell.name}: {self.options.minutes:g} min", highlight=False)
+            words = ", ".join(f"{value:g} {name}" for name, value in budget.items())
+            self.console.print(f"training {cell.name}: {words}", highlight=False)
             try:
-                found = train_cell(cell, self.setting, self.options.minutes, model)
+                found = train_cell(cell, self.setting, model, **budget)
             except TemplateError as error:
                 found = {"skipped": error.message}
             return {**self._here(), **found}
 
-        return once(path, self.asked(cell, minutes=self.options.minutes), measured)
+        return once(path, self.asked(cell, **budget), measured)
 
     def measure_errors(self, cell: Cell, trained: dict[str, Any]) -> None:
         """Errors on every set after every refinement that belongs to the cell."""
@@ -189,12 +192,14 @@ class Run:
 
     def known(self) -> Known:
         """What is there."""
-        trained, errors = {}, {}
+        trained, errors, steps = {}, {}, 0
         for cell in self.cells:
-            found = recall(self.place(cell) / "trained.json", self.asked(cell, minutes=self.options.minutes))
+            budget = {"minutes": self.options.minutes} if by_time(cell) else {"steps": steps}
+            found = recall(self.place(cell) / "trained.json", self.asked(cell, **budget))
             if found is None:
                 continue
             trained[cell] = found
+            steps = found["steps"] if cell == BASE else steps
             for name in self.sets:
                 for how in METHODS:
                     record = self.error(cell, name, how, found)
@@ -205,6 +210,14 @@ class Run:
 
     def _here(self) -> dict[str, Any]:
         return circumstances(self.setting.threads, 1)
+
+
+def by_time(cell: Cell) -> bool:
+    """Whether its budget is time: where representations and constraints, which differ in cost, are compared.
+
+    All others, which are compared for what they learn, take as many steps as the base does in that time.
+    """
+    return replace(cell, field=BASE.field, constraint=BASE.constraint, seed=BASE.seed) == BASE
 
 
 def methods_of(cell: Cell) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Train a cell for its minutes, and measure it on shapes that it has not seen."""
+"""Train a cell for its budget, and measure it on shapes that it has not seen."""
 
 from __future__ import annotations
 
@@ -23,11 +23,14 @@ from meshmatch.training.run import export, validation_error
 from meshmatch.training.setup import build_deformer, build_loss_points
 
 
-def train_cell(cell: Cell, setting: Setting, minutes: float, folder: Path) -> dict[str, Any]:
+def train_cell(
+    cell: Cell, setting: Setting, folder: Path, *, minutes: float = 0.0, steps: int = 0
+) -> dict[str, Any]:
     """Train from the beginning, write a model folder, and say how it went.
 
-    The budget is time: of the processor where the network is on it, so that what else the machine does costs nothing;
-    else on the clock. What is slow learns less. The rate falls to 0 at the end of the budget, not of a number of steps.
+    The budget is time or a number of steps. Time is the processor's where the network is on it, so that what else the
+    machine does costs little; else the clock's. What is slow then learns less. The rate falls to 0 at the end of the
+    budget.
 
     Returns
     -------
@@ -45,9 +48,9 @@ def train_cell(cell: Cell, setting: Setting, minutes: float, folder: Path) -> di
     clock = time.process_time if on_cpu else time.monotonic
     model.train()
     began, spent = clock(), 0.0
-    while spent < 60 * minutes:
-        steps = max(trainer.step + 1, round(trainer.step * 60 * minutes / max(spent, 1e-3)))
-        trainer.config = replace(recipe.train, steps=steps)
+    while trainer.step < steps if steps else spent < 60 * minutes:
+        whole = steps or max(trainer.step + 1, round(trainer.step * 60 * minutes / max(spent, 1e-3)))
+        trainer.config = replace(recipe.train, steps=whole)
         batch = pool.batch(trainer.step, recipe.train.shapes, cell.shapes, cell.seed, model.encoder)
         trainer.iterate(replace(batch, targets=batch.targets[:, : cell.supervised]))
         trainer.wait()

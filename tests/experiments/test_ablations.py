@@ -88,16 +88,21 @@ def test_a_run_is_tables_figures_and_a_line_and_goes_on(
     words += ["--preset", "small", "--identities", "16", "--code", "16", "--width", "32", "--rounds", "1"]
     few = [*words, "--tables", "", "--figures", "10"]
     assert main([*few, "--cells", "supervised-100"]) == 0
-    assert calls["train_cell"] == 1
+    assert calls["train_cell"] == 2  # the base says how many steps
     out, record = line(capsys)
-    assert "Not measured: base, supervised-50" in out
-    assert set(record["cells"]) == {"supervised-100"}
+    assert "Not measured: supervised-50" in out
+    assert set(record["cells"]) == {"base", "supervised-100"}
+    steps = record["cells"]["base"]["steps"]
+    assert record["cells"]["supervised-100"]["steps"] == steps
     assert main([*few, "--cells", "base,seed-7"]) == 1
     assert "no cell 'seed-7'" in said(capsys)
     assert main(few) == 0
     assert calls == {"train_cell": 3, "errors_of": 6, "timed": 0, "memory": 0, "oriented": 4}
     out, record = line(capsys)
-    assert "0.0005 CPU min of training a cell, preset small, 2 steps on the code" in out
+    assert (
+        f"0.0005 CPU min of training a cell or the base's {steps} steps, preset small, 2 steps on the code"
+        in out
+    )
     assert set(record["cells"]) == {"base", "supervised-100", "supervised-50"}
     assert {"base scape chamfer", "base scape none", "supervised-50 faust code"} <= record["errors"].keys()
     assert (tmp_path / "out" / "figure-10.png").is_file()

@@ -123,7 +123,7 @@ def test_a_cell_is_trained_into_a_model(
 ) -> None:
     small = pool_of(setting, "T", 3)
     monkeypatch.setattr(cell_training, "pool_of", lambda *_: small)
-    found = train_cell(cell, setting, 0.005, tmp_path / "model")
+    found = train_cell(cell, setting, tmp_path / "model", minutes=0.005)
     assert found["steps"] >= 1
     assert found["seconds"] >= 0.3
     assert 0 < found["held_out_cm"] < 200
@@ -137,13 +137,23 @@ def test_a_cell_is_trained_into_a_model(
 
 
 def test_longer_training_is_better(setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = pool_of(setting, "T", 4)
+    source = setting.sources("T")[0]
+    monkeypatch.setattr(Setting, "sources", lambda *_: (source, source))  # as well as what it learns from
+    small = pool_of(setting, "T", 8)
     monkeypatch.setattr(cell_training, "pool_of", lambda *_: small)
     none = replace(BASE, constraint="none")
-    seen = small.batch(0, 12, 4, 0, new_network(none, setting, small).encoder)
-    small = replace(small, held_out=seen)
-    short, long = (train_cell(none, setting, m, tmp_path / str(m))["held_out_cm"] for m in (1e-5, 0.03))
-    assert long < short
+    short, long = (train_cell(none, setting, tmp_path / str(n), steps=n)["held_out_cm"] for n in (1, 200))
+    assert long < short - 0.03
+
+
+def test_a_number_of_steps_is_a_budget_too(
+    setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = pool_of(setting, "T", 2)
+    monkeypatch.setattr(cell_training, "pool_of", lambda *_: small)
+    first, again = (train_cell(BASE, setting, tmp_path / name, steps=7) for name in ("a", "b"))
+    assert first["steps"] == again["steps"] == 7
+    assert first["model"] == again["model"]
 
 
 def test_fewer_supervised_points_are_regularised_everywhere(setting: Setting) -> None:
