@@ -2,10 +2,10 @@
 
 The benchmark's animals (cats, dogs, cows, hippos, horses) stand in different poses and are turned every way. One is
 the template; a model is trained on all of them without correspondence, or, with ``--points N``, with N known points on
-each. Then every ordered pair is matched (or some, evenly spread: ``--limit-pairs``), and every landmark counts. The
-error is the Euclidean distance on the target between the matched and the true point, in units of sqrt(area), times 100.
-Beside it: rigid alignment and the nearest vertex. Animals are trained and measured on the same shapes: a registration
-of a collection.
+each. Then every ordered pair is matched (or some, evenly spread: ``--limit-shapes``, ``--limit-pairs``), and every
+landmark counts. The error is the Euclidean distance on the target between the matched and the true point, in units of
+sqrt(area), times 100. Beside it: rigid alignment and the nearest vertex. Animals are trained and measured on the same
+shapes: a registration of a collection.
 """
 
 from __future__ import annotations
@@ -85,13 +85,18 @@ def known_points(truth: Mapping[str, np.ndarray], shapes: Mapping[str, Shape], t
     return {name: ids[at] for name, ids in truth.items()}
 
 
-def run(training: Training, *, data: Path, template: str, points: int, limit: int | None) -> dict[str, Any]:
+def run(
+    training: Training, *, data: Path, template: str, points: int, limit: int | None, some: int | None
+) -> dict[str, Any]:
     """Train, match, measure, print a table and a JSON line; the line's record is returned too."""
     set_threads(training.threads)
     shapes, truth = load_category(data / "animal", TRUTH)
     if template not in shapes:
         raise InputError(f"there is no animal {template!r}", f"choose from {', '.join(shapes)}")
-    pairs = spread_pairs(shapes, limit)
+    names = list(shapes)
+    picked = names if some is None else [names[k] for k in np.linspace(0, len(names) - 1, some).astype(int)]
+    measured = {name: shapes[name] for name in picked}
+    pairs = spread_pairs(measured, limit)
     landmarks = None
     if points:
         place = training.work / "points"
@@ -102,7 +107,7 @@ def run(training: Training, *, data: Path, template: str, points: int, limit: in
     results: dict[str, dict[str, Any]] = {}
     with Console(stderr=True).status("animals") as status:
         tell = status.update
-        nearest = nearest_all(shapes, "rigid", "area", tell, pairs)
+        nearest = nearest_all(measured, "rigid", "area", tell, pairs)
         found = {pair: index for pair, (index, _) in nearest.items()}
         results["rigid alignment, nearest vertex"] = animal_errors(shapes, truth, found)
         model, how = trained(
@@ -120,8 +125,8 @@ def run(training: Training, *, data: Path, template: str, points: int, limit: in
             ("nodes refined", FitConfig(seed=training.seed, partial="no")),
         ):
             began = time.monotonic()
-            fits = fit_all(model, shapes, config, tell)
-            maps = map_all(model, shapes, fits, config, tell, pairs)
+            fits = fit_all(model, measured, config, tell)
+            maps = map_all(model, measured, fits, config, tell, pairs)
             found = {pair: each.index for pair, each in maps.items()}
             results[label] = animal_errors(shapes, truth, found)
             results[label]["seconds"] = round(time.monotonic() - began, 1)
@@ -143,9 +148,10 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--template", default="dog_alph", help="which animal; %(default)s")
     parser.add_argument("--points", type=int, default=0, help="known points on each animal; %(default)s")
     parser.add_argument("--limit-pairs", type=int, metavar="N", help="N of the pairs, evenly spread")
+    parser.add_argument("--limit-shapes", type=int, metavar="N", help="N of the animals are measured")
     options = parser.parse_args(words)
-    if options.points < 0 or (options.limit_pairs or 1) < 1:
-        parser.error("points of 0 or more and a pair or more are needed")
+    if options.points < 0 or (options.limit_pairs or 1) < 1 or (options.limit_shapes or 2) < 2:
+        parser.error("points of 0 or more, a pair or more and two shapes or more are needed")
     with training_of(parser, options) as training:
         return status_of(
             lambda: run(
@@ -154,6 +160,7 @@ def main(words: list[str] | None = None) -> int:
                 template=options.template,
                 points=options.points,
                 limit=options.limit_pairs,
+                some=options.limit_shapes,
             )
         )
 

@@ -279,7 +279,7 @@ def test_kinds_of_animals_and_their_errors_by_hand(cube: Shape) -> None:
 
 @pytest.mark.parametrize("points", [0, 6])
 def test_animals_from_end_to_end(points: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    balls(tmp_path / "animal", ".landmarks.npy")
+    balls(tmp_path / "animal", ".landmarks.npy", 3)
     for file in (tmp_path / "animal").glob("*.npy"):
         np.save(file, np.arange(162))
     words = ["--data", tmp_path, "--template", "1", "--points", points, "--steps", "2", "--threads", "1"]
@@ -296,11 +296,17 @@ def test_animals_from_end_to_end(points: int, tmp_path: Path, capsys: pytest.Cap
         "0.35",
         "--limit-pairs",
         "1",
+        "--limit-shapes",
+        "2",
     ]
     assert animals.main([str(word) for word in words]) == 0
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert (record["training"]["template"], record["points"]) == ("1", points)
     assert record["results"]["rigid alignment, nearest vertex"]["mean_x100"] < 12
     assert record["results"]["nodes refined"]["pairs"] == 1
+    assert list(record["results"]["nodes refined"]["verdicts"]) == [
+        "0",
+        "2",
+    ]  # evenly spread; all are learned
     assert animals.main(["--data", str(tmp_path), "--template", "9"]) == 1
     assert "no animal" in capsys.readouterr().err
