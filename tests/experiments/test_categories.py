@@ -44,6 +44,7 @@ def test_errors_of_hearts_by_hand(cube: Shape) -> None:
     wrong = right.copy()
     wrong[0] = right[4]  # from x = 0 to x = 1: one edge, and the other chamber
     wrong[7] = 0  # does not count
+    assert found["across_x100"] == 0.0
     found = heart_truth.heart_errors(shapes, truth, {("a", "b"): wrong, ("b", "a"): right}, ["a"])
     assert found["unseen_pairs"] == 0  # of two shapes that are both unseen
     found = heart_truth.heart_errors(shapes, truth, {("a", "b"): wrong}, ["b", "a"])
@@ -51,6 +52,8 @@ def test_errors_of_hearts_by_hand(cube: Shape) -> None:
     assert found["mean_x100"] == pytest.approx(100 / 7 / np.sqrt(6), abs=1e-3)
     assert found["right_chamber"] == pytest.approx(6 / 7, abs=1e-3)
     assert found["worst_pair"] == ["a", "b"]
+    # the normal of a corner, whatever its triangles weigh, looks away from the middle
+    assert 0.2 * found["mean_x100"] < found["across_x100"] < 0.9 * found["mean_x100"]
 
 
 def test_maps_through_registered_vertices(cube: Shape) -> None:
