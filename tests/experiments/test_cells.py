@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import flop_registry
 
 from meshmatch.errors import TemplateError
 from meshmatch.experiments import cell_training
@@ -13,10 +15,24 @@ from meshmatch.experiments.cell_training import fewer, is_trained, new_network, 
 from meshmatch.experiments.cells import BASE, CONSTRAINTS, Cell, Setting
 from meshmatch.experiments.iterations import built, memory, timed
 from meshmatch.experiments.pool import SCANS, pool_of
-from meshmatch.fields.choice import FIELDS
+from meshmatch.fields.choice import FIELDS, FieldName
 from meshmatch.models.trained import load_model
 from meshmatch.training.setup import build_loss_points
 from tests.experiments.egg_cells import make_small, prepare_eggs
+
+
+class Work(TorchDispatchMode):
+    """Counts the multiplications and additions of products of matrices, gradients included."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.done = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        if func._overloadpacket in flop_registry:
+            self.done += flop_registry[func._overloadpacket](*args, **(kwargs or {}), out_val=out)
+        return out
 
 
 @pytest.fixture(scope="module")
@@ -185,6 +201,22 @@ def test_a_cell_without_constraints_has_no_terms_of_them(setting: Setting) -> No
     trainer, batches = built(setting, replace(BASE, field="pointwise"))
     assert {"volume", "arap", "blend"} < set(trainer.iterate(batches[0]))
     assert trainer.step == 1
+
+
+def test_constraints_multiply_the_work_of_a_pointwise_network(prepared: Path) -> None:
+    setting = Setting(folder=str(prepared), batch=4)
+
+    def work(field: FieldName, constraint: str) -> int:
+        trainer, batches = built(setting, replace(BASE, field=field, constraint=constraint))
+        with Work() as work:
+            trainer.iterate(batches[0])
+        return work.done
+
+    factor = {field: work(field, "vol+arap+Z") / work(field, "none") for field in FIELDS}
+    assert factor["mls"] < 2
+    assert factor["rbf"] < 2
+    assert factor["pointwise"] > 3
+    assert work("pointwise", "vol+arap+Z") > 10 * work("mls", "vol+arap+Z")
 
 
 def test_memory_is_that_of_the_iterations(prepared: Path) -> None:
