@@ -34,21 +34,24 @@ _SMALLEST = 1e-3  # a stretch below it is taken for it: a logarithm must stay fi
 
 @dataclass(frozen=True)
 class AgreeConfig:
-    """Steps, weight of the common stretch, robust scale (units of sqrt(area)), share of the pull along the surface, and
-    how many points of the scan are paired with the template."""
+    """Steps, weight of the common stretch, robust scale (units of sqrt(area)), share of the pull along the surface, how
+    many points of the scan are paired with the template, and how much these are shared (see `NodeRefineConfig`)."""
 
     steps: int = 8
     strain: float = 0.0004
     scale: float = 0.05
     point_share: float = 0.1
     back_points: int = 8000
+    shared: float = 0.0
 
     def suited(self, roughness: float) -> AgreeConfig:
-        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all points, a stiffer template."""
+        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all points, shared, a stiffer template."""
         return replace(
             self,
-            strain=between(self.strain, 5 * self.strain, roughness),
+            strain=between(self.strain, 10 * self.strain, roughness),
+            point_share=between(self.point_share, max(self.point_share, 1.0), roughness),
             back_points=round(self.back_points * (1 + roughness)),
+            shared=max(self.shared, roughness),
         )
 
 
@@ -143,7 +146,12 @@ def agree(
         for number, (scan, F) in enumerate(zip(scans, gradients, strict=True)):
             one_sided = partial is not None and partial[number]
             config = configs[number]
-            pairing = replace(nodes, point_share=config.point_share, back_points=config.back_points)
+            pairing = replace(
+                nodes,
+                point_share=config.point_share,
+                back_points=config.back_points,
+                shared=config.shared,
+            )
             weights, pulls = pair_terms(system, scan, refined[number], config.scale, pairing, one_sided)
             if landmarks is not None:
                 add_landmarks(weights, pulls, landmarks[number], nodes.landmark_weight)

@@ -7,6 +7,7 @@ import numpy as np
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.place import at_footpoints, in_core_frame, place, unit, vertex_normals
+from meshmatch.maps.scatter import expected, is_scattered, land, noise_of
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.repair import Repaired
@@ -28,7 +29,7 @@ def build_map(
 
     Source vertex -> closest point of the template as fitted to the source -> the same point of the template as
     fitted to the target -> closest point of the target. Closest points must face the same way, and belong to the
-    same place of the template where two sheets touch (see `place`).
+    same place of the template where two sheets touch (see `place`); of noisy clouds, see `scatter`.
 
     Parameters
     ----------
@@ -73,14 +74,34 @@ def carry(
     """Where on the target every source vertex lands, and a confidence in 0..1."""
     foot, belongs = place(source, source_fit, workers)
     moved = at_footpoints(foot, source_fit.faces, target_fit.points)
-    facing = unit(at_footpoints(foot, source_fit.faces, vertex_normals(target_fit.points, target_fit.faces)))
-    there, there_normals = in_core_frame(target, target_fit)
-    if target.is_cloud:
-        facing = np.zeros_like(facing)
-    surface = Surface(there, target.faces, there_normals, place(target, target_fit, workers)[1])
-    landed = surface.query(moved, facing, workers, belongs)
+    if is_scattered(source):
+        points, noise = in_core_frame(source, source_fit)[0], noise_of(foot.distance)
+        (moved, belongs), _ = expected(points, source_fit, noise, [target_fit.points, source_fit.resting])
+    there = place(target, target_fit, workers)
+    if is_scattered(target):
+        landed = land(target, target_fit, noise_of(there[0].distance), moved, belongs, workers)
+    else:
+        landed = _closest(foot, source_fit, moved, belongs, target, target_fit, there[1], workers)
     confidence = np.exp(-np.square(foot.distance / _FIT_SCALE) - np.square(landed.distance / _FIT_SCALE))
     return landed, confidence
+
+
+def _closest(
+    foot: Footpoints,
+    source_fit: Fit,
+    moved: np.ndarray,
+    belongs: np.ndarray,
+    target: Shape,
+    target_fit: Fit,
+    resting: np.ndarray,
+    workers: int,
+) -> Footpoints:
+    """Closest points of the target that face as the template does there and belong to the same place of it."""
+    facing = unit(at_footpoints(foot, source_fit.faces, vertex_normals(target_fit.points, target_fit.faces)))
+    points, normals = in_core_frame(target, target_fit)
+    if target.is_cloud:
+        facing = np.zeros_like(facing)
+    return Surface(points, target.faces, normals, resting).query(moved, facing, workers, belongs)
 
 
 def _nearest_corner(target: Shape, landed: Footpoints) -> np.ndarray:

@@ -100,6 +100,45 @@ def test_pairs_are_those_of_a_plain_loop(system: NodeSystem) -> None:
     assert weights.any()
 
 
+def test_shared_pairs_are_those_of_a_plain_loop(system: NodeSystem) -> None:
+    scan = scan_of(Shape(1.1 * system.verts + 0.02, system.faces), 60)
+    config = replace(CONFIG, back_points=20, shared=1.0, spread=0.05)
+    vectors = np.zeros((system.K, 3))
+    normals, area = system.normals(system.verts), vertex_areas(system.verts, system.faces)
+    H, s = np.zeros((len(area), 3, 3)), np.zeros((len(area), 3))
+    for p in range(0, 60, 3):
+        apart = np.linalg.norm(system.verts - scan.points[p], axis=1)
+        near = np.argsort(apart)[:16]
+        share = area[near] * np.exp(-0.5 * (apart[near] / 0.05) ** 2)
+        share *= 1 / share.sum() / 20 / (1 + apart.min() ** 2 / 0.08**2) ** 2
+        for v, weight in zip(near, share, strict=True):
+            term = weight * (np.outer(normals[v], normals[v]) + config.point_share * np.eye(3))
+            H[v] += term
+            s[v] += term @ scan.points[p]
+    weights, pulls = pair_terms(system, scan, vectors, 0.08, config)
+    assert np.allclose(weights, H.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
+    assert np.allclose(pulls, s)
+    # in between both kinds have their share
+    nearest = pair_terms(system, scan, vectors, 0.08, replace(config, shared=0.0))
+    mixed = pair_terms(system, scan, vectors, 0.08, replace(config, shared=0.25))
+    for found, alone, together in zip(mixed, nearest, (weights, pulls), strict=True):
+        assert np.allclose(found, 0.75 * alone + 0.25 * together)
+
+
+def test_noise_that_shares_its_pairs_leaves_the_template_where_it_belongs(system: NodeSystem) -> None:
+    """Points about a surface that rests: the nearest ones pull the template away, shared ones less."""
+    clean = scan_of(Shape(system.verts, system.faces), 4000)
+    noisy = clean.points + 0.03 * np.random.default_rng(0).standard_normal(clean.points.shape)
+    scan = Scan(noisy, clean.normals)
+    start = np.zeros((system.K, 3))
+    moves = []
+    for shared in (0.0, 1.0):
+        config = replace(CONFIG, back_points=4000, point_share=1.0, shared=shared, spread=0.03)
+        found = refine_nodes(system, scan, start, config)
+        moves.append(np.linalg.norm(system.moved(found) - system.verts, axis=1).mean())
+    assert moves[1] < 0.95 * moves[0]
+
+
 def test_a_surface_that_faces_the_other_way_is_no_partner(system: NodeSystem, scan: Scan) -> None:
     inside_out = Scan(scan.points, -scan.normals)
     weights, _ = pair_terms(system, inside_out, np.zeros((system.K, 3)), 0.1, CONFIG)
