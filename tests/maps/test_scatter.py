@@ -1,0 +1,103 @@
+"""Points of noisy clouds: means over where they may belong, and who stands back."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from meshmatch.fitting.fit import Fit
+from meshmatch.maps import build
+from meshmatch.maps.scatter import expected, is_scattered, land, noise_of
+from meshmatch.shapes.shape import Frame, Shape
+
+NO_FACES = np.empty((0, 3), np.int64)
+
+
+def plate(side: int = 21, height: float = 0.0) -> Fit:
+    """A square plate of side 1, that rests where it lies."""
+    ticks = np.linspace(0, 1, side)
+    x, y = (each.reshape(-1) for each in np.meshgrid(ticks, ticks, indexing="ij"))
+    points = np.stack([x, y, 0 * x + height], 1)
+    a = np.arange(side * side).reshape(side, side)
+    p, q, r, t = (c.reshape(-1) for c in (a[:-1, :-1], a[1:, :-1], a[1:, 1:], a[:-1, 1:]))
+    faces = np.concatenate([np.stack([p, q, r], 1), np.stack([p, r, t], 1)])
+    return Fit(
+        "", Frame.identity(), points, points, points, faces, 0.0, np.zeros(1), "good", (), "+y", "+z", 0.0, 0
+    )  # fmt: skip
+
+
+def test_the_noise_is_that_of_the_distances_whatever_a_few_strays_do() -> None:
+    apart = np.abs(0.015 * np.random.default_rng(0).standard_normal(4000))
+    assert noise_of(apart) == pytest.approx(0.015, rel=0.06)
+    apart[:200] = 3.0
+    assert noise_of(apart) == pytest.approx(0.015, rel=0.12)
+    assert (noise_of(0 * apart), noise_of(apart + 9)) == (0.006, 0.03)
+
+
+def test_means_are_those_of_a_plain_loop() -> None:
+    fit = plate(5)  # 25 vertices and 32 face centres; 48 of them are asked
+    values = np.stack([fit.points[:, 0] ** 2, fit.points[:, 1]], 1)
+    samples = np.concatenate([fit.points, fit.points[fit.faces].mean(1)])
+    sampled = np.concatenate([values, values[fit.faces].mean(1)])
+    areas = np.full(len(fit.faces), 1 / 32)
+    prior = np.concatenate([np.bincount(fit.faces.reshape(-1), np.repeat(areas / 3, 3)), areas]) / 2
+    asked = np.array([[0.4, 0.3, 0.1], [1.2, 0.5, 0]])
+    (mean, other), variance = expected(asked, fit, 0.2, [values, fit.points])
+    for n, point in enumerate(asked):
+        apart = np.linalg.norm(samples - point, axis=1)
+        near = np.argsort(apart)[:48]
+        share = prior[near] * np.exp(-0.5 * (apart[near] / 0.2) ** 2)
+        share /= share.sum()
+        assert np.allclose(mean[n], share @ sampled[near])
+        assert np.allclose(other[n], share @ samples[near])
+        around = np.square(sampled[near] - mean[n]).sum(1)
+        assert variance[n] == pytest.approx(share @ around)
+
+
+def test_a_point_far_from_everything_has_a_mean_all_the_same() -> None:
+    fit = plate()
+    (mean,), variance = expected(np.array([[0.5, 0.5, 40.0]]), fit, 0.01, [fit.points])
+    assert np.allclose(mean, [[0.5, 0.5, 0]], atol=0.05) and np.isfinite(variance).all()
+
+
+def test_of_two_points_as_near_the_better_known_one_is_chosen() -> None:
+    """Between two plates a point may belong to either: it stands back behind one that lies on its plate."""
+    low, high = plate(), plate(height=0.1)
+    points = np.concatenate([low.points, high.points])
+    fit = replace(
+        low, points=points, resting=points, faces=np.concatenate([low.faces, high.faces + len(low.points)])
+    )
+    cloud = Shape(np.array([[0.5, 0.52, 0.05], [0.5, 0.45, 0.0]]), NO_FACES)
+    sought = np.array([[0.5, 0.5, 0.02]])
+    found = land(cloud, fit, 0.02, sought, sought)
+    assert found.vertex.tolist() == [1]
+    assert found.distance == pytest.approx(np.hypot(0.05, 0.02))
+    assert found.face.tolist() == [-1] and found.barycentric.tolist() == [[1, 0, 0]]
+
+
+def noisy(shape: np.ndarray, size: float, seed: int) -> Shape:
+    return Shape(shape + size * np.random.default_rng(seed).standard_normal(shape.shape), NO_FACES)
+
+
+def rolled(sheet: np.ndarray, radius: float) -> np.ndarray:
+    """Angles and heights (N, 2) on a cylinder."""
+    return np.stack([radius * np.cos(sheet[:, 0]), radius * np.sin(sheet[:, 0]), sheet[:, 1]], 1)
+
+
+def test_noise_costs_a_map_less_than_closest_points_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two noisy copies of the same points of a limb, laid on perfectly."""
+    across, along = 0.04, np.random.default_rng(0).random(4000)
+    angle = 2 * np.pi * np.random.default_rng(1).random(4000)
+    clean = rolled(np.stack([angle, along], 1), across)
+    flat = plate(41)
+    limb = rolled(flat.points[:, :2] * [2 * np.pi, 1], across)
+    fit = replace(flat, points=limb, resting=limb)
+    source, target = noisy(clean, 0.015, 2), noisy(clean, 0.015, 3)
+    assert is_scattered(source) and is_scattered(target) and not is_scattered(noisy(clean, 0.0, 1))
+    errors = []
+    for scattered in (is_scattered, lambda shape: False):
+        monkeypatch.setattr(build, "is_scattered", scattered)
+        landed, confidence = build.carry(source, fit, target, fit)
+        errors.append(np.linalg.norm(clean[landed.vertex] - clean, axis=1).mean())
+        assert ((confidence > 0) & (confidence <= 1)).all()
+    assert errors[0] < 0.99 * errors[1]
