@@ -99,6 +99,8 @@ def prepare(
     for option, value in (("--template", template), ("--align", align), ("--landmarks", landmarks)):
         if not shapes.is_dir() and value is not None:
             raise OptionError(f"{option} goes with a folder of shapes", "one shape is its own template")
+    if shapes.is_dir() and output.is_dir() and output.samefile(shapes):
+        raise OptionError(f"cannot prepare {shapes} into itself", "choose another folder with -o")
     make_folder(output)
     if shapes.is_dir():
         with voice.progress() as report:

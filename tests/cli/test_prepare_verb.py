@@ -44,6 +44,16 @@ def folder(tmp_path: Path, sphere: Shape) -> Path:
     return shapes
 
 
+@pytest.mark.parametrize("name", ["eggs", "eggs/.", "link"])
+def test_a_folder_is_not_prepared_into_itself(run: Run, folder: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / "link").symlink_to("eggs")
+    before = sorted(folder.iterdir())
+    answer = run("prepare", folder, "-o", tmp_path / name, *FEW)
+    assert answer.status == 1
+    assert "into itself" in answer.err
+    assert sorted(folder.iterdir()) == before
+
+
 @pytest.mark.parametrize("strategy", ["spectral", "geodesic", "uniform"])
 def test_one_shape_becomes_a_template(
     run: Run,
