@@ -23,6 +23,7 @@ from meshmatch.maps.build import build_map
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel, load_model
+from meshmatch.shapes.cloud import on_a_line
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
@@ -283,6 +284,10 @@ def usable(shape: Shape) -> Repaired:
         raise InputError(
             f"{shape.name} has only {fixed.F} usable triangles",
             f"at least {MINIMUM_FACES} are needed to see a shape",
+        )
+    if fixed.is_cloud and on_a_line(fixed.verts):
+        raise InputError(
+            f"{shape.name} has no surface: all its points lie on a line", "is it a cloud at all?"
         )
     if not fixed.area > 0:
         raise InputError(f"{shape.name} has no surface area", "are all its points the same, or on a line?")

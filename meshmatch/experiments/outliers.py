@@ -50,12 +50,14 @@ def load_clouds(data: Path) -> list[Shape]:
     return [Shape(cloud, np.empty((0, 3), np.int64), f"cloud {k}") for k, cloud in enumerate(points)]
 
 
-def measure(clouds: Sequence[Shape], *, model: str, seed: int) -> dict[str, Any]:
-    """Match every ordered pair of corresponding clouds and measure every row."""
+def measure(clouds: Sequence[Shape], *, model: str, seed: int, limit: int | None = None) -> dict[str, Any]:
+    """Match every ordered pair of corresponding clouds, or ``limit`` of them evenly spread, and measure every row."""
     began = time.perf_counter()
     voice = Console(stderr=True)
     fits = [register(cloud, model=model, seed=seed) for cloud in track(clouds, "fitting", console=voice)]
-    pairs = list(permutations(range(len(clouds)), 2))
+    every = list(permutations(range(len(clouds)), 2))
+    count = len(every) if limit is None else min(limit, len(every))
+    pairs = [every[k] for k in np.linspace(0, len(every) - 1, max(1, count)).round().astype(int)]
     errors, trusted = [], []
     for a, b in track(pairs, "matching", console=voice):
         found = map_between(clouds[a], fits[a], clouds[b], fits[b], model=model)
@@ -66,6 +68,7 @@ def measure(clouds: Sequence[Shape], *, model: str, seed: int) -> dict[str, Any]
     joined, sure = np.concatenate(errors), np.concatenate(trusted)
     return {
         "pairs": len(pairs),
+        "of": len(every),
         "mean_cm": float(joined.mean()),
         "median_cm": float(np.median(joined)),
         "share_over_15cm": float((joined > LOST_CM).mean()),
@@ -77,13 +80,13 @@ def measure(clouds: Sequence[Shape], *, model: str, seed: int) -> dict[str, Any]
     }
 
 
-def run(clouds: Sequence[Shape], *, model: str, seed: int) -> dict[str, Any]:
+def run(clouds: Sequence[Shape], *, model: str, seed: int, limit: int | None = None) -> dict[str, Any]:
     """Measure, print a table and a JSON line; the line's record is returned too."""
     set_threads(1)
-    record = measure(clouds, model=model, seed=seed)
+    record = measure(clouds, model=model, seed=seed, limit=limit)
     table = Table(title="Clouds with outliers, straight distance in cm, strays counted", title_justify="left")
     row = {
-        "pairs": str(record["pairs"]),
+        "pairs": f"{record['pairs']} of {record['of']}",
         "mean": f"{record['mean_cm']:.2f}",
         "median": f"{record['median_cm']:.2f}",
         f"over {LOST_CM:g} cm": f"{100 * record['share_over_15cm']:.1f} %",
@@ -112,11 +115,13 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser("python -m meshmatch.experiments.outliers", description=__doc__)
     parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
     parser.add_argument("--limit", type=int, metavar="N", help="the first N clouds only")
+    parser.add_argument("--limit-pairs", type=int, metavar="N", help="N pairs only, evenly spread")
     parser.add_argument("--model", default="human")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(words)
     try:
-        run(load_clouds(options.data)[: options.limit], model=options.model, seed=options.seed)
+        clouds = load_clouds(options.data)[: options.limit]
+        run(clouds, model=options.model, seed=options.seed, limit=options.limit_pairs)
     except MeshmatchError as error:
         explain(error)
         return 1

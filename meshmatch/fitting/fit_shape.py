@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError
+from meshmatch.fitting.complete import seen, seen_area
 from meshmatch.fitting.fit import FAIR_RESIDUAL, Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig, check_landmarks
 from meshmatch.fitting.latent import refine_code
@@ -30,7 +31,7 @@ from meshmatch.fitting.part import cost, fit_part
 from meshmatch.fitting.placing import placed, scan_frame
 from meshmatch.fitting.readings import Judge, averaged, choose, lying
 from meshmatch.fitting.scan import Scan
-from meshmatch.fitting.settle import settle
+from meshmatch.fitting.settle import settle, without_strays
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.verdict import cloud_allowance, empty_share, judge, unexplained
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -46,7 +47,8 @@ _Laid = tuple[Frame, Scan, Candidate]
 
 # A fit of the whole that leaves this share of the template without surface may be one of a part; that is believed
 # if its residual is that much smaller. A mesh must be open for it, with a boundary of so many sqrt(area).
-_LEFT, _CLOSER, _OPEN = 0.06, 0.85, 0.3
+# A part lacks that much of the surface.
+_LEFT, _CLOSER, _OPEN, _MISSING = 0.06, 0.85, 0.3, 0.03
 
 
 @lru_cache(maxsize=4)
@@ -63,7 +65,7 @@ def fit_shape(
     landmarks: tuple[np.ndarray, np.ndarray] | None = None,
     progress: Progress | None = None,
 ) -> Fit:
-    """Lay the model's template on a repaired shape.
+    """Lay the model's template on a repaired shape; a cloud's is laid on its points without the strays.
 
     Parameters
     ----------
@@ -83,6 +85,7 @@ def fit_shape(
     if landmarks is not None:
         check_landmarks(model)
     config = (config or FitConfig()).suited(shape.roughness).possible(model)
+    whole, shape = shape, without_strays(shape)
     began = time.monotonic()
     tell = progress or (lambda what, share: None)
     rng = np.random.default_rng(config.seed)
@@ -90,9 +93,11 @@ def fit_shape(
     laid, partial = _whole(model, shape, frame, scan, config, landmarks, rng, tell), False
     if landmarks is None and _try_part(model, shape, laid, config):
         part = _part(model, frame, scan, config, tell)
-        partial = cost(part[2].residual, (frame.scale / part[0].scale) ** 2) < _CLOSER * laid[2].residual
+        visible = (frame.scale / part[0].scale) ** 2
+        smaller = cost(part[2].residual, visible) < _CLOSER * laid[2].residual
+        partial = smaller and visible < 1 - _MISSING
         laid = part if partial else laid
-    return replace(_finish(model, shape, laid, config, partial), seconds=time.monotonic() - began)
+    return replace(_finish(model, whole, laid, config, partial), seconds=time.monotonic() - began)
 
 
 def _whole(model, shape, frame, scan, config, landmarks, rng, tell) -> _Laid:
@@ -100,10 +105,12 @@ def _whole(model, shape, frame, scan, config, landmarks, rng, tell) -> _Laid:
     system = node_system(model)
     tell("orientation", 0.0)
     guesses = _hypotheses(model, scan, config)
-    coarse = Scan(scan.points[: config.coarse_samples], scan.normals[: config.coarse_samples])
+    coarse = scan.first(config.coarse_samples)
     rough = []
+    # A cloud's residual tells little before its core frame is found; asking twice does.
+    care = 2 if shape.is_cloud else 1
     for number, guess in enumerate(guesses):
-        rough.append(_lay(model, system, coarse, guess, rng, rounds=1, draws=1, stride=1))
+        rough.append(_lay(model, system, coarse, guess, rng, rounds=care, draws=care, stride=1))
         tell("orientation", 0.7 * (number + 1) / len(guesses))
     rough.sort(key=lambda candidate: candidate.residual)
     if shape.is_cloud:
@@ -143,7 +150,8 @@ def _finish(model, shape, laid: _Laid, config, partial: bool) -> Fit:
     points = system.moved(best.vectors)
     local = scan.turned(best.rotation, best.centre)
     allowance = _allowance(model, shape, local, best, config)
-    verdict, reasons = judge(best.residual, local, points, allowance, partial)
+    unseen = 1 - seen_area(system, seen(system, local, best.vectors)) if partial else None
+    verdict, reasons = judge(best.residual, local, points, allowance, partial, unseen)
     return Fit(
         template_hash=model.template.hash,
         frame=core_frame,
@@ -170,13 +178,15 @@ def _allowance(model, shape: Shape, local: Scan, best: Candidate, config: FitCon
 
 
 def _try_part(model, shape: Shape, laid: _Laid, config: FitConfig) -> bool:
-    """Whether a fit of a part is worth its time: asked for, or an open shape on which the whole fits badly."""
+    """Whether a fit of a part is worth its time: asked for, or an open shape that a whole fits badly or leaves bare."""
     if config.partial != "auto" or config.refine == "latent":
         return config.partial == "yes"
     if not shape.is_cloud and boundary_length(shape) < _OPEN * np.sqrt(shape.area):
         return False
     _, scan, best = laid
     local, points = scan.turned(best.rotation, best.centre), node_system(model).moved(best.vectors)
+    if shape.is_cloud:  # its residual says how sparse and noisy it is, not that something is missing
+        return empty_share(local, points) > _LEFT
     allowance = _allowance(model, shape, local, best, config)
     return unexplained(best.residual, allowance) > FAIR_RESIDUAL or empty_share(local, points) > _LEFT
 
@@ -190,7 +200,7 @@ def _settled(model, system, frame, scan, rough, config, rng) -> tuple[Frame, Sca
     settled = [settle(system, scan, candidate, lay) for candidate in rough]
     scale, scan, best = min(settled, key=lambda each: each[2].residual)
     others = [Candidate(c.rotation, c.centre / scale, c.vectors, c.residual) for c in rough]
-    coarse = Scan(scan.points[: config.coarse_samples], scan.normals[: config.coarse_samples])
+    coarse = scan.first(config.coarse_samples)
     return frame.compose(Frame(scale, np.eye(3), np.zeros(3))), scan, coarse, [best, *others]
 
 
@@ -218,8 +228,8 @@ def take_samples(
 ) -> tuple[Frame, Scan]:
     """Frame of a shape (area 1, centroid 0, if no other is given) and samples of it in that frame."""
     frame = sqrt_area_frame(shape) if frame is None else frame
-    samples = sample_surface(shape, P, rng)
-    return frame, Scan(frame.apply(samples.points), samples.normals @ frame.rotation.T)
+    samples = sample_surface(without_strays(shape), P, rng)
+    return frame, Scan(frame.apply(samples.points), samples.normals @ frame.rotation.T, not shape.is_cloud)
 
 
 def _hypotheses(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypothesis]:
@@ -254,7 +264,9 @@ def _refine(model, system, scan, frame, candidates, config, landmarks, rough, rn
     if config.refine == "latent":
         best = candidates[0]
         local = scan.turned(best.rotation, best.centre)
-        vectors = refine_code(model, local, config.latent, rng, lambda k, n: tell("refinement", k / n))
+        vectors = refine_code(
+            model, _facing(system, local, best), config.latent, rng, lambda k, n: tell("refinement", k / n)
+        )
         return Candidate(best.rotation, best.centre, vectors, two_way_residual(system, local, vectors))
 
     # A few steps tell which readings the surface agrees with; the prior of the full run stays the network's.
@@ -267,7 +279,8 @@ def _refine(model, system, scan, frame, candidates, config, landmarks, rough, rn
         fixed = None
         if landmarks is not None:
             fixed = (landmarks[0], (frame.apply(landmarks[1]) - candidate.centre) @ candidate.rotation)
-        vectors = refine_nodes(system, local, candidate.vectors, config.nodes if whole else screen, fixed)
+        facing = _facing(system, local, candidate)
+        vectors = refine_nodes(system, facing, candidate.vectors, config.nodes if whole else screen, fixed)
         return Candidate(
             candidate.rotation, candidate.centre, vectors, two_way_residual(system, local, vectors)
         )
@@ -281,6 +294,11 @@ def _refine(model, system, scan, frame, candidates, config, landmarks, rough, rn
         lambda found: lying(system, found),
         lambda share: tell("refinement", share),
     )
+
+
+def _facing(system, local: Scan, candidate: Candidate) -> Scan:
+    moved = system.moved(candidate.vectors)
+    return local.facing(moved, system.normals(moved))
 
 
 def boundary_length(shape: Shape) -> float:

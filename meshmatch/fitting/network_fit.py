@@ -49,10 +49,11 @@ def two_way_residual(
     Every ``stride``-th point of both is asked for its neighbour.
     """
     moved = system.moved(vectors)
-    seen = with_normals(moved, system.normals(moved))
-    forward = scan.tree.query(seen[::stride])[0]
-    back = cKDTree(seen).query(with_normals(scan.points[::stride], scan.normals[::stride]))[0]
-    return float(0.5 * np.minimum(forward, cap).mean() + 0.5 * np.minimum(back, cap).mean())
+    normals = system.normals(moved)
+    forward = _apart(scan.tree, moved[::stride], normals[::stride], scan.signed, cap)
+    tree = cKDTree(with_normals(moved, normals))
+    back = _apart(tree, scan.points[::stride], scan.normals[::stride], scan.signed, cap)
+    return float(0.5 * forward.mean() + 0.5 * back.mean())
 
 
 def one_way_residual(
@@ -60,9 +61,19 @@ def one_way_residual(
 ) -> float:
     """Mean of the capped 6-D distances from every ``stride``-th scan point to the template."""
     moved = system.moved(vectors)
-    seen = with_normals(moved, system.normals(moved))
-    back = cKDTree(seen).query(with_normals(scan.points[::stride], scan.normals[::stride]))[0]
-    return float(np.minimum(back, cap).mean())
+    tree = cKDTree(with_normals(moved, system.normals(moved)))
+    back = _apart(tree, scan.points[::stride], scan.normals[::stride], scan.signed, cap)
+    return float(back.mean())
+
+
+def _apart(tree: cKDTree, points: np.ndarray, normals: np.ndarray, signed: bool, cap: float) -> np.ndarray:
+    """(N,) capped 6-D distances to the nearest; to the nearer of both sides where normals have no sure sign."""
+    apart = np.full(len(points), cap)
+    for side in (1,) if signed else (1, -1):
+        # A search without a bound visits every point of a tree that is far away.
+        found = tree.query(with_normals(points, side * normals), distance_upper_bound=cap)[0]
+        apart = np.minimum(apart, found)
+    return apart
 
 
 @torch.inference_mode()

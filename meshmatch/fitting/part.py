@@ -7,11 +7,13 @@ must lie on the template; what the template has besides is left to the network a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from meshmatch.fitting.complete import completed, seen, seen_area
+from meshmatch.fitting.mirror import mirror_of
 from meshmatch.fitting.network_fit import Candidate, lay_on, one_way_residual, variants
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
 from meshmatch.fitting.orientation import Hypothesis
@@ -26,9 +28,28 @@ SHARES = (1.0, 0.8, 0.62, 0.48, 0.36)
 _SHARE_COST = (
     0.004  # residual that a share of 0 has to be better by than one of 1: rather the whole than a part
 )
-_LAID, _READ, _FINALISTS = 8, 2, 5
+# Readings that are completed and asked about again: so many once, of these so many twice, and so many three times.
+_SOUGHT = (14, 7, 4)
+_LAID, _READ, _FINALISTS = 6, 2, 5
 _COARSE = 2048
-_Sized = tuple[float, Candidate]  # visible share, and a fit to the scan of that size
+_LEAST = 0.2  # share of a whole that a scan is taken to show at least
+
+
+@dataclass(frozen=True, eq=False)
+class PartReading:
+    """One way to see a scan as a part: the visible share of the surface, and a fit to the scan of that size."""
+
+    share: float
+    fit: Candidate
+
+    def local(self, scan: Scan) -> Scan:
+        """A scan of area 1 where this reading lives: as large as its share, in the core frame."""
+        sized = replace(scan, points=scan.points * np.sqrt(self.share))
+        return sized.turned(self.fit.rotation, self.fit.centre)
+
+    @property
+    def cost(self) -> float:
+        return cost(self.fit.residual, self.share)
 
 
 def fit_part(
@@ -63,50 +84,72 @@ def fit_part(
     candidate : Candidate
         The fit; its residual is from the scan to the template only.
     """
-    careful: list[tuple[float, float, Candidate]] = []
-    scans = {share: Scan(scan.points * np.sqrt(share), scan.normals) for share in SHARES}
-    for number, (share, sized) in enumerate(scans.items()):
-        coarse = Scan(sized.points[:_COARSE], sized.normals[:_COARSE])
+    network, core, mirror = model.network, model.template.core, mirror_of(model)
+    readings: list[PartReading] = []
+    for number, share in enumerate(SHARES):
+        sized = replace(scan, points=scan.points * np.sqrt(share))
+        coarse = sized.first(_COARSE)
         rough = [_laid(model, system, coarse, guess, rng, rounds=1, draws=1) for guess in orient(sized)]
         for guess in sorted(rough, key=lambda laid: laid.residual)[:_LAID]:
-            laid = _laid(model, system, sized, guess, rng, rounds=2, draws=2)
-            careful.append((cost(laid.residual, share), share, laid))
-        tell(0.5 * (number + 1) / len(scans))
-    careful.sort(key=lambda entry: entry[0])
-    for _, share, best in list(careful[:_READ]):
-        here = scans[share].turned(best.rotation, best.centre)
-        near = Scan(here.points[:_COARSE], here.normals[:_COARSE])
-        for reading in variants(model.network, system, here, near, best, rng, variants_count, tilt):
-            judged = replace(reading, residual=one_way_residual(system, here, reading.vectors))
-            careful.append((cost(judged.residual, share), share, judged))
-    careful.sort(key=lambda entry: entry[0])
-    tell(0.6)
+            readings.append(PartReading(share, _laid(model, system, sized, guess, rng, rounds=2, draws=2)))
+        tell(0.4 * (number + 1) / len(SHARES))
+    for number, count in enumerate(_SOUGHT):
+        best = sorted(readings, key=lambda reading: reading.cost)[:count]
+        readings = [_asked_again(network, system, core, scan, reading, rng) for reading in best]
+        tell(0.4 + 0.2 * (number + 1) / len(_SOUGHT))
+    readings.sort(key=lambda reading: reading.cost)
+    for reading in readings[:_READ]:
+        local = reading.local(scan)
+        whole = completed(system, local, reading.fit.vectors, reading.share, rng)
+        near = local.first(_COARSE)
+        for other in variants(network, system, whole, near, reading.fit, rng, variants_count, tilt, mirror):
+            residual = one_way_residual(system, local, other.vectors)
+            readings.append(PartReading(reading.share, replace(other, residual=residual)))
+    readings.sort(key=lambda reading: reading.cost)
     if not refine:
-        _, share, best = careful[0]
-        return 1 / np.sqrt(share), scans[share], best
-
+        return _found(scan, readings[0])
     judge = Judge(system, scan)
 
-    def fitted(reading: _Sized, whole: bool) -> _Sized:
-        share, candidate = reading
-        local = scans[share].turned(candidate.rotation, candidate.centre)
+    def fitted(reading: PartReading, whole: bool) -> PartReading:
+        local, vectors = reading.local(scan), reading.fit.vectors
         config = nodes if whole else replace(nodes, steps=screening)
-        vectors = refine_nodes(system, local, candidate.vectors, config, one_sided=True)
-        return share, replace(candidate, vectors=vectors, residual=one_way_residual(system, local, vectors))
+        both = completed(system, local, vectors, reading.share, np.random.default_rng(0))
+        vectors = refine_nodes(system, both, vectors, config)
+        residual = one_way_residual(system, local, vectors)
+        return replace(reading, fit=replace(reading.fit, vectors=vectors, residual=residual))
 
-    def score(reading: _Sized) -> float:
-        share, candidate = reading
-        return cost(judge.score(scans[share].turned(candidate.rotation, candidate.centre), candidate), share)
-
-    share, chosen = choose(
-        [(share, candidate) for _, share, candidate in careful],
+    chosen = choose(
+        readings,
         _FINALISTS,
         fitted,
-        score,
-        lambda reading: lying(system, reading[1]) / np.sqrt(reading[0]),
+        lambda reading: cost(judge.score(reading.local(scan), reading.fit), reading.share),
+        lambda reading: lying(system, reading.fit) / np.sqrt(reading.share),
         lambda done: tell(0.6 + 0.4 * done),
     )
-    return float(1 / np.sqrt(share)), scans[share], chosen
+    return _found(scan, chosen)
+
+
+def _found(scan: Scan, reading: PartReading) -> tuple[float, Scan, Candidate]:
+    root = float(np.sqrt(reading.share))
+    return 1 / root, replace(scan, points=scan.points * root), reading.fit
+
+
+def _asked_again(network, system, core, scan: Scan, reading: PartReading, rng) -> PartReading:
+    """The network's answer to a scan that its last answer completes; how much of it was seen is the new share."""
+    local = reading.local(scan)
+    there = seen(system, local.first(_COARSE), reading.fit.vectors)
+    share = float(np.clip(seen_area(system, there), _LEAST, 1.0))
+    whole = completed(system, local, reading.fit.vectors, reading.share, rng)
+    grown = np.sqrt(share / reading.share)
+    whole = replace(whole, points=whole.points * grown)
+    again = lay_on(network, system, core, whole, np.eye(3), np.zeros(3), rng, stride=4)
+    fit = replace(
+        again,
+        rotation=reading.fit.rotation @ again.rotation,
+        centre=grown * reading.fit.centre + reading.fit.rotation @ again.centre,
+    )
+    found = PartReading(share, fit)
+    return replace(found, fit=replace(fit, residual=one_way_residual(system, found.local(scan), fit.vectors)))
 
 
 def _laid(model, system, scan, guess, rng, **how) -> Candidate:

@@ -67,7 +67,8 @@ class Judge:
     def torn(self, scan: Scan, vectors: np.ndarray) -> float:
         """Share (0..1) of neighbours on the scan that belong far apart on the template."""
         moved = self._system.moved(vectors)
-        tree = cKDTree(with_normals(moved, self._system.normals(moved)))
+        normals = self._system.normals(moved)
+        scan, tree = scan.facing(moved, normals), cKDTree(with_normals(moved, normals))
         belongs = self._system.verts[tree.query(with_normals(scan.points, scan.normals))[1]]
         length = np.linalg.norm(scan.points[self._from] - scan.points[self._to], axis=1)
         return float(torn(belongs[self._from], belongs[self._to], length).mean())

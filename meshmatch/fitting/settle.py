@@ -8,6 +8,8 @@ others around, is none of its surface.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,14 +18,27 @@ from meshmatch.fitting.network_fit import Candidate
 from meshmatch.fitting.nodes import vertex_areas
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.shapes.cloud import stray_points
+from meshmatch.shapes.shape import Shape
 
 _ROUNDS = 3
 _LARGEST_CHANGE = 1.3  # of the scale, in all: more is a wrong fit, not a wrong area
 _FAR = 0.06  # from the template, units of sqrt(area)
 _LONELY = 1.5  # reach of the nearest points, against what is usual on the cloud
 _NEIGHBOURS = 8
+_APART = 1.3  # reach of a stray's nearest points, against that of these points and against the usual
 
 Lay = Callable[[Scan, Candidate], Candidate]
+
+
+@lru_cache(maxsize=4)
+def without_strays(shape: Shape) -> Shape:
+    """A cloud without the points that lie apart from their neighbours; any other shape as it is.
+
+    A stray among neighbours bends their normals and turns the signs of whole regions, and it counts as surface.
+    """
+    stray = stray_points(shape.verts, _APART) if shape.is_cloud else np.zeros(0, bool)
+    return Shape(shape.verts[~stray], shape.faces, shape.name) if stray.any() else shape
 
 
 def settle(system: NodeSystem, scan: Scan, candidate: Candidate, lay: Lay) -> tuple[float, Scan, Candidate]:
@@ -54,7 +69,10 @@ def settle(system: NodeSystem, scan: Scan, candidate: Candidate, lay: Lay) -> tu
         far = cKDTree(moved @ candidate.rotation.T + candidate.centre).query(scan.points)[0] > _FAR
         keep = ~(far & lonely)
         total *= step
-        scan, lonely = Scan(scan.points[keep] / step, scan.normals[keep]), lonely[keep]
+        scan, lonely = (
+            replace(scan, points=scan.points[keep] / step, normals=scan.normals[keep]),
+            lonely[keep],
+        )
         start = Candidate(candidate.rotation, candidate.centre / step, candidate.vectors, np.inf)
         candidate = lay(scan, start)
         if keep.all() and abs(step - 1) < 0.005:

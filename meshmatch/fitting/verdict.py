@@ -14,10 +14,17 @@ from meshmatch.shapes.shape import Shape
 
 # More noise than this (units of sqrt(area), 3.4 cm on a person) is a wrong fit rather than noise.
 _MOST_NOISE = 0.025
+# One-way residual (units of sqrt(area)) of a part up to which it is called fair: what is not seen adds nothing to it.
+PART_RESIDUAL = 0.027
 
 
 def judge(
-    residual: float, scan: Scan, points: np.ndarray, allowance: float = 0.0, partial: bool = False
+    residual: float,
+    scan: Scan,
+    points: np.ndarray,
+    allowance: float = 0.0,
+    partial: bool = False,
+    unseen: float | None = None,
 ) -> tuple[str, tuple[str, ...]]:
     """Verdict on a fit and the reasons, in words.
 
@@ -33,10 +40,12 @@ def judge(
         The part of the residual that the shape itself explains (see `cloud_allowance`); squares add up.
     partial : bool
         The shape shows a part only: template without surface is as expected, and such a fit is fair at best.
+    unseen : float, optional
+        Of a part, the share (0..1) of the template that it does not show, where that is known better than by distance.
     """
     reasons = []
     excess = unexplained(residual, allowance)
-    if excess > GOOD_RESIDUAL:
+    if excess > (PART_RESIDUAL if partial else GOOD_RESIDUAL):
         reasons.append(f"template and shape stay {100 * excess:.1f} % of sqrt(area) apart on average")
     gap = cKDTree(points).query(scan.points)[0]
     missed = float((gap > 0.06).mean())
@@ -44,11 +53,12 @@ def judge(
         reasons.append(f"{100 * missed:.0f} % of the shape is not reached by the template")
     empty = empty_share(scan, points)
     if partial:
-        reasons.append(f"taken for a part: {100 * empty:.0f} % of the template has no counterpart")
+        lost = empty if unseen is None else unseen
+        reasons.append(f"taken for a part: {100 * lost:.0f} % of the template has no counterpart")
         empty = 0.0
     if empty > 0.02:
         reasons.append(f"{100 * empty:.0f} % of the template lies where the shape has no surface")
-    if excess > FAIR_RESIDUAL or missed > 0.06 or empty > 0.06:
+    if excess > (PART_RESIDUAL if partial else FAIR_RESIDUAL) or missed > 0.06 or empty > 0.06:
         return "poor", tuple(reasons)
     return ("fair" if reasons else "good"), tuple(reasons)
 
@@ -82,6 +92,6 @@ def cloud_allowance(system: NodeSystem, scan: Scan, V: int, vectors: np.ndarray,
     clean = sample_surface(surface, len(scan.points), rng)
     rough = sample_surface(surface, min(V, len(scan.points)), rng).points
     cloud = Shape(rough + noise * rng.standard_normal(rough.shape), np.empty((0, 3), np.int64))
-    expected = two_way_residual(system, Scan(cloud.verts, cloud.vertex_normals), vectors)
+    expected = two_way_residual(system, Scan(cloud.verts, cloud.vertex_normals, signed=False), vectors)
     clear = two_way_residual(system, Scan(clean.points, clean.normals), vectors)
     return float(np.sqrt(max(expected**2 - clear**2, 0.0)))

@@ -84,8 +84,8 @@ def roughness(points: Floats, invalid: NDArray[np.bool_] | None = None) -> float
     return _size(part, index)[1]
 
 
-def stray_points(points: Floats) -> NDArray[np.bool_]:
-    """(V,) True for a point that lies three times further from its neighbours than these from theirs."""
+def stray_points(points: Floats, far: float = 3.0) -> NDArray[np.bool_]:
+    """(V,) True for a point that lies ``far`` times further from its neighbours than these from theirs, and than usual."""
     from scipy.spatial import cKDTree
 
     if len(points) < 20:
@@ -100,7 +100,14 @@ def stray_points(points: Floats) -> NDArray[np.bool_]:
         distance, index = tree.query(points, k + 1)
         reach = distance[:, -1]
     usual = np.median(own_reach[index[:, 1:]], axis=1)
-    return np.asarray((reach > 3.0 * usual) & (reach > 3.0 * np.median(own_reach)))
+    return np.asarray((reach > far * usual) & (reach > far * np.median(own_reach)))
+
+
+def on_a_line(points: Floats) -> bool:
+    """Whether no point (V, 3) leaves one line by more than a billionth of its length."""
+    away = points - points.mean(axis=0)
+    _, length, _ = np.linalg.svd(away / max(np.abs(away).max(), 1e-300), full_matrices=False)
+    return bool(length[1] <= 1e-9 * length[0])
 
 
 def _part(points: Floats) -> Floats:

@@ -49,6 +49,9 @@ def test_strays_count(
 
     assert main(["--data", str(tmp_path), "--limit", "2"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["pairs"] == 2
+    assert main(["--data", str(tmp_path), "--limit-pairs", "3"]) == 0
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (record["pairs"], record["of"]) == (3, 6)
 
 
 def test_files_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
