@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError
+from meshmatch.fields.field import PointField
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_shape import node_system, take_samples
 from meshmatch.fitting.turning import FieldPath, Path, RotationBlend, StretchBlend, polar
@@ -44,7 +46,8 @@ class Blend:
 
     Each quantity is blended with the same weights of the fits: linear between two fits, a natural cubic spline
     through more; straight on beyond the ends. The fits are met exactly: what the path leaves over at them is blended
-    and added.
+    and added. Codes leave much over, so that there it is blended as seen from the parts that it moves, and turns with
+    them.
 
     Parameters
     ----------
@@ -103,9 +106,13 @@ class Blend:
             self._path = _code_path(model, shapes, fits)
         else:
             raise OptionError(f"no way {way!r} to blend", f"choose one of {', '.join(WAYS)}")
-        self._left = np.stack(
-            [key - self._path(row) for key, row in zip(self._keys, np.eye(len(fits)), strict=True)]
-        )
+        met = [self._path(row) for row in np.eye(len(fits))]
+        self._left = self._keys - np.stack(met)
+        self._near: PointField | None = None
+        if way == "codes" and model.has_nodes:
+            self._near = model.field(_beside_nodes(model))
+            turns = np.stack([_turns(self._near, vectors) for vectors in met])
+            self._left = np.einsum("nkij,nki->nkj", turns, self._left)
         self._turns = RotationBlend([fit.frame.rotation[None] for fit in fits])
         self._scales = np.array([fit.frame.scale for fit in fits])
         self._centers = np.stack([fit.frame.center for fit in fits])
@@ -124,7 +131,10 @@ class Blend:
         weights = self.weights(time)
         if weights.max() == 1.0:  # a fit itself
             return self._keys[weights.argmax()]
-        return self._path(weights) + np.tensordot(weights, self._left, 1)
+        there, left = self._path(weights), np.tensordot(weights, self._left, 1)
+        return there + (
+            left if self._near is None else np.einsum("kij,kj->ki", _turns(self._near, there), left)
+        )
 
     def points(self, vectors: np.ndarray) -> np.ndarray:
         """Template vertices (V, 3) of a pose (K, 3), core frame."""
@@ -132,9 +142,7 @@ class Blend:
 
     def turns(self, vectors: np.ndarray) -> np.ndarray:
         """How the field of a pose (K, 3) turns each template vertex: rotations (V, 3, 3)."""
-        with torch.no_grad():
-            F = self._field.deformation_gradient(torch.from_numpy(np.array(vectors)).float()[None])[0]
-        return polar(F.double().numpy())[0]
+        return _turns(self._field, vectors)
 
     def frame(self, time: float) -> Frame:
         """Between the frames of the fits: it turns, moves and grows from one to the next."""
@@ -147,6 +155,19 @@ class Blend:
         F = self._system.deformation_gradient(vectors)
         S = self._stretches.at(self.weights(time))
         return Deviation(*_apart(F, S), *_apart(F, np.eye(3)[None]))
+
+
+def _turns(field: PointField, vectors: np.ndarray) -> np.ndarray:
+    """How a pose (K, 3) turns the points of a field: rotations (P, 3, 3)."""
+    with torch.no_grad():
+        F = field.deformation_gradient(torch.from_numpy(np.array(vectors)).float()[None])[0]
+    return polar(F.double().numpy())[0]
+
+
+def _beside_nodes(model: TrainedModel) -> np.ndarray:
+    """The template vertex beside each node (K, 3): there the field is sure to have nodes enough around it."""
+    verts = model.template.shape.verts
+    return verts[cKDTree(verts).query(model.template.nodes)[1]]
 
 
 def _apart(F: np.ndarray, S: np.ndarray) -> tuple[float, float]:

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import OptionError
+from meshmatch.fitting import blend as blend_module
 from meshmatch.fitting.blend import Blend
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_shape import node_system
@@ -146,6 +147,27 @@ def test_the_fits_are_met_exactly(model: TrainedModel, three: list[Fit], way: An
         near = blend.vectors(time + 1e-7 if time < 1 else time - 1e-7)
         assert np.abs(near - fit.vectors).max() < 1e-4  # and no jump there
         assert blend.deviation(time, fit.vectors).volume < 1e-12
+
+
+def test_what_codes_leave_over_turns_with_the_part(
+    model: TrainedModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Codes that turn the whole, fits with the same small difference as seen from it: half way it is that still."""
+    nodes = model.template.nodes
+    own = 0.02 * np.sin(7 * nodes[:, [1, 2, 0]])
+
+    def turned(degrees: float) -> np.ndarray:
+        return nodes @ about("z", degrees).T - nodes
+
+    monkeypatch.setattr(
+        blend_module, "_code_path", lambda model, shapes, fits: lambda weights: turned(120 * weights[1])
+    )
+    fits = [fit_of(model, turned(angle) + own @ about("z", angle).T) for angle in (0, 120)]
+    shapes = [Shape(fit.points, fit.faces, "egg") for fit in fits]
+    blend = Blend(model, fits, None, shapes, "codes")
+    for time in (0.0, 0.5, 0.8, 1.0, 1.2):
+        there = turned(120 * time) + own @ about("z", 120 * time).T
+        assert np.allclose(blend.vectors(time), there, atol=1e-5)
 
 
 def test_there_and_back_is_one_way(model: TrainedModel, three: list[Fit]) -> None:
