@@ -57,7 +57,7 @@ def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
         out.print(sentence, soft_wrap=True)
     if options.markdown is not None:
         with replace_on_success(options.markdown) as temporary:
-            temporary.write_text(as_markdown(tables, told), encoding="utf-8")
+            temporary.write_text(as_markdown(tables, found), encoding="utf-8")
     missing = [cell.name for cell in here.cells if cell not in known.trained]
     if missing and options.minutes:
         out.print(f"Not measured: {', '.join(missing)}", soft_wrap=True)
@@ -83,21 +83,38 @@ def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
     return record
 
 
-def as_markdown(tables: Sequence[Table], sentences: Sequence[str]) -> str:
-    """The tables, each under its title, and the sentences as a list: lines for docs/results.md."""
+def as_markdown(tables: Sequence[Table], found: Sequence[Claim]) -> str:
+    """The tables, each under its title, and the claims as two more: lines for docs/results.md."""
+    grids = {
+        str(table.title): [[str(c.header), *map(str, c.cells)] for c in table.columns] for table in tables
+    }
+    places = list(dict.fromkeys(claim.where for claim in found if claim.where))
+    by_words: dict[str, dict[str, str]] = {}
+    for claim in found:
+        by_words.setdefault(claim.words, {})[claim.where] = _verdict(claim)
+    costs = {words: held[""] for words, held in by_words.items() if "" in held}
+    grids["What constraints cost"] = [["claim", *costs], ["here", *costs.values()]]
+    errors = {words: held for words, held in by_words.items() if "" not in held}
+    columns = [[place, *(held.get(place, "") for held in errors.values())] for place in places]
+    grids["Orderings of errors"] = [["claim", *errors], *columns]
     lines = []
-    for table in tables:
-        columns = [[str(column.header), *map(str, column.cells)] for column in table.columns]
-        rows = [f"| {' | '.join(row)} |" for row in zip(*columns, strict=True)]
-        lines += [f"{table.title}", "", rows[0], "|---" * len(columns) + "|", *rows[1:], ""]
-    return "\n".join([*lines, *(f"- {sentence}" for sentence in sentences), ""])
+    for title, grid in grids.items():
+        rows = [f"| {' | '.join(row)} |" for row in zip(*grid, strict=True)]
+        lines += [title, "", rows[0], "|---" * len(grid) + "|", *rows[1:], ""]
+    return "\n".join(lines)
 
 
 def said(claim: Claim) -> str:
     """A line about a claim."""
-    verdict = {True: "holds", False: "DOES NOT HOLD", None: "not measured"}[claim.holds]
+    where = f"{claim.where}: " if claim.where else ""
+    return f"{where}{claim.words}: {_verdict(claim)}"
+
+
+def _verdict(claim: Claim) -> str:
+    if claim.holds is None:
+        return "not measured"
     numbers = ", ".join(f"{value:.2f}" for value in claim.numbers)
-    return f"{verdict}: {claim.words}" + (f" ({numbers})" if numbers else "")
+    return f"{'holds' if claim.holds else 'DOES NOT HOLD'} ({numbers})"
 
 
 def budget(here: Run, known: Known) -> str:

@@ -19,12 +19,13 @@ _FULL, _PLAIN = "vol+arap+Z", "none"
 class Claim:
     """A statement, the numbers that it is about from the one that should be least to the largest, and whether it holds.
 
-    ``holds`` is None where something was not measured.
+    ``holds`` is None where something was not measured; ``where`` is empty, a set, or "held out".
     """
 
     words: str
     numbers: tuple[float, ...]
     holds: bool | None
+    where: str = ""
 
 
 def claims(known: Known, sets: Sequence[str]) -> list[Claim]:
@@ -50,8 +51,8 @@ def claims(known: Known, sets: Sequence[str]) -> list[Claim]:
         found.append(_rising(known, where, "1000 supervised points < 50", points))
         if where != "held out":
             tests = [known.error(BASE, where, how) for how in ("code", "chamfer", "none")]
-            words = f"{where}: refined with regularisers < by Chamfer alone < not at all"
-            found.append(_claim(words, tests))
+            words = "refined with regularisers < by Chamfer alone < not at all"
+            found.append(_claim(where, words, tests))
     return found
 
 
@@ -83,26 +84,26 @@ def _costs(known: Known) -> list[Claim]:
 
 
 def _rising(known: Known, where: str, words: str, cells: Sequence[Cell]) -> Claim:
-    return _claim(f"{where}: {words}", [known.error(cell, where) for cell in cells])
+    return _claim(where, words, [known.error(cell, where) for cell in cells])
 
 
 def _least(known: Known, where: str) -> Claim:
     cells = [replace(BASE, nodes=K, radius=r) for K, r in GRID]
     grid = {cell: known.error(cell, where) for cell in known.trained if cell in cells}
-    words = f"{where}: 300 nodes of radius 0.2 are the best of the grid"
+    words = "300 nodes of radius 0.2 are the best of the grid"
     if not grid.get(BASE) or len([errors for errors in grid.values() if errors]) < 2:
-        return Claim(words, (), None)
+        return Claim(words, (), None, where)
     means = {cell: fmean(errors) for cell, errors in grid.items() if errors}
     others = min(value for cell, value in means.items() if cell != BASE)
-    return Claim(words, (means[BASE], others), means[BASE] <= others)
+    return Claim(words, (means[BASE], others), means[BASE] <= others, where)
 
 
-def _claim(words: str, errors: Sequence[Sequence[float]]) -> Claim:
+def _claim(where: str, words: str, errors: Sequence[Sequence[float]]) -> Claim:
     means = [fmean(each) if each else None for each in errors]
     if None in means:
-        return Claim(words, _there(means), None)
+        return Claim(words, _there(means), None, where)
     numbers = _there(means)
-    return Claim(words, numbers, all(a < b for a, b in pairwise(numbers)))
+    return Claim(words, numbers, all(a < b for a, b in pairwise(numbers)), where)
 
 
 def _there(numbers: Sequence[float | None]) -> tuple[float, ...]:

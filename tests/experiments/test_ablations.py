@@ -148,7 +148,8 @@ def test_table_4_has_costs_without_training(
     assert head.startswith("| constraint | field | CPU ms |")
     assert rule.count("---") == head.count("|") - 1 == first.count("|") - 1
     assert first.startswith("| none | mls |")
-    assert "\n- not measured: held out: " in written
+    assert "\n| mls: both regularisers < none | not measured |" in written
+    assert "| claim | here |" in written
     out, shown = line(capsys)
     assert shown["times"] == record["times"]
     assert main([*words[:-2], "--rounds", "0"]) == 0

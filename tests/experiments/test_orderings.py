@@ -27,7 +27,7 @@ def known(
 
 
 def verdicts(found: Known) -> dict[str, bool | None]:
-    return {claim.words: claim.holds for claim in claims(found, SETS)}
+    return {f"{claim.where}: {claim.words}".removeprefix(": "): claim.holds for claim in claims(found, SETS)}
 
 
 def test_nothing_is_claimed_of_what_was_not_measured() -> None:
