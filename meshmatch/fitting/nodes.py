@@ -160,9 +160,14 @@ def _shared_pairs(system, scan, moved, normals, scale, config) -> tuple[np.ndarr
     share = vertex_areas(moved, system.faces)[at] * np.exp(-0.5 * closer / config.spread**2)
     share /= np.maximum(share.sum(1, keepdims=True), 1e-300)
     share *= 1.0 / np.square(1.0 + np.square(apart[:, :1] / scale)) / len(pick)
-    at = at.reshape(-1)
+    at, share = at.reshape(-1), share.reshape(-1)
+    V = len(moved)
+    # Directions are the template's, so all that pulls at a vertex is summed before they are asked.
+    total = np.bincount(at, share, V)
     point = np.repeat(scan.points[pick], apart.shape[1], axis=0)
-    return _accumulate(at, point, normals[at], share.reshape(-1), config.point_share, len(moved))
+    pull = np.stack([np.bincount(at, share * point[:, k], V) for k in range(3)], 1)
+    mean = pull / np.maximum(total, 1e-300)[:, None]
+    return _accumulate(np.arange(V), mean, normals, total, config.point_share, V)
 
 
 def _picked(scan: Scan, config: NodeRefineConfig) -> np.ndarray:

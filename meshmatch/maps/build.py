@@ -6,7 +6,7 @@ import numpy as np
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
-from meshmatch.maps.place import at_footpoints, in_core_frame, place, unit, vertex_normals
+from meshmatch.maps.place import at_footpoints, closest, in_core_frame, place, unit, vertex_normals
 from meshmatch.maps.scatter import expected, is_scattered, land, noise_of
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.maps.vertex_map import VertexMap
@@ -72,16 +72,18 @@ def carry(
     source: Shape, source_fit: Fit, target: Shape, target_fit: Fit, workers: int = 1
 ) -> tuple[Footpoints, np.ndarray]:
     """Where on the target every source vertex lands, and a confidence in 0..1."""
-    foot, belongs = place(source, source_fit, workers)
-    moved = at_footpoints(foot, source_fit.faces, target_fit.points)
     if is_scattered(source):
+        foot = closest(source, source_fit, workers)
         points, noise = in_core_frame(source, source_fit)[0], noise_of(foot.distance)
         (moved, belongs), _ = expected(points, source_fit, noise, [target_fit.points, source_fit.resting])
-    there = place(target, target_fit, workers)
-    if is_scattered(target):
-        landed = land(target, target_fit, noise_of(there[0].distance), moved, belongs, workers)
     else:
-        landed = _closest(foot, source_fit, moved, belongs, target, target_fit, there[1], workers)
+        foot, belongs = place(source, source_fit, workers)
+        moved = at_footpoints(foot, source_fit.faces, target_fit.points)
+    if is_scattered(target):
+        noise = noise_of(closest(target, target_fit, workers).distance)
+        landed = land(target, target_fit, noise, moved, belongs, workers)
+    else:
+        landed = _closest(foot, source_fit, moved, belongs, target, target_fit, workers)
     confidence = np.exp(-np.square(foot.distance / _FIT_SCALE) - np.square(landed.distance / _FIT_SCALE))
     return landed, confidence
 
@@ -93,12 +95,12 @@ def _closest(
     belongs: np.ndarray,
     target: Shape,
     target_fit: Fit,
-    resting: np.ndarray,
     workers: int,
 ) -> Footpoints:
     """Closest points of the target that face as the template does there and belong to the same place of it."""
     facing = unit(at_footpoints(foot, source_fit.faces, vertex_normals(target_fit.points, target_fit.faces)))
     points, normals = in_core_frame(target, target_fit)
+    resting = place(target, target_fit, workers)[1]
     if target.is_cloud:
         facing = np.zeros_like(facing)
     return Surface(points, target.faces, normals, resting).query(moved, facing, workers, belongs)

@@ -35,7 +35,7 @@ def place(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndar
     """
     points, normals = in_core_frame(shape, fit)
     template_normals = vertex_normals(fit.points, fit.faces)
-    foot = Surface(fit.points, fit.faces, template_normals).query(points, normals, workers)
+    foot = closest(shape, fit, workers)
     resting = at_footpoints(foot, fit.faces, fit.resting)
     knowing = Surface(fit.points, fit.faces, template_normals, fit.resting)
     if shape.is_cloud:
@@ -59,6 +59,14 @@ def place(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndar
         for name in ("vertex", "face", "barycentric", "distance"):
             getattr(foot, name)[ask] = getattr(again, name)
     return foot, resting
+
+
+def closest(shape: Shape, fit: Fit, workers: int = 1) -> Footpoints:
+    """Closest points of the template as fitted, of those that face the same way as the vertices of a shape."""
+    points, normals = in_core_frame(shape, fit)
+    return Surface(fit.points, fit.faces, vertex_normals(fit.points, fit.faces)).query(
+        points, normals, workers
+    )
 
 
 def neighbours(points: np.ndarray, roughness: float) -> np.ndarray:
