@@ -75,6 +75,14 @@ def train(
             "interpolate by codes. The preset's if not given.",
         ),
     ] = None,
+    stiffness: Annotated[
+        float,
+        typer.Option(
+            min=1e-6,
+            help="How firmly two fits hold a common stretch of the template; goes onto the card. 1 suits bodies; 0.05 "
+            "what differs more from shape to shape, such as organs.",
+        ),
+    ] = 1.0,
     name: Annotated[
         str | None, typer.Option(metavar="NAME", help="The model's name; the folder's if not given.")
     ] = None,
@@ -133,12 +141,13 @@ def train(
     make_folder(output)
     check_writable(picture)
     from meshmatch.models.card import check_name
+    from meshmatch.templates.gather import is_registered
     from meshmatch.training import run
     from meshmatch.training.few import few_recipe, frame_of_few
     from meshmatch.training.unsupervised import cloud_recipe
 
     label = check_name(name or output.resolve().name)
-    clouds = shapes is not None and (unsupervised or not _registered(shapes))
+    clouds = shapes is not None and (unsupervised or not is_registered(shapes))
     if unsupervised and shapes is None:
         raise OptionError("--unsupervised learns from a folder of shapes", "name it with --shapes")
     few = None if shapes is None or clouds or preset != "default" else frame_of_few(shapes)
@@ -174,7 +183,7 @@ def train(
     if shapes is not None and clouds:
         with _progress(voice, picture if first else None) as show:
             folder = _without_correspondence(
-                shapes, output, chosen, label, category, licence, started, not fresh, voice, show
+                shapes, output, chosen, label, category, licence, started, not fresh, stiffness, voice, show
             )
         return _done(folder, label, voice, json and first, picture)
     if shapes is not None:
@@ -209,15 +218,10 @@ def train(
             start=started,
             resume=not fresh,
             frame=few,
+            stiffness=stiffness,
             progress=show,
         )
     _done(folder, label, voice, json and first, picture)
-
-
-def _registered(shapes: Path) -> bool:
-    from meshmatch.templates.gather import is_registered
-
-    return is_registered(shapes)
 
 
 def _without_correspondence(
@@ -229,6 +233,7 @@ def _without_correspondence(
     licence: str,
     start: "TrainedModel | None",
     resume: bool,
+    stiffness: float,
     voice: Voice,
     show: "Callable[[Progress], None]",
 ) -> Path:
@@ -252,6 +257,7 @@ def _without_correspondence(
         licence=licence,
         start=start,
         resume=resume,
+        stiffness=stiffness,
         progress=show,
     )
 

@@ -122,6 +122,7 @@ def trained(
     depth: float = 0.03,
     landmarks: str | None = None,
     template: str | None = None,
+    stiffness: float = 1.0,
 ) -> tuple[Path, dict[str, Any]]:
     """Prepare a folder and learn from it as `meshmatch train` does; the model's folder, and how that went."""
     began = time.monotonic()
@@ -145,12 +146,26 @@ def trained(
     if few is None:
         gathered = read_gathered(work / "prepared", laid)
         model = train_clouds(
-            laid, gathered, work / "model", recipe=recipe, name=name, category=name, progress=progress
+            laid,
+            gathered,
+            work / "model",
+            recipe=recipe,
+            name=name,
+            category=name,
+            stiffness=stiffness,
+            progress=progress,
         )
     else:
         source, _ = folder_source(work / "prepared", laid, warped=True)
         model = train_model(
-            laid, source, work / "model", recipe=recipe, name=name, frame=few, progress=progress
+            laid,
+            source,
+            work / "model",
+            recipe=recipe,
+            name=name,
+            frame=few,
+            stiffness=stiffness,
+            progress=progress,
         )
     card = json.loads((model / "card.json").read_text(encoding="utf-8"))
     notes = (note.removeprefix("template: ") for note in made.notes if note.startswith("template: "))

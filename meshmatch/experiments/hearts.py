@@ -91,7 +91,13 @@ def prepared_frames(prepared: Path) -> dict[str, Frame]:
 
 
 def run(
-    ways: Sequence[str], training: Training, *, data: Path, unseen: int, picture: Path | None
+    ways: Sequence[str],
+    training: Training,
+    *,
+    data: Path,
+    unseen: int,
+    stiffness: float,
+    picture: Path | None,
 ) -> dict[str, Any]:
     """Train, match, measure, print a table and a JSON line; the line's record is returned too."""
     if strangers := [way for way in ways if way not in WAYS]:
@@ -131,7 +137,14 @@ def run(
                 save_registered(folder, shapes, truth, template, seen)
             # walls that touch move together; less than the radius that suits a body
             model, how = trained(
-                folder, here, how="near", scale="area", tell=tell, depth=0.01, template=template
+                folder,
+                here,
+                how="near",
+                scale="area",
+                tell=tell,
+                depth=0.01,
+                template=template,
+                stiffness=stiffness,
             )
             trainings[way] = how
             for refine in ("none", "nodes"):
@@ -157,6 +170,7 @@ def run(
         "seed": training.seed,
         "template": template,
         "unseen": strange,
+        "stiffness": stiffness,
         "training": trainings,
         "results": results,
     }
@@ -168,10 +182,11 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = options_of_training("hearts", __doc__, minutes=25, steps=3000, nodes=600, radius=0.1)
     parser.add_argument("--ways", default=",".join(WAYS), help="%(default)s")
     parser.add_argument("--unseen", type=int, default=4, help="hearts kept from `registered`; %(default)s")
+    parser.add_argument("--stiffness", type=float, default=0.05, help="as in meshmatch train; %(default)s")
     parser.add_argument("--picture", type=Path, help="draw one heart's chambers on the others")
     options = parser.parse_args(words)
-    if options.unseen < 0:
-        parser.error("unseen hearts of 0 or more are needed")
+    if options.unseen < 0 or not options.stiffness > 0:
+        parser.error("unseen hearts of 0 or more and a stiffness above 0 are needed")
     with training_of(parser, options) as training:
         return status_of(
             lambda: run(
@@ -179,6 +194,7 @@ def main(words: Sequence[str] | None = None) -> int:
                 training,
                 data=options.data,
                 unseen=options.unseen,
+                stiffness=options.stiffness,
                 picture=options.picture,
             )
         )

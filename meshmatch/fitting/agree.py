@@ -68,6 +68,7 @@ def agreed_fits(
     Parameters
     ----------
     landmarks : optional, for each shape template vertices (N,) and positions (N, 3) in the shape's file frame
+    how : by default as stiff as the model's card says
 
     Returns
     -------
@@ -87,7 +88,8 @@ def agreed_fits(
     if landmarks is not None:
         local = [(at, fit.frame.apply(place)) for (at, place), fit in zip(landmarks, fits, strict=True)]
     parts = [fit.partial for fit in fits]
-    how = how or AgreeConfig()
+    plain = AgreeConfig()
+    how = how or replace(plain, strain=plain.strain * model.card.stiffness)
     refined = agree(
         system,
         scans,

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 from meshmatch.errors import ModelError
 from meshmatch.outputs import replace_on_success
 
-SCHEMA = 2
+SCHEMA = 3
 MOST_BYTES = 1_000_000
 """A larger file is no card."""
 
@@ -25,7 +25,11 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 ORIENTATIONS = ("searched", "none", "near", "rigid")
 """How a fit finds the orientation: asks the network, takes what the file has, improves that, or tries all turns."""
 SCALES = ("area", "sphere")
-_OLD_FRAME = {"orientation": "searched", "scale": "area"}  # of cards of schema 1
+_OLD_FRAME = {"orientation": "searched", "scale": "area"}
+_SINCE: dict[int, dict[str, Any]] = {  # what cards of older schemas lack, and what they meant
+    1: {"frame": _OLD_FRAME, "stiffness": 1.0},
+    2: {"stiffness": 1.0},
+}
 _FIELD_KEYS = {"kernel": str, "radius": float, "nodes": int}
 
 
@@ -64,6 +68,9 @@ class ModelCard:
     frame : dict
         How a shape is brought to the template: ``orientation`` (one of `ORIENTATIONS`), ``scale`` (of `SCALES`).
 
+    stiffness : float
+        How firmly fits that agree hold a common stretch of the template; 1 suits bodies, less suits what varies more.
+
     Raises
     ------
     ModelError
@@ -88,6 +95,7 @@ class ModelCard:
     description: str = ""
     schema: int = SCHEMA
     frame: dict[str, Any] = entry(default_factory=lambda: dict(_OLD_FRAME))
+    stiffness: float = 1.0
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -111,6 +119,8 @@ class ModelCard:
             _refuse(f"weights_sha256 must be 64 hex digits, not {_shown(self.weights_sha256)}")
         if self.steps < 0 or self.training_minutes < 0:
             _refuse("steps and training_minutes must be 0 or more")
+        if not self.stiffness > 0:
+            _refuse(f"stiffness must be above 0, not {self.stiffness:g}")
         try:
             datetime.fromisoformat(self.created)
         except ValueError:
@@ -190,8 +200,9 @@ def card_from_json(text: str) -> ModelCard:
             f"the model card has schema {found['schema']}, not {SCHEMA}",
             "it needs a newer meshmatch: update it",
         )
-    if found.get("schema") == 1 and "frame" not in found:
-        found = found | {"schema": SCHEMA, "frame": dict(_OLD_FRAME)}
+    old = _SINCE.get(found["schema"]) if type(found.get("schema")) is int else None
+    if old is not None and not old.keys() & found.keys():
+        found = found | old | {"schema": SCHEMA}
     known = [item.name for item in fields(ModelCard)]
     unknown = sorted(set(found) - set(known))
     missing = [name for name in known if name not in found]

@@ -142,11 +142,12 @@ def train_model(
     start: TrainedModel | None = None,
     resume: bool = True,
     frame: dict[str, str] | None = None,
+    stiffness: float = 1.0,
     progress: Callable[[Progress], None] | None = None,
 ) -> Path:
     """Train, or go on training, and write a model folder.
 
-    ``frame`` is the card's, by default that of a network that finds the orientation.
+    ``frame`` and ``stiffness`` are the card's; the frame is by default that of a network that finds the orientation.
     ``output`` receives ``checkpoint/last.safetensors`` on the way and, at every stop, ``template.safetensors``,
     ``weights.safetensors`` and last ``card.json``. ``start`` gives the first weights; it must have the same
     template and network.
@@ -185,7 +186,18 @@ def train_model(
     if trainer.rank == 0:
         score = validation_error(_averaged(trainer), held_out, points)
         export(
-            trainer, template, output, recipe, name, category, data, licence, score, start=start, frame=frame
+            trainer,
+            template,
+            output,
+            recipe,
+            name,
+            category,
+            data,
+            licence,
+            score,
+            start=start,
+            frame=frame,
+            stiffness=stiffness,
         )
     return output
 
@@ -236,6 +248,7 @@ def export(
     storage: str = "int8",
     start: TrainedModel | None = None,
     frame: dict[str, str] | None = None,
+    stiffness: float = 1.0,
 ) -> None:
     """Write the averaged weights as a model folder; the card comes last."""
     from meshmatch.templates.template import save_template
@@ -260,6 +273,7 @@ def export(
         weights_sha256=digest,
         created=datetime.date.today().isoformat(),
         description="",
+        stiffness=stiffness,
     )
     if frame is not None:
         card = replace(card, frame=frame)

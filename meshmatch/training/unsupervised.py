@@ -85,6 +85,7 @@ def train_clouds(
     start: TrainedModel | None = None,
     resume: bool = True,
     change: CloudConfig | None = None,
+    stiffness: float = 1.0,
     progress: Callable[[Progress], None] | None = None,
 ) -> Path:
     """Train, or go on training, and write a model folder; as `meshmatch.training.run.train_model`.
@@ -135,6 +136,7 @@ def train_clouds(
             storage="float16",
             start=start,
             frame=frame,
+            stiffness=stiffness,
         )
     return output
 

@@ -86,7 +86,7 @@ def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path) -> None:
         save_shape(folder / f"egg{n}.ply", Shape(ball.verts * [0.8, 1.4 + 0.1 * n, 1.0], ball.faces))
     answer = run("prepare", folder, "-o", tmp_path / "out", *FEW[:-1], "--json")
     assert json.loads(answer.out)["align"] == "near"
-    words = ("--steps", "3", "--seed", "2")
+    words = ("--steps", "3", "--seed", "2", "--stiffness", "0.1")
     answer = run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", *words)
     assert answer.status == 0 and "after step 3;" in answer.err
     assert "going on" not in answer.err
@@ -94,6 +94,7 @@ def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path) -> None:
     assert "going on from the checkpoint" in again.err
     card = read_card(tmp_path / "mine" / "card.json")
     assert card.frame == {"orientation": "near", "scale": "area"}
+    assert card.stiffness == 0.1
     assert (card.data, card.network["align_basis"], card.recipe["train"]["seed"]) == (
         "3 registered shapes of out",
         0,
@@ -107,7 +108,8 @@ def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path) -> None:
     assert np.load(tmp_path / "map.npy").shape == (162,)
     words = ("--steps", "1", "--preset", "paper", "-q")
     assert run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "papers", *words).status == 0
-    assert read_card(tmp_path / "papers" / "card.json").frame["orientation"] == "searched"
+    papers = read_card(tmp_path / "papers" / "card.json")
+    assert (papers.frame["orientation"], papers.stiffness) == ("searched", 1.0)
 
 
 @pytest.mark.parametrize(("registered", "words"), [(True, ["--unsupervised"]), (False, [])])
@@ -131,12 +133,12 @@ def test_known_points_and_preset_reach_the_training(
     assert answer.status == 0 and "1 known points" in answer.err
     answer = run(
         *("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", "--preset", "paper", *words),
-        *("--category", "egg", "--licence", "CC0", "--seed", "4", "--fresh"),
+        *("--stiffness", "0.2", "--category", "egg", "--licence", "CC0", "--seed", "4", "--fresh"),
     )
     assert answer.status == 0, answer.err
     assert called["known"] == (2 if registered else 3, 1, 3)
     assert (called["category"], called["licence"], called["resume"]) == ("egg", "CC0", False)
-    assert called["recipe"].network.encoder == "point"
+    assert (called["recipe"].network.encoder, called["stiffness"]) == ("point", 0.2)
     assert called["recipe"].train.seed == 4
     assert "1 known points" in called["data"]
 

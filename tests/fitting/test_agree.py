@@ -135,3 +135,18 @@ def test_a_poor_fit_has_no_say(system: NodeSystem, model: TrainedModel) -> None:
     assert agreed_fits(model, [shape, shape], fits) == fits
     good = [replace(fit, verdict="good") for fit in fits]
     assert agreed_fits(model, [shape, shape], good, FitConfig(refine="none")) == good
+
+
+def test_the_card_says_how_stiff(system: NodeSystem, model: TrainedModel) -> None:
+    vectors = [slid(system, model.template.nodes, turn) for turn in (0.15, -0.15)]
+    fits = [fit_of(system, each) for each in vectors]
+    shape = Shape(fits[0].frame.undo(system.verts), system.faces)
+    soft = replace(model, card=replace(model.card, stiffness=0.25))
+
+    def points(which: TrainedModel, how: AgreeConfig | None = None) -> np.ndarray:
+        return agreed_fits(which, [shape, shape], fits, FitConfig(samples=1500), how=how)[0].points
+
+    plain = AgreeConfig()
+    assert np.array_equal(points(soft), points(model, replace(plain, strain=0.25 * plain.strain)))
+    assert np.array_equal(points(model), points(model, plain))
+    assert not np.array_equal(points(soft), points(model))

@@ -92,7 +92,9 @@ _WRONG: list[tuple[str, Any, str]] = [
     ("weights_sha256", "ab" * 31, "64 hex digits"),
     ("created", "yesterday", "ISO date"),
     ("created", "2026-02-30", "ISO date"),
-    ("schema", 0, "schema 0, not 2"),
+    ("stiffness", 0, "stiffness must be above 0"),
+    ("stiffness", -0.5, "stiffness must be above 0"),
+    ("schema", 0, "schema 0, not 3"),
     ("schema", True, "schema must be a whole number"),
 ]
 
@@ -120,14 +122,23 @@ def test_extra_entries_are_refused() -> None:
 
 def test_a_card_of_the_first_schema_is_read_as_it_was_meant() -> None:
     words = json.loads(card_to_json(small_card())) | {"schema": 1}
-    del words["frame"]
+    del words["frame"], words["stiffness"]
     card = card_from_json(json.dumps(words))
-    assert (card.schema, card.frame) == (2, {"orientation": "searched", "scale": "area"})
+    assert (card.schema, card.frame) == (3, {"orientation": "searched", "scale": "area"})
+    assert card.stiffness == 1.0
     assert card == small_card()
-    with pytest.raises(ModelError, match="missing entries: frame"):
-        card_from_json(json.dumps(words | {"schema": 2}))
-    with pytest.raises(ModelError, match="schema 1, not 2"):
+    with pytest.raises(ModelError, match="missing entries: frame, stiffness"):
+        card_from_json(json.dumps(words | {"schema": 3}))
+    with pytest.raises(ModelError, match="missing entries: stiffness"):  # a frame is no sign of the first schema
         card_from_json(json.dumps(words | {"frame": {"orientation": "none", "scale": "area"}}))
+
+
+def test_a_card_of_the_second_schema_is_as_stiff_as_it_was() -> None:
+    words = json.loads(card_to_json(small_card())) | {"schema": 2}
+    del words["stiffness"]
+    assert card_from_json(json.dumps(words)) == small_card()
+    with pytest.raises(ModelError, match="schema 2, not 3"):
+        card_from_json(json.dumps(words | {"stiffness": 0.5}))
 
 
 @pytest.mark.parametrize(
@@ -146,8 +157,8 @@ def test_a_wrong_frame_is_refused(frame: dict[str, object], told: str) -> None:
 
 
 def test_a_newer_schema_asks_for_an_update_whatever_else_it_holds() -> None:
-    words = json.loads(card_to_json(small_card())) | {"schema": 3, "unheard": 1}
-    with pytest.raises(ModelError, match="schema 3") as caught:
+    words = json.loads(card_to_json(small_card())) | {"schema": 4, "unheard": 1}
+    with pytest.raises(ModelError, match="schema 4") as caught:
         card_from_json(json.dumps(words))
     assert "update" in caught.value.hint
 
