@@ -125,8 +125,9 @@ def match(
     known = None
     if landmarks is not None:
         fits, known = honour_pairs(loaded, clean, fits, landmarks, config)
+    alone = (fits[0], fits[1])
     fits = agreed_fits(loaded, [part.shape for part in clean], fits, config, known)
-    found = build_map(clean[0], fits[0], clean[1], fits[1], workers=workers)
+    found = build_map(clean[0], fits[0], clean[1], fits[1], workers=workers, alone=alone)
     notes = tuple(
         f"{shape.name}: {note}" for shape, part in zip(shapes, clean, strict=True) for note in part.notes
     )
@@ -186,7 +187,8 @@ def map_between(
     if model is not None:
         shapes = [usable(shape).shape for shape in (source, target)]
         fits = agreed_fits(read_model(model), shapes, fits, FitConfig(seed=source_fit.seed))
-    return build_map(usable(source), fits[0], usable(target), fits[1], workers=workers)
+    alone = (source_fit, target_fit)
+    return build_map(usable(source), fits[0], usable(target), fits[1], workers=workers, alone=alone)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,8 @@ from meshmatch.shapes.shape import Shape
 
 # Distance (units of sqrt(area)) at which confidence has fallen to about 0.37.
 _FIT_SCALE = 0.03
+# The same for how far agreement moved the two fits: what a shape alone said is not what both say.
+_AGREED_SCALE = 0.05
 _ORDER = {"good": 0, "fair": 1, "poor": 2}
 
 
@@ -24,6 +26,7 @@ def build_map(
     target: Repaired,
     target_fit: Fit,
     workers: int = 1,
+    alone: tuple[Fit, Fit] | None = None,
 ) -> VertexMap:
     """Carry every source vertex through the template to the target.
 
@@ -35,6 +38,8 @@ def build_map(
     ----------
     source, target : Repaired
         The shapes as they were fitted; the map is of their *original* vertices.
+    alone : (Fit, Fit), optional
+        Both fits before they agreed on how the template stretches: where that moved them much, confidence is low.
 
     Raises
     ------
@@ -47,6 +52,8 @@ def build_map(
             "fit both shapes with the same model",
         )
     landed, confidence = carry(source.shape, source_fit, target.shape, target_fit, workers)
+    if alone is not None:
+        confidence = confidence * steadiness(source.shape, (source_fit, target_fit), alone, workers)
     index = _nearest_corner(target.shape, landed)
     worst = max(source_fit, target_fit, key=lambda fit: _ORDER[fit.verdict])
     reasons = tuple(
@@ -86,6 +93,15 @@ def carry(
         landed = _closest(foot, source_fit, moved, belongs, target, target_fit, workers)
     confidence = np.exp(-np.square(foot.distance / _FIT_SCALE) - np.square(landed.distance / _FIT_SCALE))
     return landed, confidence
+
+
+def steadiness(source: Shape, fits: tuple[Fit, Fit], alone: tuple[Fit, Fit], workers: int = 1) -> np.ndarray:
+    """How little (V,), in 0..1, the two fits moved under each source vertex when they had to agree."""
+    foot = place(source, fits[0], workers)[0]
+    moved = np.zeros(len(foot.face))
+    for fit, before in zip(fits, alone, strict=True):
+        moved += np.linalg.norm(at_footpoints(foot, fit.faces, fit.points - before.points), axis=1)
+    return np.asarray(np.exp(-np.square(moved / _AGREED_SCALE)))
 
 
 def _closest(

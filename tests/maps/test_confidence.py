@@ -1,0 +1,38 @@
+"""Confidence falls where two fits had to move until they agreed, and nowhere else."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from meshmatch.fitting.fit import Fit
+from meshmatch.maps.build import build_map
+from meshmatch.shapes.repair import repair
+from meshmatch.shapes.shape import Frame, Shape
+from tests.maps.solids import bumpy_sphere
+
+
+def lying_on(shape: Shape) -> Fit:
+    """A fit that is exactly its shape."""
+    none = np.zeros(shape.V)
+    return Fit(
+        "", Frame.identity(), shape.verts, shape.verts, shape.verts, shape.faces, 0.0, none, "good", (), "+y", "+z",
+        0.0, 0,
+    )  # fmt: skip
+
+
+def test_where_a_fit_moved_it_is_not_believed() -> None:
+    ball = bumpy_sphere()
+    unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
+    part, fit = repair(unit), lying_on(unit)
+    sure = build_map(part, fit, part, fit)
+    assert np.allclose(sure.confidence, 1)
+    high = unit.verts[:, 2] > 0.1
+    for number, moved in enumerate((0.05, 0.1)):
+        elsewhere = replace(fit, points=unit.verts + np.where(high, moved, 0.0)[:, None] * [1.0, 0, 0])
+        before = [fit, fit]
+        before[number] = elsewhere
+        found = build_map(part, fit, part, fit, alone=(before[0], before[1]))
+        assert np.allclose(found.confidence[high], np.exp(-((moved / 0.05) ** 2)), atol=1e-6)
+        assert np.allclose(found.confidence[~high], 1)
+        assert np.array_equal(found.index, sure.index)
+    assert np.array_equal(build_map(part, fit, part, fit, alone=(fit, fit)).confidence, sure.confidence)
