@@ -220,6 +220,21 @@ def test_hearts_from_end_to_end(
     assert learned["registered"] and len(learned["names"]) == 2
     assert drawn == [3]
     assert {"date", "commit", "machine"} <= record.keys()
+    alone = [
+        *map(str, words[:-1]),
+        "2",
+        "--measure",
+        "unseen",
+        "--ways",
+        "unregistered",
+        "--stiffness",
+        "0.5",
+    ]
+    assert hearts.main(alone) == 0
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert record["results"]["unregistered, nodes refined"]["unseen_pairs"] == 2
+    assert record["results"]["unregistered, nodes refined"]["pairs"] == 2
+    assert record["stiffness"] == 0.5
     assert hearts.main(["--data", str(tmp_path), "--ways", "guessed"]) == 1
     assert "no way 'guessed'" in capsys.readouterr().err
 
