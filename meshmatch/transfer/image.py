@@ -76,10 +76,10 @@ class Image:
         self.normals = _normals_at(source_to_target, target)
         kept = np.flatnonzero(~torn_faces(source_to_target, source, target, self.points, self.unit))
         lone = np.ones(source.V, bool)
-        lone[source.faces[kept].ravel()] = False
         if source.invalid is not None:  # their places are stand-ins
             kept = kept[~source.invalid[source.faces[kept]].any(axis=1)]
             lone &= ~source.invalid
+        lone[source.faces[kept].ravel()] = False
         self._source_unit = float(np.sqrt(source.area)) or source.diagonal or 1.0
         self._source = source.verts / self._source_unit
         single = np.flatnonzero(lone)
@@ -219,7 +219,8 @@ def torn_faces(
     own = np.linalg.norm(source.verts[source.faces] - source.verts[around], axis=2)
     image = np.linalg.norm(points[source.faces] - points[around], axis=2)
     usual = image <= np.quantile(image, 0.95)
-    scale = image[usual].sum() / max(own[usual].sum(), 1e-300)
+    whole = float(own[usual].sum())
+    scale = float(image[usual].sum()) / whole if whole > 0 else 0.0
     rounded = np.where(on_vertex(source_to_target), _edge_lengths(target)[source_to_target.index], 0.0)
     allowed = _STRETCH * scale * own + rounded[source.faces] + rounded[around] + _SLACK * unit
     return np.asarray((image > allowed).any(axis=1))

@@ -129,3 +129,12 @@ def test_a_map_of_everything_to_one_point_still_answers(sphere: Shape) -> None:
     found = VertexMap.between(sphere, sphere, np.zeros(sphere.V, int))
     places = Image(found, sphere, sphere).query(sphere.verts)
     assert np.allclose(places.distance, np.linalg.norm(sphere.verts - sphere.verts[0], axis=1))
+
+
+def test_the_only_vertex_with_a_place_is_found_though_all_its_faces_are_broken(sphere: Shape) -> None:
+    broken = Shape(np.zeros((42, 3)), icosphere(1).faces, "broken", None, np.arange(42) > 0)
+    huge = Shape(1e30 * sphere.verts, sphere.faces, "huge")
+    for target in (sphere, huge):
+        found = Image(VertexMap.between(broken, target, np.arange(42)), broken, target).query(target.verts)
+        assert (found.vertex == 0).all()
+        assert (found.face == -1).all()
