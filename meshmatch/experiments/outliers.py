@@ -13,6 +13,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import fields
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,11 @@ from rich.table import Table
 from meshmatch.config import set_threads
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.fitting.fit import Fit
 from meshmatch.maps.evaluate import LOST_CM
+from meshmatch.outputs import replace_on_success
 from meshmatch.pipeline import map_between, register
-from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.shape import Frame, Shape
 
 FILE = "faust_outliers.npy"
 
@@ -50,11 +53,39 @@ def load_clouds(data: Path) -> list[Shape]:
     return [Shape(cloud, np.empty((0, 3), np.int64), f"cloud {k}") for k, cloud in enumerate(points)]
 
 
-def measure(clouds: Sequence[Shape], *, model: str, seed: int, limit: int | None = None) -> dict[str, Any]:
+def fit_of(cloud: Shape, model: str, seed: int, keep: Path | None) -> Fit:
+    """The fit of a cloud; the one kept in a folder under the cloud's hash, if there is one."""
+    path = None if keep is None else keep / f"{cloud.hash}-{model}-{seed}.npz"
+    if path is not None and path.is_file():
+        with np.load(path, allow_pickle=False) as held:
+            found = {name: held[name][()] if held[name].ndim == 0 else held[name] for name in held.files}
+        frame = Frame(float(found.pop("scale")), found.pop("rotation"), found.pop("center"))
+        words = {name: str(found[name]) for name in ("template_hash", "verdict", "up", "front")}
+        return Fit(**{**found, **words, "frame": frame, "reasons": tuple(map(str, found["reasons"]))})
+    fit = register(cloud, model=model, seed=seed)
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        plain: dict[str, Any] = {
+            each.name: getattr(fit, each.name) for each in fields(fit) if each.name != "frame"
+        }
+        plain |= {"reasons": np.array(fit.reasons, str)}
+        turn: dict[str, Any] = {
+            "scale": fit.frame.scale,
+            "rotation": fit.frame.rotation,
+            "center": fit.frame.center,
+        }
+        with replace_on_success(path) as unfinished:
+            np.savez(unfinished, **plain, **turn)
+    return fit
+
+
+def measure(
+    clouds: Sequence[Shape], *, model: str, seed: int, limit: int | None = None, keep: Path | None = None
+) -> dict[str, Any]:
     """Match every ordered pair of corresponding clouds, or ``limit`` of them evenly spread, and measure every row."""
     began = time.perf_counter()
     voice = Console(stderr=True)
-    fits = [register(cloud, model=model, seed=seed) for cloud in track(clouds, "fitting", console=voice)]
+    fits = [fit_of(cloud, model, seed, keep) for cloud in track(clouds, "fitting", console=voice)]
     every = list(permutations(range(len(clouds)), 2))
     count = len(every) if limit is None else min(limit, len(every))
     pairs = [every[k] for k in np.linspace(0, len(every) - 1, max(1, count)).round().astype(int)]
@@ -80,10 +111,12 @@ def measure(clouds: Sequence[Shape], *, model: str, seed: int, limit: int | None
     }
 
 
-def run(clouds: Sequence[Shape], *, model: str, seed: int, limit: int | None = None) -> dict[str, Any]:
+def run(
+    clouds: Sequence[Shape], *, model: str, seed: int, limit: int | None = None, keep: Path | None = None
+) -> dict[str, Any]:
     """Measure, print a table and a JSON line; the line's record is returned too."""
     set_threads(1)
-    record = measure(clouds, model=model, seed=seed, limit=limit)
+    record = measure(clouds, model=model, seed=seed, limit=limit, keep=keep)
     table = Table(title="Clouds with outliers, straight distance in cm, strays counted", title_justify="left")
     row = {
         "pairs": f"{record['pairs']} of {record['of']}",
@@ -116,12 +149,16 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
     parser.add_argument("--limit", type=int, metavar="N", help="the first N clouds only")
     parser.add_argument("--limit-pairs", type=int, metavar="N", help="N pairs only, evenly spread")
+    parser.add_argument(
+        "--keep", type=Path, metavar="FOLDER", help="keep fits there, and use those that are kept"
+    )
     parser.add_argument("--model", default="human")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(words)
     try:
         clouds = load_clouds(options.data)[: options.limit]
-        run(clouds, model=options.model, seed=options.seed, limit=options.limit_pairs)
+        limit, keep = options.limit_pairs, options.keep
+        run(clouds, model=options.model, seed=options.seed, limit=limit, keep=keep)
     except MeshmatchError as error:
         explain(error)
         return 1

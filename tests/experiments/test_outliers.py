@@ -1,6 +1,7 @@
 """Clouds with strays: what the command counts, with a matcher that knows the answer for all but the strays."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,37 @@ def test_strays_count(
     assert main(["--data", str(tmp_path), "--limit-pairs", "3"]) == 0
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert (record["pairs"], record["of"]) == (3, 6)
+
+
+def test_fits_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = np.random.default_rng(0).random((2, P, 3))
+    np.save(tmp_path / outliers.FILE, points)
+    seen: list[Fit] = []
+
+    def made(shape: Shape, **how: object) -> Fit:
+        fit = register(shape)
+        return replace(
+            fit, reasons=("few", "far"), partial=True, frame=Frame(2.0, np.eye(3)[::-1] * -1, np.ones(3))
+        )
+
+    def mapped(source: Shape, fit: Fit, *rest: object, **how: object) -> VertexMap:
+        seen.append(fit)
+        return map_between(source, fit, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(outliers, "register", made)
+    monkeypatch.setattr(outliers, "map_between", mapped)
+    words = ["--data", str(tmp_path), "--keep", str(tmp_path / "kept")]
+    assert main(words) == 0
+    monkeypatch.setattr(outliers, "register", None)
+    assert main(words) == 0
+    first, *_, last = seen
+    assert (last.verdict, last.reasons, last.partial, last.up) == ("fair", ("few", "far"), True, "+y")
+    assert last.frame.scale == 2.0 and np.array_equal(last.frame.rotation, first.frame.rotation)
+    assert np.array_equal(last.points, first.points) and last.residual == first.residual
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines() if line.startswith("{")]
+    assert told[0]["mean_cm"] == told[1]["mean_cm"]
 
 
 def test_files_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
