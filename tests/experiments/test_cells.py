@@ -83,7 +83,7 @@ def test_cells_differ_in_representation_and_constraints_alone() -> None:
         assert not chosen.scan.upright
 
 
-def test_where_a_rule_leaves_too_few_nodes_all_are_taken() -> None:
+def test_where_a_rule_leaves_too_few_nodes_all_are_taken(prepared: Path) -> None:
     setting = Setting()
     assert setting.rule(BASE) == "parts"
     assert setting.template(BASE).K == 300
@@ -92,7 +92,7 @@ def test_where_a_rule_leaves_too_few_nodes_all_are_taken() -> None:
     assert setting.rule(wide) == "uniform"
     assert setting.template(wide).K == 100
     with pytest.raises(TemplateError):
-        setting.template(replace(BASE, nodes=4, radius=0.01))
+        Setting(folder=str(prepared)).template(replace(BASE, nodes=4, radius=0.01))
     assert setting.template(replace(BASE, pose="A")).name == "human-A"
 
 
