@@ -1,0 +1,90 @@
+"""Parts completed by the template: what counts as seen, what stands in, and a body that was cut."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from meshmatch.experiments.partial import part_of
+from meshmatch.experiments.protocols import load_set
+from meshmatch.fitting.complete import completed, seen, seen_area
+from meshmatch.fitting.fit_shape import fit_shape, node_system
+from meshmatch.fitting.network_fit import Candidate
+from meshmatch.fitting.part import PartReading
+from meshmatch.fitting.scan import Scan
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.pipeline import read_model
+from meshmatch.shapes.shape import Shape
+from tests.fitting.eggs import egg_model, scan_of
+
+
+@pytest.fixture(scope="module")
+def system() -> NodeSystem:
+    return node_system(egg_model())
+
+
+def above(system: NodeSystem, height: float) -> Scan:
+    whole = scan_of(Shape(system.verts, system.faces), 4000)
+    keep = whole.points[:, 1] > height
+    return Scan(whole.points[keep], whole.normals[keep])
+
+
+def test_all_of_a_whole_is_seen_and_nothing_beyond_a_cut(system: NodeSystem) -> None:
+    still = np.zeros((system.K, 3))
+    assert seen(system, above(system, -9.0), still).mean() > 0.97
+    there = seen(system, above(system, 0.0), still)
+    y = system.verts[:, 1]
+    assert there[y > 0.06].mean() > 0.97
+    assert not there[y < -0.07].any()
+    area = Shape(system.verts, system.faces).vertex_areas
+    assert seen_area(system, there) == pytest.approx(area[y > 0].sum() / area.sum(), abs=0.08)
+    assert seen_area(system, np.ones(len(y), bool)) == pytest.approx(1.0)
+
+
+def test_the_edge_of_a_cut_is_no_counterpart_of_what_lies_beyond(system: NodeSystem) -> None:
+    """A template squeezed towards the cut comes near to its edge everywhere, and is not seen for that."""
+    nodes = egg_model().template.nodes
+    squeezed = np.zeros_like(nodes)
+    squeezed[:, 1] = np.where(nodes[:, 1] < 0, -0.9 * nodes[:, 1], 0)
+    there = seen(system, above(system, 0.0), squeezed)
+    assert there[system.verts[:, 1] < -0.12].mean() < 0.1
+
+
+def test_what_is_missing_stands_in_as_densely(system: NodeSystem) -> None:
+    still, scan = np.zeros((system.K, 3)), above(system, 0.0)
+    share = seen_area(system, seen(system, scan, still))
+    whole = completed(system, scan, still, share, np.random.default_rng(0))
+    rows = {tuple(point) for point in whole.points}
+    assert all(tuple(point) in rows for point in scan.points)
+    added = np.array(list(rows - {tuple(point) for point in scan.points}))
+    assert added[:, 1].max() < 0.08 and added[:, 1].min() < 0.9 * system.verts[:, 1].min()
+    assert len(whole.points) == pytest.approx(len(scan.points) / share, rel=0.15)
+    assert np.allclose(np.linalg.norm(whole.normals, axis=1), 1)
+    everything = above(system, -9.0)
+    assert len(completed(system, everything, still, 1.0, np.random.default_rng(0)).points) < 4200
+
+
+def test_a_reading_knows_its_size_and_what_it_costs() -> None:
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    fit = Candidate(turn, np.array([1.0, 0, 0]), np.zeros((1, 3)), 0.02)
+    scan = Scan(np.array([[4.0, 2, 0]]), np.array([[1.0, 0, 0]]))
+    local = PartReading(0.25, fit).local(scan)
+    assert np.allclose(local.points, (np.array([[2.0, 1, 0]]) - [1, 0, 0]) @ turn)
+    assert np.allclose(local.normals, scan.normals @ turn)
+    assert PartReading(0.25, fit).cost > PartReading(0.5, fit).cost > fit.residual
+
+
+def test_half_of_a_body_is_read_as_what_it_is(bench: Path) -> None:
+    known = load_set("scape", bench)
+    body = known.shape(known.shapes[0])
+    half, used = part_of(body, "cut", 0)
+    model = read_model("human")
+    whole, part = fit_shape(model, body), fit_shape(model, half)
+    assert part.partial and part.verdict == "fair"
+    told = float(part.reasons[-1].split(": ")[1].split(" %")[0]) / 100
+    assert told > 0.2  # of half of the body that is missing, some lies near to what is not
+    rest = whole.resting
+    true = rest[cKDTree(whole.points).query(whole.frame.apply(body.verts[used]))[1]]
+    found = rest[cKDTree(part.points).query(part.frame.apply(half.verts))[1]]
+    assert np.linalg.norm(found - true, axis=1).mean() < 0.03  # units of sqrt(area): 4 cm
