@@ -1,4 +1,4 @@
-"""The paper's tables 4 to 7 as tables, and the orderings that it claims, read off the same cells."""
+"""The paper's tables 4 to 7, and the numbers of its figures 8 to 10, read off cells."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from statistics import fmean
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from meshmatch.experiments.ablation_cells import GRID, POSES, TABLE4, Known
+from meshmatch.experiments.ablation_cells import GRID, POSES, SHAPES, SUPERVISED, TABLE4, Known
 from meshmatch.experiments.cells import BASE, Cell
 from meshmatch.fields.choice import FIELDS
 from meshmatch.templates.nodes import STRATEGIES
@@ -79,6 +79,7 @@ def drawn(
 ) -> Table:
     """A table: steps, held-out error, mean and median on each set beside the paper's mean, and after refining nodes."""
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
+    printed = any(row.paper is not None for row in rows)
     for head in heads:
         table.add_column(head, no_wrap=True)
     for head in ("steps", "held out"):
@@ -86,7 +87,7 @@ def drawn(
     for name in sets:
         table.add_column(name, justify="right", no_wrap=True)
         table.add_column("median", justify="right")
-        if name in _PAPER_SETS:
+        if name in _PAPER_SETS and printed:
             table.add_column("paper", justify="right", style="dim")
         if nodes:
             table.add_column("nodes", justify="right")
@@ -101,7 +102,7 @@ def drawn(
             cells += [
                 number(known.error(row.cell, name, row.method, what)) for what in ("mean_cm", "median_cm")
             ]
-            if name in _PAPER_SETS:
+            if name in _PAPER_SETS and printed:
                 cells.append("" if row.paper is None else f"{row.paper[_PAPER_SETS.index(name)]:.1f}")
             if nodes:
                 cells.append(number(known.error(row.cell, name, "nodes")))
@@ -193,6 +194,24 @@ def table7(known: Known, sets: Sequence[str], budget: str) -> list[Table]:
     return [drawn(f"Table 7, errors in cm: {budget}", ("nodes by", "template"), rows, known, sets, False)]
 
 
+def figure8(known: Known, sets: Sequence[str], budget: str) -> list[Table]:
+    """The template's pose."""
+    rows = [Row((pose,), replace(BASE, pose=pose)) for pose in POSES]
+    return [drawn(f"Figure 8, errors in cm: {budget}", ("template",), rows, known, sets, False)]
+
+
+def figure9(known: Known, sets: Sequence[str], budget: str) -> list[Table]:
+    """How many shapes there are to learn from."""
+    rows = [Row((str(count),), replace(BASE, shapes=count)) for count in SHAPES]
+    return [drawn(f"Figure 9, errors in cm: {budget}", ("training shapes",), rows, known, sets, False)]
+
+
+def figure10(known: Known, sets: Sequence[str], budget: str) -> list[Table]:
+    """On how many points the right place is told."""
+    rows = [Row((str(count),), replace(BASE, supervised=count)) for count in SUPERVISED]
+    return [drawn(f"Figure 10, errors in cm: {budget}", ("supervised points",), rows, known, sets, False)]
+
+
 def _rule(known: Known, cell: Cell) -> str:
     return str(known.trained.get(cell, {}).get("rule", cell.strategy))
 
@@ -202,4 +221,7 @@ TABLES: dict[str, Callable[[Known, Sequence[str], str], list[Table]]] = {
     "table5": table5,
     "table6": table6,
     "table7": table7,
+    "figure8": figure8,
+    "figure9": figure9,
+    "figure10": figure10,
 }

@@ -100,7 +100,7 @@ def test_tables_show_what_is_there(capsys: pytest.CaptureFixture[str]) -> None:
             wide_console().print(each)
         out = capsys.readouterr().out
         assert "a budget" in out
-        assert view.replace("table", "Table ") in out
+        assert view.replace("table", "Table ").replace("figure", "Figure ") in out
         if view == "table4":
             for words in ("10.00", "50.00", "30.00", "44.44", "6.6", "123.4", "78", "4098.3", "338.7", "-"):
                 assert words in out
