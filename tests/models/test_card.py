@@ -129,7 +129,9 @@ def test_a_card_of_the_first_schema_is_read_as_it_was_meant() -> None:
     assert card == small_card()
     with pytest.raises(ModelError, match="missing entries: frame, stiffness"):
         card_from_json(json.dumps(words | {"schema": 3}))
-    with pytest.raises(ModelError, match="missing entries: stiffness"):  # a frame is no sign of the first schema
+    with pytest.raises(
+        ModelError, match="missing entries: stiffness"
+    ):  # a frame is no sign of the first schema
         card_from_json(json.dumps(words | {"frame": {"orientation": "none", "scale": "area"}}))
 
 
