@@ -27,6 +27,8 @@ _GRID, _DENSITIES = 1024, (0.6, 0.5, 0.4)
 # Way round a chart, in units of sqrt(area): a longer one leaves much of a square empty.
 _LONGEST = 3.0
 _MARGIN = 2
+# Length of an edge, in units of sqrt(area): xatlas takes seconds at this one, and hours at a few times as much.
+_THREAD = 500.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +140,9 @@ def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
     verts = shape.verts[used]
     verts = (verts - verts.mean(axis=0)) / max(float(np.sqrt(shape.face_areas.sum())), 1e-300)
     corners = corners.reshape(-1, 3)
+    edges = verts[corners] - verts[corners[:, [1, 2, 0]]]
+    if np.sqrt((edges**2).sum(axis=2).max()) > _THREAD:
+        raise _failed(shape, "it has triangles as thin as a thread")
     try:
         maker, pack = xatlas.Atlas(), xatlas.PackOptions()
         pack.resolution, pack.padding = 256, 0

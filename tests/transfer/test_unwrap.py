@@ -9,6 +9,7 @@ from meshmatch.shapes.topology import face_parts
 from meshmatch.transfer import unwrap
 from meshmatch.transfer.texels import faces_on, grown
 from meshmatch.transfer.unwrap import atlas_of, unwrapped
+from tests.conftest import icosphere
 from tests.shapes.painted import CORNERS, FACES, UV
 
 SQUARE = Shape(CORNERS, FACES, "square")
@@ -126,3 +127,14 @@ def test_what_cannot_be_unwrapped(torus: Shape, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(unwrap, "_packed", fails)
     with pytest.raises(InputError, match="cannot be unwrapped"):
         unwrapped(torus, 64, 2)
+
+
+@pytest.mark.parametrize(("thin", "fine"), [(1e-6, True), (1e-12, False)])
+def test_a_thread_is_refused_before_it_takes_hours(thin: float, fine: bool) -> None:
+    ball = icosphere(1)
+    thread = Shape(ball.verts * [1.0, thin, thin], ball.faces, "thread")
+    if fine:
+        assert np.isfinite(unwrapped(thread, 64, 1)).all()
+        return
+    with pytest.raises(InputError, match="as thin as a thread"):
+        unwrapped(thread, 64, 1)
