@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 
 from meshmatch.errors import TemplateError
 from meshmatch.fields.field import Field
-from meshmatch.fitting.scan import Scan
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
@@ -39,9 +38,9 @@ class Mirror:
 
     exchange: np.ndarray
 
-    def scan(self, scan: Scan) -> Scan:
-        """Samples of the mirrored shape; both in the core frame."""
-        return Scan(scan.points * _FLIP, scan.normals * _FLIP)
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the mirrored shape, in the core frame."""
+        return points * _FLIP
 
     def vectors(self, vectors: np.ndarray) -> np.ndarray:
         """Node vectors (K, 3) of the mirrored deformation: x moves to M f(M x) where f moved it before."""

@@ -143,7 +143,7 @@ def variants(
 
     back = read(scan.points)
     if mirror is not None:
-        back += [mirror.vectors(vectors) for vectors in read(mirror.scan(scan).points)]
+        back += [mirror.vectors(vectors) for vectors in read(mirror.points(scan.points))]
     return [
         Candidate(candidate.rotation, candidate.centre, u, two_way_residual(system, coarse, u, 1))
         for u in back

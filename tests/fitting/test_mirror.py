@@ -11,7 +11,6 @@ from meshmatch.fields.field import Field
 from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.mirror import Mirror, mirror_of
 from meshmatch.fitting.network_fit import Candidate, variants
-from meshmatch.fitting.scan import Scan
 from meshmatch.models.trained import TrainedModel
 from meshmatch.pipeline import read_model
 from meshmatch.shapes.shape import Shape
@@ -85,9 +84,3 @@ def test_a_mirror_adds_as_many_readings_which_a_network_without_sides_reads_the_
     first, last = (np.sort(asked[k][0].numpy() * flip, axis=0) for k, flip in ((0, 1.0), (3, FLIP)))
     assert np.allclose(first, last, atol=1e-6)
     assert np.allclose(found[0].vectors, 0.1) and np.allclose(found[3].vectors, 0.1 * FLIP)
-
-
-def test_the_mirror_of_a_scan_keeps_normals_with_their_points() -> None:
-    points, normals = np.array([[1.0, 2, 3]]), np.array([[0.6, 0.8, 0]])
-    seen = Mirror(np.eye(2)).scan(Scan(points, normals))
-    assert np.array_equal(seen.points, [[-1, 2, 3]]) and np.array_equal(seen.normals, [[-0.6, 0.8, 0]])
