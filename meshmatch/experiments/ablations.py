@@ -26,7 +26,6 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.ablation_cells import Known
 from meshmatch.experiments.ablation_figures import draw_views
 from meshmatch.experiments.ablation_run import Run, by_time
@@ -34,7 +33,7 @@ from meshmatch.experiments.ablation_tables import TABLES
 from meshmatch.experiments.cells import BASE, PRESETS
 from meshmatch.experiments.orderings import Claim, claims
 from meshmatch.experiments.protocols import CLOUD_SET
-from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.outputs import replace_on_success
 
 
@@ -188,12 +187,7 @@ def options_of(words: Sequence[str] | None) -> argparse.Namespace:
 def main(words: Sequence[str] | None = None) -> int:
     """Run the benchmark; 0 when it ran, 1 when the data or the choice stopped it."""
     options = options_of(words)
-    try:
-        run(options, Console(stderr=True))
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+    return status_of(lambda: run(options, Console(stderr=True)))
 
 
 if __name__ == "__main__":

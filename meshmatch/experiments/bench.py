@@ -27,7 +27,7 @@ from meshmatch.config import set_threads
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.distances import default_folder
 from meshmatch.experiments.protocols import CLOUD_SET, SET_NAMES, BenchSet, Pair, load_set
-from meshmatch.experiments.report import circumstances, explain, print_table
+from meshmatch.experiments.report import circumstances, print_table, status_of
 from meshmatch.experiments.scores import SetScores, evaluate_set
 from meshmatch.maps.curve import draw_curves
 from meshmatch.maps.files import load_map, save_map
@@ -246,12 +246,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """Run the benchmark; 0 when it ran, 1 when the data or the choice stopped it."""
     options = _arguments(words)
     console = Console(stderr=True)
-    try:
-        run(options, console)
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+    return status_of(lambda: run(options, console))
 
 
 def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:

@@ -26,10 +26,10 @@ from rich.progress import track
 from rich.table import Table
 
 from meshmatch.config import set_threads
-from meshmatch.errors import MeshmatchError, OptionError
+from meshmatch.errors import OptionError
 from meshmatch.experiments.bench import chosen_pairs
 from meshmatch.experiments.protocols import SET_NAMES, BenchSet, load_set
-from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.fields.energies import arap_energy, volume_energy
 from meshmatch.fitting.blend import WAYS, Blend, Way
 from meshmatch.fitting.fit import Fit
@@ -182,15 +182,16 @@ def main(words: Sequence[str] | None = None) -> int:
     options = parser.parse_args(words)
     if options.bodies < 0 or options.bodies == 1:
         parser.error("between fewer than two bodies there is nothing")
-    try:
-        ways = known_ways(options.ways)
-        bench = load_set(options.set, options.data)
-        models = options.models.split(",")
-        run(bench, models, limit=options.limit_pairs, seed=options.seed, ways=ways, bodies=options.bodies)
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+    return status_of(
+        lambda: run(
+            load_set(options.set, options.data),
+            options.models.split(","),
+            limit=options.limit_pairs,
+            seed=options.seed,
+            ways=known_ways(options.ways),
+            bodies=options.bodies,
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ from rich.progress import track
 from rich.table import Table
 
 from meshmatch.config import set_threads
-from meshmatch.errors import InputError, MeshmatchError
-from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.errors import InputError
+from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.evaluate import LOST_CM
 from meshmatch.outputs import replace_on_success
@@ -155,14 +155,15 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--model", default="human")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(words)
-    try:
-        clouds = load_clouds(options.data)[: options.limit]
-        limit, keep = options.limit_pairs, options.keep
-        run(clouds, model=options.model, seed=options.seed, limit=limit, keep=keep)
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+    return status_of(
+        lambda: run(
+            load_clouds(options.data)[: options.limit],
+            model=options.model,
+            seed=options.seed,
+            limit=options.limit_pairs,
+            keep=options.keep,
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -26,12 +26,11 @@ from rich.console import Console
 from rich.table import Table
 
 from meshmatch.config import set_threads
-from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.bench import chosen_pairs
 from meshmatch.experiments.category import area_under_curve
 from meshmatch.experiments.distances import TruthDistances, default_folder
 from meshmatch.experiments.protocols import SET_NAMES, BenchSet, load_set
-from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.evaluate import CM_PER_UNIT, LOST_CM
 from meshmatch.pipeline import map_between, register
@@ -172,8 +171,8 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
     parser.add_argument("--cache", type=Path, help="folder of kept geodesic distances")
     options = parser.parse_args(words)
-    try:
-        run(
+    return status_of(
+        lambda: run(
             options.sets.split(","),
             limit=options.limit_pairs,
             partial=options.partial,
@@ -182,10 +181,7 @@ def main(words: Sequence[str] | None = None) -> int:
             data=options.data,
             cache=options.cache or default_folder(),
         )
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+    )
 
 
 if __name__ == "__main__":

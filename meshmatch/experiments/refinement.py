@@ -34,10 +34,10 @@ from rich.console import Console
 from rich.table import Table
 
 from meshmatch.config import set_threads
-from meshmatch.errors import MeshmatchError, OptionError
+from meshmatch.errors import OptionError
 from meshmatch.experiments.distances import default_folder
 from meshmatch.experiments.protocols import load_set
-from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.experiments.scores import evaluate_set
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
@@ -261,8 +261,8 @@ def main(words: Sequence[str] | None = None) -> int:
     options = parser.parse_args(words)
     if options.shapes < 2 or options.steps < 1 or options.seed < 0:
         parser.error("at least two shapes, one step and a seed of 0 or more are needed")
-    try:
-        run(
+    return status_of(
+        lambda: run(
             options.sets.split(","),
             shapes=options.shapes,
             steps=options.steps,
@@ -271,10 +271,7 @@ def main(words: Sequence[str] | None = None) -> int:
             data=options.data,
             cache=options.cache,
         )
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+    )
 
 
 if __name__ == "__main__":

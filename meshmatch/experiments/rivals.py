@@ -32,11 +32,11 @@ from typing import Any
 from rich.console import Console
 
 from meshmatch.config import set_threads
-from meshmatch.errors import MeshmatchError, OptionError, OutputError
+from meshmatch.errors import OptionError, OutputError
 from meshmatch.experiments.adapters import CodedMatcher, MeshmonkMatcher, NricpMatcher, RigidMatcher
 from meshmatch.experiments.bench import PipelineMatcher, chosen_pairs
 from meshmatch.experiments.protocols import CLOUD_SET, SET_NAMES, load_set
-from meshmatch.experiments.report import circumstances, explain
+from meshmatch.experiments.report import circumstances, status_of
 from meshmatch.experiments.rival_cells import Cells, Rival, draw_cells, measured, print_cells
 from meshmatch.experiments.spectral import ZoomOutMatcher
 from meshmatch.maps.geodesics import GEODESIC
@@ -200,12 +200,7 @@ def options_of(words: Sequence[str] | None) -> argparse.Namespace:
 def main(words: Sequence[str] | None = None) -> int:
     """Run the benchmark; 0 when it ran, 1 when the data or the choice stopped it."""
     options = options_of(words)
-    try:
-        run(options, Console(stderr=True))
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+    return status_of(lambda: run(options, Console(stderr=True)))
 
 
 if __name__ == "__main__":

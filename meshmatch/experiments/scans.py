@@ -20,8 +20,7 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from meshmatch.config import set_threads
-from meshmatch.errors import MeshmatchError
-from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.maps.place import place
@@ -98,12 +97,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--model", default="human")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(words)
-    try:
-        run(options.files, options.output, model=options.model, seed=options.seed)
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+    return status_of(lambda: run(options.files, options.output, model=options.model, seed=options.seed))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ import numpy as np
 from rich.table import Table
 
 from meshmatch.errors import MeshmatchError
-from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -197,12 +197,7 @@ def main(words: Sequence[str] | None = None) -> int:
         parser.error(f"no case {unknown[0]!r}; there are {', '.join(CASES)}")
     if options.runs < 1 or options.cores < 1:
         parser.error("--runs and --cores begin at 1")
-    try:
-        run(cases, options.runs, options.cores)
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+    return status_of(lambda: run(cases, options.runs, options.cores))
 
 
 if __name__ == "__main__":

@@ -24,10 +24,10 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from meshmatch.config import set_threads
-from meshmatch.errors import InputError, MeshmatchError
+from meshmatch.errors import InputError
 from meshmatch.experiments.distances import TruthDistances, default_folder
 from meshmatch.experiments.protocols import SET_NAMES, BenchSet, load_set
-from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.maps.evaluate import CM_PER_UNIT, LOST_CM
 from meshmatch.shapes.shape import Shape
 
@@ -113,12 +113,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
     parser.add_argument("--cache", type=Path, help="folder of kept geodesic distances")
     options = parser.parse_args(words)
-    try:
-        run(load_set(options.set, options.data), options.cache or default_folder())
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+    return status_of(lambda: run(load_set(options.set, options.data), options.cache or default_folder()))
 
 
 if __name__ == "__main__":
