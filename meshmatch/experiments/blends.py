@@ -182,16 +182,13 @@ def main(words: Sequence[str] | None = None) -> int:
     options = parser.parse_args(words)
     if options.bodies < 0 or options.bodies == 1:
         parser.error("between fewer than two bodies there is nothing")
-    return status_of(
-        lambda: run(
-            load_set(options.set, options.data),
-            options.models.split(","),
-            limit=options.limit_pairs,
-            seed=options.seed,
-            ways=known_ways(options.ways),
-            bodies=options.bodies,
-        )
-    )
+
+    def work() -> None:
+        ways = known_ways(options.ways)  # before anything is read
+        bench, models = load_set(options.set, options.data), options.models.split(",")
+        run(bench, models, limit=options.limit_pairs, seed=options.seed, ways=ways, bodies=options.bodies)
+
+    return status_of(work)
 
 
 if __name__ == "__main__":
