@@ -175,6 +175,8 @@ def run(
     if strangers := [name for name in classes if name not in CLASSES]:
         raise OptionError(f"there is no class '{strangers[0]}'", f"choose from {', '.join(CLASSES)}")
     set_threads(training.threads)
+    if pictures is not None:
+        pictures.mkdir(parents=True, exist_ok=True)
     numbers = ["mean", "median", f"within {RIGHT:g}", "IoU", "AUC", "sure if right", "if wrong"]
     told = [*numbers, "AUC of legs", "sure if as many", "if not"]
     title = f"Keypoints, orientation {turns}: error / diagonal, all pairs"
