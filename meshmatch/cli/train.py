@@ -144,6 +144,7 @@ def train(
     from meshmatch.templates.gather import is_registered
     from meshmatch.training import run
     from meshmatch.training.few import few_recipe, frame_of_few
+    from meshmatch.training.folder import checkpoint_in
     from meshmatch.training.unsupervised import cloud_recipe
 
     label = check_name(name or output.resolve().name)
@@ -166,7 +167,7 @@ def train(
     )
     chosen = replace(chosen, train=settings, network=replace(chosen.network, field=field))
     voice = Voice(quiet or not first)
-    if not fresh and (output / "checkpoint" / run.CHECKPOINT).is_file():
+    if not fresh and checkpoint_in(output).is_file():
         voice.say(f"going on from the checkpoint in {output}; --fresh starts anew")
     started = None
     if start is not None:

@@ -6,6 +6,7 @@ import datetime
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +14,7 @@ import numpy as np
 import platformdirs
 import torch
 
-from meshmatch.errors import OptionError, OutputError
+from meshmatch.errors import OptionError
 from meshmatch.models.card import ModelCard, write_card
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig
@@ -22,6 +23,7 @@ from meshmatch.templates.prepare import read_registered
 from meshmatch.templates.template import Template, load_template
 from meshmatch.training.clouds import warped_source
 from meshmatch.training.datasets import Source, body_source, registered_source
+from meshmatch.training.folder import VALIDATION_SEED, make_checkpoint_folder, train_into
 from meshmatch.training.human_template import restrict
 from meshmatch.training.loop import Progress, TrainConfig, Trainer
 from meshmatch.training.losses import LossConfig, LossPoints, distance
@@ -31,8 +33,6 @@ from meshmatch.training.scans import ScanConfig
 from meshmatch.training.setup import build_dataset, build_deformer, build_loss_points
 
 Preset = Literal["default", "paper"]
-CHECKPOINT = "last.safetensors"
-_VALIDATION_SEED = 999_983
 
 
 @dataclass(frozen=True)
@@ -158,13 +158,7 @@ def train_model(
         The model folder.
     """
     output = Path(output)
-    checkpoint = output / "checkpoint" / CHECKPOINT
-    try:
-        checkpoint.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot make the folder {checkpoint.parent}: {error.strerror}", "choose another folder"
-        ) from error
+    make_checkpoint_folder(output)
     config = recipe.train
     model = build_deformer(template, source, recipe.network, recipe.scan, recipe.kernel, config.seed)
     if start is not None:
@@ -174,32 +168,19 @@ def train_model(
         template, source, model, recipe.scan, config.shapes, config.scans_per_shape, config.seed, config.steps
     )
     trainer = Trainer(model, points, config)
-    if resume and checkpoint.is_file():
-        trainer.load(checkpoint)
-    held_out = replace(dataset, seed=_VALIDATION_SEED, shapes=32, scans_per_shape=1)[0]
+    held_out = replace(dataset, seed=VALIDATION_SEED, shapes=32, scans_per_shape=1)[0]
 
-    def validate(model: Deformer) -> float:
+    def measure(model: Deformer) -> float:
         return validation_error(model, held_out, points)
 
-    trainer.run(dataset, checkpoint, progress, validate)
-    trainer.close()
-    if trainer.rank == 0:
-        score = validation_error(_averaged(trainer), held_out, points)
-        export(
-            trainer,
-            template,
-            output,
-            recipe,
-            name,
-            category,
-            data,
-            licence,
-            score,
-            start=start,
-            frame=frame,
-            stiffness=stiffness,
-        )
-    return output
+    write = partial(
+        export,
+        *(trainer, template, output, recipe, name, category, data, licence),
+        start=start,
+        frame=frame,
+        stiffness=stiffness,
+    )
+    return train_into(output, trainer, dataset, measure, write, resume, progress)
 
 
 def take_weights(model: Deformer, template: Template, recipe: Recipe, start: TrainedModel) -> None:
@@ -217,11 +198,6 @@ def take_weights(model: Deformer, template: Template, recipe: Recipe, start: Tra
             "start from a model of the same template and preset, or from nothing",
         )
     model.load_state_dict(start.network.state_dict())
-
-
-def _averaged(trainer: Trainer) -> Deformer:
-    trainer.model.load_state_dict(trainer.averaged_state())
-    return trainer.model
 
 
 @torch.no_grad()

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
 
-from meshmatch.errors import InputError, OutputError
+from meshmatch.errors import InputError
 from meshmatch.models.deformer import PAPER, Deformer
 from meshmatch.models.trained import TrainedModel
 from meshmatch.templates.gather import Gathered
@@ -16,13 +17,12 @@ from meshmatch.templates.template import Template
 from meshmatch.training.chamfer import SurfacePoints, build_surface_points, chamfer_losses
 from meshmatch.training.clouds import CloudBatch, CloudConfig, CloudDataset, build_warp
 from meshmatch.training.few import few_recipe
+from meshmatch.training.folder import VALIDATION_SEED, make_checkpoint_folder, train_into
 from meshmatch.training.loop import Progress, TrainConfig, Trainer
 from meshmatch.training.losses import LossConfig
-from meshmatch.training.run import CHECKPOINT, Preset, Recipe, export, take_weights
+from meshmatch.training.run import Preset, Recipe, export, take_weights
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.setup import fill_basis, lay_anchors
-
-_VALIDATION_SEED = 999_983
 
 
 def cloud_recipe(preset: Preset = "default") -> Recipe:
@@ -100,13 +100,7 @@ def train_clouds(
             "one shape is too few to learn from", "prepare a folder of several; ten or more are better"
         )
     output = Path(output)
-    checkpoint = output / "checkpoint" / CHECKPOINT
-    try:
-        checkpoint.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot make the folder {checkpoint.parent}: {error.strerror}", "choose another folder"
-        ) from error
+    make_checkpoint_folder(output)
     config = recipe.train
     dataset = build_cloud_dataset(gathered, recipe, change)
     model = build_cloud_deformer(template, dataset, recipe, config.seed)
@@ -115,30 +109,20 @@ def train_clouds(
     dataset = replace(dataset, encoder=model.encoder)
     points = build_surface_points(template, recipe.kernel, model, gathered.template_landmarks)
     trainer = Trainer(model, points, config, chamfer_losses)
-    if resume and checkpoint.is_file():
-        trainer.load(checkpoint)
-    held_out = replace(dataset, seed=_VALIDATION_SEED, shapes=min(32, 2 * len(gathered.points)))[0]
-    trainer.run(dataset, checkpoint, progress, lambda model: surface_error(model, held_out, points))
-    if trainer.rank == 0:
-        trainer.model.load_state_dict(trainer.averaged_state())
-        score = surface_error(trainer.model, held_out, points)
-        frame: dict[str, str] = {"orientation": gathered.align, "scale": gathered.scale}
-        export(
-            trainer,
-            template,
-            output,
-            recipe,
-            name,
-            category,
-            data,
-            licence,
-            score,
-            storage="float16",
-            start=start,
-            frame=frame,
-            stiffness=stiffness,
-        )
-    return output
+    held_out = replace(dataset, seed=VALIDATION_SEED, shapes=min(32, 2 * len(gathered.points)))[0]
+
+    def measure(model: Deformer) -> float:
+        return surface_error(model, held_out, points)
+
+    write = partial(
+        export,
+        *(trainer, template, output, recipe, name, category, data, licence),
+        storage="float16",
+        start=start,
+        frame={"orientation": gathered.align, "scale": gathered.scale},
+        stiffness=stiffness,
+    )
+    return train_into(output, trainer, dataset, measure, write, resume, progress)
 
 
 @torch.no_grad()

@@ -1,0 +1,73 @@
+"""The folder that a training writes into: the checkpoint that it goes on from, and the end that every training has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from meshmatch.errors import OutputError
+from meshmatch.models.deformer import Deformer
+from meshmatch.training.loop import Progress, Trainer
+
+VALIDATION_SEED = 999_983
+"""Of the batch that no training sees and every training is measured on."""
+
+
+def checkpoint_in(output: Path) -> Path:
+    """Where the checkpoint of a training into a folder lies."""
+    return output / "checkpoint" / "last.safetensors"
+
+
+def make_checkpoint_folder(output: Path) -> None:
+    """Make the folder, so that one that cannot be made is told before anything is computed.
+
+    Raises
+    ------
+    OutputError
+        It cannot be made.
+    """
+    folder = checkpoint_in(output).parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the folder {folder}: {error.strerror}", "choose another folder"
+        ) from error
+
+
+def train_into(
+    output: Path,
+    trainer: Trainer,
+    data: torch.utils.data.Dataset,
+    measure: Callable[[Deformer], float],
+    write: Callable[[float], None],
+    resume: bool,
+    progress: Callable[[Progress], None] | None,
+) -> Path:
+    """Train, or go on from the folder's checkpoint; then measure the averaged weights, and write them.
+
+    Parameters
+    ----------
+    output : Path
+        The model folder.
+    measure : callable
+        The error of a network on what it has not seen.
+    write : callable
+        Writes the model, given the error of its averaged weights. Of several processes one calls it.
+
+    Returns
+    -------
+    Path
+        The model folder.
+    """
+    checkpoint = checkpoint_in(output)
+    if resume and checkpoint.is_file():
+        trainer.load(checkpoint)
+    trainer.run(data, checkpoint, progress, measure)
+    trainer.close()
+    if trainer.rank == 0:
+        trainer.model.load_state_dict(trainer.averaged_state())
+        write(measure(trainer.model))
+    return output
