@@ -21,9 +21,9 @@ def plain_text(text: str) -> str:
 def replace_on_success(path: str | Path) -> Iterator[Path]:
     """Give a temporary path beside `path`, and rename it to `path` when the block ends well.
 
-    The temporary name keeps the suffix, so writers that choose a format by it still do. On any exception,
-    Ctrl-C included, the temporary file is removed and whatever was at `path` before is untouched. Where `path` is a
-    link, what it leads to is replaced, and the link stays.
+    The temporary name keeps the suffix, so writers that choose a format by it still do. On any exception, Ctrl-C
+    included (and SIGTERM, which the command line turns into it), the temporary file is removed and whatever was at
+    `path` before is untouched. Where `path` is a link, what it leads to is replaced, and the link stays.
 
     Raises
     ------

@@ -1,16 +1,22 @@
 """The only place where an error becomes words and an exit status.
 
-0 done, 1 the user's data or choice, 2 usage, 130 interrupted. Anything that is not a `MeshmatchError` is a bug and
-keeps its traceback; with MESHMATCH_DEBUG=1 so does everything else.
+0 done, 1 the user's data or choice, 2 usage, 130 interrupted, 143 killed by SIGTERM. Anything that is not a
+`MeshmatchError` is a bug and keeps its traceback; with MESHMATCH_DEBUG=1 so does everything else.
 """
 
 import os
-from collections.abc import Sequence
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 from meshmatch.errors import MeshmatchError
 
 DEBUG_VARIABLE = "MESHMATCH_DEBUG"
-INTERRUPTED = 130
+INTERRUPTED, KILLED = 130, 143
+_TWICE = 1.0  # seconds within which a second signal is the same one: `timeout` sends two
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -22,20 +28,58 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Words after the program's name; those of the process if not given.
     """
     debug = os.environ.get(DEBUG_VARIABLE, "") not in ("", "0")
-    try:
-        status = _run(arguments)
-    except MeshmatchError as error:
-        if debug:
-            raise
-        _tell("error", error.message, error.hint)
-        return 1
-    except KeyboardInterrupt:
-        if debug:
-            raise
-        status = INTERRUPTED
-    if status == INTERRUPTED:
-        _tell("interrupted", "no file is half-written")
+    with _kill_as_interrupt() as killed:
+        try:
+            status = _run(arguments)
+        except KeyboardInterrupt:
+            if debug:
+                raise
+            status = INTERRUPTED
+        except Exception as error:
+            if debug:
+                raise
+            if killed():  # a process that was killed with this one may be missed first
+                status = INTERRUPTED
+            elif isinstance(error, MeshmatchError):
+                _tell("error", error.message, error.hint)
+                return 1
+            else:
+                raise
+    if killed() and status:
+        status = KILLED
+    if status in (INTERRUPTED, KILLED):
+        _tell("interrupted" if status == INTERRUPTED else "killed", "no file is half-written")
     return status
+
+
+@contextmanager
+def _kill_as_interrupt() -> Iterator[Callable[[], bool]]:
+    """Inside, SIGTERM ends the program as Ctrl-C does, so that nothing half-written stays; gives whether it came.
+
+    A program that runs this one inside itself may have its own way with the signal, which is left as it is.
+    """
+    came: list[float] = []
+    owner = os.getpid()
+
+    def stop(number: int, frame: Any) -> None:
+        if os.getpid() != owner:  # forked from this one: such a process ends as if nothing had been said
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        again = bool(came) and time.monotonic() - came[0] < _TWICE
+        came.append(time.monotonic())
+        if not again:
+            raise KeyboardInterrupt
+
+    ours = threading.current_thread() is threading.main_thread()
+    if not ours or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield lambda: False
+        return
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        yield lambda: bool(came)
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _run(arguments: Sequence[str] | None) -> int:

@@ -1,5 +1,7 @@
 """Errors become words and a status in one place."""
 
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +12,8 @@ from meshmatch import __version__
 from meshmatch.cli import main
 from meshmatch.errors import InputError
 from tests.cli.conftest import Run
+
+ROOT = Path(__file__).resolve().parents[2]
 
 VERBS = ("match", "register", "evaluate", "info", "models", "prepare", "train")
 
@@ -83,6 +87,107 @@ def test_ctrl_c_before_the_verb_is_the_same(run: Run, monkeypatch: pytest.Monkey
     assert (answer.status, answer.err) == (130, "interrupted: no file is half-written\n")
 
 
+# A verb that writes, ends a process that it forked, and waits; while it cleans up, a second signal comes.
+WRITING = """
+import os, signal, sys, time
+from pathlib import Path
+from meshmatch.cli import main
+from meshmatch.outputs import replace_on_success
+from meshmatch.shapes import files
+
+def load(path):
+    child = os.fork()
+    if not child:
+        try:
+            time.sleep(60)
+        finally:
+            os._exit(7)
+    os.kill(child, signal.SIGTERM)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+    try:
+        with replace_on_success("out.ply") as temporary:
+            temporary.write_text("ply")
+            print("writing", flush=True)
+            time.sleep(60)
+    finally:
+        os.kill(os.getpid(), signal.SIGTERM)
+        Path("cleaned").touch()
+
+files.load_shape = load
+sys.exit(main(["info", "a.ply"]))
+"""
+
+
+def test_a_kill_leaves_no_file_behind_and_is_143(tmp_path: Path) -> None:
+    outside = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITING],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=outside,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        assert process.stdout.readline() == f"{-signal.SIGTERM}\n"  # the forked one ended as any other
+        assert process.stdout.readline() == "writing\n"
+        (half,) = tmp_path.iterdir()
+        assert half.name.startswith(".out.")
+        process.send_signal(signal.SIGTERM)
+        words = process.communicate()[1]
+    assert (process.returncode, words) == (143, "killed: no file is half-written\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["cleaned"]
+
+
+def test_a_second_kill_later_counts(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the first was lost, in a callback that swallows whatever is raised, another one is heard."""
+    clock = iter((0.0, 5.0, 5.0))
+    monkeypatch.setattr("meshmatch.cli.boundary.time", type("Clock", (), {"monotonic": lambda: next(clock)}))
+    lost = []
+
+    def load(path: Path) -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            lost.append(path)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("meshmatch.shapes.files.load_shape", load)
+    assert run("info", "a.ply").status == 143
+    assert lost
+
+
+def test_what_a_kill_breaks_is_no_bug(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(path: Path) -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            raise RuntimeError("a worker is gone") from None
+
+    monkeypatch.setattr("meshmatch.shapes.files.load_shape", load)
+    answer = run("info", "a.ply")
+    assert (answer.status, answer.err) == (143, "killed: no file is half-written\n")
+
+
+def test_the_signal_is_only_borrowed(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Afterwards it does what it did; and a handler of a program around this one is left alone."""
+    inside: list[object] = []
+
+    def load(path: Path) -> None:
+        inside.append(signal.getsignal(signal.SIGTERM))
+        raise InputError("bad file")
+
+    def own(number: int, frame: object) -> None: ...
+
+    monkeypatch.setattr("meshmatch.shapes.files.load_shape", load)
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        for handler in (signal.SIG_DFL, own, signal.SIG_IGN):
+            signal.signal(signal.SIGTERM, handler)
+            assert run("info", "a.ply").status == 1
+            assert signal.getsignal(signal.SIGTERM) is handler
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert inside[0] is not signal.SIG_DFL
+    assert inside[1:] == [own, signal.SIG_IGN]
+
+
 def test_a_bug_keeps_its_traceback(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     fail(ZeroDivisionError("a bug"), monkeypatch)
     with pytest.raises(ZeroDivisionError):
@@ -106,7 +211,7 @@ def test_debug_can_be_off(run: Run, monkeypatch: pytest.MonkeyPatch, value: str)
 
 def test_python_m_meshmatch_passes_the_status_on(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "meshmatch", "info", str(tmp_path / "nothing.ply")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 1
     assert done.stdout == ""
     assert "Traceback" not in done.stderr
