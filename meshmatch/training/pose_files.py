@@ -8,11 +8,8 @@ and carry along everything beyond the joint.
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -23,14 +20,16 @@ import numpy as np
 import torch
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.arrays import read_npz
 from meshmatch.training.rig import Rig
 from meshmatch.training.rotations import rotation_from_vector
 from meshmatch.training.skeleton import forward_kinematics
 
 MOST_BYTES = 60_000_000
-"""A larger file, or a larger array in an archive, is refused before it is read."""
+"""A larger file is refused before it is read."""
 MOST_VECTORS = 5_000_000
-"""Poses times joints."""
+"""Poses times joints, of a table."""
+_MOST_LETTERS = 1_000_000  # bytes of an array of names: each becomes a string of its own
 COLUMNS = ("pose", "joint", "x", "y", "z")
 
 _HINT = "see docs/formats.md for what a file of poses holds"
@@ -155,47 +154,33 @@ def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
         raise InputError(f"there is no file {path}", _HINT)
     try:
         if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"it is larger than {MOST_BYTES // 10**6} MB", "split it, or keep fewer poses")
+            raise InputError(
+                f"{path.name}: it is larger than {MOST_BYTES // 10**6} MB", "split it, or keep fewer poses"
+            )
         joints, vectors = read(path)
+    except _DAMAGE as error:
+        raise InputError(f"{path.name} is no file of poses: {error}", _HINT) from error
+    try:
         return GivenPoses(joints, vectors, share)
     except InputError as error:
         raise InputError(f"{path.name}: {error.message}", error.hint) from error
-    except _DAMAGE as error:
-        raise InputError(f"{path.name} is no file of poses: {error}", _HINT) from error
 
 
-_DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, csv.Error, zipfile.BadZipFile, zlib.error,
-           NotImplementedError, RecursionError, RuntimeError)  # fmt: skip
+_DAMAGE = (OSError, ValueError, KeyError, TypeError, csv.Error, RecursionError)
 
 
 def _read_npz(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
     """Arrays `joints` (J,) of text and `rotations` (P, J, 3)."""
-    with zipfile.ZipFile(path) as archive:
-        joints, vectors = (_member(archive, name) for name in ("joints", "rotations"))
+    found = read_npz(path, ("joints", "rotations"))
+    for name in ("joints", "rotations"):
+        if name not in found:
+            raise ValueError(f"it has no array {name!r}")
+    joints = found["joints"]
     if joints.dtype.kind not in "US" or joints.ndim != 1:
         raise ValueError(f"joints are {joints.dtype} of {_shown(joints.shape)}, not a list of names")
-    return _names(joints.astype(np.str_).tolist()), vectors
-
-
-def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """An array of an archive; neither a bomb nor a header that promises too much is followed."""
-    try:
-        info = archive.getinfo(f"{name}.npy")
-    except KeyError:
-        raise ValueError(f"it has no array {name!r}") from None
-    if info.file_size > MOST_BYTES:
-        raise ValueError(f"{name} is larger than {MOST_BYTES // 10**6} MB")
-    data = io.BytesIO(archive.read(info))
-    version = np.lib.format.read_magic(data)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = header(data)
-    if dtype.hasobject or dtype.kind not in "fiuUS":
-        raise ValueError(f"{name} holds {dtype}, neither numbers nor text")
-    if math.prod(shape) * dtype.itemsize > info.file_size - data.tell():
-        raise ValueError(f"{name} is cut short")
-    data.seek(0)
-    array: np.ndarray = np.load(data, allow_pickle=False)
-    return array
+    if max(joints.nbytes, len(joints)) > _MOST_LETTERS:
+        raise ValueError(f"{len(joints)} joints of {joints.dtype} are too many")
+    return _names(joints.astype(np.str_).tolist()), found["rotations"]
 
 
 def _read_json(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
@@ -207,7 +192,7 @@ def _read_json(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
         raise ValueError("joints are not a list of names")
     try:
         vectors = np.array(found["rotations"], np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         raise ValueError("rotations are not lists of numbers, equally long") from None
     return _names(found["joints"]), vectors
 
