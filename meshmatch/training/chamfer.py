@@ -93,6 +93,7 @@ def chamfer_losses(
     terms = dict(shape)
     if config.blend:
         share = torch.rand(len(code), 1, generator=generator).to(code.device)
+        # Neighbours are of different shapes: each is drawn once before one comes again, and scanned once.
         F = points.deformation_gradient(model.decoder(share * code + (1 - share) * code.roll(1, 0)))
         terms["blend"] = config.blend * (volume_energy(F).mean() + arap_energy(F).mean())
     if model.corrector is not None:
