@@ -83,6 +83,33 @@ def test_points_far_away_and_lonely_are_dropped_and_no_others(system: NodeSystem
     assert sum(tuple(point) not in kept for point in strays[~near]) > 0.8 * (~near).sum() > 5
 
 
+def test_what_is_far_is_told_where_the_template_lies(system: NodeSystem) -> None:
+    """A cloud that stands elsewhere, and a candidate that says so: the same points are dropped."""
+    scan, none = cloud_of(system, 800, strays=40), np.zeros((system.K, 3))
+    turn, centre = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([0.4, -0.3, 0.2])
+    moved = Scan(scan.points @ turn.T + centre, scan.normals @ turn.T)
+    left = []
+    for cloud, rest in (
+        (scan, Candidate(EYE, ZERO, none, 0.0)),
+        (moved, Candidate(turn, centre, none, 0.0)),
+    ):
+        left.append(settle(system, cloud, rest, lambda part, start, rest=rest: rest)[1])
+    assert len(left[0].points) < 840
+    assert np.allclose(left[1].points, left[0].points @ turn.T + centre)
+    assert np.allclose(left[1].normals, left[0].normals @ turn.T)
+
+
+def test_a_centre_is_scaled_with_its_cloud(system: NodeSystem) -> None:
+    larger, centre = Candidate(EYE, np.array([0.4, -0.3, 0.2]), 0.1 * egg_model().template.nodes, 0.0), []
+
+    def lay(scan: Scan, start: Candidate) -> Candidate:
+        centre.append(start.centre)
+        return start
+
+    settle(system, cloud_of(system, 300), larger, lay)
+    assert np.allclose(centre, larger.centre / np.array([[1.1], [1.1**2], [1.3]]), rtol=1e-4)
+
+
 def test_a_lost_limb_is_not_dropped(system: NodeSystem) -> None:
     """Far from the template, but as dense as a surface is."""
     scan = cloud_of(system, 800)

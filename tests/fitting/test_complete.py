@@ -42,6 +42,32 @@ def test_all_of_a_whole_is_seen_and_nothing_beyond_a_cut(system: NodeSystem) -> 
     assert seen_area(system, np.ones(len(y), bool)) == pytest.approx(1.0)
 
 
+class Threads:
+    """Stands for a system: vertices that face up, each moved by a vector of its own."""
+
+    def __init__(self, verts: np.ndarray) -> None:
+        self.verts = verts
+
+    def moved(self, vectors: np.ndarray) -> np.ndarray:
+        return self.verts + vectors
+
+    def normals(self, moved: np.ndarray) -> np.ndarray:
+        return np.tile([0.0, 0.0, 1.0], (len(moved), 1))
+
+
+def test_what_is_seen_is_near_and_belongs_there() -> None:
+    """A thread that is shown but for a loop that was pulled out of it; and another one, which lies upon it."""
+    x = np.linspace(0, 1, 21)
+    thread = np.stack([x, 0 * x, 0 * x], 1)
+    both = Threads(np.concatenate([thread, thread + np.array([2.0, 0, 0])]))
+    vectors = np.zeros_like(both.verts)
+    vectors[10] = [0, 0, 0.2]
+    vectors[21:] = [-2.0, 0, 0.03]
+    shown = np.delete(thread, 10, 0)
+    there = seen(both, Scan(shown, both.normals(shown)), vectors)  # type: ignore[arg-type]
+    assert there.nonzero()[0].tolist() == [n for n in range(21) if n != 10]
+
+
 def test_the_edge_of_a_cut_is_no_counterpart_of_what_lies_beyond(system: NodeSystem) -> None:
     """A template squeezed towards the cut comes near to its edge everywhere, and is not seen for that."""
     nodes = egg_model().template.nodes
@@ -53,8 +79,12 @@ def test_the_edge_of_a_cut_is_no_counterpart_of_what_lies_beyond(system: NodeSys
 
 def test_what_is_missing_stands_in_as_densely(system: NodeSystem) -> None:
     still, scan = np.zeros((system.K, 3)), above(system, 0.0)
-    share = seen_area(system, seen(system, scan, still))
+    there = seen(system, scan, still)
+    share = seen_area(system, there)
     whole = completed(system, scan, still, share, np.random.default_rng(0))
+    bare = np.array([face for face in system.faces if not there[face].any()])
+    count = round(len(scan.points) * Shape(system.verts, bare).area / share)
+    assert len(whole.points) == len(scan.points) + count
     rows = {tuple(point) for point in whole.points}
     assert all(tuple(point) in rows for point in scan.points)
     added = np.array(list(rows - {tuple(point) for point in scan.points}))
@@ -63,6 +93,47 @@ def test_what_is_missing_stands_in_as_densely(system: NodeSystem) -> None:
     assert np.allclose(np.linalg.norm(whole.normals, axis=1), 1)
     everything = above(system, -9.0)
     assert len(completed(system, everything, still, 1.0, np.random.default_rng(0)).points) < 4200
+
+
+def test_normals_of_no_sure_side_are_turned_first(system: NodeSystem) -> None:
+    scan, still = above(system, 0.0), np.zeros((system.K, 3))
+    inward = Scan(scan.points, -scan.normals, signed=False)
+    assert (seen(system, inward, still) == seen(system, scan, still)).mean() > 0.97
+    whole = completed(system, inward, still, 0.5, np.random.default_rng(0))
+    assert ((whole.normals * whole.points).sum(1) > 0).mean() > 0.97
+
+
+def test_what_stands_in_lies_on_the_fit_and_is_mixed_in(system: NodeSystem) -> None:
+    longer = np.zeros((system.K, 3))
+    longer[:, 1] = 0.3 * egg_model().template.nodes[:, 1]
+    egg = scan_of(Shape(system.moved(longer), system.faces), 4000)
+    upper = egg.points[:, 1] > 0
+    scan = Scan(egg.points[upper], egg.normals[upper])
+    whole = completed(system, scan, longer, 0.5, np.random.default_rng(0))
+    assert cKDTree(egg.points).query(whole.points)[0].max() < 0.06
+    assert whole.points[:, 1].min() == pytest.approx(egg.points[:, 1].min(), abs=0.02)
+    apart, which = cKDTree(scan.points).query(whole.points)
+    own = apart == 0
+    assert own.sum() == len(scan.points)
+    assert np.array_equal(whole.normals[own], scan.normals[which[own]])
+    quarter = len(own) // 4  # what is coarse takes the first points alone
+    assert own[:quarter].mean() == pytest.approx(own.mean(), abs=0.1)
+
+
+def test_a_small_part_is_not_drowned(system: NodeSystem) -> None:
+    scan = above(system, float(np.quantile(system.verts[:, 1], 0.9)))
+    whole = completed(system, scan, np.zeros((system.K, 3)), 0.2, np.random.default_rng(0))
+    assert len(whole.points) == 4 * len(scan.points)
+
+
+def test_what_is_seen_is_measured_by_area(system: NodeSystem) -> None:
+    area = np.zeros(len(system.verts))
+    for face in system.faces:
+        a, b, c = system.verts[face]
+        area[face] += np.linalg.norm(np.cross(b - a, c - a)) / 6
+    there = area > np.median(area)
+    assert seen_area(system, there) == pytest.approx(area[there].sum() / area.sum())
+    assert seen_area(system, there) > there.mean() + 0.05
 
 
 def test_a_reading_knows_its_size_and_what_it_costs() -> None:

@@ -50,6 +50,17 @@ def test_strays_are_left_out_and_surface_is_not(system: NodeSystem) -> None:
     assert without_strays(surface) is surface
 
 
+def test_only_clouds_have_strays(system: NodeSystem) -> None:
+    """A spike of a mesh is surface: its triangles say so."""
+    verts = np.array(system.verts)
+    verts[7] *= 5
+    mesh, cloud = Shape(verts, system.faces), Shape(verts, NO_FACES, "thorn")
+    assert without_strays(mesh) is mesh
+    left = without_strays(cloud)
+    assert left.name == "thorn"
+    assert tuple(verts[7]) not in {tuple(point) for point in left.verts}
+
+
 def test_a_sparse_region_is_not_stray() -> None:
     """Far from each other, but not further than their neighbours are from theirs."""
     fine = np.stack(np.meshgrid(np.arange(30.0), np.arange(30.0), [0.0]), -1).reshape(-1, 3)
