@@ -48,8 +48,8 @@ class AgreeConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all points, shared, a stiffer template."""
         return replace(
             self,
-            strain=between(self.strain, 10 * self.strain, roughness),
-            point_share=between(self.point_share, max(self.point_share, 1.0), roughness),
+            strain=between(self.strain, 20 * self.strain, roughness),
+            point_share=between(self.point_share, max(self.point_share, 3.0), roughness),
             back_points=round(self.back_points * (1 + roughness)),
             shared=max(self.shared, roughness),
         )
