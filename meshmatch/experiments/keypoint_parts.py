@@ -17,6 +17,7 @@ from meshmatch.render.scales import label_colors
 from meshmatch.shapes.shape import Shape
 
 _TOPS, _FEET = (4, 6, 8, 10), (5, 7, 9, 11)  # keypoints of a table's legs
+_SQUARE = [[(first + way * k) % 4 for k in range(4)] for first in range(4) for way in (1, -1)]
 _BELOW = 0.25  # of the way from the legs' tops to their feet: there legs are apart
 _SMALLEST = 20  # vertices of a leg
 
@@ -66,6 +67,30 @@ def leg_confidence(
         "legs_alike": rounded(float(values[same].mean()) if same.any() else np.nan),
         "legs_unlike": rounded(float(values[~same].mean()) if (~same).any() else np.nan),
     }
+
+
+def leg_errors(
+    shapes: Mapping[str, Shape],
+    keypoints: Mapping[str, np.ndarray],
+    maps: Mapping[Pair, tuple[np.ndarray, np.ndarray]],
+    near: float,
+) -> dict[str, Any]:
+    """Errors at the ends of tables' legs, over the target's diagonal, whichever leg is called the first and whichever
+    way round they are counted: of the eight numberings of a square the one that suits a pair best. A table looks the
+    same in all of them; a leg that is torn between two others is wrong in each."""
+    found = []
+    for (source, target), (index, _) in maps.items():
+        shape = shapes[target]
+        ends = np.array([_TOPS, _FEET])  # 2 4
+        places = shape.verts[index[keypoints[source][ends]]]
+        truth = shape.verts[keypoints[target][ends]]
+        apart = [
+            np.linalg.norm(places - truth[:, order], axis=-1).reshape(-1) / shape.diagonal
+            for order in _SQUARE
+        ]
+        found.append(min(apart, key=lambda each: float(each.mean())))
+    error = np.concatenate(found)
+    return {"legs_mean": rounded(float(error.mean())), "legs_arrived": rounded(float((error < near).mean()))}
 
 
 def rounded(value: float) -> float | None:

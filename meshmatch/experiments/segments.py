@@ -10,8 +10,9 @@ the area under its ROC curve, and its mean where the keypoint is right and where
 Files are turned every way. `--turns given` (the default) brings each shape to the axes of the first one with the turn
 of a cube that suits its keypoints best, so upright and facing the same way, as the benchmark's protocol gives it;
 `--turns searched` lets `meshmatch prepare --align rigid` find the orientation. The same shapes, in the same
-orientation, are matched by rigid alignment and the nearest vertex. Trained and measured on the same ten. The keypoints
-of tables run round the legs one way on some and the other way on others: their truth holds up to a reflection only.
+orientation, are matched by rigid alignment and the nearest vertex. Trained and measured on the same ten. A table looks
+the same from several sides, and keypoints begin at any leg and run round either way: so the ends of legs are measured
+once more, for every method, in the numbering that suits a pair best.
 Parts are drawn from keypoints: a vertex belongs to the nearest one. Labels of the target, fetched along the map, are
 compared with the source's own: intersection over union (IoU), by area, the mean over parts and pairs. Of tables the
 legs are counted (three, four or eight): a leg can have no counterpart where the other table has another number of
@@ -48,6 +49,7 @@ from meshmatch.experiments.keypoint_parts import (
     carried_picture,
     keypoint_parts,
     leg_confidence,
+    leg_errors,
     mean_overlap,
     rounded,
     table_legs,
@@ -144,7 +146,10 @@ def measure(
     if name == "table":
         legs = {key: table_legs(shape, keypoints[key]) for key, shape in shapes.items()}
     answers = nearest_all(shapes, how, "sphere", tell)
-    results: dict[str, Any] = {"rigid alignment, nearest vertex": keypoint_errors(shapes, keypoints, answers)}
+    rigid = keypoint_errors(shapes, keypoints, answers)
+    if legs:
+        rigid |= leg_errors(shapes, keypoints, answers, RIGHT)
+    results: dict[str, Any] = {"rigid alignment, nearest vertex": rigid}
     model, went = trained(folder, training, how=how, scale="sphere", tell=tell)
     for label, config in (
         ("network alone", FitConfig(seed=training.seed, refine="none", partial="no")),
@@ -160,7 +165,7 @@ def measure(
         results[label] = keypoint_errors(shapes, keypoints, answers)
         results[label]["verdicts"] = sorted(fit.verdict for fit in fits.values())
         if legs:
-            results[label] |= leg_confidence(legs, answers)
+            results[label] |= leg_confidence(legs, answers) | leg_errors(shapes, keypoints, answers, RIGHT)
     if pictures is not None:
         first = Path(went["template"]).stem
         parts = keypoint_parts(shapes[first], keypoints[first])
@@ -178,7 +183,7 @@ def run(
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
     numbers = ["mean", "median", f"within {RIGHT:g}", "IoU", "AUC", "sure if right", "if wrong"]
-    told = [*numbers, "AUC of legs", "sure if as many", "if not"]
+    told = [*numbers, "legs", f"within {RIGHT:g}", "AUC of legs", "sure if as many", "if not"]
     title = f"Keypoints, orientation {turns}: error / diagonal, all pairs"
     table = columns(title, ["class", "method"], told if "table" in classes else numbers)
     records = {}
@@ -188,6 +193,7 @@ def run(
         for number, (label, each) in enumerate(records[name]["results"].items()):
             sure = [each[f"confidence_{key}"] for key in ("auc", "right", "wrong")]
             if "table" in classes:
+                sure += [each.get("legs_mean"), each.get("legs_arrived")]
                 sure += [each.get(f"legs_{key}") for key in ("auc", "alike", "unlike")]
             table.add_row(
                 name if number == 0 else "",

@@ -144,6 +144,28 @@ def test_legs_are_counted_and_their_confidence_compared(monkeypatch: pytest.Monk
     assert alone["legs_auc"] is None and alone["legs_unlike"] is None
 
 
+def test_the_ends_of_legs_are_measured_in_the_best_of_a_squares_numberings() -> None:
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+    verts = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in (0.0, 1.0)])
+    table = Shape(verts, np.zeros((0, 3), int))
+    keypoints = np.array([0, 1, 2, 3, 4, 0, 5, 1, 6, 2, 7, 3])  # corners, then each leg's top and foot
+
+    def measured(order: list[int]) -> dict[str, float]:
+        index = np.array([*order, *(4 + k for k in order)])
+        maps = {("a", "b"): (index, np.ones(8))}
+        return keypoint_parts.leg_errors(
+            {"a": table, "b": table}, {"a": keypoints, "b": keypoints}, maps, 0.1
+        )
+
+    for order in ([0, 1, 2, 3], [1, 2, 3, 0], [3, 2, 1, 0], [0, 3, 2, 1]):
+        assert measured(order) == {"legs_mean": 0, "legs_arrived": 1}, order
+    # Two neighbours are exchanged: no numbering of a square suits more than two of the four legs.
+    assert measured([1, 0, 2, 3]) == {
+        "legs_mean": pytest.approx(0.5 / np.sqrt(3), abs=1e-4),
+        "legs_arrived": 0.5,
+    }
+
+
 def test_shapes_are_stood_alike() -> None:
     ball = icosphere(1)
     verts = ball.verts * [1, 2, 3]
