@@ -65,6 +65,9 @@ def train_into(
     checkpoint = checkpoint_in(output)
     if resume and checkpoint.is_file():
         trainer.load(checkpoint)
+        for name in ("encoder", "aligner"):  # what reads the batches are copies (see `build_dataset`)
+            if (reader := getattr(data, name, None)) is not None:
+                reader.load_state_dict(getattr(trainer.model, name).state_dict())
     trainer.run(data, checkpoint, progress, measure)
     trainer.close()
     if trainer.rank == 0:

@@ -111,8 +111,13 @@ def draw_limbs(draw: Draw, arm: torch.Tensor, family: torch.Tensor) -> Limbs:
         [0.45, 0.4, 0.15], [draw.normal(10, 14).abs(), draw.uniform(0, 145), draw.normal(90, 25)]
     )
     elbow = torch.stack([any_elbow] * FOLDED + [draw.normal(95, 26), draw.normal(130, 14)])[arm, at]
-    # A positive twist turns the forearm inwards.
+    # A positive twist turns the forearm inwards. An arm that is raised turns outwards in its socket, or palms would
+    # face away from each other overhead.
+    raised = ((elevation - 70) / 80).clamp(0, 1)
     twist = torch.stack([draw.normal(0, 30)] * FOLDED + [draw.normal(45, 24), draw.normal(20, 26)])[arm, at]
+    twist = twist - raised * draw.uniform(10, 110)
+    any_pronation = draw.choice([0.7, 0.3], [draw.normal(10, 38), draw.uniform(-85, 95)])
+    pronation = any_pronation - raised * draw.uniform(0, 50)
     # Families of the legs: stand, wide, crouch or sit, kneel, bend forward, lunge (left or right first).
     flexion = torch.stack(
         [
@@ -148,9 +153,9 @@ def draw_limbs(draw: Draw, arm: torch.Tensor, family: torch.Tensor) -> Limbs:
     return Limbs(
         arm_elevation=elevation,
         arm_azimuth=azimuth,
-        arm_twist=twist.clamp(-80, 85),
+        arm_twist=twist.clamp(-130, 85),
         elbow=elbow.clamp(0, 150),
-        pronation=draw.normal(10, 38).clamp(-85, 95),
+        pronation=pronation.clamp(-90, 95),
         hip_flexion=flexion,
         hip_abduction=spread,
         hip_twist=draw.normal(5, 16) + 0.25 * flexion.clamp_min(0) * draw.uniform(-0.6, 1.2),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 
@@ -38,7 +39,7 @@ class LossPoints:
     positions: torch.Tensor
     field: PointField
 
-    def to(self, device: torch.device) -> LossPoints:
+    def to(self, device: torch.device) -> Self:
         return type(self)(*(value.to(device) for value in vars(self).values()))
 
     def moved(self, vectors: torch.Tensor) -> torch.Tensor:

@@ -171,7 +171,7 @@ def train_model(
     held_out = replace(dataset, seed=VALIDATION_SEED, shapes=32, scans_per_shape=1)[0]
 
     def measure(model: Deformer) -> float:
-        return validation_error(model, held_out, points)
+        return validation_error(model, held_out, trainer.points)
 
     write = partial(
         export,

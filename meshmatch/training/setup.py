@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import numpy as np
 import torch
 
@@ -97,7 +99,10 @@ def build_dataset(
     length: int = 1,
     supervised: int = 1000,
 ) -> BatchDataset:
-    """Batches of a source for a model, supervised on ``supervised`` template vertices."""
+    """Batches of a source for a model, supervised on ``supervised`` template vertices.
+
+    Batches are drawn on the CPU, by processes of their own, wherever the model goes: so they have its encoders' copies.
+    """
     verts = torch.from_numpy(np.array(template.shape.verts)).float()
     core = torch.from_numpy(template.core)
     return BatchDataset(
@@ -106,8 +111,8 @@ def build_dataset(
         template_core=verts[core],
         core=core,
         loss_points=torch.from_numpy(loss_vertices(template, supervised)),
-        encoder=model.encoder,
-        aligner=model.aligner,
+        encoder=deepcopy(model.encoder).cpu(),
+        aligner=None if model.aligner is None else deepcopy(model.aligner).cpu(),
         scan=scan,
         shapes=shapes,
         scans_per_shape=scans_per_shape,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -106,13 +107,13 @@ def train_clouds(
     model = build_cloud_deformer(template, dataset, recipe, config.seed)
     if start is not None:
         take_weights(model, template, recipe, start)
-    dataset = replace(dataset, encoder=model.encoder)
+    dataset = replace(dataset, encoder=deepcopy(model.encoder).cpu())
     points = build_surface_points(template, recipe.kernel, model, gathered.template_landmarks)
     trainer = Trainer(model, points, config, chamfer_losses)
     held_out = replace(dataset, seed=VALIDATION_SEED, shapes=min(32, 2 * len(gathered.points)))[0]
 
     def measure(model: Deformer) -> float:
-        return surface_error(model, held_out, points)
+        return surface_error(model, held_out, points.to(trainer.device))
 
     write = partial(
         export,

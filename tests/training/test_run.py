@@ -19,7 +19,7 @@ from meshmatch.training import run
 from meshmatch.training.loop import Progress, TrainConfig
 from meshmatch.training.run import Recipe, copy_model, folder_source, read_template, recipe, train_model
 from meshmatch.training.scans import ScanConfig
-from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template
+from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template, small_data, small_network
 from tests.training.stick import stick_figure
 
 SMALL = Recipe(
@@ -79,6 +79,30 @@ def test_a_folder_becomes_a_model(prepared: Path, tmp_path: Path, chosen: Recipe
     points = torch.randn(2, 50, 3, generator=torch.Generator().manual_seed(0)) * 0.2
     assert model.network(points).shape == (2, model.template.K, 3)
     assert not model.network.training
+
+
+def test_batches_are_drawn_on_the_cpu_wherever_the_model_is() -> None:
+    template = egg_template()
+    model = small_network(template)
+    data = small_data(template, model)
+    there = data[0]
+    model.to("meta")  # a device on which nothing can be computed
+    assert torch.equal(data[0].encode_features, there.encode_features)
+    assert there.align_features is not None and data[0].align_features is not None
+    assert torch.equal(data[0].align_features, there.align_features)
+
+
+def test_a_training_begun_from_a_model_goes_on_without_being_told_of_it(
+    prepared: Path, tmp_path: Path
+) -> None:
+    """The basis of the encoder is the model's, and reads the rest of the batches too."""
+    other = replace(SMALL, train=replace(SMALL.train, seed=5))
+    start = load_model(trained(prepared, tmp_path / "start", other))
+    whole = verify_model(trained(prepared, tmp_path / "whole", start=start))
+    half = replace(SMALL, train=replace(SMALL.train, minutes=1e-9))
+    trained(prepared, tmp_path / "stopped", half, start=start)  # one step of four
+    card = verify_model(trained(prepared, tmp_path / "stopped"))
+    assert (card.steps, card.weights_sha256) == (4, whole.weights_sha256)
 
 
 def test_training_goes_on_from_the_checkpoint_unless_told_not_to(prepared: Path, tmp_path: Path) -> None:
