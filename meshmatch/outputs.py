@@ -17,6 +17,22 @@ def plain_text(text: str) -> str:
     return text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder if it is not there; before long work, so that one that cannot be made is told at once.
+
+    Raises
+    ------
+    OutputError
+        It cannot be made, or is a file.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the folder {path}: {error.strerror}", "choose another folder"
+        ) from error
+
+
 @contextmanager
 def replace_on_success(path: str | Path) -> Iterator[Path]:
     """Give a temporary path beside `path`, and rename it to `path` when the block ends well.

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.folders import make_folder
 from meshmatch.cli.voice import Voice, print_json
+from meshmatch.outputs import make_folder
 
 if TYPE_CHECKING:
     import numpy as np

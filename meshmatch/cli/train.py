@@ -11,8 +11,8 @@ import typer
 
 from meshmatch.cli import options
 from meshmatch.cli.claims import check_png, check_writable
-from meshmatch.cli.folders import make_folder
 from meshmatch.cli.voice import Voice, print_json
+from meshmatch.outputs import make_folder
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel

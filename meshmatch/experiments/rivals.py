@@ -32,7 +32,7 @@ from typing import Any
 from rich.console import Console
 
 from meshmatch.config import set_threads
-from meshmatch.errors import OptionError, OutputError
+from meshmatch.errors import OptionError
 from meshmatch.experiments.adapters import CodedMatcher, MeshmonkMatcher, NricpMatcher, RigidMatcher
 from meshmatch.experiments.bench import PipelineMatcher, chosen_pairs
 from meshmatch.experiments.protocols import CLOUD_SET, SET_NAMES, load_set
@@ -40,6 +40,7 @@ from meshmatch.experiments.report import circumstances, status_of
 from meshmatch.experiments.rival_cells import Cells, Rival, draw_cells, measured, print_cells
 from meshmatch.experiments.spectral import ZoomOutMatcher
 from meshmatch.maps.geodesics import GEODESIC
+from meshmatch.outputs import make_folder
 
 NAMES = ("rigid", "zoomout", "nricp", "meshmonk", "coded", "transmatch", "ours")
 _INSTALL = "pip install 'meshmatch[bench]'"
@@ -127,10 +128,7 @@ def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
     until = time.monotonic() + 60 * options.minutes
     benches = [load_set(name, options.data) for name in options.sets.split(",")]
     rivals = find_rivals(options)
-    try:
-        options.output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder {options.output}: {error.strerror}") from error
+    make_folder(options.output)
     cells: Cells = {bench.name: {} for bench in benches}
     for rival in rivals:
         for bench in benches:

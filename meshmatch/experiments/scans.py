@@ -24,6 +24,7 @@ from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.maps.place import place
+from meshmatch.outputs import make_folder
 from meshmatch.pipeline import as_shape, read_model, register, usable
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
@@ -49,6 +50,7 @@ def scan_panels(name: str, shape: Shape, fit: Fit, labels: np.ndarray) -> list[P
 def run(files: Sequence[Path], folder: Path, *, model: str, seed: int) -> dict[str, Any]:
     """Register, measure, draw; prints a table and a JSON line, whose record is returned too."""
     set_threads(1)
+    make_folder(folder)
     template = read_model(model).template
     labels = np.asarray(template.labels)
     rows: dict[str, Any] = {}
@@ -66,7 +68,6 @@ def run(files: Sequence[Path], folder: Path, *, model: str, seed: int) -> dict[s
         }
         panels += scan_panels(path.stem, shape, fit, labels)
     pictures = []
-    folder.mkdir(parents=True, exist_ok=True)
     for number, first in enumerate(range(0, len(panels), 2 * _IN_A_PICTURE)):
         pictures.append(folder / f"scans-{number + 1}.png")
         render_shapes(panels[first : first + 2 * _IN_A_PICTURE], pictures[-1], Look())

@@ -57,6 +57,7 @@ from meshmatch.experiments.keypoint_parts import (
 from meshmatch.experiments.report import columns, publish, status_of
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.latent import LatentRefineConfig
+from meshmatch.outputs import make_folder
 from meshmatch.render.picture import Look
 from meshmatch.shapes.align import Align
 from meshmatch.shapes.files import save_shape
@@ -181,7 +182,7 @@ def run(
         raise OptionError(f"there is no class '{strangers[0]}'", f"choose from {', '.join(CLASSES)}")
     set_threads(training.threads)
     if pictures is not None:
-        pictures.mkdir(parents=True, exist_ok=True)
+        make_folder(pictures)
     numbers = ["mean", "median", f"within {RIGHT:g}", "IoU", "AUC", "sure if right", "if wrong"]
     told = [*numbers, "legs", f"within {RIGHT:g}", "AUC of legs", "sure if as many", "if not"]
     title = f"Keypoints, orientation {turns}: error / diagonal, all pairs"

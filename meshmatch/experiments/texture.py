@@ -35,6 +35,7 @@ from meshmatch.experiments.speed import Cost, cost_of, keep_to_cores, sized
 from meshmatch.fitting.dense import dense_shape
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.outputs import make_folder
 from meshmatch.pipeline import carry, read_model, register
 from meshmatch.shapes.appearance import Appearance, Material, load_appearance
 from meshmatch.shapes.decimate import decimate
@@ -256,7 +257,7 @@ def main(words: Sequence[str] | None = None) -> int:
     choices = replace(Choices(), size=options.size, samples=options.samples, workers=options.threads)
     try:
         if options.keep is not None:
-            options.keep.mkdir(parents=True, exist_ok=True)
+            make_folder(options.keep)
         run(cases, options.data, choices, options.keep, not options.no_clock)
     except MeshmatchError as error:
         explain(error)

@@ -27,11 +27,11 @@ from rich.console import Console
 from torch import nn
 
 from meshmatch.config import set_threads
-from meshmatch.errors import MeshmatchError, OptionError, OutputError
+from meshmatch.errors import MeshmatchError, OptionError
 from meshmatch.experiments.report import circumstances, explain
 from meshmatch.experiments.transformer import TEMPLATE, WEIGHTS, WORDS, TransConfig, TransMatch
 from meshmatch.models.checkpoint import load_weights, save_weights
-from meshmatch.outputs import replace_on_success
+from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import Template, load_template, save_template
 from meshmatch.training.datasets import Source
@@ -108,10 +108,7 @@ def train(
     ModelError
         The checkpoint is of another network or template.
     """
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder {output}: {error.strerror}") from error
+    make_folder(output)
     torch.manual_seed(schedule.seed)
     network = TransMatch(config)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

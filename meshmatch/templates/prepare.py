@@ -11,8 +11,8 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from meshmatch.errors import InputError, MeshmatchError, OutputError
-from meshmatch.outputs import replace_on_success
+from meshmatch.errors import InputError, MeshmatchError
+from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.shapes.align import Align
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
@@ -103,7 +103,7 @@ def prepare_folder(
     known_files = find_known(landmarks, folder, files)
     if not files:
         raise InputError(f"no shapes in {folder}", f"files that end in {', '.join(SUFFIXES)} are read")
-    _make_folder(output / "normalised")
+    make_folder(output / "normalised")
     tell = progress or (lambda done, total: None)
     found: list[Repaired] = []
     known: list[np.ndarray | None] = []
@@ -239,15 +239,6 @@ def _template_known(first, own, known, landmarks, made, low) -> np.ndarray | Non
     # the way from the template's file to its frame, read off two of its vertices' places
     frame = sqrt_area_frame(Shape(first.shape.verts[low[0]], low[1], made.name))
     return frame.apply(places)
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot make the folder {folder}: {error.strerror}", "choose another folder"
-        ) from error
 
 
 def _enough(clean: Repaired) -> Repaired:

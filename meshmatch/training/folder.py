@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 
-from meshmatch.errors import OutputError
 from meshmatch.models.deformer import Deformer
 from meshmatch.training.loop import Progress, Trainer
 
@@ -18,23 +17,6 @@ VALIDATION_SEED = 999_983
 def checkpoint_in(output: Path) -> Path:
     """Where the checkpoint of a training into a folder lies."""
     return output / "checkpoint" / "last.safetensors"
-
-
-def make_checkpoint_folder(output: Path) -> None:
-    """Make the folder, so that one that cannot be made is told before anything is computed.
-
-    Raises
-    ------
-    OutputError
-        It cannot be made.
-    """
-    folder = checkpoint_in(output).parent
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot make the folder {folder}: {error.strerror}", "choose another folder"
-        ) from error
 
 
 def train_into(

@@ -19,11 +19,12 @@ from meshmatch.models.card import ModelCard, write_card
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig
 from meshmatch.models.trained import TrainedModel
+from meshmatch.outputs import make_folder
 from meshmatch.templates.prepare import read_registered
 from meshmatch.templates.template import Template, load_template
 from meshmatch.training.clouds import warped_source
 from meshmatch.training.datasets import Source, body_source, registered_source
-from meshmatch.training.folder import VALIDATION_SEED, make_checkpoint_folder, train_into
+from meshmatch.training.folder import VALIDATION_SEED, checkpoint_in, train_into
 from meshmatch.training.human_template import restrict
 from meshmatch.training.loop import Progress, TrainConfig, Trainer
 from meshmatch.training.losses import LossConfig, LossPoints, distance
@@ -158,7 +159,7 @@ def train_model(
         The model folder.
     """
     output = Path(output)
-    make_checkpoint_folder(output)
+    make_folder(checkpoint_in(output).parent)
     config = recipe.train
     model = build_deformer(template, source, recipe.network, recipe.scan, recipe.kernel, config.seed)
     if start is not None:

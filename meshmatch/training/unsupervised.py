@@ -13,12 +13,13 @@ import torch
 from meshmatch.errors import InputError
 from meshmatch.models.deformer import PAPER, Deformer
 from meshmatch.models.trained import TrainedModel
+from meshmatch.outputs import make_folder
 from meshmatch.templates.gather import Gathered
 from meshmatch.templates.template import Template
 from meshmatch.training.chamfer import SurfacePoints, build_surface_points, chamfer_losses
 from meshmatch.training.clouds import CloudBatch, CloudConfig, CloudDataset, build_warp
 from meshmatch.training.few import few_recipe
-from meshmatch.training.folder import VALIDATION_SEED, make_checkpoint_folder, train_into
+from meshmatch.training.folder import VALIDATION_SEED, checkpoint_in, train_into
 from meshmatch.training.loop import Progress, TrainConfig, Trainer
 from meshmatch.training.losses import LossConfig
 from meshmatch.training.run import Preset, Recipe, export, take_weights
@@ -101,7 +102,7 @@ def train_clouds(
             "one shape is too few to learn from", "prepare a folder of several; ten or more are better"
         )
     output = Path(output)
-    make_checkpoint_folder(output)
+    make_folder(checkpoint_in(output).parent)
     config = recipe.train
     dataset = build_cloud_dataset(gathered, recipe, change)
     model = build_cloud_deformer(template, dataset, recipe, config.seed)
