@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from meshmatch.experiments import segments
 from meshmatch.experiments.scans import main, scan_panels
 from meshmatch.pipeline import read_model, register
 from meshmatch.render.scales import label_colors
@@ -33,3 +34,19 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert (tmp_path / "new" / "scans-1.png").stat().st_size > 10_000
     assert main([str(tmp_path / "none.ply")]) == 1
     assert "none.ply" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("benchmark", ["scans", "segments"])
+def test_a_folder_that_cannot_be_made_is_told_before_any_work(
+    benchmark: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = tmp_path / "taken"
+    taken.write_text("a file")
+    words = {
+        "scans": [str(DANCER), "-o", str(taken)],
+        "segments": ["--data", str(tmp_path), "--pictures", str(taken)],
+    }[benchmark]
+    assert {"scans": main, "segments": segments.main}[benchmark](words) == 1
+    said = capsys.readouterr().err
+    assert "cannot make the folder" in said and "choose another folder" in said
+    assert "fitting" not in said
