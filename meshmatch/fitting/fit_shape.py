@@ -49,6 +49,8 @@ _Laid = tuple[Frame, Scan, Candidate]
 # if its residual is that much smaller. A mesh must be open for it, with a boundary of so many sqrt(area).
 # A part lacks that much of the surface.
 _LEFT, _CLOSER, _OPEN, _MISSING = 0.06, 0.85, 0.3, 0.03
+# Frames of each share of a part that are laid on with care, at first and where that gave a poor fit.
+_LAID, _MORE_LAID = 6, 16
 
 
 @lru_cache(maxsize=4)
@@ -92,8 +94,8 @@ def fit_shape(
     frame, scan = take_samples(shape, config.samples, rng, scan_frame(model, shape))
     laid, partial = _whole(model, shape, frame, scan, config, landmarks, rng, tell), False
     if landmarks is None and _try_part(model, shape, laid, config):
-        part = _part(model, frame, scan, config, tell)
-        visible = (frame.scale / part[0].scale) ** 2
+        part = _part(model, whole, frame, scan, config, tell)
+        visible = _shown(frame, part)
         smaller = cost(part[2].residual, visible) < _CLOSER * laid[2].residual
         partial = smaller and visible < 1 - _MISSING
         laid = part if partial else laid
@@ -124,8 +126,23 @@ def _whole(model, shape, frame, scan, config, landmarks, rng, tell) -> _Laid:
     return frame, scan, _refine(model, system, scan, frame, candidates, config, landmarks, rough, rng, tell)
 
 
-def _part(model, frame, scan, config, tell) -> _Laid:
-    """The template on a shape that is taken for a part."""
+def _part(model, shape, frame, scan, config, tell) -> _Laid:
+    """The template on a shape that is taken for a part; where that is poor, more orientations are tried."""
+    found = _sought(model, frame, scan, config, _LAID, tell)
+    if _finish(model, shape, found, config, partial=True).verdict != "poor":
+        return found
+    wider = replace(config, copies=2 * config.copies, hypotheses=4 * config.hypotheses)
+    again = _sought(model, frame, scan, wider, _MORE_LAID, tell)
+    return min(found, again, key=lambda laid: cost(laid[2].residual, _shown(frame, laid)))
+
+
+def _shown(frame: Frame, laid: _Laid) -> float:
+    """The share (0..1) of the whole that a fit of a part takes a shape to be."""
+    return (frame.scale / laid[0].scale) ** 2
+
+
+def _sought(model, frame, scan, config, laid: int, tell) -> _Laid:
+    """The best fit of a part that a search finds."""
     scale, sized, best = fit_part(
         model,
         node_system(model),
@@ -133,6 +150,7 @@ def _part(model, frame, scan, config, tell) -> _Laid:
         lambda part: _hypotheses(model, part, config),
         config.nodes,
         np.random.default_rng(config.seed),
+        laid=laid,
         variants_count=config.variants,
         tilt=config.tilt,
         screening=config.screening,

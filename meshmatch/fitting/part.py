@@ -30,7 +30,7 @@ _SHARE_COST = (
 )
 # Readings that are completed and asked about again: so many once, of these so many twice, and so many three times.
 _SOUGHT = (14, 7, 4)
-_LAID, _READ, _FINALISTS = 6, 2, 5
+_READ, _FINALISTS = 2, 5
 _COARSE = 2048
 _LEAST = 0.2  # share of a whole that a scan is taken to show at least
 
@@ -60,6 +60,7 @@ def fit_part(
     nodes: NodeRefineConfig,
     rng: np.random.Generator,
     *,
+    laid: int,
     variants_count: int,
     tilt: float,
     screening: int,
@@ -72,6 +73,7 @@ def fit_part(
     ----------
     scan : samples of what there is, area 1
     orient : core frames to try for a scan
+    laid : how many frames of each share are laid on with care
     nodes, screening : node refinement, and how many of its steps the finalists get
     variants_count, tilt : tilted readings of the best candidates
 
@@ -90,7 +92,7 @@ def fit_part(
         sized = replace(scan, points=scan.points * np.sqrt(share))
         coarse = sized.first(_COARSE)
         rough = [_laid(model, system, coarse, guess, rng, rounds=1, draws=1) for guess in orient(sized)]
-        for guess in sorted(rough, key=lambda laid: laid.residual)[:_LAID]:
+        for guess in sorted(rough, key=lambda laid: laid.residual)[:laid]:
             readings.append(PartReading(share, _laid(model, system, sized, guess, rng, rounds=2, draws=2)))
         tell(0.4 * (number + 1) / len(SHARES))
     for number, count in enumerate(_SOUGHT):

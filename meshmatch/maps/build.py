@@ -17,6 +17,8 @@ from meshmatch.shapes.shape import Shape
 _FIT_SCALE = 0.03
 # The same for how far agreement moved the two fits: what a shape alone said is not what both say.
 _AGREED_SCALE = 0.05
+# Of what a fit is judged poor by, no vertex knows: all of its map is believed half.
+_POOR = 0.5
 _ORDER = {"good": 0, "fair": 1, "poor": 2}
 
 
@@ -54,8 +56,10 @@ def build_map(
     landed, confidence = carry(source.shape, source_fit, target.shape, target_fit, workers)
     if alone is not None:
         confidence = confidence * steadiness(source.shape, (source_fit, target_fit), alone, workers)
-    index = _nearest_corner(target.shape, landed)
     worst = max(source_fit, target_fit, key=lambda fit: _ORDER[fit.verdict])
+    if worst.verdict == "poor":
+        confidence = _POOR * confidence
+    index = _nearest_corner(target.shape, landed)
     reasons = tuple(
         f"{part.shape.name}: {reason}"
         for part, fit in ((source, source_fit), (target, target_fit))

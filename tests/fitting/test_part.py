@@ -5,15 +5,16 @@ import pytest
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import boundary_length, fit_shape, node_system
-from meshmatch.fitting.network_fit import one_way_residual
+from meshmatch.fitting.fit_shape import _part, boundary_length, fit_shape, node_system, take_samples
+from meshmatch.fitting.network_fit import Candidate, one_way_residual
 from meshmatch.fitting.part import SHARES, cost
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.verdict import empty_share, judge
+from meshmatch.models.trained import TrainedModel
 from meshmatch.pipeline import map_between, read_model
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
-from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.shape import Frame, Shape
 from meshmatch.templates.location import bundled_folder
 from tests.fitting.eggs import egg_model
 
@@ -80,3 +81,26 @@ def test_one_side_of_a_body_is_found_to_be_a_part_and_matches_the_whole() -> Non
 def test_a_whole_stays_a_whole_where_parts_are_tried() -> None:
     climber = load_shape(bundled_folder() / "samples" / "climber.ply")
     assert not fit_shape(read_model("human"), climber, FitConfig(partial="yes")).partial
+
+
+@pytest.mark.parametrize("residuals", [(0.01, 0.0), (0.08, 0.01), (0.06, 0.08)])
+def test_a_poor_part_is_looked_at_again_from_more_sides_and_the_better_fit_kept(
+    monkeypatch: pytest.MonkeyPatch, residuals: tuple[float, float]
+) -> None:
+    model = egg_model()
+    open_egg, _ = side_of(model.template.shape, np.array([0.0, 1.0, 0.0]))
+    asked: list[tuple[int, int, int]] = []
+
+    def seek(
+        model: TrainedModel, frame: Frame, scan: Scan, config: FitConfig, laid: int, tell: object
+    ) -> tuple[Frame, Scan, Candidate]:
+        asked.append((config.copies, config.hypotheses, laid))
+        still = np.zeros((model.template.K, 3))
+        return frame, scan, Candidate(np.eye(3), np.zeros(3), still, residuals[len(asked) - 1])
+
+    monkeypatch.setattr("meshmatch.fitting.fit_shape._sought", seek)
+    frame, scan = take_samples(open_egg, 500, np.random.default_rng(0), Frame.identity())
+    found = _part(model, open_egg, frame, scan, FitConfig(), print)
+    once, again = (48, 2, 6), (96, 8, 16)
+    assert asked == ([once] if residuals[0] == 0.01 else [once, again])
+    assert found[2].residual == min(residuals[: len(asked)])

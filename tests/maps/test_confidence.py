@@ -1,4 +1,4 @@
-"""Confidence falls where two fits had to move until they agreed, and nowhere else."""
+"""Confidence falls where two fits had to move until they agreed, and nowhere else; and with a poor fit everywhere."""
 
 from dataclasses import replace
 
@@ -50,3 +50,15 @@ def test_both_fits_count_where_the_source_lies() -> None:
     found = build_map(repair(unit), fit, repair(turned), other, alone=(before, before_there))
     assert np.allclose(found.confidence[high], np.exp(-1.0), atol=1e-6)
     assert np.allclose(found.confidence[~high], 1)
+
+
+def test_a_map_by_a_poor_fit_is_believed_half() -> None:
+    ball = bumpy_sphere()
+    unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
+    part, fit = repair(unit), lying_on(unit)
+    for verdict, believed in (("good", 1.0), ("fair", 1.0), ("poor", 0.5)):
+        judged = replace(fit, verdict=verdict)
+        for source_fit, target_fit in ((judged, fit), (fit, judged)):
+            found = build_map(part, source_fit, part, target_fit)
+            assert np.allclose(found.confidence, believed)
+            assert found.verdict == verdict
