@@ -17,7 +17,7 @@ from meshmatch.shapes.shape import Shape
 _FIT_SCALE = 0.03
 # The same for how far agreement moved the two fits: what a shape alone said is not what both say.
 _AGREED_SCALE = 0.05
-# Of what a fit is judged poor by, no vertex knows: all of its map is believed half.
+# No vertex knows what is wrong with a poor fit: its whole map is believed half.
 _POOR = 0.5
 _ORDER = {"good": 0, "fair": 1, "poor": 2}
 
