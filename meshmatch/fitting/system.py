@@ -5,8 +5,8 @@ normal matrix is sum_p (Phi_p^T Phi_p) (x) H_p. The products Phi_pi Phi_pj never
 one sparse matrix over node pairs: assembling costs about 6 V n^2 / 2 multiplications (n = 17 nodes in
 reach), a few milliseconds. Only nodes that meet at some template point share an entry; with the nodes in
 reverse Cuthill-McKee order these lie in a band, whose Cholesky takes a third of the dense one's time.
-Where every node reaches every point, keeping the products would take gigabytes: they are formed in each step, and the
-band is the whole matrix.
+Where nodes reach most points, keeping the products would take gigabytes: they are formed in each step, and the band is
+the whole matrix.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from meshmatch.shapes.shape import Shape
 # Where the upper triangle xx xy xz yy yz zz belongs in a 3 x 3 block, row by row.
 _BLOCK = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 _DIAGONAL = [0, 3, 5]
+# More products than this (about a gigabyte while they are sorted) are not kept.
+_MOST_PRODUCTS = 20_000_000
 
 
 class NodeSystem:
@@ -163,13 +165,15 @@ class _EveryPair:
 def _pair_products(phi: Any) -> tuple[np.ndarray, np.ndarray, Any]:
     """Node pairs (i <= j) that meet somewhere, and the sparse matrix (pairs, V) of Phi_pi Phi_pj."""
     V, K = phi.shape
+    if not isinstance(phi, np.ndarray):
+        counts = np.diff(phi.indptr).astype(np.int64)
+        sizes = counts**2
+        phi = phi.toarray() if sizes.sum() > _MOST_PRODUCTS else phi
     if isinstance(phi, np.ndarray):
         row, column = np.triu_indices(K)
         return row, column, _EveryPair(phi, row, column)
-    counts = np.diff(phi.indptr)
     start = phi.indptr[:-1]
     # All ordered index pairs inside each row, rows side by side.
-    sizes = counts.astype(np.int64) ** 2
     row = np.repeat(np.arange(V), sizes)
     within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     first = start[row] + within // counts[row]

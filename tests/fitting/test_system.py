@@ -5,7 +5,7 @@ import pytest
 
 from meshmatch.fields.mls import KERNELS
 from meshmatch.fitting.fit_shape import node_system
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.system import NodeSystem, _EveryPair
 from meshmatch.models.trained import TrainedModel
 from tests.fitting.eggs import egg_model, gentle_vectors
 
@@ -67,6 +67,18 @@ def test_the_solution_is_that_of_dense_least_squares(system: NodeSystem, seed: i
     matrix, right = problem.rows(system)
     wanted = np.linalg.lstsq(matrix, right, rcond=None)[0].reshape(-1, 3)
     assert np.allclose(problem.solve(system), wanted, atol=1e-8)
+
+
+def test_products_too_many_to_be_kept_are_formed_anew(
+    model: TrainedModel, system: NodeSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = int((np.diff(system.phi.indptr) ** 2).sum())
+    shape, problem = model.template.shape, Problem(system)
+    for most, formed in ((kept, False), (kept - 1, True)):
+        monkeypatch.setattr("meshmatch.fitting.system._MOST_PRODUCTS", most)
+        other = NodeSystem(shape, model.field(shape.verts), strain_points=40)
+        assert isinstance(other._pairs, _EveryPair) == formed
+        assert np.allclose(problem.solve(other), problem.solve(system), atol=1e-8)
 
 
 def test_a_step_never_raises_the_energy_that_it_minimises(system: NodeSystem) -> None:
