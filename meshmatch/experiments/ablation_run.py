@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -49,7 +49,8 @@ class Run:
         self.measure = Measure(shapes=options.shapes, code_steps=options.code_steps)
         self.folder: Path = options.output
         self.views = asked_views(options.tables, options.figures)
-        self.cells = all_cells(self.views, options.seeds, cells_of("table4"))
+        repeated = [cell for view in known_views(options.repeated.split(",")) for cell in cells_of(view)]
+        self.cells = all_cells(self.views, options.seeds, repeated)
         self.sets = [name for name in options.sets.split(",") if name]
         self.benches = [] if options.show else [load_set(name, options.data) for name in self.sets]
         self._subjects: dict[str, list[Subject]] = {}
@@ -242,7 +243,18 @@ def asked_views(tables: str, figures: str) -> list[str]:
     """
     asked = [f"table{number}" for number in tables.split(",") if number]
     asked += [f"figure{number}" for number in figures.split(",") if number]
+    return known_views(asked)
+
+
+def known_views(asked: Sequence[str]) -> list[str]:
+    """The views of these names, in the order of `VIEWS`; an empty name is none.
+
+    Raises
+    ------
+    OptionError
+        There is no such view.
+    """
     for view in asked:
-        if view not in VIEWS:
+        if view and view not in VIEWS:
             raise OptionError(f"there is no {view}", f"choose from {', '.join(VIEWS)}")
     return [view for view in VIEWS if view in asked]

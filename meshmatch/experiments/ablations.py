@@ -146,7 +146,13 @@ def options_of(words: Sequence[str] | None) -> argparse.Namespace:
         default=2.0,
         help="of training a cell; 0 trains none, table 4 then has its cost alone",
     )
-    add("--seeds", type=int, default=1, help="trainings of each cell of table 4")
+    add("--seeds", type=int, default=1, help="trainings of each cell of the views that are repeated")
+    add(
+        "--repeated",
+        default="table4",
+        metavar="VIEWS",
+        help="which these are, such as table4,figure9: %(default)s; may be empty",
+    )
     add(
         "--cells",
         default="",

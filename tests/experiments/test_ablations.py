@@ -190,6 +190,27 @@ def test_all_cells_of_two_seeds(
 
 
 @pytest.mark.parametrize(
+    ("repeated", "more"), [("", 0), ("table5,figure6", 6), ("figure6", 2), ("figure9", 1)]
+)
+def test_the_views_that_are_repeated_are_a_choice(
+    places: Path, tmp_path: Path, calls: dict[str, int], repeated: str, more: int
+) -> None:
+    words = [
+        "--output",
+        str(tmp_path),
+        "--folder",
+        str(places / "prepared"),
+        "--minutes",
+        "1e-6",
+        "--batch",
+        "2",
+    ]
+    words += ["--sets", "", "--tables", "5", "--figures", "6", "--rounds", "0", "--seeds", "2"]
+    assert main([*words, "--repeated", repeated]) == 0
+    assert calls["train_cell"] == 6 + more
+
+
+@pytest.mark.parametrize(
     "words",
     [["--minutes", "-1"], ["--rounds", "-1"], ["--seeds", "0"], ["--code-steps", "0"], ["--shapes", "1"]],
 )
@@ -199,7 +220,7 @@ def test_choices_that_cannot_be(words: list[str], tmp_path: Path, capsys: pytest
     assert "needed" in said(capsys)
 
 
-@pytest.mark.parametrize("words", [["--tables", "8"], ["--figures", "x"]])
+@pytest.mark.parametrize("words", [["--tables", "8"], ["--figures", "x"], ["--repeated", "4"]])
 def test_views_that_are_not_there(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
