@@ -29,8 +29,7 @@ import numpy as np
 from rich.table import Table
 
 from meshmatch.config import set_threads
-from meshmatch.errors import MeshmatchError
-from meshmatch.experiments.report import circumstances, explain, wide_console
+from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.experiments.speed import Cost, cost_of, keep_to_cores, sized
 from meshmatch.fitting.dense import dense_shape
 from meshmatch.maps.files import save_map
@@ -255,14 +254,13 @@ def main(words: Sequence[str] | None = None) -> int:
         parser.error("--threads begins at 1")
     set_threads(1)
     choices = replace(Choices(), size=options.size, samples=options.samples, workers=options.threads)
-    try:
+
+    def work() -> None:
         if options.keep is not None:
             make_folder(options.keep)
         run(cases, options.data, choices, options.keep, not options.no_clock)
-    except MeshmatchError as error:
-        explain(error)
-        return 1
-    return 0
+
+    return status_of(work)
 
 
 if __name__ == "__main__":

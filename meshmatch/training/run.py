@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -273,10 +272,3 @@ def read_template(name: str | Path) -> Template:
         return load_template(path)
     inside = bundled_folder() / "human" / f"{name}.safetensors"
     return load_template(inside if inside.is_file() else path)
-
-
-def copy_model(folder: Path, target: Path) -> None:
-    """Copy the three files of a model, the card last."""
-    target.mkdir(parents=True, exist_ok=True)
-    for file in ("template.safetensors", "weights.safetensors", "card.json"):
-        shutil.copy2(folder / file, target / file)

@@ -1,6 +1,7 @@
 """Fitting moves the template with the kernel that the network was trained with, wherever it moves it."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,6 @@ from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy
 from meshmatch.fitting.scan import Scan
 from meshmatch.models.registry import built_in_folder
 from meshmatch.models.trained import TrainedModel, load_model
-from meshmatch.training.run import copy_model
 from tests.fitting.eggs import egg_model
 
 OTHER: dict[Kernel, Kernel] = {"cubic": "smooth", "smooth": "cubic"}
@@ -97,7 +97,7 @@ def test_the_dense_mesh_is_moved_with_the_models_kernel(model: TrainedModel) -> 
 
 def test_a_model_with_a_kernel_that_is_not_known_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "human"
-    copy_model(built_in_folder() / "human", folder)
+    shutil.copytree(built_in_folder() / "human", folder)
     card = json.loads((folder / "card.json").read_text())
     card["field"]["kernel"] = "wendland"
     (folder / "card.json").write_text(json.dumps(card))

@@ -1,5 +1,6 @@
 """The networks: what must not matter does not, and what goes in one by one comes out as in a batch."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -265,9 +266,8 @@ def test_the_model_that_ships_leaves_its_own_template_at_rest(human: TrainedMode
 
 def test_another_template_beside_the_weights_is_refused(tmp_path: Path) -> None:
     from meshmatch.templates.template import load_template, save_template
-    from meshmatch.training.run import copy_model
 
-    copy_model(built_in_folder() / "human", tmp_path / "human")
+    shutil.copytree(built_in_folder() / "human", tmp_path / "human")
     template = load_template(tmp_path / "human" / "template.safetensors")
     save_template(replace(template, radius=0.14), tmp_path / "human" / "template.safetensors")
     with pytest.raises(ModelError, match="trained with another template"):

@@ -17,7 +17,7 @@ from meshmatch.templates.prepare import prepare_folder
 from meshmatch.templates.template import Template, save_template
 from meshmatch.training import run
 from meshmatch.training.loop import Progress, TrainConfig
-from meshmatch.training.run import Recipe, copy_model, folder_source, read_template, recipe, train_model
+from meshmatch.training.run import Recipe, folder_source, read_template, recipe, train_model
 from meshmatch.training.scans import ScanConfig
 from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template, small_data, small_network
 from tests.training.stick import stick_figure
@@ -185,12 +185,6 @@ def test_templates_are_found_by_file_and_by_name(prepared: Path) -> None:
         read_template("human-Z")
     with pytest.raises(InputError, match="another template"):
         folder_source(prepared, egg_template())
-
-
-def test_a_model_is_copied_whole(prepared: Path, tmp_path: Path) -> None:
-    folder = trained(prepared, tmp_path / "model", replace(SMALL, train=replace(SMALL.train, steps=1)))
-    copy_model(folder, tmp_path / "deep" / "copy")
-    assert verify_model(tmp_path / "deep" / "copy") == verify_model(folder)
 
 
 def test_bodies_need_a_template_of_the_body_model(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
