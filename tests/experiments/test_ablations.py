@@ -1,14 +1,18 @@
 """The command on eggs: a table, figures and a line; a run that goes on; every option."""
 
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import pytest
 
 from meshmatch.experiments import ablation_run, cell_errors, pool
+from meshmatch.experiments.ablation_cells import VIEWS, all_cells
+from meshmatch.experiments.ablation_run import methods_of
 from meshmatch.experiments.ablations import main
 from meshmatch.experiments.cell_errors import Measure
+from meshmatch.experiments.cells import BASE
 from meshmatch.fitting.fit_config import FitConfig
 from tests.experiments.egg_cells import make_small, prepare_eggs
 from tests.experiments.small_bench import build
@@ -226,3 +230,11 @@ def test_views_that_are_not_there(
 ) -> None:
     assert main(["--output", str(tmp_path), "--sets", "", *words]) == 1
     assert "choose from table4" in said(capsys)
+
+
+def test_a_cell_is_measured_alike_with_every_seed() -> None:
+    for cell in all_cells(VIEWS):
+        assert methods_of(replace(cell, seed=3)) == methods_of(cell)
+    assert methods_of(replace(BASE, seed=1)) == ("code", "none", "chamfer", "nodes")
+    assert methods_of(replace(BASE, field="rbf", seed=1)) == ("code", "nodes")
+    assert methods_of(replace(BASE, pose="A", seed=1)) == ("code",)
