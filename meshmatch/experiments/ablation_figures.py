@@ -13,6 +13,7 @@ from meshmatch.experiments.ablation_cells import GRID, POSES, SHAPES, SUPERVISED
 from meshmatch.experiments.ablation_tables import number
 from meshmatch.experiments.cells import BASE, Cell
 from meshmatch.fields.choice import FIELDS
+from meshmatch.outputs import make_folder
 from meshmatch.render.bars import Bar, draw_bars
 from meshmatch.render.series import Panel, Series, draw_series
 from meshmatch.templates.nodes import STRATEGIES
@@ -48,7 +49,7 @@ def _bars(known: Known, sets: Sequence[str], path: Path, cells: Sequence[tuple[s
         groups[_words(where)] = bars
     if not any(groups.values()):
         return False
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     draw_bars(groups, path, _AXIS)
     return True
 
@@ -106,7 +107,7 @@ def _against(
             lines[where] = Series(tuple(at for at, _ in there), middle, half)
     if not lines:
         return False
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     draw_series([Panel(across, lines, tuple(at for at, _ in cells), True)], path, _AXIS)
     return True
 
@@ -139,7 +140,7 @@ def _figure6(known: Known, sets: Sequence[str], path: Path) -> bool:
         Panel("steps of refinement", steps, (0, 1, 3, 10, 30, 100, 300), True),
         Panel("seconds of refinement of a body (processor)", seconds, (0.0, *ticks), True),
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     draw_series(panels, path, _AXIS)
     return True
 

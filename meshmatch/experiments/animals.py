@@ -36,6 +36,7 @@ from meshmatch.experiments.category import (
 )
 from meshmatch.experiments.report import columns, publish, status_of
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.outputs import make_folder
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 
@@ -100,7 +101,7 @@ def run(
     landmarks = None
     if points:
         place = training.work / "points"
-        place.mkdir(parents=True, exist_ok=True)
+        make_folder(place)
         for name, ids in known_points(truth, shapes, template, points).items():
             np.save(place / f"{name}.npy", ids.astype(np.int64))
         landmarks = str(place)

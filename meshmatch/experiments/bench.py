@@ -33,6 +33,7 @@ from meshmatch.maps.curve import draw_curves
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.outputs import make_folder
 from meshmatch.shapes.shape import Shape
 
 
@@ -211,7 +212,7 @@ def _map_path(folder: Path, bench: BenchSet, pair: Pair) -> Path:
 
 def save_maps(folder: Path, bench: BenchSet, maps: dict[Pair, NDArray[np.int64]]) -> None:
     """Keep maps as ``folder/set/source-target.npy``, where `load_maps` finds them."""
-    (folder / bench.name).mkdir(parents=True, exist_ok=True)
+    make_folder(folder / bench.name)
     for pair, index in maps.items():
         save_map(_map_path(folder, bench, pair), VertexMap(*pair, index))
 

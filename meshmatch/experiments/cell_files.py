@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from meshmatch.errors import InputError, OptionError
-from meshmatch.outputs import replace_on_success
+from meshmatch.outputs import make_folder, replace_on_success
 
 
 def recall(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -43,7 +43,7 @@ def recall(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
 def keep(path: Path, asked: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
     """Write an answer with its question, and return both."""
     record = _plain({"asked": asked, **found})
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     with replace_on_success(path) as temporary:
         temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return record

@@ -17,6 +17,7 @@ from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.encoder import BasisEncoder
 from meshmatch.models.registry import CARD, WEIGHTS, read_card
+from meshmatch.outputs import make_folder
 from meshmatch.training.loop import Trainer
 from meshmatch.training.losses import LossPoints
 from meshmatch.training.run import export, validation_error
@@ -59,7 +60,7 @@ def train_cell(
     trainer.config = recipe.train
     model.load_state_dict(trainer.averaged_state())
     held_out = validation_error(model, pool.held_out, points.to(trainer.device))
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     export(
         trainer,
         template,

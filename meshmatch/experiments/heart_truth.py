@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from meshmatch.experiments.category import Pair
 from meshmatch.maps.place import at_footpoints, vertex_normals
 from meshmatch.maps.surface import Surface
+from meshmatch.outputs import make_folder
 from meshmatch.render.picture import Look, Panel, render_shapes
 from meshmatch.render.scales import label_colors
 from meshmatch.shapes.files import save_shape
@@ -89,7 +90,7 @@ def save_registered(
     names: Sequence[str],
 ) -> None:
     """Some hearts as meshes with the vertices and triangles of one of them, a file for each."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     first, ids = shapes[template], truth[template][:, 0]
     for name in names:
         verts = first.verts if name == template else registered(first, ids, shapes[name], truth[name][:, 0])

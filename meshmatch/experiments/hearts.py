@@ -50,6 +50,7 @@ from meshmatch.experiments.category import (
 from meshmatch.experiments.heart_truth import chamber_picture, heart_errors, save_registered, through
 from meshmatch.experiments.report import columns, publish, status_of
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.outputs import make_folder
 from meshmatch.pipeline import usable
 from meshmatch.shapes.shape import Frame, Shape
 from meshmatch.templates.gather import most_typical
@@ -66,7 +67,7 @@ def meshmonk_maps(
 ) -> dict[Pair, np.ndarray]:
     """Maps through meshmonk's registrations of the template, a minute each, kept as files."""
     ours = template.shape
-    kept.mkdir(parents=True, exist_ok=True)
+    make_folder(kept)
     places = {}
     for name, shape in shapes.items():
         tell(f"meshmonk: {name}")

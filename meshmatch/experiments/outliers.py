@@ -28,7 +28,7 @@ from meshmatch.errors import InputError
 from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.evaluate import LOST_CM
-from meshmatch.outputs import replace_on_success
+from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.pipeline import map_between, register
 from meshmatch.shapes.shape import Frame, Shape
 
@@ -64,7 +64,7 @@ def fit_of(cloud: Shape, model: str, seed: int, keep: Path | None) -> Fit:
         return Fit(**{**found, **words, "frame": frame, "reasons": tuple(map(str, found["reasons"]))})
     fit = register(cloud, model=model, seed=seed)
     if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         plain: dict[str, Any] = {
             each.name: getattr(fit, each.name) for each in fields(fit) if each.name != "frame"
         }

@@ -140,7 +140,7 @@ def measure(
     if turns == "given":
         shapes, how = stood_alike(shapes, keypoints), "none"
     folder = training.work / "shapes"
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     for key, shape in shapes.items():
         save_shape(folder / f"{key}.ply", shape)
     legs = {}

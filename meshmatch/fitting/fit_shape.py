@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.errors import OptionError
 from meshmatch.fitting.complete import seen, seen_area
 from meshmatch.fitting.fit import FAIR_RESIDUAL, Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig, check_landmarks
@@ -19,16 +18,9 @@ from meshmatch.fitting.latent import refine_code
 from meshmatch.fitting.mirror import mirror_of
 from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual, variants
 from meshmatch.fitting.nodes import refine_nodes
-from meshmatch.fitting.orientation import (
-    Hypothesis,
-    axis_vector,
-    forced_frames,
-    propose,
-    standing_grid,
-    with_flips,
-)
+from meshmatch.fitting.orientation import Hypothesis
 from meshmatch.fitting.part import cost, fit_part
-from meshmatch.fitting.placing import placed, scan_frame
+from meshmatch.fitting.placing import frames_to_try, scan_frame
 from meshmatch.fitting.readings import Judge, averaged, choose, lying
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.settle import settle, without_strays
@@ -106,7 +98,7 @@ def _whole(model, shape, frame, scan, config, landmarks, rng, tell) -> _Laid:
     """The template on a shape that is taken for a whole."""
     system = node_system(model)
     tell("orientation", 0.0)
-    guesses = _hypotheses(model, scan, config)
+    guesses = frames_to_try(model, scan, config)
     coarse = scan.first(config.coarse_samples)
     rough = []
     # A cloud's residual tells little before its core frame is found; asking twice does.
@@ -147,7 +139,7 @@ def _sought(model, frame, scan, config, laid: int, tell) -> _Laid:
         model,
         node_system(model),
         scan,
-        lambda part: _hypotheses(model, part, config),
+        lambda part: frames_to_try(model, part, config),
         config.nodes,
         np.random.default_rng(config.seed),
         laid=laid,
@@ -248,32 +240,6 @@ def take_samples(
     frame = sqrt_area_frame(shape) if frame is None else frame
     samples = sample_surface(without_strays(shape), P, rng)
     return frame, Scan(frame.apply(samples.points), samples.normals @ frame.rotation.T, not shape.is_cloud)
-
-
-def _hypotheses(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypothesis]:
-    """Core frames to try: the aligner's (or a grid where there is none), or those that obey the user's axes."""
-    given = placed(model, scan)
-    if given is not None:
-        voted = given
-    elif model.network.aligner is None:
-        voted = standing_grid(scan.points.mean(0))
-    else:
-        voted = with_flips(
-            propose(model.network, scan.points[:2048], config.copies, config.hypotheses, config.seed)
-        )
-    if config.up is None and config.front is None:
-        return voted
-    up = axis_vector(config.up) if config.up else None
-    front = axis_vector(config.front) if config.front else None
-    if up is not None and front is not None and abs(up @ front) > 0.5:
-        raise OptionError("up and front lie along the same axis", "choose two different axes")
-    obeying = [
-        guess
-        for guess in voted
-        if (up is None or guess.rotation[:, 1] @ up > 0.5)
-        and (front is None or guess.rotation[:, 2] @ front > 0.5)
-    ]
-    return obeying or forced_frames(up, front)
 
 
 def _refine(model, system, scan, frame, candidates, config, landmarks, rough, rng, tell) -> Candidate:

@@ -1,4 +1,4 @@
-"""How a category wants its shapes placed before they are fitted; its card says it, as its folder was prepared."""
+"""In which frames a shape is looked at: as its category is placed (the card says it), as the user or the network says."""
 
 from __future__ import annotations
 
@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from meshmatch.fitting.orientation import Hypothesis
+from meshmatch.errors import OptionError
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.orientation import (
+    Hypothesis,
+    axis_vector,
+    forced_frames,
+    propose,
+    standing_grid,
+    with_flips,
+)
 from meshmatch.fitting.scan import Scan
 from meshmatch.shapes.align import ALIGNS, Oriented, align
 from meshmatch.shapes.shape import Frame, Shape
@@ -33,3 +42,36 @@ def placed(model: TrainedModel, scan: Scan) -> list[Hypothesis] | None:
         return [Hypothesis(np.eye(3), np.zeros(3), 1.0)]
     found = align(Oriented(scan.points, scan.normals), template_samples(model.template), how, _TURNS)
     return [Hypothesis(each.rotation, each.centre, 1.0 / len(found)) for each in found]
+
+
+def frames_to_try(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypothesis]:
+    """Core frames to try: the category's, the aligner's (or a grid where there is none), or those that obey the user's
+    axes.
+
+    Raises
+    ------
+    OptionError
+        An axis that is none, or up and front along one axis.
+    """
+    given = placed(model, scan)
+    if given is not None:
+        voted = given
+    elif model.network.aligner is None:
+        voted = standing_grid(scan.points.mean(0))
+    else:
+        voted = with_flips(
+            propose(model.network, scan.points[:2048], config.copies, config.hypotheses, config.seed)
+        )
+    if config.up is None and config.front is None:
+        return voted
+    up = axis_vector(config.up) if config.up else None
+    front = axis_vector(config.front) if config.front else None
+    if up is not None and front is not None and abs(up @ front) > 0.5:
+        raise OptionError("up and front lie along the same axis", "choose two different axes")
+    obeying = [
+        guess
+        for guess in voted
+        if (up is None or guess.rotation[:, 1] @ up > 0.5)
+        and (front is None or guess.rotation[:, 2] @ front > 0.5)
+    ]
+    return obeying or forced_frames(up, front)

@@ -117,7 +117,7 @@ def cached_rig(identities: int, seed: int, progress: Callable[[int, int], None] 
     )
     if path.is_file():
         return load_rig(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     rig = build_rig(identities, seed, progress=progress)
     save_rig(rig, path)
     return rig

@@ -238,3 +238,12 @@ def test_a_cell_is_measured_alike_with_every_seed() -> None:
     assert methods_of(replace(BASE, seed=1)) == ("code", "none", "chamfer", "nodes")
     assert methods_of(replace(BASE, field="rbf", seed=1)) == ("code", "nodes")
     assert methods_of(replace(BASE, pose="A", seed=1)) == ("code",)
+
+
+def test_a_file_in_the_way_of_the_folder_is_an_error_in_words(
+    places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("here first")
+    words = ["--output", str(tmp_path / "file"), "--folder", str(places / "prepared"), "--minutes", "1e-6"]
+    assert main([*words, "--sets", "", "--tables", "", "--figures", "10", "--batch", "2"]) == 1
+    assert "cannot make the folder" in said(capsys)
