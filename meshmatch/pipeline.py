@@ -281,7 +281,10 @@ def usable(shape: Shape) -> Repaired:
     clean = repair(shape)
     fixed = clean.shape
     if fixed.is_cloud and fixed.V < MINIMUM_POINTS:
-        raise InputError(f"{shape.name} has only {fixed.V} points", f"at least {MINIMUM_POINTS} are needed")
+        places = "place" if fixed.V == 1 else "places"
+        raise InputError(
+            f"{shape.name} has points in only {fixed.V} {places}", f"at least {MINIMUM_POINTS} are needed"
+        )
     if not fixed.is_cloud and fixed.F < MINIMUM_FACES:
         raise InputError(
             f"{shape.name} has only {fixed.F} usable triangles",

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -180,7 +181,7 @@ def read_gathered(folder: str | Path, template: Template) -> Gathered:
     """
     path = Path(folder) / "points.safetensors"
     try:
-        words = json.loads((Path(folder) / "prepared.json").read_text(encoding="utf-8"))
+        words = prepared_words(folder)
         arrays = load_file(path)
         with safe_open(str(path), framework="np") as file:
             frame = file.metadata() or {}
@@ -203,13 +204,26 @@ def read_gathered(folder: str | Path, template: Template) -> Gathered:
     return found
 
 
+def prepared_words(folder: str | Path) -> dict[str, Any]:
+    """What ``prepared.json`` says.
+
+    Raises
+    ------
+    OSError, ValueError
+        It is not there, or is no JSON object.
+    """
+    words = json.loads((Path(folder) / "prepared.json").read_text(encoding="utf-8"))
+    if not isinstance(words, dict):
+        raise ValueError("no object")
+    return words
+
+
 def is_registered(folder: str | Path) -> bool:
     """Whether the shapes of a prepared folder share one connectivity; True where it is no such folder."""
     try:
-        words = json.loads((Path(folder) / "prepared.json").read_text(encoding="utf-8"))
+        return prepared_words(folder).get("registered") is not False
     except (OSError, ValueError):
         return True  # whoever reads it as registered says what is wrong with it
-    return not isinstance(words, dict) or words.get("registered") is not False
 
 
 def read_known(file: Path, clean: Repaired) -> np.ndarray:
@@ -224,7 +238,10 @@ def read_known(file: Path, clean: Repaired) -> np.ndarray:
         if file.suffix == ".npy":
             values = read_npy(file)
         else:
-            values = np.loadtxt(file, delimiter="," if "," in file.read_text(encoding="utf-8") else None)
+            delimiter = "," if "," in file.read_text(encoding="utf-8") else None
+            with warnings.catch_warnings():  # of a file without numbers, which is told below
+                warnings.simplefilter("ignore", UserWarning)
+                values = np.loadtxt(file, delimiter=delimiter)
         values = np.asarray(values)
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read the landmarks {file.name}", "numbers, one point a line") from error
@@ -236,10 +253,11 @@ def read_known(file: Path, clean: Repaired) -> np.ndarray:
             f"{file.name} holds no landmarks",
             "either one vertex a line (-1: missing), or x, y and z of a place on each line",
         )
-    if values.max() >= clean.original.V or values.min() < -1:
+    outside = values[(values < -1) | (values >= clean.original.V)]
+    if len(outside):
         raise InputError(
-            f"{file.name} names vertex {values.max():.0f}, but {clean.original.name} has {clean.original.V}",
-            "vertices are counted from 0",
+            f"{file.name} names vertex {outside[0]:.0f}, but {clean.original.name} has {clean.original.V}",
+            "vertices are counted from 0; -1 is a missing one",
         )
     index = clean.original_to_repaired[values.astype(np.int64)]
     places = clean.shape.verts[index].copy()

@@ -26,6 +26,7 @@ from meshmatch.templates.gather import (
     find_known,
     gather,
     most_typical,
+    prepared_words,
     read_known,
     save_gathered,
 )
@@ -245,8 +246,8 @@ def _enough(clean: Repaired) -> Repaired:
     """The same shape, if there is enough of it to learn from; `InputError` otherwise."""
     shape = clean.shape
     if shape.is_cloud and shape.V < MINIMUM_POINTS:
-        points = "point" if shape.V == 1 else "points"
-        raise InputError(f"it has only {shape.V} {points}", f"at least {MINIMUM_POINTS} are needed")
+        places = "place" if shape.V == 1 else "places"
+        raise InputError(f"it has points in only {shape.V} {places}", f"at least {MINIMUM_POINTS} are needed")
     if not shape.is_cloud and shape.F < MINIMUM_FACES:
         raise InputError(f"it has only {shape.F} usable triangles", f"at least {MINIMUM_FACES} are needed")
     sqrt_area_frame(shape)
@@ -259,11 +260,11 @@ def read_registered(folder: str | Path, template: Template) -> np.ndarray:
     Raises
     ------
     InputError
-        Not a prepared folder, prepared for another template, or its shapes are not registered.
+        Not a prepared folder, prepared for another template or scale, or its shapes are not registered.
     """
     folder = Path(folder)
     try:
-        words = json.loads((folder / "prepared.json").read_text())
+        words = prepared_words(folder)
         shapes = load_file(folder / "shapes.safetensors")["verts"]
     except (OSError, ValueError, KeyError, SafetensorError) as error:
         raise InputError(
@@ -271,6 +272,11 @@ def read_registered(folder: str | Path, template: Template) -> np.ndarray:
         ) from error
     if words.get("template") != template.hash:
         raise InputError(f"{folder} was prepared for another template", "prepare it again")
+    if words.get("scale", "area") != "area":
+        raise InputError(
+            f"{folder} was prepared with --scale {words['scale']}, but registered shapes are learned at equal areas",
+            "prepare it with --scale area, or learn without correspondence (--unsupervised)",
+        )
     if not len(shapes):
         raise InputError(
             f"the shapes of {folder} do not share one connectivity",

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from meshmatch.models.deformer import NetworkConfig
+from meshmatch.templates.gather import prepared_words
 from meshmatch.templates.registered import FEW
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import LossConfig
@@ -28,7 +28,7 @@ def few_recipe() -> Recipe:
 def frame_of_few(folder: str | Path) -> dict[str, str] | None:
     """What a card says of orientation and scale for a prepared folder of few registered shapes; None for others."""
     try:
-        words = json.loads((Path(folder) / "prepared.json").read_text(encoding="utf-8"))
+        words = prepared_words(folder)
         if not words["registered"] or len(words["names"]) >= FEW:
             return None
         return {"orientation": str(words["align"]), "scale": "area"}

@@ -122,7 +122,8 @@ class Trainer:
             arrays |= {f"optimiser.{index}.{n}": torch.as_tensor(t) for n, t in state.items()}
         arrays = {n: t.detach().cpu().contiguous().clone() for n, t in arrays.items()}
         with replace_on_success(path) as temporary:
-            save_file(arrays, temporary, {"step": str(self.step), "seconds": f"{self.seconds:.1f}"})
+            words = {"step": str(self.step), "seconds": f"{self.seconds:.1f}", "seed": str(self.config.seed)}
+            save_file(arrays, temporary, words)
 
     def load(self, path: Path) -> None:
         """Continue exactly where :meth:`save` was called.
@@ -130,16 +131,19 @@ class Trainer:
         Raises
         ------
         ModelError
-            The file is no checkpoint, or is of another network or another template.
+            The file is no checkpoint, or is of another seed, network or template.
         """
         hint = "train into another folder, or start afresh"
         try:
             with safe_open(str(path), framework="pt") as file:
                 words = file.metadata() or {}
                 step, seconds = int(words["step"]), float(words.get("seconds", 0.0))
+                seed = int(words.get("seed", self.config.seed))
                 arrays = {n: file.get_tensor(n) for n in file.keys()}  # noqa: SIM118 (it is no dictionary)
         except (SafetensorError, OSError, KeyError, ValueError) as error:
             raise ModelError(f"{path} is no checkpoint of a training", hint) from error
+        if seed != self.config.seed:
+            raise ModelError(f"{path} is a checkpoint of a training with seed {seed}", hint)
         weights = _part(arrays, "model.")
         here = self.model.state_dict()
         if {n: t.shape for n, t in weights.items()} != {n: t.shape for n, t in here.items()}:

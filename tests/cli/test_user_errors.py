@@ -93,7 +93,7 @@ BAD_FILES = {
     "a cloud of NaN": ("bad.npy", nan_cloud, "NaN"),
     "one triangle": ("bad.ply", one_triangle, "only 1 usable triangle"),
     "no face with area": ("bad.ply", flat_faces, "no face with any area"),
-    "few points": ("bad.npy", few_points, "only 20 points"),
+    "few points": ("bad.npy", few_points, "points in only 20 places"),
     "two components far apart": ("bad.ply", far_apart, "2 large parts far apart"),
     "a folder": ("bad.ply", lambda path: path.mkdir(), "is a folder"),
     "a map for a cloud": ("bad.npy", lambda path: np.save(path, np.arange(9)), "bad.npy"),

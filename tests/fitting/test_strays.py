@@ -111,7 +111,7 @@ def test_a_cloud_is_tried_as_a_part_only_where_it_leaves_the_template_bare(
     """A residual says that a cloud is sparse and noisy, not that something is missing."""
     tried = []
 
-    def part(model, frame, scan, config, tell):
+    def part(model, shape, frame, scan, config, tell):
         tried.append(frame)
         raise KeyboardInterrupt
 
@@ -142,8 +142,8 @@ def test_a_tenth_of_strays_changes_little_and_nine_tenths_are_told() -> None:
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        (np.ones((500, 3)), "has only 1 points"),
-        (np.eye(3), "has only 3 points"),
+        (np.ones((500, 3)), "has points in only 1 place"),
+        (np.eye(3), "has points in only 3 places"),
         (np.outer(np.linspace(0, 1, 500), [1.0, 2.0, 3.0]), "all its points lie on a line"),
         (np.full((500, 3), np.nan), "not finite"),
     ],

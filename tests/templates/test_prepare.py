@@ -11,6 +11,7 @@ from meshmatch.errors import InputError, OutputError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates import registered
+from meshmatch.templates.gather import read_gathered
 from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.prepare import prepare_folder, read_registered
 from meshmatch.templates.template import load_template
@@ -169,6 +170,11 @@ def test_a_folder_of_another_template_or_none_is_refused(folder: Path, tmp_path:
     with pytest.raises(InputError, match="not a prepared folder") as caught:
         read_registered(tmp_path, made.template)
     assert "meshmatch prepare" in caught.value.hint
+    (tmp_path / "other" / "prepared.json").write_text("[]")
+    with pytest.raises(InputError, match="not a prepared folder"):
+        read_registered(tmp_path / "other", other.template)
+    with pytest.raises(InputError, match="not a prepared folder"):
+        read_gathered(tmp_path / "other", other.template)
     (tmp_path / "out" / "shapes.safetensors").write_bytes(b"?")
     with pytest.raises(InputError, match="not a prepared folder"):
         read_registered(tmp_path / "out", made.template)
@@ -190,3 +196,11 @@ def test_correspondence_says_whether_registered_shapes_stand_alike(
     assert prepare_folder(folder, tmp_path / "many", FEW).align == "none"
     monkeypatch.setattr("meshmatch.training.few.FEW", 4)
     assert frame_of_few(tmp_path / "many") is None
+
+
+def test_registered_shapes_are_learned_at_equal_areas_alone(folder: Path, tmp_path: Path) -> None:
+    made = prepare_folder(folder, tmp_path / "out", FEW, scale="sphere")
+    with pytest.raises(InputError, match="prepared with --scale sphere") as caught:
+        read_registered(tmp_path / "out", made.template)
+    assert "--unsupervised" in caught.value.hint
+    assert read_gathered(tmp_path / "out", made.template).scale == "sphere"

@@ -216,6 +216,8 @@ def test_a_checkpoint_that_does_not_fit_is_refused(egg: Template, tmp_path: Path
     with pytest.raises(ModelError, match="another network") as caught:
         other.load(path)
     assert caught.value.hint
+    with pytest.raises(ModelError, match="of a training with seed 0"):
+        trainer(egg, replace(CONFIG, seed=CONFIG.seed + 1)).load(path)
     held = load_file(path)
     held["model.nodes"] = held["model.nodes"] + 1e-3
     save_file(held, path, {"step": "4"})
