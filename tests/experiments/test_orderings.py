@@ -58,6 +58,8 @@ def test_refinements_are_ordered_on_sets() -> None:
     assert verdicts(known({BASE: 1.0}, errors | {(BASE, "none"): 1.5}))[words] is False
     again = replace(BASE, seed=1)  # measured after one refinement alone, which is no comparison
     assert verdicts(known({BASE: 1.0, again: 1.0}, errors | {(again, "code"): 9.0}))[words] is True
+    more = errors | {(again, "code"): 9.0, (again, "chamfer"): 3.0, (again, "none"): 9.0}
+    assert verdicts(known({BASE: 1.0, again: 1.0}, more))[words] is False
 
 
 def test_costs_are_told_by_their_ratios() -> None:
