@@ -64,7 +64,7 @@ def prepare(
             metavar="FILE", help="The part of every vertex of a single shape, a number a line, from 0."
         ),
     ] = None,
-    nodes: Annotated[int, typer.Option(min=4, help="How many control nodes.")] = 320,
+    nodes: Annotated[int, typer.Option(min=4, max=10_000, help="How many control nodes.")] = 320,
     radius: Annotated[
         float, typer.Option(min=1e-6, help="Support radius of a node, in units of sqrt(surface area).")
     ] = 0.13,
