@@ -20,7 +20,7 @@ from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual, v
 from meshmatch.fitting.nodes import refine_nodes
 from meshmatch.fitting.orientation import Hypothesis
 from meshmatch.fitting.part import cost, fit_part
-from meshmatch.fitting.placing import frames_to_try, scan_frame
+from meshmatch.fitting.placing import frames_of_part, frames_to_try, scan_frame
 from meshmatch.fitting.readings import Judge, averaged, choose, lying
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.settle import settle, without_strays
@@ -120,11 +120,11 @@ def _whole(model, shape, frame, scan, config, landmarks, rng, tell) -> _Laid:
 
 def _part(model, shape, frame, scan, config, tell) -> _Laid:
     """The template on a shape that is taken for a part; where that is poor, more orientations are tried."""
-    found = _sought(model, frame, scan, config, _LAID, tell)
+    found = _sought(model, frame, scan, config, False, tell)
     if _finish(model, shape, found, config, partial=True).verdict != "poor":
         return found
     wider = replace(config, copies=2 * config.copies, hypotheses=4 * config.hypotheses)
-    again = _sought(model, frame, scan, wider, _MORE_LAID, tell)
+    again = _sought(model, frame, scan, wider, True, tell)
     return min(found, again, key=lambda laid: cost(laid[2].residual, _shown(frame, laid)))
 
 
@@ -133,16 +133,16 @@ def _shown(frame: Frame, laid: _Laid) -> float:
     return (frame.scale / laid[0].scale) ** 2
 
 
-def _sought(model, frame, scan, config, laid: int, tell) -> _Laid:
+def _sought(model, frame, scan, config, wide: bool, tell) -> _Laid:
     """The best fit of a part that a search finds."""
     scale, sized, best = fit_part(
         model,
         node_system(model),
         scan,
-        lambda part: frames_to_try(model, part, config),
+        lambda part: frames_of_part(model, part, config, wide),
         config.nodes,
         np.random.default_rng(config.seed),
-        laid=laid,
+        laid=_MORE_LAID if wide else _LAID,
         variants_count=config.variants,
         tilt=config.tilt,
         screening=config.screening,

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
 
 _TURNS = 4  # orientations that a fit tries where the alignment has to search
+# How far along its own up axis a body's core may lie from the middle of a part of it (units of sqrt(area)).
+_ALONG = (-0.3, -0.15, 0.0, 0.15)
 
 
 def scan_frame(model: TrainedModel, shape: Shape) -> Frame:
@@ -64,10 +66,7 @@ def frames_to_try(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hy
         )
     if config.up is None and config.front is None:
         return voted
-    up = axis_vector(config.up) if config.up else None
-    front = axis_vector(config.front) if config.front else None
-    if up is not None and front is not None and abs(up @ front) > 0.5:
-        raise OptionError("up and front lie along the same axis", "choose two different axes")
+    up, front = _axes(config)
     obeying = [
         guess
         for guess in voted
@@ -75,3 +74,39 @@ def frames_to_try(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hy
         and (front is None or guess.rotation[:, 2] @ front > 0.5)
     ]
     return obeying or forced_frames(up, front)
+
+
+def frames_of_part(model: TrainedModel, scan: Scan, config: FitConfig, wide: bool) -> list[Hypothesis]:
+    """Core frames to try for a part, whose middle is not that of the whole, and which a vote seldom knows.
+
+    Besides those of `frames_to_try`: all turns about the user's axes, or, if the search is to be ``wide``, about the
+    axes of the file; each with several places of the core along the body.
+    """
+    frames = frames_to_try(model, scan, config)
+    if model.card.frame["orientation"] in ALIGNS:
+        return frames
+    up, front = _axes(config)
+    if up is not None or front is not None:
+        return frames + _along(forced_frames(up, front))
+    if not wide:
+        return frames
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    return frames + _along([frame for axis in axes for frame in forced_frames(axis, None, 8)])
+
+
+def _along(frames: list[Hypothesis]) -> list[Hypothesis]:
+    """Every frame with its origin at several places along its own up axis."""
+    return [
+        Hypothesis(frame.rotation, frame.centre + apart * frame.rotation[:, 1], frame.votes)
+        for frame in frames
+        for apart in _ALONG
+    ]
+
+
+def _axes(config: FitConfig) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """The user's up and front."""
+    up = axis_vector(config.up) if config.up else None
+    front = axis_vector(config.front) if config.front else None
+    if up is not None and front is not None and abs(up @ front) > 0.5:
+        raise OptionError("up and front lie along the same axis", "choose two different axes")
+    return up, front

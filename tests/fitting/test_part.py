@@ -1,5 +1,7 @@
 """Parts of shapes: when one is tried, what it costs, and one side of a real body."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fit_shape import _part, boundary_length, fit_shape, node_system, take_samples
 from meshmatch.fitting.network_fit import Candidate, one_way_residual
 from meshmatch.fitting.part import SHARES, cost
+from meshmatch.fitting.placing import frames_of_part, frames_to_try
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.verdict import empty_share, judge
 from meshmatch.models.trained import TrainedModel
@@ -89,18 +92,56 @@ def test_a_poor_part_is_looked_at_again_from_more_sides_and_the_better_fit_kept(
 ) -> None:
     model = egg_model()
     open_egg, _ = side_of(model.template.shape, np.array([0.0, 1.0, 0.0]))
-    asked: list[tuple[int, int, int]] = []
+    asked: list[tuple[int, int, bool]] = []
 
     def seek(
-        model: TrainedModel, frame: Frame, scan: Scan, config: FitConfig, laid: int, tell: object
+        model: TrainedModel, frame: Frame, scan: Scan, config: FitConfig, wide: bool, tell: object
     ) -> tuple[Frame, Scan, Candidate]:
-        asked.append((config.copies, config.hypotheses, laid))
+        asked.append((config.copies, config.hypotheses, wide))
         still = np.zeros((model.template.K, 3))
         return frame, scan, Candidate(np.eye(3), np.zeros(3), still, residuals[len(asked) - 1])
 
     monkeypatch.setattr("meshmatch.fitting.fit_shape._sought", seek)
     frame, scan = take_samples(open_egg, 500, np.random.default_rng(0), Frame.identity())
     found = _part(model, open_egg, frame, scan, FitConfig(), print)
-    once, again = (48, 2, 6), (96, 8, 16)
+    once, again = (48, 2, False), (96, 8, True)
     assert asked == ([once] if residuals[0] == 0.01 else [once, again])
     assert found[2].residual == min(residuals[: len(asked)])
+
+
+def test_frames_of_a_part_are_tried_along_the_body() -> None:
+    model = read_model("human")
+    bust = load_shape(bundled_folder() / "samples" / "dancer.ply")
+    scan = take_samples(bust, 2048, np.random.default_rng(0))[1]
+    plain = FitConfig(copies=4, hypotheses=1)
+    few = frames_of_part(model, scan, plain, wide=False)
+    assert len(few) == len(frames_to_try(model, scan, plain))
+    many = frames_of_part(model, scan, plain, wide=True)
+    assert len(many) == len(few) + 6 * 8 * 4
+    turned = {tuple(frame.rotation.round(6).ravel()) for frame in many[len(few) :]}
+    assert len(turned) == 6 * 8
+    for given, turns in (({"up": "y"}, 12), ({"up": "z", "front": "-y"}, 1)):
+        config = replace(plain, **given)
+        own = len(frames_to_try(model, scan, config))
+        found = frames_of_part(model, scan, config, wide=False)[own:]
+        assert len(found) == 4 * turns
+        assert all(frame.rotation["xyz".index(given["up"]), 1] == pytest.approx(1) for frame in found)
+        along = {round(float(frame.centre @ frame.rotation[:, 1]), 6) for frame in found}
+        assert along == {-0.3, -0.15, 0.0, 0.15}
+        assert all(np.linalg.norm(np.cross(f.centre, f.rotation[:, 1])) < 1e-9 for f in found)
+    placed = replace(model, card=replace(model.card, frame={"orientation": "none", "scale": "area"}))
+    assert len(frames_of_part(placed, scan, plain, wide=True)) == 1
+
+
+def test_a_bust_is_found_where_its_up_is_told() -> None:
+    """Of a third of a body the network alone does not know which way is up."""
+    dancer = load_shape(bundled_folder() / "samples" / "dancer.ply")
+    height = dancer.verts[dancer.faces].mean(1)[:, 1]
+    faces = dancer.faces[height > np.median(height)]
+    used = np.unique(faces)
+    bust = Shape(dancer.verts[used], np.searchsorted(used, faces), "bust")
+    model = read_model("human")
+    whole, part = fit_shape(model, dancer), fit_shape(model, bust, FitConfig(up="y", front="z"))
+    assert part.partial and part.verdict == "fair"
+    found = map_between(bust, part, dancer, whole, model="human").index
+    assert np.linalg.norm(dancer.verts[found] - dancer.verts[used], axis=1).mean() < 4  # centimetres
