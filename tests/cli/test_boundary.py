@@ -96,12 +96,15 @@ from meshmatch.outputs import replace_on_success
 from meshmatch.shapes import files
 
 def load(path):
+    ready, say = os.pipe()
     child = os.fork()
     if not child:
         try:
+            os.write(say, b"!")  # before this Python may forget a signal that came while it forked
             time.sleep(60)
         finally:
             os._exit(7)
+    os.read(ready, 1)
     os.kill(child, signal.SIGTERM)
     print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
     try:
