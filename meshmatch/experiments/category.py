@@ -133,8 +133,7 @@ def trained(
         folder, work / "prepared", config, template=template, align=how, scale=scale, landmarks=landmarks
     )
     prepared = time.monotonic() - began
-    # Registered shapes are learned at equal areas; at equal radii they are learned as if nothing were known of them.
-    few = frame_of_few(work / "prepared") if scale == "area" else None
+    few = frame_of_few(work / "prepared")
     plain = cloud_recipe() if few is None else few_recipe()
     asked = {name: getattr(training, name) for name in ("steps", "minutes", "threads", "seed")}
     recipe = replace(plain, train=replace(plain.train, **asked))

@@ -26,10 +26,11 @@ def few_recipe() -> Recipe:
 
 
 def frame_of_few(folder: str | Path) -> dict[str, str] | None:
-    """What a card says of orientation and scale for a prepared folder of few registered shapes; None for others."""
+    """What a card says of orientation and scale for a prepared folder of few registered shapes; None for others, and for
+    those of equal radii: registered shapes are learned at equal areas."""
     try:
         words = prepared_words(folder)
-        if not words["registered"] or len(words["names"]) >= FEW:
+        if not words["registered"] or words["scale"] != "area" or len(words["names"]) >= FEW:
             return None
         return {"orientation": str(words["align"]), "scale": "area"}
     except (OSError, ValueError, KeyError, TypeError):

@@ -160,20 +160,16 @@ def test_table_4_has_costs_without_training(
     assert line(capsys)[1]["times"] == {}
 
 
+def two_seeds(places: Path, output: Path) -> list[str]:
+    """Words for table 5 and figure 6 with two seeds, measured on no set."""
+    words = ["--output", str(output), "--folder", str(places / "prepared"), "--minutes", "1e-6", "--sets", ""]
+    return [*words, "--batch", "2", "--seeds", "2", "--tables", "5", "--figures", "6", "--rounds", "0"]
+
+
 def test_all_cells_of_two_seeds(
     places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = [
-        "--output",
-        str(tmp_path),
-        "--folder",
-        str(places / "prepared"),
-        "--minutes",
-        "1e-6",
-        "--sets",
-        "",
-    ]
-    words += ["--batch", "2", "--seeds", "2", "--tables", "5", "--figures", "6", "--rounds", "0"]
+    words = two_seeds(places, tmp_path)
     assert main(words) == 0
     assert calls["train_cell"] == 6 + 4
     out, record = line(capsys)
@@ -199,18 +195,7 @@ def test_all_cells_of_two_seeds(
 def test_the_views_that_are_repeated_are_a_choice(
     places: Path, tmp_path: Path, calls: dict[str, int], repeated: str, more: int
 ) -> None:
-    words = [
-        "--output",
-        str(tmp_path),
-        "--folder",
-        str(places / "prepared"),
-        "--minutes",
-        "1e-6",
-        "--batch",
-        "2",
-    ]
-    words += ["--sets", "", "--tables", "5", "--figures", "6", "--rounds", "0", "--seeds", "2"]
-    assert main([*words, "--repeated", repeated]) == 0
+    assert main([*two_seeds(places, tmp_path), "--repeated", repeated]) == 0
     assert calls["train_cell"] == 6 + more
 
 

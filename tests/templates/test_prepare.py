@@ -204,3 +204,4 @@ def test_registered_shapes_are_learned_at_equal_areas_alone(folder: Path, tmp_pa
         read_registered(tmp_path / "out", made.template)
     assert "--unsupervised" in caught.value.hint
     assert read_gathered(tmp_path / "out", made.template).scale == "sphere"
+    assert frame_of_few(tmp_path / "out") is None
