@@ -54,6 +54,14 @@ def test_a_folder_is_not_prepared_into_itself(run: Run, folder: Path, tmp_path: 
     assert sorted(folder.iterdir()) == before
 
 
+@pytest.mark.parametrize("count", ["3", "10001"])
+def test_too_few_and_too_many_nodes_are_refused(run: Run, folder: Path, tmp_path: Path, count: str) -> None:
+    answer = run("prepare", folder, "-o", tmp_path / "out", "--nodes", count)
+    assert answer.status == 2
+    assert "--nodes" in answer.err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("strategy", ["spectral", "geodesic", "uniform"])
 def test_one_shape_becomes_a_template(
     run: Run,

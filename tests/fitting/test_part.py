@@ -1,5 +1,6 @@
 """Parts of shapes: when one is tried, what it costs, and one side of a real body."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import _part, boundary_length, fit_shape, node_system, take_samples
+from meshmatch.fitting.fit_shape import _part, _sought, boundary_length, fit_shape, node_system, take_samples
 from meshmatch.fitting.network_fit import Candidate, one_way_residual
 from meshmatch.fitting.part import SHARES, cost
 from meshmatch.fitting.placing import frames_of_part, frames_to_try
@@ -145,3 +146,26 @@ def test_a_bust_is_found_where_its_up_is_told() -> None:
     assert part.partial and part.verdict == "fair"
     found = map_between(bust, part, dancer, whole, model="human").index
     assert np.linalg.norm(dancer.verts[found] - dancer.verts[used], axis=1).mean() < 4  # centimetres
+
+
+def test_a_wide_search_lays_more_frames_with_care(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, laid, tried = read_model("human"), [], []
+
+    def search(
+        model: TrainedModel,
+        system: object,
+        scan: Scan,
+        orient: Callable[[Scan], list],
+        *rest: object,
+        **how: int,
+    ) -> tuple[float, Scan, Candidate]:
+        laid.append(how["laid"])
+        tried.append(len(orient(scan)))
+        return 1.0, scan, Candidate(np.eye(3), np.zeros(3), np.zeros((model.template.K, 3)), 0.0)
+
+    monkeypatch.setattr("meshmatch.fitting.fit_shape.fit_part", search)
+    frame, scan = take_samples(model.template.shape, 2048, np.random.default_rng(0))
+    for wide in (False, True):
+        _sought(model, frame, scan, FitConfig(copies=4, hypotheses=1), wide, print)
+    assert laid == [6, 16]
+    assert tried[1] == tried[0] + 6 * 8 * 4
