@@ -13,22 +13,22 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from meshmatch.config import set_threads
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import Blend, Deviation, Way
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig, Partial, Refine
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
-from meshmatch.maps.place import in_core_frame
 from meshmatch.maps.surface import Surface
+from meshmatch.maps.template_footpoints import in_core_frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
 from meshmatch.pipeline import Progress, as_shape, read_model, refine_notes, usable
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.ride import Rider
+from meshmatch.threads import set_threads
+from meshmatch.transfer.surface_binding import SurfaceBinding
 
 Mesh = Literal["source", "template"]
 Place = Literal["auto", "files", "source"]
@@ -146,7 +146,9 @@ def interpolate(
     repaired = [part.shape for part in clean]
     fits = agreed_fits(loaded, repaired, fits, config)
     blend = Blend(loaded, fits, None, repaired, way)
-    rider = Rider(clean[0], fits[0], blend.turns(fits[0].vectors), workers) if mesh == "source" else None
+    rider = (
+        SurfaceBinding(clean[0], fits[0], blend.turns(fits[0].vectors), workers) if mesh == "source" else None
+    )
     chosen = place if place != "auto" else _usual_place(fits)
 
     def seen(moment: float) -> tuple[np.ndarray, np.ndarray]:

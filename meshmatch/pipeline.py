@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.config import set_threads
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
@@ -27,6 +26,7 @@ from meshmatch.shapes.cloud import on_a_line
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import set_threads
 from meshmatch.transfer.direction import check_map, pull_back
 
 # What is going on, on which shape, and which share of it is done.

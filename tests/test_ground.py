@@ -11,9 +11,9 @@ import pytest
 
 import meshmatch
 from meshmatch import errors
-from meshmatch.config import set_threads
 from meshmatch.errors import InputError, MeshmatchError, OutputError
 from meshmatch.outputs import folder_on_success, replace_on_success
+from meshmatch.threads import set_threads
 
 
 def test_error_has_a_line_and_a_hint() -> None:
@@ -122,7 +122,7 @@ def test_public_names() -> None:
 
 def test_importing_the_package_and_the_ground_loads_nothing_heavy() -> None:
     code = (
-        "import sys, meshmatch, meshmatch.errors, meshmatch.outputs, meshmatch.config\n"
+        "import sys, meshmatch, meshmatch.errors, meshmatch.outputs, meshmatch.threads\n"
         "print([m for m in ('numpy', 'scipy', 'torch', 'trimesh', 'pymeshlab') if m in sys.modules])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -96,6 +96,6 @@ def _run(arguments: Sequence[str] | None) -> int:
 
 
 def _tell(what: str, message: str, hint: str = "") -> None:
-    from meshmatch.cli.voice import Voice
+    from meshmatch.cli.console import Console
 
-    Voice().trouble(what, message, hint)
+    Console().trouble(what, message, hint)

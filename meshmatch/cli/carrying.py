@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.voice import Voice
+from meshmatch.cli.console import Console
 
 if TYPE_CHECKING:
     from meshmatch.maps.vertex_map import VertexMap
     from meshmatch.pipeline import MatchResult
     from meshmatch.render.carried import Scene
     from meshmatch.shapes.shape import Shape
-    from meshmatch.transfer.fill import Doubt
+    from meshmatch.transfer.low_confidence import Doubt
 
 Source = Annotated[Path, typer.Argument(metavar="SRC", help="The shape that has it.")]
 Target = Annotated[Path, typer.Argument(metavar="TGT", help="The shape that gets it.")]
@@ -95,7 +95,7 @@ def check_request(request: Request, fill: bool = False, blank: str | None = None
 @contextmanager
 def output_file(request: Request, output: Path, inputs: list[Path | None]) -> Iterator[Path]:
     """A temporary path for the output, which replaces it when all went well; no input is ever replaced."""
-    from meshmatch.cli.claims import check_apart
+    from meshmatch.cli.output_paths import check_apart
     from meshmatch.models.registry import locate_model
     from meshmatch.outputs import replace_on_success
 
@@ -108,7 +108,7 @@ def output_file(request: Request, output: Path, inputs: list[Path | None]) -> It
 
 def check_picture(request: Request, picture: Path | None, others: list[Path | None]) -> None:
     """Refuse a picture that is no PNG, cannot be written, or would replace a file of this command: before the work."""
-    from meshmatch.cli.claims import check_apart, check_writable
+    from meshmatch.cli.output_paths import check_apart, check_writable
 
     check_apart([picture], [request.source, request.target, request.map, *others])
     check_writable(picture)
@@ -116,7 +116,7 @@ def check_picture(request: Request, picture: Path | None, others: list[Path | No
 
 def draw(
     request: Request,
-    voice: Voice,
+    voice: Console,
     picture: Path | None,
     shapes: "tuple[Shape, Shape]",
     maps: Maps,
@@ -137,7 +137,7 @@ def draw(
     voice.say(f"drew {picture}: what was carried, on both shapes")
 
 
-def find_maps(request: Request, voice: Voice, source: "Shape", target: "Shape") -> Maps:
+def find_maps(request: Request, voice: Console, source: "Shape", target: "Shape") -> Maps:
     """The maps both ways, from the file or by matching; what was found is said, and judged if ``strict``."""
     from meshmatch.errors import PoorFit
 
@@ -167,7 +167,7 @@ def _from_file(request: Request, source: "Shape", target: "Shape") -> Maps | Non
     return Maps(pull_back(forward, source, target, request.threads), forward)
 
 
-def _by_matching(request: Request, voice: Voice, source: "Shape", target: "Shape") -> Maps:
+def _by_matching(request: Request, voice: Console, source: "Shape", target: "Shape") -> Maps:
     from meshmatch import pipeline
 
     with voice.progress() as report:
@@ -185,7 +185,7 @@ def _by_matching(request: Request, voice: Voice, source: "Shape", target: "Shape
     return Maps(result.back, result.forward, result.match)
 
 
-def _tell(request: Request, voice: Voice, result: Maps) -> None:
+def _tell(request: Request, voice: Console, result: Maps) -> None:
     a, b = request.names
     if result.match is None:
         voice.say(f"used the map {request.map} from {a} to {b}")
@@ -216,7 +216,7 @@ def map_record(request: Request, result: Maps, used: "VertexMap") -> dict[str, A
     return record
 
 
-def tell_doubt(voice: Voice, doubt: "Doubt", least: float, what: str = "vertices") -> None:
+def tell_doubt(voice: Console, doubt: "Doubt", least: float, what: str = "vertices") -> None:
     """How much was in doubt, and what became of it, in words."""
     if not doubt.low:
         return

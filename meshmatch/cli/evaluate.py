@@ -7,8 +7,8 @@ import typer
 
 from meshmatch.cli import options
 from meshmatch.cli import truth as truths
-from meshmatch.cli.claims import check_apart, check_png, claimed
-from meshmatch.cli.voice import Voice, print_json, print_rows
+from meshmatch.cli.console import Console, print_json, print_rows
+from meshmatch.cli.output_paths import check_apart, check_png, claimed
 
 if TYPE_CHECKING:
     from meshmatch.maps.evaluate import Evaluation
@@ -74,7 +74,7 @@ def evaluate(
 
             render_errors(*shapes, found, known, result.errors, drawing, unit=unit)
     for reason in found.reasons:
-        Voice().say(f"note: {reason}")
+        Console().say(f"note: {reason}")
     if json:
         print_json(dict(result.as_dict(threshold)))
     else:

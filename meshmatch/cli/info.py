@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.voice import print_json, print_rows
+from meshmatch.cli.console import print_json, print_rows
 
 if TYPE_CHECKING:
     from meshmatch.shapes.shape import Shape
@@ -57,9 +57,9 @@ def _is_list(file: Path) -> bool:
 
 def _shape(file: Path) -> Record:
     from meshmatch.shapes.files import load_shape
-    from meshmatch.shapes.guesses import long_axis, person_unit
     from meshmatch.shapes.repair import repair
     from meshmatch.shapes.topology import edges_of, face_parts
+    from meshmatch.shapes.unit_heuristics import guess_unit, long_axis
 
     shape = load_shape(file)
     record: Record = {
@@ -80,7 +80,7 @@ def _shape(file: Path) -> Record:
     if not shape.is_cloud:  # of the repaired mesh: the seams of texture and the corners of an stl are joined
         record["parts"] = int(face_parts(clean.shape.faces, clean.shape.V).max()) + 1
     record["longest_along"] = long_axis(clean.shape)
-    record["unit_if_a_person"] = person_unit(clean.shape)
+    record["unit_if_a_person"] = guess_unit(clean.shape)
     record["repair"] = list(clean.notes)
     record["repaired_vertices"] = clean.shape.V
     record["repaired_faces"] = clean.shape.F

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.claims import check_apart, check_png, claimed
-from meshmatch.cli.voice import Voice, print_json
+from meshmatch.cli.console import Console, print_json
+from meshmatch.cli.output_paths import check_apart, check_png, claimed
 
 if TYPE_CHECKING:
     from meshmatch.interpolation import Interpolation
@@ -79,7 +79,7 @@ def interpolate(
     The model's template is laid on each, and its poses are blended; A's own mesh goes along. Time 0 is A as its
     file has it, and at time 1 A's mesh lies on B. Shapes given with --through are met at even times in between.
     """
-    from meshmatch.config import set_threads
+    from meshmatch.threads import set_threads
 
     set_threads(1)
     from meshmatch.errors import PoorFit
@@ -93,7 +93,7 @@ def interpolate(
     check_png(plot)
     files = [source, *way, target]
     check_apart([output, plot], files)
-    voice = Voice(quiet)
+    voice = Console(quiet)
     # Outputs that cannot be written, a mistyped model and broken files are told before the long work.
     claim = folder_on_success if kind == "folder" else replace_on_success
     with claimed(plot) as plotted, claim(output) as temporary:
@@ -194,7 +194,7 @@ def _plot(path: Path, result: "Interpolation", met: dict[float, str]) -> None:
     draw_lines(path, [step.time for step in result.steps], lines, caption, met)
 
 
-def _tell(voice: Voice, result: "Interpolation", files: list[Path], asked: str) -> None:
+def _tell(voice: Console, result: "Interpolation", files: list[Path], asked: str) -> None:
     for note in result.notes:
         voice.say(note)
     for file, fit in zip(files, result.fits, strict=True):

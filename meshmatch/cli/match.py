@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.claims import check_apart, check_png, claimed
-from meshmatch.cli.voice import Voice, print_json
+from meshmatch.cli.console import Console, print_json
+from meshmatch.cli.output_paths import check_apart, check_png, claimed
 
 if TYPE_CHECKING:
     from meshmatch.fitting.fit import Fit
@@ -53,7 +53,7 @@ def match(
     The two files may differ in vertex count, unit, up axis and facing. In the map, index[i] is the vertex of
     the target matched to vertex i of the source; vertices are counted from 0, in the order of the files.
     """
-    from meshmatch.config import set_threads
+    from meshmatch.threads import set_threads
 
     set_threads(1)  # before NumPy reads it: the two fits run side by side, one thread each
     from meshmatch.errors import PoorFit
@@ -67,7 +67,7 @@ def match(
     check_suffix(output)
     check_png(picture)
     check_apart([output, picture], [source, target, landmarks])
-    voice = Voice(quiet)
+    voice = Console(quiet)
     names = _apart(source, target)
     # Outputs that cannot be written, a mistyped model and broken files are told before the long work.
     with claimed(picture) as drawing:
@@ -143,7 +143,7 @@ def register(
 
     Whatever shape it was laid on, the result has the same vertices and triangles in the same order.
     """
-    from meshmatch.config import set_threads
+    from meshmatch.threads import set_threads
 
     set_threads(threads)
     import numpy as np
@@ -157,7 +157,7 @@ def register(
     options.check_axes(up, front)
     check_png(picture)
     check_apart([output, picture], [shape])
-    voice = Voice(quiet)
+    voice = Console(quiet)
     with claimed(picture) as drawing:
         with replace_on_success(output) as temporary:
             speck = Shape(np.eye(3), np.array([[0, 1, 2]]))
@@ -213,7 +213,7 @@ def _apart(source: Path, target: Path) -> tuple[str, str]:
     return (source.name, target.name) if source.name != target.name else (str(source), str(target))
 
 
-def _tell_match(voice: Voice, result: "MatchResult", names: tuple[str, str], output: Path) -> None:
+def _tell_match(voice: Console, result: "MatchResult", names: tuple[str, str], output: Path) -> None:
     found = result.map
     for note in result.notes:
         voice.say(note)
@@ -226,7 +226,7 @@ def _tell_match(voice: Voice, result: "MatchResult", names: tuple[str, str], out
     )
 
 
-def _warn(voice: Voice, verdict: str, reasons: tuple[str, ...]) -> None:
+def _warn(voice: Console, verdict: str, reasons: tuple[str, ...]) -> None:
     if verdict == "poor":
         voice.warn(f"the fit is poor: {_why(reasons)}")
     elif verdict != "good":

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.voice import Voice, print_json, print_rows, print_text
+from meshmatch.cli.console import Console, print_json, print_rows, print_text
 
 models = typer.Typer(
     help="List, show, add, remove and verify trained models.", no_args_is_help=True, rich_markup_mode=None
@@ -46,7 +46,7 @@ def list_all(json: options.Json = False) -> None:
     print_rows(rows)
     for entry in entries:
         if entry.problem:
-            Voice().warn(f"model {entry.name}: {entry.problem}")
+            Console().warn(f"model {entry.name}: {entry.problem}")
 
 
 @models.command()
@@ -79,7 +79,7 @@ def add(
     from meshmatch.models.registry import add_model
 
     entry = add_model(folder, replace=replace)
-    Voice().say(f"added model {entry.name} to {entry.folder.parent}")
+    Console().say(f"added model {entry.name} to {entry.folder.parent}")
     if json:
         print_json({"added": entry.name, "folder": str(entry.folder)})
 
@@ -90,7 +90,7 @@ def remove(name: Name, json: options.Json = False) -> None:
     from meshmatch.models.registry import remove_model
 
     remove_model(name)
-    Voice().say(f"removed model {name}")
+    Console().say(f"removed model {name}")
     if json:
         print_json({"removed": name})
 
@@ -112,7 +112,7 @@ def verify(
             card = verify_model(name)
         except ModelError as error:
             checked.append({"name": name, "sha256": None, "problem": error.message})
-            Voice().trouble(name, error.message, error.hint)
+            Console().trouble(name, error.message, error.hint)
         else:
             checked.append({"name": name, "sha256": card.weights_sha256, "problem": ""})
             if not json:

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from meshmatch.cli import options
+from meshmatch.cli import options, picture_options
 from meshmatch.cli import truth as truths
-from meshmatch.cli.claims import check_apart, check_png
-from meshmatch.cli.voice import Voice, print_json
+from meshmatch.cli.console import Console, print_json
+from meshmatch.cli.output_paths import check_apart, check_png
 
 if TYPE_CHECKING:
-    from meshmatch.cli.scenes import Subject
+    from meshmatch.cli.picture_options import Subject
 
 View = Literal["quarter", "front", "left", "right", "back", "above"]
 
@@ -112,10 +112,9 @@ def picture(
 
     A PNG without a GPU, a display or OpenGL. Textures and colours of the files are shown where there are any.
     """
-    from meshmatch.config import set_threads
+    from meshmatch.threads import set_threads
 
     set_threads(1)  # sums in another order would differ in their last bits
-    from meshmatch.cli import scenes
     from meshmatch.errors import OptionError
     from meshmatch.outputs import replace_on_success
     from meshmatch.render.framing import VIEWS
@@ -124,7 +123,7 @@ def picture(
     options.check_axes(up, front)
     check_png(output)
     told = truths.check_truth(truth, points)
-    asked = scenes.Asked(
+    asked = picture_options.Asked(
         map, confidence, (truth, points) if told else None, unit, values or [], title, range, labels or [], on,
         fit, image, plain, seed,
     )  # fmt: skip
@@ -136,11 +135,11 @@ def picture(
         )
     look = Look(_size(size), background, up, front, *VIEWS[view], ground)
     check_apart([output], [*shapes, *asked.files])
-    voice = Voice(quiet)
+    voice = Console(quiet)
     with replace_on_success(output) as temporary:
-        subjects = [scenes.load_subject(path, asked) for path in shapes]
+        subjects = [picture_options.load_subject(path, asked) for path in shapes]
         labelled = name or _apart(shapes, subjects)
-        drawn = scenes.compose(asked, subjects, labelled, look, voice)
+        drawn = picture_options.compose(asked, subjects, labelled, look, voice)
         width, height = render_shapes(
             drawn.panels, temporary, drawn.look, labels=None if names else [""] * len(drawn.panels)
         )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.voice import Voice, print_json
+from meshmatch.cli.console import Console, print_json
 from meshmatch.outputs import make_folder
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def prepare(
     from meshmatch.templates.prepare import prepare_folder, template_shape
     from meshmatch.templates.template import save_template
 
-    voice = Voice(quiet)
+    voice = Console(quiet)
     config = NodeConfig(strategy=strategy, K=nodes, radius=radius, seed=seed)
     if (strategy == "parts") != (labels is not None):
         raise OptionError(

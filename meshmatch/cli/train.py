@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.claims import check_png, check_writable
-from meshmatch.cli.voice import Voice, print_json
+from meshmatch.cli.console import Console, print_json
+from meshmatch.cli.output_paths import check_png, check_writable
 from meshmatch.outputs import make_folder
 
 if TYPE_CHECKING:
@@ -132,8 +132,8 @@ def train(
     command goes on from the checkpoint, exactly. On several GPUs:
     `torchrun --nproc-per-node N -m meshmatch train ...`.
     """
-    from meshmatch.config import set_threads
     from meshmatch.errors import OptionError
+    from meshmatch.threads import set_threads
 
     set_threads(threads)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
@@ -141,10 +141,10 @@ def train(
     make_folder(output)
     check_writable(picture)
     from meshmatch.models.card import check_name
-    from meshmatch.templates.gather import is_registered
+    from meshmatch.templates.unregistered import is_registered
     from meshmatch.training import run
-    from meshmatch.training.few import few_recipe, frame_of_few
     from meshmatch.training.folder import checkpoint_in
+    from meshmatch.training.small_data import few_recipe, frame_of_few
     from meshmatch.training.unsupervised import cloud_recipe
 
     label = check_name(name or output.resolve().name)
@@ -166,7 +166,7 @@ def train(
         seed=seed,
     )
     chosen = replace(chosen, train=settings, network=replace(chosen.network, field=field))
-    voice = Voice(quiet or not first)
+    voice = Console(quiet or not first)
     if not fresh and checkpoint_in(output).is_file():
         voice.say(f"going on from the checkpoint in {output}; --fresh starts anew")
     started = None
@@ -235,10 +235,10 @@ def _without_correspondence(
     start: "TrainedModel | None",
     resume: bool,
     stiffness: float,
-    voice: Voice,
+    voice: Console,
     show: "Callable[[Progress], None]",
 ) -> Path:
-    from meshmatch.templates.gather import read_gathered
+    from meshmatch.templates.unregistered import read_gathered
     from meshmatch.training import run
     from meshmatch.training.unsupervised import train_clouds
 
@@ -263,7 +263,7 @@ def _without_correspondence(
     )
 
 
-def _done(folder: Path, label: str, voice: Voice, json: bool, picture: Path | None) -> None:
+def _done(folder: Path, label: str, voice: Console, json: bool, picture: Path | None) -> None:
     from meshmatch.models.registry import CARD, read_card
 
     if voice.quiet and not json:
@@ -287,7 +287,7 @@ def _done(folder: Path, label: str, voice: Voice, json: bool, picture: Path | No
 
 
 @contextmanager
-def _progress(voice: Voice, picture: Path | None) -> "Iterator[Callable[[Progress], None]]":
+def _progress(voice: Console, picture: Path | None) -> "Iterator[Callable[[Progress], None]]":
     """A bar with the losses while people watch; a line now and then where they read a log; at the end a picture."""
     lines = 0
     seen: list[Progress] = []

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from meshmatch.cli import carrying, options
-from meshmatch.cli.voice import Voice, print_json
+from meshmatch.cli.console import Console, print_json
 
 
 def transfer_color(
@@ -49,7 +49,7 @@ def transfer_color(
     They are interpolated within the faces of SRC. What --blank writes is a number, as many numbers as there
     are columns (1,0,0), or a colour (#ff0000).
     """
-    from meshmatch.config import set_threads
+    from meshmatch.threads import set_threads
 
     set_threads(1)
     import numpy as np
@@ -58,7 +58,7 @@ def transfer_color(
     from meshmatch.shapes.files import load_shape
     from meshmatch.transfer import colors
     from meshmatch.transfer.attributes import carry_values
-    from meshmatch.transfer.fill import settle_values
+    from meshmatch.transfer.low_confidence import resolve_values
     from meshmatch.transfer.value_files import (
         Values,
         check_values_suffix,
@@ -74,7 +74,7 @@ def transfer_color(
     else:
         colors.check_suffix(output)
     carrying.check_picture(request, picture, [output, values])
-    voice = Voice(quiet)
+    voice = Console(quiet)
     with carrying.output_file(request, output, [values]) as temporary:
         a, b = load_shape(source), load_shape(target)
         given = colors.of_shape(a) if values is None else load_values(values, a)
@@ -86,7 +86,7 @@ def transfer_color(
             empty = colors.light(empty)
         result = carrying.find_maps(request, voice, a, b)
         carried = carry_values(result.back, a, given.numbers)
-        carried, doubt = settle_values(
+        carried, doubt = resolve_values(
             carried, result.back.confidence.astype(np.float64), b, min_confidence, empty, fill
         )
         if values is None:

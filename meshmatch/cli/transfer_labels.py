@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from meshmatch.cli import carrying, options
-from meshmatch.cli.voice import Voice, print_json
+from meshmatch.cli.console import Console, print_json
 
 On = Literal["vertices", "faces"]
 
@@ -56,7 +56,7 @@ def transfer_labels(
     Labels are voted on and never averaged. --blank names the label to write where the confidence is too low,
     such as -1 or unknown; where SRC has no label it is also what TGT gets.
     """
-    from meshmatch.config import set_threads
+    from meshmatch.threads import set_threads
 
     set_threads(1)
     import numpy as np
@@ -65,14 +65,14 @@ def transfer_labels(
     from meshmatch.shapes.files import load_shape
     from meshmatch.transfer.attributes import carry_labels
     from meshmatch.transfer.face_labels import carry_face_labels, of_faces
-    from meshmatch.transfer.fill import settle_labels
     from meshmatch.transfer.label_files import check_labels_suffix, load_labels, named, save_labels
+    from meshmatch.transfer.low_confidence import resolve_labels
 
     request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
     carrying.check_request(request, fill, blank)
     check_labels_suffix(output)
     carrying.check_picture(request, picture, [output, labels])
-    voice = Voice(quiet)
+    voice = Console(quiet)
     with carrying.output_file(request, output, [labels]) as temporary:
         a, b = load_shape(source), load_shape(target)
         given = load_labels(labels, a, on)
@@ -88,7 +88,7 @@ def transfer_labels(
             confidence = of_faces(confidence, b)
         else:
             found = carry_labels(result.back, a, given.codes, given.on == "faces")
-        found, doubt = settle_labels(
+        found, doubt = resolve_labels(
             found, confidence, b, min_confidence, blank is not None, fill, kind == "faces"
         )
         carried = named(found, given, kind, blank)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from meshmatch.cli import carrying, options
-from meshmatch.cli.voice import Voice, print_json
+from meshmatch.cli.console import Console, print_json
 
 
 def transfer_landmarks(
@@ -41,7 +41,7 @@ def transfer_landmarks(
     that is (.csv, .json); or name and position (.pp). A position in FILE stands for the nearest point of SRC.
     Landmarks below --min-confidence are named.
     """
-    from meshmatch.config import set_threads
+    from meshmatch.threads import set_threads
 
     set_threads(1)
     import numpy as np
@@ -54,7 +54,7 @@ def transfer_landmarks(
     carrying.check_request(request)
     check_landmarks_suffix(output)
     carrying.check_picture(request, picture, [output, landmarks])
-    voice = Voice(quiet)
+    voice = Console(quiet)
     with carrying.output_file(request, output, [landmarks]) as temporary:
         a, b = load_shape(source), load_shape(target)
         given, furthest = load_landmarks(landmarks, a)

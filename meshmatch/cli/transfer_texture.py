@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from meshmatch.cli import carrying, options
-from meshmatch.cli.voice import Voice, print_json
+from meshmatch.cli.console import Console, print_json
 
 if TYPE_CHECKING:
     from meshmatch.shapes.appearance import Appearance
@@ -89,10 +89,10 @@ def transfer_texture(
     its vertex colours. The first vertices of a written glb are those of TGT in their order, and copies where the
     texture has seams follow; an obj has exactly the vertices and faces of TGT.
     """
-    from meshmatch.config import set_threads
+    from meshmatch.threads import set_threads
 
     set_threads(1)
-    from meshmatch.cli.claims import check_apart
+    from meshmatch.cli.output_paths import check_apart
     from meshmatch.models.registry import locate_model
     from meshmatch.outputs import replace_on_success
     from meshmatch.shapes.appearance import load_appearance
@@ -106,7 +106,7 @@ def transfer_texture(
     choices = Choices(size, samples, padding, min_confidence, fill, _color(blank), threads)
     check_choices(choices)
     _check_suffix(output)
-    voice = Voice(quiet)
+    voice = Console(quiet)
     a, b = load_shape(source), load_shape(target)
     painted = b.is_cloud or output.suffix.lower() in _COLORS
     files = [output] if painted else files_of(output)
@@ -193,20 +193,20 @@ def _paint(
     look: "Appearance",
     result: carrying.Maps,
     choices: "Choices",
-    voice: Voice,
+    voice: Console,
 ) -> dict[str, Any]:
     """Write the target with vertex colours."""
     import numpy as np
 
     from meshmatch.transfer import colors
-    from meshmatch.transfer.fill import settle_values
+    from meshmatch.transfer.low_confidence import resolve_values
     from meshmatch.transfer.texture import colors_of_vertices
 
     source, target = shapes
     found = colors_of_vertices(source, look, target, result.back)
     empty = None if choices.blank is None else colors.light(np.array(choices.blank))
     confidence = result.back.confidence.astype(np.float64)
-    found, doubt = settle_values(found, confidence, target, choices.min_confidence, empty, choices.fill)
+    found, doubt = resolve_values(found, confidence, target, choices.min_confidence, empty, choices.fill)
     colors.save(path, target, found)
     carrying.tell_doubt(voice, doubt, choices.min_confidence)
     return carrying.doubt_record(doubt, choices.min_confidence)
@@ -220,7 +220,7 @@ def _bake(
     result: carrying.Maps,
     atlas: "Atlas",
     choices: "Choices",
-    voice: Voice,
+    voice: Console,
 ) -> dict[str, Any]:
     """Write the target with a texture."""
     from meshmatch.shapes.textured_files import TexturedFiles

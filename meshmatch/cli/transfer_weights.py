@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from meshmatch.cli import carrying, options
-from meshmatch.cli.voice import Voice, print_json
+from meshmatch.cli.console import Console, print_json
 
 
 def transfer_weights(
@@ -41,7 +41,7 @@ def transfer_weights(
     They are interpolated within the faces of SRC; each vertex keeps its heaviest joints, and their weights sum
     to 1.
     """
-    from meshmatch.config import set_threads
+    from meshmatch.threads import set_threads
 
     set_threads(1)
     import numpy as np
@@ -49,14 +49,14 @@ def transfer_weights(
     from meshmatch.errors import InputError
     from meshmatch.shapes.files import load_shape
     from meshmatch.transfer.attributes import carry_weights
-    from meshmatch.transfer.fill import settle_weights
+    from meshmatch.transfer.low_confidence import resolve_weights
     from meshmatch.transfer.weight_files import SkinWeights, check_weights_suffix, load_weights, save_weights
 
     request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
     carrying.check_request(request, fill)
     check_weights_suffix(output)
     carrying.check_picture(request, picture, [output, weights])
-    voice = Voice(quiet)
+    voice = Console(quiet)
     with carrying.output_file(request, output, [weights]) as temporary:
         a, b = load_shape(source), load_shape(target)
         if weights is None and source.suffix.lower() not in (".glb", ".gltf"):
@@ -65,7 +65,7 @@ def transfer_weights(
         result = carrying.find_maps(request, voice, a, b)
         confidence = result.back.confidence.astype(np.float64)
         carried = carry_weights(result.back, a, given.matrix, influences)
-        carried, doubt = settle_weights(carried, confidence, b, min_confidence, fill, influences)
+        carried, doubt = resolve_weights(carried, confidence, b, min_confidence, fill, influences)
         save_weights(temporary, SkinWeights(carried, given.names))
     carrying.tell_doubt(voice, doubt, min_confidence)
     bare = int((np.diff(carried.indptr) == 0).sum())

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from meshmatch.cli import carrying, options
-from meshmatch.cli.voice import Voice, print_json
+from meshmatch.cli.console import Console, print_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,7 +38,7 @@ def view(
     Matched places have one colour; point at one shape and see the place on the other. The page is one file for
     any browser and needs no network. With --map, --up and --front say how SOURCE is to stand.
     """
-    from meshmatch.config import set_threads
+    from meshmatch.threads import set_threads
 
     set_threads(1)
     from meshmatch.render.viewer import check_page, write_page
@@ -47,7 +47,7 @@ def view(
     request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
     options.check_axes(up, front)
     check_page(output)
-    voice = Voice(quiet)
+    voice = Console(quiet)
     with carrying.output_file(request, output, []) as temporary:
         shapes = load_shape(source), load_shape(target)
         result = carrying.find_maps(request, voice, *shapes)
@@ -90,7 +90,7 @@ def _rotations(
 
 
 def _looks(
-    request: carrying.Request, voice: Voice, shapes: "tuple[Shape, Shape]", result: carrying.Maps
+    request: carrying.Request, voice: Console, shapes: "tuple[Shape, Shape]", result: carrying.Maps
 ) -> "Looks | None":
     """What the shapes wear. A look that cannot be read is no reason to show nothing."""
     from meshmatch.errors import InputError

@@ -44,7 +44,7 @@ class Placed:
 
 
 def placed(shape: Shape, seed: int = 0, faces: int | None = None) -> Placed:
-    """Scale and centre a shape, sample it, and thin it to about so many faces."""
+    """Scale and center a shape, sample it, and thin it to about so many faces."""
     frame = sqrt_area_frame(shape)
     drawn = sample_surface(shape, _SAMPLES, np.random.default_rng(seed))
     whole = Shape(frame.apply(shape.verts), shape.faces, shape.name, invalid=shape.invalid)
@@ -55,7 +55,7 @@ def placed(shape: Shape, seed: int = 0, faces: int | None = None) -> Placed:
 def turn_to(source: Placed, target: Placed) -> Frame:
     """The rigid motion that lays a source on a target."""
     best = align(source.samples, target.samples, "rigid")[0]
-    return Frame(1.0, best.rotation.T, best.centre)
+    return Frame(1.0, best.rotation.T, best.center)
 
 
 def nearest_map(source: Shape, target: Shape, moved: np.ndarray, there: Placed) -> VertexMap:
@@ -104,7 +104,7 @@ class RigidMatcher:
     seed: int = 0
 
     def fit(self, shape: Shape) -> Placed:
-        """Scale, centre, sample."""
+        """Scale, center, sample."""
         return placed(shape, self.seed)
 
     def map(self, source: Shape, source_fit: Placed, target: Shape, target_fit: Placed) -> VertexMap:
@@ -124,7 +124,7 @@ class NricpMatcher:
     seed: int = 0
 
     def fit(self, shape: Shape) -> Placed:
-        """Scale, centre, sample, thin."""
+        """Scale, center, sample, thin."""
         need_meshes("nricp", shape)
         return placed(shape, self.seed, self.faces)
 
@@ -151,7 +151,7 @@ class MeshmonkMatcher:
     seed: int = 0
 
     def fit(self, shape: Shape) -> Placed:
-        """Scale, centre, sample, thin."""
+        """Scale, center, sample, thin."""
         need_meshes("meshmonk", shape)
         return placed(shape, self.seed, self.faces)
 

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from meshmatch.config import set_threads
 from meshmatch.errors import InputError
 from meshmatch.experiments.category import (
     Pair,
@@ -39,6 +38,7 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import set_threads
 
 TRUTH = ".landmarks.npy"
 RIGHT = 0.15

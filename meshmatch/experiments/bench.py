@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from meshmatch.config import set_threads
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.distances import default_folder
 from meshmatch.experiments.protocols import CLOUD_SET, SET_NAMES, BenchSet, Pair, load_set
@@ -35,6 +34,7 @@ from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import set_threads
 
 
 class Matcher(Protocol):

@@ -25,7 +25,6 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from meshmatch.config import set_threads
 from meshmatch.errors import OptionError
 from meshmatch.experiments.bench import chosen_pairs
 from meshmatch.experiments.protocols import SET_NAMES, BenchSet, load_set
@@ -35,6 +34,7 @@ from meshmatch.fitting.blend import WAYS, Blend, Way
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.evaluate import SKIN_M2
 from meshmatch.pipeline import read_model, register, usable
+from meshmatch.threads import set_threads
 from meshmatch.training.losses import distance
 from meshmatch.training.run import human_source
 from meshmatch.training.scans import ScanConfig

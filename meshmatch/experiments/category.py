@@ -28,13 +28,13 @@ from meshmatch.shapes.align import Align, Oriented, align
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.gather import Scale, read_gathered, unit_frame
 from meshmatch.templates.nodes import NodeConfig, Strategy
 from meshmatch.templates.prepare import prepare_folder
 from meshmatch.templates.template import load_template
-from meshmatch.training.few import few_recipe, frame_of_few
+from meshmatch.templates.unregistered import Scale, read_gathered, unit_frame
 from meshmatch.training.loop import Progress
 from meshmatch.training.run import folder_source, train_model
+from meshmatch.training.small_data import few_recipe, frame_of_few
 from meshmatch.training.unsupervised import cloud_recipe, train_clouds
 
 Pair = tuple[str, str]
@@ -237,7 +237,7 @@ def nearest_all(
     for source, target in pairs or spread_pairs(shapes):
         tell(f"aligning {source} to {target}")
         best = align(seen[source], seen[target], how)[0]
-        moved = (places[source] - best.centre) @ best.rotation
+        moved = (places[source] - best.center) @ best.rotation
         distance, index = trees[target].query(moved)
         found[source, target] = (index, np.exp(-distance / 0.03))
     return found

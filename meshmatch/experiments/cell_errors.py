@@ -142,8 +142,8 @@ def begin(model: TrainedModel, one: Subject, reference: str, measure: Measure) -
     scan = Scan(turn.apply(one.scan.points), one.scan.normals @ turn.rotation.T)
     rng = np.random.default_rng(measure.seed)
     found = lay_on(model.network, node_system(model), ours.core, scan, np.eye(3), np.zeros(3), rng)
-    frame = one.frame.compose(turn).compose(Frame(1.0, found.rotation.T, found.centre))
-    return Start(frame, scan.turned(found.rotation, found.centre), found)
+    frame = one.frame.compose(turn).compose(Frame(1.0, found.rotation.T, found.center))
+    return Start(frame, scan.turned(found.rotation, found.center), found)
 
 
 def refined(

@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 
-from meshmatch.config import set_threads
 from meshmatch.experiments.cells import Cell, Setting
 from meshmatch.experiments.pool import Pool, pool_of
 from meshmatch.fields.field import Field
@@ -18,6 +17,7 @@ from meshmatch.models.deformer import Deformer
 from meshmatch.models.encoder import BasisEncoder
 from meshmatch.models.registry import CARD, WEIGHTS, read_card
 from meshmatch.outputs import make_folder
+from meshmatch.threads import set_threads
 from meshmatch.training.loop import Trainer
 from meshmatch.training.losses import LossPoints
 from meshmatch.training.run import export, validation_error

@@ -21,10 +21,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from meshmatch.config import set_threads
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.report import circumstances, explain
 from meshmatch.models.registry import CARD, read_card
+from meshmatch.threads import set_threads
 from meshmatch.training.loop import Progress
 from meshmatch.training.run import Recipe, human_source, read_template, recipe, train_model
 from meshmatch.training.scans import ScanConfig

@@ -93,8 +93,8 @@ def _start(model: TrainedModel, verts: np.ndarray, measure: Measure) -> tuple[St
     R, t = rigid_motion(template.shape.verts[template.core], places[template.core])
     rng = np.random.default_rng(measure.seed)
     found = lay_on(model.network, node_system(model), template.core, scan, R, t, rng, rounds=1)
-    local = scan.turned(found.rotation, found.centre)
-    return Start(frame, local, found), (places - found.centre) @ found.rotation
+    local = scan.turned(found.rotation, found.center)
+    return Start(frame, local, found), (places - found.center) @ found.rotation
 
 
 def _error(model: TrainedModel, rows: np.ndarray, true: np.ndarray) -> float:

@@ -32,7 +32,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from meshmatch.config import set_threads
 from meshmatch.errors import OptionError
 from meshmatch.experiments.adapters import viscoelastic
 from meshmatch.experiments.category import (
@@ -53,10 +52,11 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.outputs import make_folder
 from meshmatch.pipeline import usable
 from meshmatch.shapes.shape import Frame, Shape
-from meshmatch.templates.gather import most_typical
 from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.prepare import prepare_folder
 from meshmatch.templates.template import Template
+from meshmatch.templates.unregistered import most_typical
+from meshmatch.threads import set_threads
 
 TRUTH = ".truth.npy"
 WAYS = ("meshmonk", "unregistered", "registered")

@@ -13,9 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from meshmatch.config import set_threads
 from meshmatch.experiments.cell_training import fewer
 from meshmatch.experiments.cells import Cell, Setting
+from meshmatch.threads import set_threads
 from meshmatch.training.loop import Trainer
 from meshmatch.training.setup import build_dataset, build_deformer, build_loss_points
 

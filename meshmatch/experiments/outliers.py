@@ -23,7 +23,6 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from meshmatch.config import set_threads
 from meshmatch.errors import InputError
 from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.fitting.fit import Fit
@@ -31,6 +30,7 @@ from meshmatch.maps.evaluate import LOST_CM
 from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.pipeline import map_between, register
 from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.threads import set_threads
 
 FILE = "faust_outliers.npy"
 

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from meshmatch.config import set_threads
 from meshmatch.experiments.bench import chosen_pairs
 from meshmatch.experiments.category import area_under_curve
 from meshmatch.experiments.distances import TruthDistances, default_folder
@@ -37,6 +36,7 @@ from meshmatch.pipeline import map_between, register
 from meshmatch.render.scene import Scene
 from meshmatch.render.surface import FacePaint, Surface
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import set_threads
 
 Kind = Literal["view", "cut"]
 KINDS: tuple[Kind, ...] = ("view", "cut")
@@ -48,23 +48,23 @@ def part_of(shape: Shape, kind: Kind, seed: int) -> tuple[Shape, NDArray[np.int6
     rng = np.random.default_rng(seed)
     direction = rng.standard_normal(3)
     direction /= np.linalg.norm(direction)
-    centres = shape.verts[shape.faces].mean(axis=1)
+    centers = shape.verts[shape.faces].mean(axis=1)
     if kind == "cut":
-        height = centres @ direction
+        height = centers @ direction
         keep = height >= np.quantile(height, 1 - rng.uniform(_FEWEST, _MOST))
     else:
-        keep = seen_faces(shape, centres, direction)
+        keep = seen_faces(shape, centers, direction)
     used = np.unique(shape.faces[keep])
     return Shape(shape.verts[used], np.searchsorted(used, shape.faces[keep]), shape.name), used
 
 
-def seen_faces(shape: Shape, centres: np.ndarray, direction: np.ndarray) -> NDArray[np.bool_]:
+def seen_faces(shape: Shape, centers: np.ndarray, direction: np.ndarray) -> NDArray[np.bool_]:
     """(F,) whether a camera far away in a direction (3,) sees the middle of each face."""
     facing = shape.face_normals @ direction > 0
     scene = Scene(
         [Surface(shape.verts, shape.faces, np.zeros_like(shape.verts), FacePaint(np.ones((shape.F, 3))))]
     )
-    lifted = (centres + 1e-4 * shape.diagonal * shape.face_normals).astype(np.float32)
+    lifted = (centers + 1e-4 * shape.diagonal * shape.face_normals).astype(np.float32)
     towards = np.broadcast_to(direction.astype(np.float32), lifted.shape)
     return np.asarray(facing & ~scene.blocked(lifted, towards, 2 * shape.diagonal))
 

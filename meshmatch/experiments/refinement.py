@@ -33,7 +33,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from meshmatch.config import set_threads
 from meshmatch.errors import OptionError
 from meshmatch.experiments.distances import default_folder
 from meshmatch.experiments.protocols import load_set
@@ -51,6 +50,7 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.pipeline import map_between, read_model, usable
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import set_threads
 
 METHODS = ("network", "code", "nodes")
 BAR = 50.0

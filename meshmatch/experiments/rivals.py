@@ -31,7 +31,6 @@ from typing import Any
 
 from rich.console import Console
 
-from meshmatch.config import set_threads
 from meshmatch.errors import OptionError
 from meshmatch.experiments.adapters import CodedMatcher, MeshmonkMatcher, NricpMatcher, RigidMatcher
 from meshmatch.experiments.bench import PipelineMatcher, chosen_pairs
@@ -41,6 +40,7 @@ from meshmatch.experiments.rival_cells import Cells, Rival, draw_cells, measured
 from meshmatch.experiments.spectral import ZoomOutMatcher
 from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.outputs import make_folder
+from meshmatch.threads import set_threads
 
 NAMES = ("rigid", "zoomout", "nricp", "meshmonk", "coded", "transmatch", "ours")
 _INSTALL = "pip install 'meshmatch[bench]'"

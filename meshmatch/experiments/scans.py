@@ -19,17 +19,17 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from meshmatch.config import set_threads
 from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.evaluate import CM_PER_UNIT
-from meshmatch.maps.place import place
+from meshmatch.maps.template_footpoints import place
 from meshmatch.outputs import make_folder
 from meshmatch.pipeline import as_shape, read_model, register, usable
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import label_colors
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import set_threads
 
 _IN_A_PICTURE = 5
 _FAR_CM = 5.0

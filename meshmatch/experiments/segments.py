@@ -31,7 +31,6 @@ from rich.console import Console
 from rich.status import Status
 from scipy.spatial.transform import Rotation
 
-from meshmatch.config import set_threads
 from meshmatch.errors import OptionError
 from meshmatch.experiments.category import (
     Pair,
@@ -62,6 +61,7 @@ from meshmatch.render.picture import Look
 from meshmatch.shapes.align import Align
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import set_threads
 
 CLASSES = ("table", "plane", "chair")
 KEYPOINTS = ".keypoints.npy"

@@ -28,7 +28,6 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from meshmatch.config import set_threads
 from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.experiments.speed import Cost, cost_of, keep_to_cores, sized
 from meshmatch.fitting.dense import dense_shape
@@ -38,18 +37,19 @@ from meshmatch.outputs import make_folder
 from meshmatch.pipeline import carry, read_model, register
 from meshmatch.shapes.appearance import Appearance, Material, load_appearance
 from meshmatch.shapes.decimate import decimate
-from meshmatch.shapes.doubles import seams
+from meshmatch.shapes.duplicates import seams
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.light import to_srgb
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.srgb import to_srgb
 from meshmatch.shapes.textured_files import save_textured
 from meshmatch.templates.location import bundled_folder
+from meshmatch.threads import set_threads
 from meshmatch.transfer.bake import Choices
-from meshmatch.transfer.coat import Coat
-from meshmatch.transfer.ground import Ground
-from meshmatch.transfer.image import Image
+from meshmatch.transfer.mapped_mesh import MappedMesh
+from meshmatch.transfer.material_sampler import MaterialSampler
+from meshmatch.transfer.surface_walk import SurfaceWalker
 from meshmatch.transfer.texture import Worn, transfer_texture
 from meshmatch.transfer.unwrap import atlas_of
 
@@ -89,7 +89,7 @@ class Loss:
 
 def nearest_map(a: Shape, b: Shape) -> VertexMap:
     """From a to b, which lie in one place: the nearest points of b's surface that face the same way."""
-    image = Image(VertexMap.identity(b), b, b)
+    image = MappedMesh(VertexMap.identity(b), b, b)
     places = image.query(a.verts, a.vertex_normals)
     return VertexMap.between(
         a, b, places.vertex, face=places.face, barycentric=places.barycentric, verdict="good"
@@ -125,8 +125,8 @@ def trip_of(name: str, folder: Path) -> Trip:
 
 def colors_at(shape: Shape, look: Appearance, points: Floats) -> Floats:
     """sRGB (N, 3) of a textured shape at its points nearest to given ones (N, 3)."""
-    places = Image(VertexMap.identity(shape), shape, shape).query(points, None)
-    coat = Coat(look, Ground(shape))
+    places = MappedMesh(VertexMap.identity(shape), shape, shape).query(points, None)
+    coat = MaterialSampler(look, SurfaceWalker(shape))
     face = np.maximum(places.face, 0)
     found = coat.colors(face, places.barycentric.T.astype(np.float32), np.zeros(len(points), np.float32))
     return np.asarray(to_srgb(found[:3].T))

@@ -197,13 +197,13 @@ def _lay(
     network: TransMatch, scan: np.ndarray, turns: np.ndarray, rest: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Template points on a scan (P, 3), for every turn: (T, N, 3) in the scan's frame, and Chamfer distances (T,)."""
-    centre = scan.mean(0)
+    center = scan.mean(0)
     start = torch.from_numpy(np.array(rest)).float()
     tree = cKDTree(scan)
     laid, far = [], []
     for turn in turns:
-        seen = torch.from_numpy((scan - centre) @ turn).float()[None]
-        there = (start + network(seen, start))[0].double().numpy() @ turn.T + centre
+        seen = torch.from_numpy((scan - center) @ turn).float()[None]
+        there = (start + network(seen, start))[0].double().numpy() @ turn.T + center
         forward, back = tree.query(there)[0], cKDTree(there).query(scan)[0]
         laid.append(there)
         far.append(float(forward.mean() + back.mean()))

@@ -26,7 +26,6 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from meshmatch.config import set_threads
 from meshmatch.errors import MeshmatchError, OptionError
 from meshmatch.experiments.report import circumstances, explain
 from meshmatch.experiments.transformer import TEMPLATE, WEIGHTS, WORDS, TransConfig, TransMatch
@@ -34,6 +33,7 @@ from meshmatch.models.checkpoint import load_weights, save_weights
 from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import Template, load_template, save_template
+from meshmatch.threads import set_threads
 from meshmatch.training.datasets import Source
 from meshmatch.training.run import human_source
 from meshmatch.training.scans import ScanConfig, bump, normalise, sample_scan, yaw_rotations
@@ -86,9 +86,9 @@ def draw_batch(
     verts, areas = normalise(bump(verts / size * 0.3, scan.bumps, generator), faces)
     verts = verts * (1 + scan.scale * torch.randn(shapes, 1, 1, generator=generator).clamp(-2, 2))
     points = sample_scan(verts, areas, faces, scan, generator)
-    centre, turn = points.mean(1, keepdim=True), yaw_rotations(shapes, generator).transpose(1, 2)
+    center, turn = points.mean(1, keepdim=True), yaw_rotations(shapes, generator).transpose(1, 2)
     chosen = torch.randperm(verts.shape[1], generator=generator)[:targets]
-    return (points - centre) @ turn, chosen, (verts[:, chosen] - centre) @ turn
+    return (points - center) @ turn, chosen, (verts[:, chosen] - center) @ turn
 
 
 def train(

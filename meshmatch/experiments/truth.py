@@ -23,13 +23,13 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from meshmatch.config import set_threads
 from meshmatch.errors import InputError
 from meshmatch.experiments.distances import TruthDistances, default_folder
 from meshmatch.experiments.protocols import SET_NAMES, BenchSet, load_set
 from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.maps.evaluate import CM_PER_UNIT, LOST_CM
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import set_threads
 
 _ASKED, _NEAR = 200, 5  # vertices that are asked for so many neighbours
 _NEAR_SHARE = 0.5  # of the distance of any two vertices, below which neighbours are near

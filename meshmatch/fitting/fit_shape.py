@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.fitting.complete import seen, seen_area
+from meshmatch.fitting.candidates import CandidateScorer, averaged, choose, lying
+from meshmatch.fitting.cloud_scale import settle, without_outliers
+from meshmatch.fitting.completion import seen, seen_area
 from meshmatch.fitting.fit import FAIR_RESIDUAL, Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig, check_landmarks
+from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try, scan_frame
 from meshmatch.fitting.latent import refine_code
 from meshmatch.fitting.mirror import mirror_of
 from meshmatch.fitting.network_fit import Candidate, lay_on, two_way_residual, variants
 from meshmatch.fitting.nodes import refine_nodes
 from meshmatch.fitting.orientation import Hypothesis
 from meshmatch.fitting.part import cost, fit_part
-from meshmatch.fitting.placing import frames_of_part, frames_to_try, scan_frame
-from meshmatch.fitting.readings import Judge, averaged, choose, lying
 from meshmatch.fitting.scan import Scan
-from meshmatch.fitting.settle import settle, without_strays
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.verdict import cloud_allowance, empty_share, judge, unexplained
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -79,7 +79,7 @@ def fit_shape(
     if landmarks is not None:
         check_landmarks(model)
     config = (config or FitConfig()).suited(shape.roughness).possible(model)
-    whole, shape = shape, without_strays(shape)
+    whole, shape = shape, without_outliers(shape)
     began = time.monotonic()
     tell = progress or (lambda what, share: None)
     rng = np.random.default_rng(config.seed)
@@ -156,9 +156,9 @@ def _finish(model, shape, laid: _Laid, config, partial: bool) -> Fit:
     """The noun, with its verdict."""
     frame, scan, best = laid
     system = node_system(model)
-    core_frame = frame.compose(Frame(1.0, best.rotation.T, best.centre))
+    core_frame = frame.compose(Frame(1.0, best.rotation.T, best.center))
     points = system.moved(best.vectors)
-    local = scan.turned(best.rotation, best.centre)
+    local = scan.turned(best.rotation, best.center)
     allowance = _allowance(model, shape, local, best, config)
     unseen = 1 - seen_area(system, seen(system, local, best.vectors)) if partial else None
     verdict, reasons = judge(best.residual, local, points, allowance, partial, unseen)
@@ -194,7 +194,7 @@ def _try_part(model, shape: Shape, laid: _Laid, config: FitConfig) -> bool:
     if not shape.is_cloud and boundary_length(shape) < _OPEN * np.sqrt(shape.area):
         return False
     _, scan, best = laid
-    local, points = scan.turned(best.rotation, best.centre), node_system(model).moved(best.vectors)
+    local, points = scan.turned(best.rotation, best.center), node_system(model).moved(best.vectors)
     if shape.is_cloud:  # its residual says how sparse and noisy it is, not that something is missing
         return empty_share(local, points) > _LEFT
     allowance = _allowance(model, shape, local, best, config)
@@ -209,7 +209,7 @@ def _settled(model, system, frame, scan, rough, config, rng) -> tuple[Frame, Sca
 
     settled = [settle(system, scan, candidate, lay) for candidate in rough]
     scale, scan, best = min(settled, key=lambda each: each[2].residual)
-    others = [Candidate(c.rotation, c.centre / scale, c.vectors, c.residual) for c in rough]
+    others = [Candidate(c.rotation, c.center / scale, c.vectors, c.residual) for c in rough]
     coarse = scan.first(config.coarse_samples)
     return frame.compose(Frame(scale, np.eye(3), np.zeros(3))), scan, coarse, [best, *others]
 
@@ -217,20 +217,20 @@ def _settled(model, system, frame, scan, rough, config, rng) -> tuple[Frame, Sca
 def _readings(model, system, scan, coarse, candidates, config, rng) -> list[Candidate]:
     """The candidates and tilted readings of the best one, best first on the coarse scan."""
     best = candidates[0]
-    here, near = (part.turned(best.rotation, best.centre) for part in (scan, coarse))
+    here, near = (part.turned(best.rotation, best.center) for part in (scan, coarse))
     mirror = mirror_of(model)
     pool = variants(model.network, system, here, near, best, rng, config.variants, config.tilt, mirror)
     for other in candidates:
-        there = coarse.turned(other.rotation, other.centre)
+        there = coarse.turned(other.rotation, other.center)
         residual = two_way_residual(system, there, other.vectors, 1)
-        pool.append(Candidate(other.rotation, other.centre, other.vectors, residual))
+        pool.append(Candidate(other.rotation, other.center, other.vectors, residual))
     return sorted(pool, key=lambda candidate: candidate.residual)
 
 
 def _lay(
     model: TrainedModel, system: NodeSystem, scan: Scan, guess: Hypothesis | Candidate, rng, **how
 ) -> Candidate:
-    return lay_on(model.network, system, model.template.core, scan, guess.rotation, guess.centre, rng, **how)
+    return lay_on(model.network, system, model.template.core, scan, guess.rotation, guess.center, rng, **how)
 
 
 def take_samples(
@@ -238,7 +238,7 @@ def take_samples(
 ) -> tuple[Frame, Scan]:
     """Frame of a shape (area 1, centroid 0, if no other is given) and samples of it in that frame."""
     frame = sqrt_area_frame(shape) if frame is None else frame
-    samples = sample_surface(without_strays(shape), P, rng)
+    samples = sample_surface(without_outliers(shape), P, rng)
     return frame, Scan(frame.apply(samples.points), samples.normals @ frame.rotation.T, not shape.is_cloud)
 
 
@@ -247,11 +247,11 @@ def _refine(model, system, scan, frame, candidates, config, landmarks, rough, rn
         return candidates[0]
     if config.refine == "latent":
         best = candidates[0]
-        local = scan.turned(best.rotation, best.centre)
+        local = scan.turned(best.rotation, best.center)
         vectors = refine_code(
             model, _facing(system, local, best), config.latent, rng, lambda k, n: tell("refinement", k / n)
         )
-        return Candidate(best.rotation, best.centre, vectors, two_way_residual(system, local, vectors))
+        return Candidate(best.rotation, best.center, vectors, two_way_residual(system, local, vectors))
 
     # A few steps tell which readings the surface agrees with; the prior of the full run stays the network's.
     screen = replace(config.nodes, steps=config.screening)
@@ -259,22 +259,22 @@ def _refine(model, system, scan, frame, candidates, config, landmarks, rough, rn
     def fitted(candidate: Candidate, whole: bool) -> Candidate:
         if whole:
             candidate = averaged(system, candidate, candidates)
-        local = scan.turned(candidate.rotation, candidate.centre)
+        local = scan.turned(candidate.rotation, candidate.center)
         fixed = None
         if landmarks is not None:
-            fixed = (landmarks[0], (frame.apply(landmarks[1]) - candidate.centre) @ candidate.rotation)
+            fixed = (landmarks[0], (frame.apply(landmarks[1]) - candidate.center) @ candidate.rotation)
         facing = _facing(system, local, candidate)
         vectors = refine_nodes(system, facing, candidate.vectors, config.nodes if whole else screen, fixed)
         return Candidate(
-            candidate.rotation, candidate.centre, vectors, two_way_residual(system, local, vectors)
+            candidate.rotation, candidate.center, vectors, two_way_residual(system, local, vectors)
         )
 
-    judge = Judge(system, scan, rough)
+    judge = CandidateScorer(system, scan, rough)
     return choose(
         candidates,
         config.finalists,
         fitted,
-        lambda found: judge.score(scan.turned(found.rotation, found.centre), found),
+        lambda found: judge.score(scan.turned(found.rotation, found.center), found),
         lambda found: lying(system, found),
         lambda share: tell("refinement", share),
     )

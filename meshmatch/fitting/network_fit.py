@@ -21,13 +21,13 @@ _VARIANT_POINTS = (700, 1400)
 class Candidate:
     """One way to lay the template on a scan.
 
-    rotation, centre : the core frame, scan = R core + centre
+    rotation, center : the core frame, scan = R core + center
     vectors : (K, 3) node vectors in the core frame
     residual : mean normal-compatible distance, both ways, in units of sqrt(area)
     """
 
     rotation: np.ndarray
-    centre: np.ndarray
+    center: np.ndarray
     vectors: np.ndarray
     residual: float
 
@@ -93,7 +93,7 @@ def lay_on(
     core: np.ndarray,
     scan: Scan,
     rotation: np.ndarray,
-    centre: np.ndarray,
+    center: np.ndarray,
     rng: np.random.Generator,
     rounds: int = 2,
     draws: int = 2,
@@ -104,12 +104,12 @@ def lay_on(
     ``draws`` point samples are averaged each time; ``stride`` coarsens the residual.
     """
     for turn in range(rounds):
-        local = scan.turned(rotation, centre)
+        local = scan.turned(rotation, center)
         vectors = predict(model, local, draws, rng)
         if turn < rounds - 1:
             R, t = rigid_motion(system.verts[core], system.moved(vectors)[core])
-            rotation, centre = rotation @ R, rotation @ t + centre
-    return Candidate(rotation, centre, vectors, two_way_residual(system, local, vectors, stride))
+            rotation, center = rotation @ R, rotation @ t + center
+    return Candidate(rotation, center, vectors, two_way_residual(system, local, vectors, stride))
 
 
 @torch.inference_mode()
@@ -145,6 +145,6 @@ def variants(
     if mirror is not None:
         back += [mirror.vectors(vectors) for vectors in read(mirror.points(scan.points))]
     return [
-        Candidate(candidate.rotation, candidate.centre, u, two_way_residual(system, coarse, u, 1))
+        Candidate(candidate.rotation, candidate.center, u, two_way_residual(system, coarse, u, 1))
         for u in back
     ]

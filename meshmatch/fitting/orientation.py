@@ -19,10 +19,10 @@ from meshmatch.models.neighbours import nearest
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A proposed core frame: scan = R core + centre. ``votes`` is the share of copies that agree."""
+    """A proposed core frame: scan = R core + center. ``votes`` is the share of copies that agree."""
 
     rotation: np.ndarray
-    centre: np.ndarray
+    center: np.ndarray
     votes: float
 
 
@@ -61,9 +61,9 @@ def propose(
     copies : how many turned copies vote
     keep : how many hypotheses to return at most
     """
-    rotations, centres = ask_aligner(model, points, turned_copies(copies, seed))
+    rotations, centers = ask_aligner(model, points, turned_copies(copies, seed))
     # Second look: from its own proposed frame the network knows the pose best.
-    rotations, centres = ask_aligner(model, points, rotations.transpose(0, 2, 1))
+    rotations, centers = ask_aligner(model, points, rotations.transpose(0, 2, 1))
     trace = np.einsum("nij,mij->nm", rotations, rotations)
     angle = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
     close = angle < 30
@@ -74,7 +74,7 @@ def propose(
         leader = int(support.argmax())
         members = close[leader] & free
         mean = Rotation.from_matrix(rotations[members]).mean().as_matrix()
-        found.append(Hypothesis(mean, np.median(centres[members], 0), members.mean()))
+        found.append(Hypothesis(mean, np.median(centers[members], 0), members.mean()))
         free &= ~members
     return found
 
@@ -88,17 +88,17 @@ _FLIPS = Rotation.from_rotvec(
 def with_flips(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
     """Every hypothesis and its flips; front and back of a body look alike to a vote, not to a fit."""
     return [
-        Hypothesis(guess.rotation @ flip, guess.centre, guess.votes)
+        Hypothesis(guess.rotation @ flip, guess.center, guess.votes)
         for flip in _FLIPS
         for guess in hypotheses
     ]
 
 
-def standing_grid(centre: np.ndarray) -> list[Hypothesis]:
+def standing_grid(center: np.ndarray) -> list[Hypothesis]:
     """Six axes up, twelve turns about each: for networks without an aligner."""
     grid = []
     for axis in np.concatenate([np.eye(3), -np.eye(3)]):
-        grid += [Hypothesis(guess.rotation, centre, guess.votes) for guess in forced_frames(axis, None)]
+        grid += [Hypothesis(guess.rotation, center, guess.votes) for guess in forced_frames(axis, None)]
     return grid
 
 

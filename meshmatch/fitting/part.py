@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from meshmatch.fitting.complete import completed, seen, seen_area
+from meshmatch.fitting.candidates import CandidateScorer, choose, lying
+from meshmatch.fitting.completion import completed, seen, seen_area
 from meshmatch.fitting.mirror import mirror_of
 from meshmatch.fitting.network_fit import Candidate, lay_on, one_way_residual, variants
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
 from meshmatch.fitting.orientation import Hypothesis
-from meshmatch.fitting.readings import Judge, choose, lying
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
 
@@ -45,7 +45,7 @@ class PartReading:
     def local(self, scan: Scan) -> Scan:
         """A scan of area 1 where this reading lives: as large as its share, in the core frame."""
         sized = replace(scan, points=scan.points * np.sqrt(self.share))
-        return sized.turned(self.fit.rotation, self.fit.centre)
+        return sized.turned(self.fit.rotation, self.fit.center)
 
     @property
     def cost(self) -> float:
@@ -110,7 +110,7 @@ def fit_part(
     readings.sort(key=lambda reading: reading.cost)
     if not refine:
         return _found(scan, readings[0])
-    judge = Judge(system, scan)
+    judge = CandidateScorer(system, scan)
 
     def fitted(reading: PartReading, whole: bool) -> PartReading:
         local, vectors = reading.local(scan), reading.fit.vectors
@@ -148,16 +148,16 @@ def _asked_again(network, system, core, scan: Scan, reading: PartReading, rng) -
     fit = replace(
         again,
         rotation=reading.fit.rotation @ again.rotation,
-        centre=grown * reading.fit.centre + reading.fit.rotation @ again.centre,
+        center=grown * reading.fit.center + reading.fit.rotation @ again.center,
     )
     found = PartReading(share, fit)
     return replace(found, fit=replace(fit, residual=one_way_residual(system, found.local(scan), fit.vectors)))
 
 
 def _laid(model, system, scan, guess, rng, **how) -> Candidate:
-    rotation, centre = guess.rotation, guess.centre
-    laid = lay_on(model.network, system, model.template.core, scan, rotation, centre, rng, stride=4, **how)
-    local = scan.turned(laid.rotation, laid.centre)
+    rotation, center = guess.rotation, guess.center
+    laid = lay_on(model.network, system, model.template.core, scan, rotation, center, rng, stride=4, **how)
+    local = scan.turned(laid.rotation, laid.center)
     return replace(laid, residual=one_way_residual(system, local, laid.vectors))
 
 

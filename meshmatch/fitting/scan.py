@@ -37,9 +37,9 @@ class Scan:
     def pair_tree(self) -> cKDTree:
         return cKDTree(with_normals(self.points, self.normals, PAIR_WEIGHT))
 
-    def turned(self, rotation: np.ndarray, centre: np.ndarray) -> Scan:
-        """The same samples in the core frame: R^T (x - centre)."""
-        return replace(self, points=(self.points - centre) @ rotation, normals=self.normals @ rotation)
+    def turned(self, rotation: np.ndarray, center: np.ndarray) -> Scan:
+        """The same samples in the core frame: R^T (x - center)."""
+        return replace(self, points=(self.points - center) @ rotation, normals=self.normals @ rotation)
 
     def first(self, count: int) -> Scan:
         """The first samples."""

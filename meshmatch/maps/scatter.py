@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.nodes import vertex_areas
-from meshmatch.maps.place import in_core_frame
 from meshmatch.maps.surface import RESTING_WEIGHT, Footpoints
+from meshmatch.maps.template_footpoints import in_core_frame
 from meshmatch.shapes.shape import Shape
 
 _ROUGH = 0.5  # from this `Shape.roughness` on, noise is larger than what triangles of a template span
@@ -87,15 +87,15 @@ def land(
 
 
 def _samples(fit: Fit):
-    """Vertices and face centres as a matrix (S, T) over the vertices, and how much of the surface each stands for."""
+    """Vertices and face centers as a matrix (S, T) over the vertices, and how much of the surface each stands for."""
     from scipy.sparse import csr_matrix, identity, vstack
 
     F, T = len(fit.faces), len(fit.points)
     rows = np.repeat(np.arange(F), 3)
-    centres = csr_matrix((np.full(3 * F, 1 / 3), (rows, fit.faces.reshape(-1))), (F, T))
+    centers = csr_matrix((np.full(3 * F, 1 / 3), (rows, fit.faces.reshape(-1))), (F, T))
     area = vertex_areas(fit.points, fit.faces)  # a third of each face to each of its corners
-    # Half of a face's area is its centre's.
-    return vstack([identity(T), centres]).tocsr(), np.concatenate([0.5 * area, 0.5 * _face_areas(fit)])
+    # Half of a face's area is its center's.
+    return vstack([identity(T), centers]).tocsr(), np.concatenate([0.5 * area, 0.5 * _face_areas(fit)])
 
 
 def _face_areas(fit: Fit) -> np.ndarray:

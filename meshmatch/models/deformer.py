@@ -153,7 +153,7 @@ class Deformer(nn.Module):
         return (nodes + vectors) @ turn - nodes
 
     def align(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Aligner features -> rotation R (B, 3, 3) and centre t (B, 3) of the core: scan = R core + t."""
+        """Aligner features -> rotation R (B, 3, 3) and center t (B, 3) of the core: scan = R core + t."""
         assert self.aligner is not None
         out = self.aligner(features)
         return rotation_from_six(out[:, :6]), out[:, 6:]

@@ -16,8 +16,8 @@ from meshmatch.render.matched import PALE, Rotations, same_side
 from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import Scale, label_colors, label_swatches
 from meshmatch.shapes.appearance import Appearance
-from meshmatch.shapes.light import to_srgb
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.srgb import to_srgb
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.shapes.light import to_linear, to_srgb
 from meshmatch.shapes.palette import oklab_to_linear
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.srgb import to_linear, to_srgb
 
 FloatArray = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import Scale
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
-from meshmatch.transfer.image import Image
+from meshmatch.transfer.mapped_mesh import MappedMesh
 
 FloatArray = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ def fit_panels(
 
 def distances(shape: Shape, fitted: Shape) -> FloatArray:
     """Distance (V,) of each vertex of a shape to the surface of another; nan where it has no position."""
-    found = Image(VertexMap.identity(fitted), fitted, fitted).query(shape.verts).distance
+    found = MappedMesh(VertexMap.identity(fitted), fitted, fitted).query(shape.verts).distance
     return found if shape.invalid is None else np.where(shape.invalid, np.nan, found)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from meshmatch.errors import OptionError
 from meshmatch.render.framing import GAP, in_a_row
 from meshmatch.render.legend import Legend, legend_height
-from meshmatch.render.window import Window
+from meshmatch.render.viewport import Window
 
 FloatArray = NDArray[np.float64]
 

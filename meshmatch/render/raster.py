@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.render.light import BLOCK, GROUND_BLOCK, seen_light, shade, shadow
 from meshmatch.render.scene import Floats32, Hits, Scene
+from meshmatch.render.shading import BLOCK, GROUND_BLOCK, seen_light, shade, shadow
 from meshmatch.render.slivers import edge_points, slivers
-from meshmatch.render.window import Window
+from meshmatch.render.viewport import Window
 
 BAND = 100_000
 """How many pixels are worked on at once."""

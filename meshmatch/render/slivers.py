@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.render.scene import Floats32, Scene
-from meshmatch.render.window import Window
+from meshmatch.render.viewport import Window
 
 MOST_POINTS = 6_000_000
 """Along the edges of each of the three sides of the triangles."""

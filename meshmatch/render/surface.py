@@ -128,7 +128,7 @@ def mesh_surface(verts: FloatArray, faces: IntArray, paint: Paint, chosen: IntAr
 
 
 def balls(centers: FloatArray, radius: float, colors: FloatArray) -> Surface:
-    """A ball for every centre (K, 3) in its linear colour (K, 3), round enough for its number."""
+    """A ball for every center (K, 3) in its linear colour (K, 3), round enough for its number."""
     verts, faces = _ball(
         4 if len(centers) <= 60 else 3 if len(centers) <= 1_000 else 2 if len(centers) <= 5_000 else 1
     )
@@ -136,7 +136,7 @@ def balls(centers: FloatArray, radius: float, colors: FloatArray) -> Surface:
 
 
 def discs(centers: FloatArray, normals: FloatArray, radius: FloatArray, colors: FloatArray) -> Surface:
-    """A flat disc of eight sides for every centre (K, 3), across its normal (K, 3), with its radius (K,)."""
+    """A flat disc of eight sides for every center (K, 3), across its normal (K, 3), with its radius (K,)."""
     turn = 2 * np.pi * np.arange(8) / 8
     side = np.where(np.abs(normals[:, :1]) < 0.8, [[1.0, 0, 0]], [[0, 1.0, 0]])
     first = np.cross(normals, side)

@@ -39,9 +39,9 @@ class Oriented:
         step = max(1, len(self.points) // P)
         return Oriented(self.points[::step], self.normals[::step])
 
-    def moved(self, rotation: Floats, centre: Floats) -> Oriented:
-        """In the frame of a target: R^T (x - centre)."""
-        return Oriented((self.points - centre) @ rotation, self.normals @ rotation)
+    def moved(self, rotation: Floats, center: Floats) -> Oriented:
+        """In the frame of a target: R^T (x - center)."""
+        return Oriented((self.points - center) @ rotation, self.normals @ rotation)
 
     @property
     def six(self) -> Floats:
@@ -51,10 +51,10 @@ class Oriented:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """shape = R target + centre, as in a core frame; residual: mean capped distance both ways, normals included."""
+    """shape = R target + center, as in a core frame; residual: mean capped distance both ways, normals included."""
 
     rotation: Floats
-    centre: Floats
+    center: Floats
     residual: float
 
 
@@ -120,10 +120,10 @@ def rigid_motion(source: Floats, target: Floats, weights: Floats | None = None) 
 
 
 def _icp(shape: Oriented, target: Oriented, start: Alignment, steps: int) -> Alignment:
-    rotation, centre = start.rotation, start.centre
+    rotation, center = start.rotation, start.center
     tree = cKDTree(target.six)
     for _ in range(steps):
-        here = shape.moved(rotation, centre)
+        here = shape.moved(rotation, center)
         six = here.six
         to_target = tree.query(six)[1]
         to_shape = cKDTree(six).query(target.six)[1]
@@ -133,10 +133,10 @@ def _icp(shape: Oriented, target: Oriented, start: Alignment, steps: int) -> Ali
         weights[: len(six)] /= len(six)
         weights[len(six) :] /= len(target.points)
         R, t = rigid_motion(source, place, weights)
-        rotation, centre = rotation @ R, rotation @ t + centre
+        rotation, center = rotation @ R, rotation @ t + center
         if np.abs(R - np.eye(3)).max() < 1e-4 and np.abs(t).max() < 1e-4:
             break
-    return Alignment(rotation, centre, residual(shape.moved(rotation, centre), target))
+    return Alignment(rotation, center, residual(shape.moved(rotation, center), target))
 
 
 def _starts(shape: Floats, target: Floats) -> list[Floats]:

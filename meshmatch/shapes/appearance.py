@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from meshmatch.errors import InputError
 from meshmatch.shapes.files import read_bytes
 from meshmatch.shapes.images import ImageReader, Pixels
-from meshmatch.shapes.light import to_linear
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.srgb import to_linear
 
 Wrap = Literal["repeat", "clamp", "mirror"]
 Alpha = Literal["opaque", "mask", "blend"]

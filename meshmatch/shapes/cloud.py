@@ -50,7 +50,7 @@ def estimate_normals(points: Floats, invalid: NDArray[np.bool_] | None = None) -
     """(V, 3) unit normals: where the neighbourhood is thinnest; zeros for an invalid point.
 
     Signs are made to agree between neighbours (Hoppe et al. 1992, section 3.3), then each connected part is
-    turned to face away from its own centre; for an open or very noisy cloud that can be wrong, so treat the
+    turned to face away from its own center; for an open or very noisy cloud that can be wrong, so treat the
     sign with care.
     """
     normals = np.zeros((len(points), 3))
@@ -84,7 +84,7 @@ def roughness(points: Floats, invalid: NDArray[np.bool_] | None = None) -> float
     return _size(part, index)[1]
 
 
-def stray_points(points: Floats, far: float = 3.0) -> NDArray[np.bool_]:
+def outlier_points(points: Floats, far: float = 3.0) -> NDArray[np.bool_]:
     """(V,) True for a point that lies ``far`` times further from its neighbours than these from theirs, and than usual."""
     from scipy.spatial import cKDTree
 

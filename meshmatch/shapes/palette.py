@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.shapes.light import to_srgb
+from meshmatch.shapes.srgb import to_srgb
 
 UNKNOWN = (0.62, 0.64, 0.67)
 """What has no value."""

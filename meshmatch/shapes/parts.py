@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from meshmatch.shapes.shape import Floats, Ints, squared_lengths
 from meshmatch.shapes.topology import face_parts
 
-STRAY_SHARE = 0.02
+OUTLIER_SHARE = 0.02
 """A part with less than this share of the largest part's area is stray."""
 _FAR = 0.25  # gap between two big parts, in diagonals of the largest, from which they count as apart
 _NEAR = 0.05  # gap up to which a small part belongs to a shape that is made of small parts
@@ -38,14 +38,14 @@ class Parts:
 
 
 def find_parts(verts: Floats, faces: Ints, cross: Floats) -> Parts:
-    """Judge the connected parts of a mesh; `cross` (F, 3) is the normal of each face, twice its area long."""
+    """CandidateScorer the connected parts of a mesh; `cross` (F, 3) is the normal of each face, twice its area long."""
     part = face_parts(faces, len(verts))
     if part.max() == 0:
         return Parts(np.zeros(len(faces), bool), 0, 1, 0, 0.0)
     face_areas = 0.5 * np.sqrt(squared_lengths(cross))
     areas = np.bincount(part, weights=face_areas)
     largest = int(areas.argmax())
-    small = areas < STRAY_SHARE * areas[largest]
+    small = areas < OUTLIER_SHARE * areas[largest]
     big = np.flatnonzero(~small)
     # the body grows from the largest part by all big parts that are near
     body = np.array([largest])

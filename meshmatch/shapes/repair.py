@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.cloud import stray_points
-from meshmatch.shapes.doubles import double_faces, flat_faces, seams
+from meshmatch.shapes.cloud import outlier_points
+from meshmatch.shapes.duplicates import duplicate_faces, flat_faces, seams
 from meshmatch.shapes.orientation import turn_faces
 from meshmatch.shapes.parts import find_parts
 from meshmatch.shapes.shape import Floats, Ints, Shape
@@ -64,7 +64,7 @@ def repair(shape: Shape) -> Repaired:
     position are merged if they lie on an open edge (texture seams of obj and glTF files, every corner of an
     stl; two layers that merely touch stay apart); faces without area; faces that occur twice (both of them,
     where they are a flap of no volume on a closed surface); stray parts (see
-    `meshmatch.shapes.parts.STRAY_SHARE`; unless together they are more than a tenth of the surface: then the
+    `meshmatch.shapes.parts.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the
     shape is made of small parts, and only those far from the rest are stray); vertices that no face uses.
     Then faces are turned so that neighbours agree and the shape is not inside out. Open and non-manifold
     edges are counted, not mended. Of a cloud: points without a position, double ones, and strays far from all
@@ -86,7 +86,7 @@ def _repair_cloud(shape: Shape) -> Repaired:
     kept = valid & (twin == np.arange(shape.V))
     _note(notes, int(valid.sum() - kept.sum()), "point", "merged with another at the same position")
     chosen = np.flatnonzero(kept)
-    stray = stray_points(shape.verts[chosen])
+    stray = outlier_points(shape.verts[chosen])
     _note(notes, int(stray.sum()), "stray point", "far from all others dropped")
     kept[chosen[stray]] = False
     return _result(shape, kept, twin, shape.faces, np.arange(shape.F), valid, notes)
@@ -110,7 +110,7 @@ def _repair_mesh(shape: Shape) -> Repaired:
     if flat.any():
         _note(notes, int(flat.sum()), "face", "without area dropped")
         faces, cross, which = faces[~flat], cross[~flat], which[~flat]
-    double = double_faces(faces)
+    double = duplicate_faces(faces)
     if double.any():
         _note(notes, int(double.sum()), "face", "dropped that occurred twice")
         faces, cross, which = faces[~double], cross[~double], which[~double]

@@ -219,13 +219,13 @@ def spectral_clusters(
     # Not a constant start: that is an eigenvector already, and the search would go on from a random one.
     values, vectors = eigsh(stiffness, count, mass, sigma=-1e-8, v0=rng.standard_normal(shape.V))
     signature = vectors[:, 1:] / np.sqrt(np.maximum(values[1:], 1e-9))
-    centres = signature[farthest_points_any(signature, clusters)]
+    centers = signature[farthest_points_any(signature, clusters)]
     for _ in range(20):
-        label = cKDTree(centres).query(signature)[1]
+        label = cKDTree(centers).query(signature)[1]
         for axis in range(signature.shape[1]):
-            total = np.bincount(label, signature[:, axis], len(centres))
-            centres[:, axis] = total / np.maximum(np.bincount(label, minlength=len(centres)), 1)
-    return np.unique(cKDTree(centres).query(signature)[1], return_inverse=True)[1].astype(np.int64)
+            total = np.bincount(label, signature[:, axis], len(centers))
+            centers[:, axis] = total / np.maximum(np.bincount(label, minlength=len(centers)), 1)
+    return np.unique(cKDTree(centers).query(signature)[1], return_inverse=True)[1].astype(np.int64)
 
 
 def farthest_points_any(points: np.ndarray, K: int) -> np.ndarray:

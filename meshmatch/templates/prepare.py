@@ -20,7 +20,11 @@ from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.triangulate import triangulate_cloud
-from meshmatch.templates.gather import (
+from meshmatch.templates.make import LOW_FACES, low_resolution, make_template
+from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.registered import registered_stack, same_faces, turned
+from meshmatch.templates.template import Template, save_template
+from meshmatch.templates.unregistered import (
     STRANGE,
     Scale,
     find_known,
@@ -30,10 +34,6 @@ from meshmatch.templates.gather import (
     read_known,
     save_gathered,
 )
-from meshmatch.templates.make import LOW_FACES, low_resolution, make_template
-from meshmatch.templates.nodes import NodeConfig
-from meshmatch.templates.registered import registered_stack, same_faces, turned
-from meshmatch.templates.template import Template, save_template
 
 MINIMUM_FACES = 50
 MINIMUM_POINTS = 100
@@ -85,7 +85,7 @@ def prepare_folder(
     scale : {"area", "sphere"}
         Which size of every shape is made that of the template.
     landmarks : folder or suffix, optional
-        Where the known points of shapes are, see `meshmatch.templates.gather`.
+        Where the known points of shapes are, see `meshmatch.templates.unregistered`.
 
     Raises
     ------

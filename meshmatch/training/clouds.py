@@ -10,7 +10,7 @@ import torch
 from meshmatch.fields.field import Field
 from meshmatch.fields.mls import build_field
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
-from meshmatch.templates.gather import Gathered
+from meshmatch.templates.unregistered import Gathered
 from meshmatch.training.datasets import Source, registered_source
 from meshmatch.training.scans import ScanConfig, small_rotations
 

@@ -121,5 +121,5 @@ class BatchDataset(torch.utils.data.Dataset):
         middle = points.mean(1, keepdim=True)
         anywhere = random_rotations(B, generator)
         turned = (points - middle) @ anywhere.transpose(1, 2)
-        centre = (anywhere @ (t - middle[:, 0])[..., None])[..., 0]
-        return Batch(in_core, targets, features, self.aligner.features(turned), anywhere @ R, centre)
+        center = (anywhere @ (t - middle[:, 0])[..., None])[..., 0]
+        return Batch(in_core, targets, features, self.aligner.features(turned), anywhere @ R, center)

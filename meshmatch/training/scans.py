@@ -58,13 +58,13 @@ def random_rotations(B: int, generator: torch.Generator) -> torch.Tensor:
 
 def rigid_fit(source: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Best rigid motion: target ~ R source + t (Kabsch), batched. source (N, 3), target (B, N, 3)."""
-    centre = target.mean(1)
-    covariance = (target - centre[:, None]).transpose(1, 2) @ (source - source.mean(0))
+    center = target.mean(1)
+    covariance = (target - center[:, None]).transpose(1, 2) @ (source - source.mean(0))
     U, _, Vh = torch.linalg.svd(covariance)
     sign = torch.det(U @ Vh)
     U = torch.cat([U[..., :2], U[..., 2:] * sign[:, None, None]], -1)
     R = U @ Vh
-    return R, centre - (R @ source.mean(0)[:, None])[..., 0]
+    return R, center - (R @ source.mean(0)[:, None])[..., 0]
 
 
 def small_rotations(B: int, generator: torch.Generator) -> torch.Tensor:
@@ -91,17 +91,17 @@ def bump(verts: torch.Tensor, amplitude: float, generator: torch.Generator) -> t
 
 
 def seen_share(
-    normals: torch.Tensor, centres: torch.Tensor, share: float, generator: torch.Generator
+    normals: torch.Tensor, centers: torch.Tensor, share: float, generator: torch.Generator
 ) -> torch.Tensor:
     """Factors (B, F) for the chance of each face: nearly 0 where a partial scan does not see it, else 1.
 
     A ``share`` of the scans is partial. Half of those see what faces one direction, the others lose what lies
-    beyond a plane, at most half of the centres. Faces that hide each other are not told apart.
+    beyond a plane, at most half of the centers. Faces that hide each other are not told apart.
     """
-    B = len(centres)
+    B = len(centers)
     direction = torch.nn.functional.normalize(torch.randn(B, 3, 1, generator=generator), dim=1)
     facing = (normals @ direction)[..., 0] > 0
-    height = (centres @ direction)[..., 0]  # B F
+    height = (centers @ direction)[..., 0]  # B F
     rank = (0.5 * torch.rand(B, generator=generator) * height.shape[1]).long()
     plane = height.sort(dim=1).values[torch.arange(B), rank]
     kind = torch.rand(B, 1, generator=generator) / max(share, 1e-9)
@@ -119,20 +119,20 @@ def sample_scan(
     """Points (B, P, 3) on the surface, with uneven density, holes, noise and outliers."""
     B, P = len(verts), config.points
     a, b, c = (verts[:, faces[:, k]] for k in range(3))
-    centres = (a + b + c) / 3  # B F 3
+    centers = (a + b + c) / 3  # B F 3
     chance = areas.clone()
     if config.partial:
-        chance = chance * seen_share(torch.linalg.cross(b - a, c - a), centres, config.partial, generator)
+        chance = chance * seen_share(torch.linalg.cross(b - a, c - a), centers, config.partial, generator)
     waves = torch.randn(B, 3, 1, generator=generator) * 4
     strength = config.density * torch.rand(B, 1, generator=generator)
-    chance = chance * (strength * torch.sin((centres @ waves)[..., 0])).exp()
+    chance = chance * (strength * torch.sin((centers @ waves)[..., 0])).exp()
     # A hole swallows everything within a ball around a random surface point.
     for _ in range(2):
-        here = torch.randint(centres.shape[1], (B,), generator=generator)
-        middle = centres[torch.arange(B), here]
+        here = torch.randint(centers.shape[1], (B,), generator=generator)
+        middle = centers[torch.arange(B), here]
         radius = 0.16 * torch.rand(B, generator=generator)
         radius = radius * (torch.rand(B, generator=generator) < config.holes)
-        inside = (centres - middle[:, None]).square().sum(-1) < radius[:, None] ** 2
+        inside = (centers - middle[:, None]).square().sum(-1) < radius[:, None] ** 2
         chance = torch.where(inside, chance * 1e-4, chance)
     pick = torch.multinomial(chance, P, True, generator=generator)  # B P
     corner = faces[pick]  # B P 3

@@ -14,17 +14,17 @@ from meshmatch.errors import InputError
 from meshmatch.models.deformer import PAPER, Deformer
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import make_folder
-from meshmatch.templates.gather import Gathered
 from meshmatch.templates.template import Template
+from meshmatch.templates.unregistered import Gathered
 from meshmatch.training.chamfer import SurfacePoints, build_surface_points, chamfer_losses
 from meshmatch.training.clouds import CloudBatch, CloudConfig, CloudDataset, build_warp
-from meshmatch.training.few import few_recipe
 from meshmatch.training.folder import VALIDATION_SEED, checkpoint_in, train_into
 from meshmatch.training.loop import Progress, TrainConfig, Trainer
 from meshmatch.training.losses import LossConfig
 from meshmatch.training.run import Preset, Recipe, export, take_weights
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.setup import fill_basis, lay_anchors
+from meshmatch.training.small_data import few_recipe
 
 
 def cloud_recipe(preset: Preset = "default") -> Recipe:

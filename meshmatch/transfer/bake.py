@@ -1,7 +1,7 @@
 """Baking: for every texel of the target's atlas the colour of its place on the source.
 
 A texel is a point of a triangle of the target. The map says where the triangle's corners lie on the source; the
-point between these images slides onto the source (`meshmatch.transfer.ground`), and the face that it ends on says
+point between these images slides onto the source (`meshmatch.transfer.surface_walk`), and the face that it ends on says
 its texture coordinates: they are never interpolated across the source's seams. Colours are averaged as light.
 """
 
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Alpha
 from meshmatch.shapes.images import Pixels
-from meshmatch.shapes.light import bytes_of
 from meshmatch.shapes.shape import Floats, Shape
-from meshmatch.transfer.coat import Coat
-from meshmatch.transfer.footing import Footing
-from meshmatch.transfer.ground import Ground
+from meshmatch.shapes.srgb import bytes_of
+from meshmatch.transfer.material_sampler import MaterialSampler
 from meshmatch.transfer.pyramid import fill
+from meshmatch.transfer.surface_walk import SurfaceWalker
+from meshmatch.transfer.texel_locator import TexelLocator
 from meshmatch.transfer.texels import beside_another, faces_on, grown
 
 # So many texels past a seam show the surface that goes on there; further out, the nearest mean (see `pyramid`).
@@ -87,8 +87,8 @@ class Baked:
 
 
 def bake(
-    coat: Coat,
-    ground: Ground,
+    coat: MaterialSampler,
+    walker: SurfaceWalker,
     target: Shape,
     back: VertexMap,
     uv: Floats,
@@ -99,7 +99,7 @@ def bake(
 
     Parameters
     ----------
-    coat, ground
+    coat, walker
         Of the source.
     back : VertexMap
         From target to source.
@@ -109,7 +109,7 @@ def bake(
         Gets the share that is done.
     """
     size = choices.size
-    footing = Footing(ground, target, back, uv * size)
+    footing = TexelLocator(walker, target, back, uv * size)
     inside = faces_on(uv * size, size)[0]
     on = grown(inside, _OVERHANG if choices.padding else 0).reshape(-1)
     texels = np.flatnonzero(on >= 0)

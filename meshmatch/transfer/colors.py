@@ -8,8 +8,8 @@ import numpy as np
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.light import to_linear, to_srgb
 from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.srgb import to_linear, to_srgb
 from meshmatch.transfer.value_files import Values, save_values
 
 CHANNELS = ("red", "green", "blue", "alpha")

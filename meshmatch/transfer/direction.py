@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from meshmatch.errors import InputError
-from meshmatch.maps.place import small_pieces, surroundings
+from meshmatch.maps.template_footpoints import small_pieces, surroundings
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
 from meshmatch.shapes.shape import Floats, Ints, Shape
 from meshmatch.shapes.topology import edges_of
-from meshmatch.transfer.image import Image, Places, on_vertex
+from meshmatch.transfer.mapped_mesh import ClosestPlaces, MappedMesh, on_vertex
 
 _ROUNDS = 2
 
@@ -80,7 +80,7 @@ def pull_back(source_to_target: VertexMap, source: Shape, target: Shape, workers
     """A map from target to source, from one from source to target.
 
     The source's vertices at their matched points, with the source's faces, are an image of the source on the
-    target; each target vertex takes the closest point of it (see `meshmatch.transfer.image`). Confidence falls
+    target; each target vertex takes the closest point of it (see `meshmatch.transfer.mapped_mesh`). Confidence falls
     with the distance: it is low where nothing of the source was mapped to.
 
     Raises
@@ -91,7 +91,7 @@ def pull_back(source_to_target: VertexMap, source: Shape, target: Shape, workers
     checked = check_map(source_to_target, source, target)
     if source.hash == target.hash and target.invalid is None and _is_identity(checked):
         return replace(checked, source=target.name, target=source.name)
-    image = Image(checked, source, target)
+    image = MappedMesh(checked, source, target)
     normals = target_normals(target)
     found = image.query(target.verts, normals, workers)
     chosen = _middles(checked, source, target.V)
@@ -116,7 +116,7 @@ def pull_back(source_to_target: VertexMap, source: Shape, target: Shape, workers
 
 
 def _ask_neighbours(
-    image: Image, found: Places, source: Shape, target: Shape, normals: Floats, workers: int
+    image: MappedMesh, found: ClosestPlaces, source: Shape, target: Shape, normals: Floats, workers: int
 ) -> None:
     """Correct small pieces of the target that lie elsewhere on the source than all around them.
 
@@ -144,7 +144,7 @@ def _ask_neighbours(
         at[ask] = places_on(source, again) / source_unit
 
 
-def places_on(source: Shape, places: Places) -> Floats:
+def places_on(source: Shape, places: ClosestPlaces) -> Floats:
     """(N, 3) the points themselves, in the source's frame."""
     points = source.verts[places.vertex]
     inside = places.face >= 0

@@ -14,9 +14,9 @@ from meshmatch.transfer.attributes import (
     vertex_votes,
 )
 from meshmatch.transfer.direction import target_normals
-from meshmatch.transfer.image import Image, torn_faces
+from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces
 
-# A face is cut into so many rows of small triangles, whose centres vote: its square of points.
+# A face is cut into so many rows of small triangles, whose centers vote: its square of points.
 _ROWS = 3
 # A face this many times as large as those of the source there may hold more labels than its corners tell.
 _LARGE = 4.0
@@ -48,7 +48,9 @@ def carry_face_labels(
     if not len(ask):
         return found
     votes = csr_array(_incidence(target) @ vertex_votes(back, source, labels, on_faces))[ask]
-    torn = torn_faces(back, target, source, back.points(source), float(np.sqrt(source.area)) or 1.0)[ask]
+    torn = discontinuous_faces(back, target, source, back.points(source), float(np.sqrt(source.area)) or 1.0)[
+        ask
+    ]
     whole = np.flatnonzero(~torn)
     if len(whole):
         sampled = _sampled(back, source, target, labels, on_faces, ask[whole], workers)
@@ -97,7 +99,7 @@ def _sampled(
     spread = lattice(_ROWS)  # P 3
     corners = target.faces[faces]
     points = np.einsum("pk,nkd->npd", spread, back.points(source)[corners]).reshape(-1, 3)
-    image = Image(VertexMap.identity(source), source, source)
+    image = MappedMesh(VertexMap.identity(source), source, source)
     normals = _normals(back, source)
     facing = np.einsum("pk,nkd->npd", spread, normals[corners]).reshape(-1, 3)
     places = image.query(points, facing, workers)
@@ -137,7 +139,7 @@ def of_faces(confidence: Floats, target: Shape) -> Floats:
 
 
 def lattice(rows: int) -> Floats:
-    """(rows^2, 3) barycentric centres of the equal triangles into which a triangle is cut."""
+    """(rows^2, 3) barycentric centers of the equal triangles into which a triangle is cut."""
     points = []
     for i in range(rows):
         for j in range(rows - i):

@@ -11,7 +11,7 @@ from meshmatch.errors import InputError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Floats, Ints, Shape
 from meshmatch.transfer.direction import target_normals
-from meshmatch.transfer.image import Image, torn_faces
+from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces
 
 # A landmark this far from the surface (of the diagonal) is not meant for this shape.
 _ELSEWHERE = 0.25
@@ -85,7 +85,7 @@ def at_points(shape: Shape, points: Floats, names: tuple[str, ...] = ()) -> tupl
     bad = np.flatnonzero(~(np.abs(points) < 1e60).all(axis=1))
     if len(bad):
         raise InputError(f"landmark {names[bad[0]]} has no position: {points[bad[0]].tolist()}")
-    places = Image(VertexMap.identity(shape), shape, shape).query(points)
+    places = MappedMesh(VertexMap.identity(shape), shape, shape).query(points)
     far = np.flatnonzero(places.distance > _ELSEWHERE * max(shape.diagonal, 1e-30))
     if len(far):
         raise InputError(
@@ -153,14 +153,14 @@ def carry_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks:
     points = forward.points(target)
     inside = np.flatnonzero((landmarks.face >= 0) & (landmarks.barycentric.max(axis=1) < 1.0 - 1e-9))
     if len(inside):
-        torn = torn_faces(forward, source, target, points, float(np.sqrt(target.area)) or 1.0)
+        torn = discontinuous_faces(forward, source, target, points, float(np.sqrt(target.area)) or 1.0)
         inside = inside[~torn[landmarks.face[inside]]]
     if len(inside):
         corners = source.faces[landmarks.face[inside]]
         share = landmarks.barycentric[inside]
         mean = np.einsum("nk,nkd->nd", share, points[corners])
         facing = np.einsum("nk,nkd->nd", share, target_normals(target)[forward.index[corners]])
-        places = Image(VertexMap.identity(target), target, target).query(mean, facing)
+        places = MappedMesh(VertexMap.identity(target), target, target).query(mean, facing)
         vertex[inside], face[inside], weights[inside] = places.vertex, places.face, places.barycentric
         confidence[inside] = np.einsum("nk,nk->n", share, forward.confidence[corners])
     return _on_surface(target, landmarks.names, vertex, face, weights, np.clip(confidence, 0, 1))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from meshmatch.shapes.appearance import Material, Wrap
 from meshmatch.shapes.images import Pixels
-from meshmatch.shapes.light import LINEAR_OF_BYTE, bytes_of
+from meshmatch.shapes.srgb import LINEAR_OF_BYTE, bytes_of
 
 _ROWS = 256  # at a time
 Light = NDArray[np.float32]

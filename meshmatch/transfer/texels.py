@@ -17,9 +17,9 @@ MOST_ROWS = 40_000_000
 
 @dataclass(frozen=True, eq=False)
 class Spans:
-    """Runs of texels whose centres lie in a triangle: face (N,), row (N,), first column (N,), length (N,).
+    """Runs of texels whose centers lie in a triangle: face (N,), row (N,), first column (N,), length (N,).
 
-    A centre on an edge belongs to one of the two triangles that share it. Rows and columns are not bounded.
+    A center on an edge belongs to one of the two triangles that share it. Rows and columns are not bounded.
     """
 
     face: Ints
@@ -47,7 +47,7 @@ class Spans:
 
 
 def rows_of(corners: Floats) -> Ints:
-    """(F,) how many rows of texel centres each triangle (F, 3, 2) crosses."""
+    """(F,) how many rows of texel centers each triangle (F, 3, 2) crosses."""
     y = corners[:, :, 1]
     return np.asarray(np.ceil(y.max(axis=1) - 0.5) - np.ceil(y.min(axis=1) - 0.5), np.int64)
 

@@ -13,9 +13,9 @@ from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.formats.textured import Textured
 from meshmatch.shapes.shape import Floats, Shape
 from meshmatch.transfer.bake import Baked, Choices, bake
-from meshmatch.transfer.coat import Coat
-from meshmatch.transfer.footing import images_of
-from meshmatch.transfer.ground import ground_of
+from meshmatch.transfer.material_sampler import MaterialSampler
+from meshmatch.transfer.surface_walk import walker_of
+from meshmatch.transfer.texel_locator import images_of
 from meshmatch.transfer.unwrap import Atlas
 
 LARGEST = 8192
@@ -73,8 +73,8 @@ def transfer_texture(
         Choices that cannot be.
     """
     check_choices(choices)
-    ground = ground_of(source)
-    coat = Coat(_of_faces(look, source), ground)
+    ground = walker_of(source)
+    coat = MaterialSampler(_of_faces(look, source), ground)
     uv = atlas.uv
     if target.invalid is not None:  # a face with a corner nowhere is no face
         sound = ~target.invalid[target.faces].any(axis=1)
@@ -86,10 +86,10 @@ def transfer_texture(
 
 def colors_of_vertices(source: Shape, look: Appearance, target: Shape, back: VertexMap) -> Floats:
     """(V_tgt, 4) linear colours and alpha of a target's vertices or points, as wide as the gaps between them."""
-    ground = ground_of(source)
-    coat = Coat(_of_faces(look, source), ground)
+    ground = walker_of(source)
+    coat = MaterialSampler(_of_faces(look, source), ground)
     points, start = images_of(ground, back)
-    place, weights, _ = ground.slide(points.T.astype(np.float32, order="C"), start.astype(np.int32))
+    place, weights, _ = ground.closest(points.T.astype(np.float32, order="C"), start.astype(np.int32))
     reach = np.sqrt(target.vertex_areas / max(target.area, 1e-300)).astype(np.float32)
     return coat.colors(place, weights, coat.footprint(place, reach)).T.astype(np.float64)
 

@@ -459,7 +459,7 @@ def test_threads_are_set(
     run: Run, two: tuple[Path, Path], stub: Recorder, monkeypatch: pytest.MonkeyPatch, verb: str
 ) -> None:
     asked: list[int] = []
-    monkeypatch.setattr("meshmatch.config.set_threads", asked.append)
+    monkeypatch.setattr("meshmatch.threads.set_threads", asked.append)
     words = (
         (*two, "-o", two[0].with_name("map.npy"))
         if verb == "match"

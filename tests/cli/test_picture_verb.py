@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from meshmatch import pipeline
-from meshmatch.cli.scenes import Asked
+from meshmatch.cli.picture_options import Asked
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render import picture as drawing

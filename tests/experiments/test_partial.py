@@ -22,12 +22,12 @@ def test_a_camera_sees_what_faces_it_and_is_not_hidden() -> None:
         np.concatenate([ball.verts, ball.verts * 0.5 - [0, 0, 4.0]]),
         np.concatenate([ball.faces, ball.faces + ball.V]),
     )
-    centres = behind.verts[behind.faces].mean(axis=1)
-    seen = seen_faces(behind, centres, np.array([0.0, 0.0, 1.0]))
+    centers = behind.verts[behind.faces].mean(axis=1)
+    seen = seen_faces(behind, centers, np.array([0.0, 0.0, 1.0]))
     front = behind.face_normals[:, 2] > 0
     assert np.array_equal(seen[: ball.F], front[: ball.F])
     assert not seen[ball.F :].any()  # the small ball stands in the shadow of the large one
-    aside = seen_faces(behind, centres, np.array([1.0, 0.0, 0.0]))
+    aside = seen_faces(behind, centers, np.array([1.0, 0.0, 0.0]))
     assert np.array_equal(aside, behind.face_normals[:, 0] > 0)
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.agree import AgreeConfig, agreed_fits
+from meshmatch.fitting.cloud_scale import lonely_points, settle
 from meshmatch.fitting.fit import GOOD_RESIDUAL
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fit_shape import fit_shape, node_system
 from meshmatch.fitting.network_fit import Candidate, two_way_residual
 from meshmatch.fitting.nodes import pair_terms, refine_nodes
 from meshmatch.fitting.scan import Scan
-from meshmatch.fitting.settle import lonely_points, settle
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.verdict import cloud_allowance, judge
 from meshmatch.shapes.sampling import sample_surface
@@ -48,7 +48,7 @@ class Scaler:
         self.calls += 1
         larger = float(np.median(np.linalg.norm(scan.points, axis=1))) / self.size
         vectors = (larger**self.share - 1) * self.nodes
-        return Candidate(start.rotation, start.centre, vectors, 0.0)
+        return Candidate(start.rotation, start.center, vectors, 0.0)
 
 
 @pytest.mark.parametrize("factor", [0.87, 1.0, 1.15])
@@ -86,28 +86,28 @@ def test_points_far_away_and_lonely_are_dropped_and_no_others(system: NodeSystem
 def test_what_is_far_is_told_where_the_template_lies(system: NodeSystem) -> None:
     """A cloud that stands elsewhere, and a candidate that says so: the same points are dropped."""
     scan, none = cloud_of(system, 800, strays=40), np.zeros((system.K, 3))
-    turn, centre = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([0.4, -0.3, 0.2])
-    moved = Scan(scan.points @ turn.T + centre, scan.normals @ turn.T)
+    turn, center = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([0.4, -0.3, 0.2])
+    moved = Scan(scan.points @ turn.T + center, scan.normals @ turn.T)
     left = []
     for cloud, rest in (
         (scan, Candidate(EYE, ZERO, none, 0.0)),
-        (moved, Candidate(turn, centre, none, 0.0)),
+        (moved, Candidate(turn, center, none, 0.0)),
     ):
         left.append(settle(system, cloud, rest, lambda part, start, rest=rest: rest)[1])
     assert len(left[0].points) < 840
-    assert np.allclose(left[1].points, left[0].points @ turn.T + centre)
+    assert np.allclose(left[1].points, left[0].points @ turn.T + center)
     assert np.allclose(left[1].normals, left[0].normals @ turn.T)
 
 
 def test_a_centre_is_scaled_with_its_cloud(system: NodeSystem) -> None:
-    larger, centre = Candidate(EYE, np.array([0.4, -0.3, 0.2]), 0.1 * egg_model().template.nodes, 0.0), []
+    larger, center = Candidate(EYE, np.array([0.4, -0.3, 0.2]), 0.1 * egg_model().template.nodes, 0.0), []
 
     def lay(scan: Scan, start: Candidate) -> Candidate:
-        centre.append(start.centre)
+        center.append(start.center)
         return start
 
     settle(system, cloud_of(system, 300), larger, lay)
-    assert np.allclose(centre, larger.centre / np.array([[1.1], [1.1**2], [1.3]]), rtol=1e-4)
+    assert np.allclose(center, larger.center / np.array([[1.1], [1.1**2], [1.3]]), rtol=1e-4)
 
 
 def test_a_lost_limb_is_not_dropped(system: NodeSystem) -> None:

@@ -80,12 +80,12 @@ def test_laying_on_again_moves_the_frame_to_where_the_core_went(
     R, c = Rotation.from_rotvec([0.1, 0.4, 0]).as_matrix(), np.array([0.1, 0, 0])
     first = lay_on(model.network, system, core, scan, R, c, np.random.default_rng(0), rounds=1, draws=1)
     assert np.array_equal(first.rotation, R)
-    assert np.array_equal(first.centre, c)
+    assert np.array_equal(first.center, c)
     second = lay_on(model.network, system, core, scan, R, c, np.random.default_rng(0), rounds=2, draws=1)
     assert np.linalg.det(second.rotation) == pytest.approx(1)
     # the template's core in the new frame lies, in the scan's, where the first prediction put it, rigidly
     there = system.moved(first.vectors)[core] @ R.T + c
-    laid = system.verts[core] @ second.rotation.T + second.centre
+    laid = system.verts[core] @ second.rotation.T + second.center
     best_R, best_t = rigid_motion(system.verts[core], there)
     assert np.allclose(laid, system.verts[core] @ best_R.T + best_t)
 

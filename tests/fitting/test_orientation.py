@@ -48,7 +48,7 @@ def test_a_scan_in_its_core_frame() -> None:
     scan = Scan(rng.normal(size=(20, 3)), rng.normal(size=(20, 3)))
     R, c = Rotation.random(random_state=1).as_matrix(), rng.normal(size=3)
     core = scan.turned(R, c)
-    # scan = R core + centre, for rows
+    # scan = R core + center, for rows
     assert np.allclose(core.points @ R.T + c, scan.points)
     assert np.allclose(core.normals @ R.T, scan.normals)
     S, d = Rotation.random(random_state=2).as_matrix(), rng.normal(size=3)
@@ -77,9 +77,9 @@ def test_asking_about_turned_copies_is_turning_the_points_and_asking(
     for k, turn in enumerate(turns):
         copy = torch.from_numpy((points - middle) @ turn.T).float()[None]
         with torch.inference_mode():
-            there, centre = model.network.align(aligner.features(copy))
+            there, center = model.network.align(aligner.features(copy))
         assert np.allclose(R[k], turn.T @ there[0].numpy(), atol=1e-4)
-        assert np.allclose(t[k], turn.T @ centre[0].numpy() + middle, atol=1e-4)
+        assert np.allclose(t[k], turn.T @ center[0].numpy() + middle, atol=1e-4)
     check_rotations(R)
 
 
@@ -112,7 +112,7 @@ def test_flips_keep_each_hypothesis_and_its_centre() -> None:
     check_rotations(rotations(flipped))
     for k, guess in enumerate(guesses):
         own = flipped[k::2]
-        assert all(np.array_equal(each.centre, guess.centre) for each in own)
+        assert all(np.array_equal(each.center, guess.center) for each in own)
         # about the guess's own axes: half turns about each, quarter turns about up
         relative = guess.rotation.T @ rotations(own)
         angles = np.degrees(Rotation.from_matrix(relative).magnitude())
@@ -126,7 +126,7 @@ def test_the_standing_grid_tries_all_axes_all_round() -> None:
     grid = standing_grid(np.array([1.0, 2, 3]))
     assert len(grid) == 72
     check_rotations(rotations(grid))
-    assert all(np.array_equal(guess.centre, [1, 2, 3]) for guess in grid)
+    assert all(np.array_equal(guess.center, [1, 2, 3]) for guess in grid)
     ups = rotations(grid)[:, :, 1]
     for axis in AXES:
         here = np.isclose(ups @ axis, 1)

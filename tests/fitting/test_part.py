@@ -9,9 +9,9 @@ import pytest
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fit_shape import _part, _sought, boundary_length, fit_shape, node_system, take_samples
+from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
 from meshmatch.fitting.network_fit import Candidate, one_way_residual
 from meshmatch.fitting.part import SHARES, cost
-from meshmatch.fitting.placing import frames_of_part, frames_to_try
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.verdict import empty_share, judge
 from meshmatch.models.trained import TrainedModel
@@ -127,9 +127,9 @@ def test_frames_of_a_part_are_tried_along_the_body() -> None:
         found = frames_of_part(model, scan, config, wide=False)[own:]
         assert len(found) == 4 * turns
         assert all(frame.rotation["xyz".index(given["up"]), 1] == pytest.approx(1) for frame in found)
-        along = {round(float(frame.centre @ frame.rotation[:, 1]), 6) for frame in found}
+        along = {round(float(frame.center @ frame.rotation[:, 1]), 6) for frame in found}
         assert along == {-0.3, -0.15, 0.0, 0.15}
-        assert all(np.linalg.norm(np.cross(f.centre, f.rotation[:, 1])) < 1e-9 for f in found)
+        assert all(np.linalg.norm(np.cross(f.center, f.rotation[:, 1])) < 1e-9 for f in found)
     placed = replace(model, card=replace(model.card, frame={"orientation": "none", "scale": "area"}))
     assert len(frames_of_part(placed, scan, plain, wide=True)) == 1
 

@@ -35,7 +35,7 @@ def test_the_noise_is_that_of_the_distances_whatever_a_few_strays_do() -> None:
 
 
 def test_means_are_those_of_a_plain_loop() -> None:
-    fit = plate(5)  # 25 vertices and 32 face centres; 48 of them are asked
+    fit = plate(5)  # 25 vertices and 32 face centers; 48 of them are asked
     values = np.stack([fit.points[:, 0] ** 2, fit.points[:, 1]], 1)
     samples = np.concatenate([fit.points, fit.points[fit.faces].mean(1)])
     sampled = np.concatenate([values, values[fit.faces].mean(1)])

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from meshmatch.render import light, raster, slivers
+from meshmatch.render import raster, shading, slivers
 from meshmatch.render.framing import leant
 from meshmatch.render.raster import Image, draw, laid_over
 from meshmatch.render.scene import Ground, Scene
 from meshmatch.render.surface import FacePaint, Surface, VertexPaint, balls, discs, mesh_surface
-from meshmatch.render.window import Window
+from meshmatch.render.viewport import Window
 
 WINDOW = Window(90, 70, -0.45, 0.35, 0.01)
 GREY = np.array([0.5, 0.5, 0.5])
@@ -111,12 +111,12 @@ def test_a_hollow_is_darker_than_a_hill() -> None:
     grid = np.arange(41 * 41).reshape(41, 41)
     a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
     faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    centre = []
+    center = []
     for sign in (1, -1):
         z = sign * 0.4 * np.exp(-60 * (x**2 + y**2))
         image = draw(Scene([surface(np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1), faces)]), WINDOW)
-        centre.append(image.light[33:37, 43:47].mean())
-    assert centre[0] > 1.25 * centre[1]
+        center.append(image.light[33:37, 43:47].mean())
+    assert center[0] > 1.25 * center[1]
 
 
 def test_light_that_nothing_blocks_is_whole_and_a_lid_takes_it() -> None:
@@ -124,10 +124,10 @@ def test_light_that_nothing_blocks_is_whole_and_a_lid_takes_it() -> None:
     x = np.array([0.0, 0.1])
     hits = open_floor.look(x, x, 0.01)
     rows = np.arange(2)
-    assert (light.seen_light(open_floor, hits, rows, rows, rows) == 1).all()
+    assert (shading.seen_light(open_floor, hits, rows, rows, rows) == 1).all()
     lid = square(8.0, 0.02)
     covered = Scene([square(0.8), Surface(lid.verts, lid.faces, lid.normals, lid.paint)])
-    seen = light.seen_light(covered, hits, rows, rows, rows)
+    seen = shading.seen_light(covered, hits, rows, rows, rows)
     assert (seen[:, 0] == 0).all()
     assert (seen[:, 1] < 0.35).all()  # some rays end before the lid: what is near counts most
 

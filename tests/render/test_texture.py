@@ -7,10 +7,10 @@ from meshmatch.render.raster import draw
 from meshmatch.render.scene import Scene
 from meshmatch.render.surface import mesh_surface
 from meshmatch.render.texture import TexturePaint
-from meshmatch.render.window import Window
+from meshmatch.render.viewport import Window
 from meshmatch.shapes.appearance import Appearance, Material
-from meshmatch.shapes.light import to_linear
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.srgb import to_linear
 from tests.shapes.painted import CORNERS, FACES, UV, quarters
 
 SQUARE = Shape(CORNERS, FACES, "square")

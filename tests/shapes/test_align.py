@@ -19,17 +19,17 @@ def pear(sphere: Shape) -> Oriented:
     return Oriented(samples.points - samples.points.mean(0), samples.normals)
 
 
-def turned(part: Oriented, rotation: np.ndarray, centre: np.ndarray) -> Oriented:
-    return Oriented(part.points @ rotation.T + centre, part.normals @ rotation.T)
+def turned(part: Oriented, rotation: np.ndarray, center: np.ndarray) -> Oriented:
+    return Oriented(part.points @ rotation.T + center, part.normals @ rotation.T)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_any_turn_is_found(pear: Oriented, seed: int) -> None:
     rotation = Rotation.random(random_state=np.random.default_rng(seed)).as_matrix()
-    centre = np.array([0.02, -0.03, 0.01])
-    best = align(turned(pear, rotation, centre), pear, "rigid")[0]
+    center = np.array([0.02, -0.03, 0.01])
+    best = align(turned(pear, rotation, center), pear, "rigid")[0]
     assert np.allclose(best.rotation, rotation, atol=0.02)
-    assert np.allclose(best.centre, centre, atol=0.01)
+    assert np.allclose(best.center, center, atol=0.01)
     assert best.residual < 0.02
 
 

@@ -12,8 +12,8 @@ from meshmatch.shapes import images
 from meshmatch.shapes.appearance import Appearance, load_appearance
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.text import behind_slash
-from meshmatch.shapes.light import LINEAR_OF_BYTE, bytes_of, to_linear, to_srgb
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.srgb import LINEAR_OF_BYTE, bytes_of, to_linear, to_srgb
 from tests.shapes.painted import CORNERS, FACES, UV, encoded, quarters, write_gltf, write_square_obj
 
 

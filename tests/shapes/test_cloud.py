@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from meshmatch.shapes import cloud
-from meshmatch.shapes.cloud import estimate_normals, local_areas, stray_points
+from meshmatch.shapes.cloud import estimate_normals, local_areas, outlier_points
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.orientation import agreeing_flips
 from meshmatch.shapes.sampling import sample_surface
@@ -135,8 +135,8 @@ def test_large_cloud_gives_each_point_its_share(monkeypatch: pytest.MonkeyPatch)
 def test_strays(monkeypatch: pytest.MonkeyPatch, largest: int) -> None:
     monkeypatch.setattr(cloud, "LARGEST", largest)
     points = np.vstack([on_sphere(2000), [[3, 0, 0], [0, 0, 0]]])
-    np.testing.assert_array_equal(np.flatnonzero(stray_points(points)), [2000, 2001])
-    assert not stray_points(points[:10]).any()
+    np.testing.assert_array_equal(np.flatnonzero(outlier_points(points)), [2000, 2001])
+    assert not outlier_points(points[:10]).any()
 
 
 def test_loose_point_of_a_dense_patch_is_no_stray() -> None:
@@ -144,7 +144,7 @@ def test_loose_point_of_a_dense_patch_is_no_stray() -> None:
     x, y = np.meshgrid(np.arange(30.0), np.arange(30.0))
     grid = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
     patch = grid[:100] * 0.02 + [100, 0, 0]
-    assert not stray_points(np.vstack([grid, patch, [[100.3, 0.5, 0]]])).any()
+    assert not outlier_points(np.vstack([grid, patch, [[100.3, 0.5, 0]]])).any()
 
 
 def test_flips_against_the_slow_way() -> None:

@@ -14,8 +14,8 @@ from meshmatch.shapes.appearance import load_appearance, load_coordinates
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.formats.textured import Textured, split_at_seams
 from meshmatch.shapes.images import png_bytes
-from meshmatch.shapes.light import LINEAR_OF_BYTE
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.srgb import LINEAR_OF_BYTE
 from meshmatch.shapes.textured_files import claim_textured, files_of, save_textured
 from meshmatch.transfer.pyramid import Pyramid
 from tests.shapes.painted import CORNERS, FACES, UV, quarters
@@ -121,7 +121,7 @@ def test_trimesh_sees_the_same_colours(
     np.testing.assert_allclose(ours, uv * (1, -1) + (0, 1), atol=1e-4)
     look = load_appearance(path, load_shape(path))
     pyramid = Pyramid.of(look.materials[0])
-    # it mixes bytes where we mix light: compare at the centres of texels, where there is nothing to mix
+    # it mixes bytes where we mix light: compare at the centers of texels, where there is nothing to mix
     middle = (np.floor(ours * 16) + 0.5) / 16
     light = pyramid.look(*middle.T.astype(np.float32), np.zeros(500, np.float32))
     column, row = np.floor(ours * 16).astype(int).clip(0, 15).T

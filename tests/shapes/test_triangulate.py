@@ -16,8 +16,8 @@ def test_a_ball_of_points_becomes_a_ball(sphere: Shape) -> None:
     kept, faces = triangulate_cloud(cloud, 10_000)
     mesh = Shape(cloud.verts[kept], faces)
     assert mesh.area == pytest.approx(sphere.area, rel=0.02)
-    centres = mesh.verts[mesh.faces].mean(1)
-    assert ((mesh.face_normals * centres).sum(1) > 0.9).all()  # outwards, all of them
+    centers = mesh.verts[mesh.faces].mean(1)
+    assert ((mesh.face_normals * centers).sum(1) > 0.9).all()  # outwards, all of them
 
 
 def test_many_points_are_thinned_and_noise_leaves_a_surface(sphere: Shape) -> None:

@@ -11,11 +11,11 @@ from meshmatch.errors import InputError, OutputError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates import registered
-from meshmatch.templates.gather import read_gathered
 from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.prepare import prepare_folder, read_registered
 from meshmatch.templates.template import load_template
-from meshmatch.training.few import frame_of_few
+from meshmatch.templates.unregistered import read_gathered
+from meshmatch.training.small_data import frame_of_few
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.3)
 FAR = np.array([1e6, -3e5, 2e4])  # a surveyor's coordinates
@@ -194,7 +194,7 @@ def test_correspondence_says_whether_registered_shapes_stand_alike(
     assert frame_of_few(tmp_path / "nowhere") is None
     monkeypatch.setattr(registered, "FEW", 4)
     assert prepare_folder(folder, tmp_path / "many", FEW).align == "none"
-    monkeypatch.setattr("meshmatch.training.few.FEW", 4)
+    monkeypatch.setattr("meshmatch.training.small_data.FEW", 4)
     assert frame_of_few(tmp_path / "many") is None
 
 

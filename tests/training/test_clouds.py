@@ -9,8 +9,8 @@ import torch
 from meshmatch.models.deformer import NetworkConfig
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.gather import Gathered
 from meshmatch.templates.template import Template
+from meshmatch.templates.unregistered import Gathered
 from meshmatch.training.chamfer import build_surface_points, chamfer, chamfer_losses, robust
 from meshmatch.training.clouds import CloudConfig, CloudDataset, build_warp, turned_normals, warped_source
 from meshmatch.training.loop import TrainConfig, Trainer

@@ -108,7 +108,7 @@ def test_holes_swallow_a_ball() -> None:
         points = scan(config, seed)[0, :, :2]
         grid = torch.cartesian_prod(torch.linspace(0.05, 0.95, 19), torch.linspace(0.05, 0.95, 19))
         widest.append(float(torch.cdist(grid, points).amin(1).max()))
-    # faces are swallowed whole, by their centres: of a coarse square only some seeds show one
+    # faces are swallowed whole, by their centers: of a coarse square only some seeds show one
     assert max(widest) > 0.1
     assert float(torch.cdist(grid, scan(CLEAN)[0, :, :2]).amin(1).max()) < 0.05
 
@@ -131,16 +131,16 @@ def test_outliers_stray_far_from_the_surface() -> None:
 
 def test_partial_scans_see_one_side_or_lose_a_part() -> None:
     ball = icosphere(3)
-    centres = torch.from_numpy(ball.verts[ball.faces].mean(axis=1)).float().expand(200, -1, -1)
-    seen = seen_share(centres, centres, 1.0, seeded()) > 0.5
+    centers = torch.from_numpy(ball.verts[ball.faces].mean(axis=1)).float().expand(200, -1, -1)
+    seen = seen_share(centers, centers, 1.0, seeded()) > 0.5
     share = seen.float().mean(1)
     assert 0.45 < share.min() and share.max() <= 1
     assert ((share - 0.5).abs() < 0.03).float().mean() > 0.4  # what faces one way is a half of a ball
     assert (share > 0.6).float().mean() > 0.25
-    apart = (centres * seen[..., None]).sum(1) / seen.sum(1)[:, None]
+    apart = (centers * seen[..., None]).sum(1) / seen.sum(1)[:, None]
     assert apart.norm(dim=-1).mean() > 0.2  # and all of it on one side
-    assert (seen_share(centres, centres, 0.0, seeded()) == 1).all()
-    some = seen_share(centres, centres, 0.25, seeded()).amin(1) < 0.5
+    assert (seen_share(centers, centers, 0.0, seeded()) == 1).all()
+    some = seen_share(centers, centers, 0.25, seeded()).amin(1) < 0.5
     assert 0.15 < some.float().mean() < 0.35
 
 

@@ -21,7 +21,7 @@ def inside(corners: np.ndarray, x: float, y: float) -> bool:
 
 def test_a_square_of_two_triangles_by_hand() -> None:
     found, twice = faces_on(SQUARE, 5)
-    # centres on the diagonal go to one of the two, and the texels beyond the square to none
+    # centers on the diagonal go to one of the two, and the texels beyond the square to none
     want = [[1, 0, 0, 0, -1], [1, 1, 0, 0, -1], [1, 1, 1, 0, -1], [1, 1, 1, 1, -1], [-1] * 5]
     on_diagonal = np.eye(5, dtype=bool)
     assert twice == 0
@@ -41,7 +41,7 @@ def test_random_triangles_against_the_slow_way() -> None:
 def test_every_texel_of_a_triangulation_is_held_once() -> None:
     rng = np.random.default_rng(1)
     points = np.concatenate([rng.uniform(0, 32, (200, 2)), [[0, 0], [32, 0], [0, 32], [32, 32]]])
-    points[:100] = np.round(points[:100] * 2) / 2  # many corners and edges on centres
+    points[:100] = np.round(points[:100] * 2) / 2  # many corners and edges on centers
     corners = points[Delaunay(points).simplices]
     found, twice = faces_on(corners, 32)
     assert twice == 0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from meshmatch.shapes.decimate import decimate
-from meshmatch.shapes.doubles import seams
+from meshmatch.shapes.duplicates import seams
 from meshmatch.shapes.shape import Floats, Ints, Shape
 
 MOST = 150_000

@@ -13,8 +13,8 @@ from PIL import Image
 from meshmatch.render.viewer.packing import small_integers, to_bytes
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.images import Pixels, png_bytes
-from meshmatch.shapes.light import to_srgb
 from meshmatch.shapes.shape import Ints
+from meshmatch.shapes.srgb import to_srgb
 from meshmatch.shapes.topology import same_rows
 
 LARGEST = 2048

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged
-from meshmatch.shapes.light import to_srgb
+from meshmatch.shapes.srgb import to_srgb
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.shapes.formats.textured import Textured, split_at_seams
-from meshmatch.shapes.light import to_linear
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.srgb import to_linear
 
 _POINTS, _TRIANGLES = 0, 4
 _FLOAT, _UNSIGNED = 5126, 5125

@@ -18,8 +18,8 @@ from meshmatch.shapes.formats import damaged, fan
 from meshmatch.shapes.formats.obj import joined_lines, with_old
 from meshmatch.shapes.formats.text import behind_slash, columns, lines_of, numbers, words_per_line
 from meshmatch.shapes.images import ImageReader, Pixels
-from meshmatch.shapes.light import to_linear
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.srgb import to_linear
 
 # How many numbers follow an option of a map; up to three where it is None.
 _OPTIONS = {

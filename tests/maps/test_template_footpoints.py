@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.fit import Fit
-from meshmatch.maps.place import medians, neighbours, place, small_pieces, surroundings
+from meshmatch.maps.template_footpoints import medians, neighbours, place, small_pieces, surroundings
 from meshmatch.shapes.shape import Frame, Shape
 
 # A chain of ten vertices, one apart; where they belong is where they are.

@@ -36,7 +36,7 @@ def flat_faces(verts: Floats, faces: Ints, cross: Floats, diagonal: float) -> ND
     return np.asarray(flat)
 
 
-def double_faces(faces: Ints) -> NDArray[np.bool_]:
+def duplicate_faces(faces: Ints) -> NDArray[np.bool_]:
     """True for faces to drop: all but the first of the same three corners, and both of a flap.
 
     Two that face opposite ways cancel. On a surface that goes on around them they are a fold of no volume,

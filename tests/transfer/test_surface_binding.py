@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.fitting.fit import Fit
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Frame, Shape
-from meshmatch.transfer.ride import Rider
+from meshmatch.transfer.surface_binding import SurfaceBinding
 from tests.conftest import icosphere
 
 TURN = Rotation.from_euler("xyz", [20, 50, -30], degrees=True).as_matrix()
@@ -55,7 +55,7 @@ def turns(V: int, R: np.ndarray) -> np.ndarray:
 def test_the_pose_of_the_fit_gives_back_the_shape(bumpy: Shape) -> None:
     fit = ball_fit(bumpy)
     own = Rotation.random(len(fit.points), random_state=np.random.default_rng(1)).as_matrix()
-    rider = Rider(repair(bumpy), fit, own)
+    rider = SurfaceBinding(repair(bumpy), fit, own)
     found = rider.shape(fit.frame.undo(rider.at(fit.points, own)), "again")
     assert np.abs(found.verts - bumpy.verts).max() < 1e-12 * bumpy.diagonal
     assert np.array_equal(found.faces, bumpy.faces)
@@ -67,7 +67,7 @@ def test_the_pose_of_the_fit_gives_back_the_shape(bumpy: Shape) -> None:
 def test_it_goes_where_the_template_goes_and_turns_with_it(bumpy: Shape) -> None:
     fit = ball_fit(bumpy)
     V = len(fit.points)
-    rider = Rider(repair(bumpy), fit, turns(V, np.eye(3)))
+    rider = SurfaceBinding(repair(bumpy), fit, turns(V, np.eye(3)))
     R, shift = Rotation.from_euler("y", 80, degrees=True).as_matrix(), np.array([0.3, 2, -1])
     found = rider.at(fit.points @ R.T + shift, turns(V, R))
     assert np.allclose(found, fit.frame.apply(bumpy.verts) @ R.T + shift)
@@ -75,7 +75,7 @@ def test_it_goes_where_the_template_goes_and_turns_with_it(bumpy: Shape) -> None
 
 def test_bumps_keep_their_height_where_the_template_grows(bumpy: Shape) -> None:
     fit = ball_fit(bumpy)
-    rider = Rider(repair(bumpy), fit, turns(len(fit.points), np.eye(3)))
+    rider = SurfaceBinding(repair(bumpy), fit, turns(len(fit.points), np.eye(3)))
     grown = rider.at(3 * fit.points, turns(len(fit.points), np.eye(3)))
     before = np.linalg.norm(fit.frame.apply(bumpy.verts[:642]), axis=1)
     # Facets of a sphere of 162 vertices lie up to 2 % below it, three times as much when it is three times as large.
@@ -85,6 +85,6 @@ def test_bumps_keep_their_height_where_the_template_grows(bumpy: Shape) -> None:
 def test_twins_stay_together(bumpy: Shape) -> None:
     fit = ball_fit(bumpy)
     own = Rotation.random(len(fit.points), random_state=np.random.default_rng(2)).as_matrix()
-    rider = Rider(repair(bumpy), fit, turns(len(fit.points), np.eye(3)))
+    rider = SurfaceBinding(repair(bumpy), fit, turns(len(fit.points), np.eye(3)))
     found = rider.at(fit.points + 0.2 * own[:, 0], own)
     assert np.allclose(found[0], found[642])

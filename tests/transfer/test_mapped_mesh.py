@@ -1,18 +1,18 @@
-"""Places on the source of points near its image."""
+"""ClosestPlaces on the source of points near its image."""
 
 import numpy as np
 import pytest
 
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.image import Image, on_vertex, torn_faces
+from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, on_vertex
 from tests.conftest import icosphere
 from tests.maps.solids import bumpy_sphere
 from tests.transfer.known import brute_force, split
 
 
-def own_image(shape: Shape) -> Image:
-    return Image(VertexMap.identity(shape), shape, shape)
+def own_image(shape: Shape) -> MappedMesh:
+    return MappedMesh(VertexMap.identity(shape), shape, shape)
 
 
 @pytest.mark.parametrize("reach", [0.01, 0.3, 3.0])
@@ -37,7 +37,7 @@ def test_more_points_than_one_portion_are_each_answered(
 ) -> None:
     points = np.random.default_rng(2).normal(size=(500, 3))
     whole = own_image(sphere).query(points)
-    monkeypatch.setattr("meshmatch.transfer.image._CHUNK", 37)
+    monkeypatch.setattr("meshmatch.transfer.mapped_mesh._CHUNK", 37)
     parts = own_image(sphere).query(points)
     assert np.array_equal(whole.face, parts.face)
     assert np.array_equal(whole.barycentric, parts.barycentric)
@@ -56,7 +56,9 @@ def test_a_little_doubt_moves_nothing_but_a_guess_gives_way() -> None:
     shape = icosphere(2)
     confidence = np.ones(shape.V)
     confidence[0] = 0.7
-    places = Image(VertexMap.between(shape, shape, np.arange(shape.V), confidence=confidence), shape, shape)
+    places = MappedMesh(
+        VertexMap.between(shape, shape, np.arange(shape.V), confidence=confidence), shape, shape
+    )
     assert places.query(shape.verts[:1]).vertex[0] == 0
     # A guess lies exactly here, and a sure vertex very near.
     index = np.arange(shape.V)
@@ -64,7 +66,7 @@ def test_a_little_doubt_moves_nothing_but_a_guess_gives_way() -> None:
     confidence = np.ones(shape.V)
     confidence[0] = 1e-6
     doubled = VertexMap.between(shape, shape, index, confidence=confidence)
-    found = Image(doubled, shape, shape).query(shape.verts[:1])
+    found = MappedMesh(doubled, shape, shape).query(shape.verts[:1])
     assert found.confidence[0] > 0.5
     assert found.vertex[0] != 0
 
@@ -73,7 +75,7 @@ def test_a_place_is_sought_near_where_it_is_said_to_be() -> None:
     """Two far points of the source lie on one point of the target."""
     two = Shape(np.array([[0.0, 0, 0], [1, 0, 0]]), np.empty((0, 3), int), "two")
     sphere = icosphere(1)
-    image = Image(VertexMap.between(two, sphere, np.array([4, 4])), two, sphere)
+    image = MappedMesh(VertexMap.between(two, sphere, np.array([4, 4])), two, sphere)
     for k in (0, 1):
         assert image.query(sphere.verts[[4]], near=two.verts[[k]]).vertex.tolist() == [k]
 
@@ -82,7 +84,7 @@ def test_faces_are_torn_where_their_image_is_far_longer(sphere: Shape) -> None:
     index = np.arange(sphere.V)
     index[7] = int(np.argmin(sphere.verts @ sphere.verts[7]))
     found = VertexMap.between(sphere, sphere, index)
-    torn = torn_faces(found, sphere, sphere, found.points(sphere), float(np.sqrt(sphere.area)))
+    torn = discontinuous_faces(found, sphere, sphere, found.points(sphere), float(np.sqrt(sphere.area)))
     assert np.array_equal(np.flatnonzero(torn), np.flatnonzero((sphere.faces == 7).any(axis=1)))
 
 
@@ -92,9 +94,11 @@ def test_whole_maps_are_not_torn_whatever_the_units(size: float) -> None:
     fine, forward, back = split(Shape(shape.verts * size, shape.faces))
     coarse = Shape(shape.verts * size, shape.faces)
     for found, a, b in ((forward, coarse, fine), (back, fine, coarse)):
-        assert not torn_faces(found, a, b, found.points(b), float(np.sqrt(b.area))).any()
+        assert not discontinuous_faces(found, a, b, found.points(b), float(np.sqrt(b.area))).any()
     rounded = VertexMap.between(fine, coarse, back.index)  # to vertices alone: each by up to half an edge
-    assert not torn_faces(rounded, fine, coarse, rounded.points(coarse), float(np.sqrt(coarse.area))).any()
+    assert not discontinuous_faces(
+        rounded, fine, coarse, rounded.points(coarse), float(np.sqrt(coarse.area))
+    ).any()
 
 
 def test_rounding_to_a_coarse_target_tears_nothing(sphere: Shape) -> None:
@@ -105,13 +109,13 @@ def test_rounding_to_a_coarse_target_tears_nothing(sphere: Shape) -> None:
     points = found.points(coarse)
     longest = np.linalg.norm(points[sphere.faces] - points[sphere.faces[:, [1, 2, 0]]], axis=2).max()
     assert longest > 5 * np.linalg.norm(np.diff(sphere.verts[sphere.faces[0, :2]], axis=0))
-    assert not torn_faces(found, sphere, coarse, points, float(np.sqrt(coarse.area))).any()
+    assert not discontinuous_faces(found, sphere, coarse, points, float(np.sqrt(coarse.area))).any()
 
 
 def test_a_cloud_has_no_faces_to_tear(sphere: Shape) -> None:
     points = Shape(sphere.verts, np.empty((0, 3), int))
     found = VertexMap.identity(points)
-    assert torn_faces(found, points, points, points.verts, 1.0).shape == (0,)
+    assert discontinuous_faces(found, points, points, points.verts, 1.0).shape == (0,)
 
 
 def test_places_on_vertices_are_known_as_such() -> None:
@@ -127,7 +131,7 @@ def test_places_on_vertices_are_known_as_such() -> None:
 
 def test_a_map_of_everything_to_one_point_still_answers(sphere: Shape) -> None:
     found = VertexMap.between(sphere, sphere, np.zeros(sphere.V, int))
-    places = Image(found, sphere, sphere).query(sphere.verts)
+    places = MappedMesh(found, sphere, sphere).query(sphere.verts)
     assert np.allclose(places.distance, np.linalg.norm(sphere.verts - sphere.verts[0], axis=1))
 
 
@@ -135,6 +139,8 @@ def test_the_only_vertex_with_a_place_is_found_though_all_its_faces_are_broken(s
     broken = Shape(np.zeros((42, 3)), icosphere(1).faces, "broken", None, np.arange(42) > 0)
     huge = Shape(1e30 * sphere.verts, sphere.faces, "huge")
     for target in (sphere, huge):
-        found = Image(VertexMap.between(broken, target, np.arange(42)), broken, target).query(target.verts)
+        found = MappedMesh(VertexMap.between(broken, target, np.arange(42)), broken, target).query(
+            target.verts
+        )
         assert (found.vertex == 0).all()
         assert (found.face == -1).all()

@@ -1,4 +1,4 @@
-"""The surface that colours are taken from: points near it slide on it to the closest place.
+"""The surface that colours are taken from: points near it closest on it to the closest place.
 
 A point knows a face to begin with, and goes from face to face over shared edges. So it never changes to another
 sheet that merely passes by, and neighbouring points end on neighbouring places.
@@ -20,7 +20,7 @@ Near = NDArray[np.float32]
 Faces = NDArray[np.int32]
 
 
-class Ground:
+class SurfaceWalker:
     """A mesh arranged for sliding; lengths in units of `unit`, seen from `center`.
 
     Parameters
@@ -56,7 +56,7 @@ class Ground:
         """(N, 3) points of faces (N,) by weights (N, 3)."""
         return np.asarray(np.einsum("nk,nkd->nd", weights, self.verts[self.faces[face]]))
 
-    def slide(self, points: Near, face: Faces) -> tuple[Faces, Near, Near]:
+    def closest(self, points: Near, face: Faces) -> tuple[Faces, Near, Near]:
         """The closest place on the surface, as far as sliding gets.
 
         Parameters
@@ -140,8 +140,8 @@ class Ground:
         return np.asarray(self._tree.query(points.T)[1], np.int32)
 
 
-class CloudGround(Ground):
-    """A point cloud as a ground: each point with its two nearest neighbours stands for a face.
+class PointWalker(SurfaceWalker):
+    """A point cloud as a walker: each point with its two nearest neighbours stands for a face.
 
     Sliding is a search for the nearest point; weights fall with the square of the distance.
     """
@@ -160,17 +160,17 @@ class CloudGround(Ground):
         """The face of a point has its number."""
         return vertex
 
-    def slide(self, points: Near, face: Faces) -> tuple[Faces, Near, Near]:
-        """The nearest points, wherever the search began; see `Ground.slide`."""
+    def closest(self, points: Near, face: Faces) -> tuple[Faces, Near, Near]:
+        """The nearest points, wherever the search began; see `SurfaceWalker.closest`."""
         place = self._valid[self._points.query(points.T)[1]].astype(np.int32)
         away = self.verts[self.faces[place]] - points.T[:, None]
         near = 1.0 / np.maximum(np.einsum("nkd,nkd->kn", away, away), 1e-18)
         return place, (near / near.sum(axis=0)).astype(np.float32), np.zeros(len(place), np.float32)
 
 
-def ground_of(shape: Shape) -> Ground:
-    """The ground of a mesh or a cloud."""
-    return CloudGround(shape) if shape.is_cloud else Ground(shape)
+def walker_of(shape: Shape) -> SurfaceWalker:
+    """The walker of a mesh or a cloud."""
+    return PointWalker(shape) if shape.is_cloud else SurfaceWalker(shape)
 
 
 def _product(a: list[Near], b: list[Near]) -> Near:

@@ -87,7 +87,7 @@ def most_typical(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int
         part = Oriented(unit_frame(shape, scale, 0.5).apply(samples.points), samples.normals)
         if seen:
             best = align(part, seen[0], how)[0]
-            part = part.moved(best.rotation, best.centre)
+            part = part.moved(best.rotation, best.center)
         seen.append(part)
     apart = np.zeros((len(seen), len(seen)))
     for i in range(len(seen)):
@@ -135,10 +135,10 @@ def gather(
         samples = sample_surface(one.shape, P, rng)
         part = Oriented(frame.apply(samples.points), samples.normals)
         best = align(part, target, how)[0]
-        part = part.moved(best.rotation, best.centre)
+        part = part.moved(best.rotation, best.center)
         points.append(part.points)
         normals.append(part.normals)
-        frames.append(frame.compose(Frame(1.0, best.rotation.T, best.centre)))
+        frames.append(frame.compose(Frame(1.0, best.rotation.T, best.center)))
         far.append(best.residual)
         places = known[number]
         if L and places is not None:

@@ -36,7 +36,7 @@ _CHUNK, _FIRST, _MOST = 8192, 12, 512
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class ClosestPlaces:
     """Where N points of the target lie on the source.
 
     Parameters
@@ -60,7 +60,7 @@ class Places:
     distance: Floats
 
 
-class Image:
+class MappedMesh:
     """The source laid on the target by a map from source to target.
 
     Parameters
@@ -74,7 +74,7 @@ class Image:
         self.confidence = source_to_target.confidence.astype(np.float64)
         self.unit = float(np.sqrt(target.area)) or target.diagonal or 1.0
         self.normals = _normals_at(source_to_target, target)
-        kept = np.flatnonzero(~torn_faces(source_to_target, source, target, self.points, self.unit))
+        kept = np.flatnonzero(~discontinuous_faces(source_to_target, source, target, self.points, self.unit))
         lone = np.ones(source.V, bool)
         if source.invalid is not None:  # their places are stand-ins
             kept = kept[~source.invalid[source.faces[kept]].any(axis=1)]
@@ -95,7 +95,7 @@ class Image:
         self._gap = self.unit / np.sqrt(distinct) if source.is_cloud else 0.0
 
     def _by_size(self) -> list[tuple[cKDTree, Ints, float]]:
-        """For triangles of each size: a tree of their centres, their numbers, and the largest radius."""
+        """For triangles of each size: a tree of their centers, their numbers, and the largest radius."""
         largest = float(self._radius.max()) or 1.0
         size = np.floor(np.log2(np.maximum(self._radius / largest, 0.5**_CLASSES)))
         groups = [np.flatnonzero(size == k) for k in np.unique(size)]
@@ -107,8 +107,8 @@ class Image:
         normals: Floats | None = None,
         workers: int = 1,
         near: Floats | None = None,
-    ) -> Places:
-        """Places on the source of (N, 3) points on the target, in its file's frame.
+    ) -> ClosestPlaces:
+        """ClosestPlaces on the source of (N, 3) points on the target, in its file's frame.
 
         Parameters
         ----------
@@ -134,7 +134,7 @@ class Image:
         face = self.face[item]
         vertex = corners[np.arange(N), weights.argmax(axis=1)]
         weights[face < 0] = (1.0, 0.0, 0.0)
-        return Places(vertex, face, weights, confidence, distance)
+        return ClosestPlaces(vertex, face, weights, confidence, distance)
 
     def _search(
         self, points: Floats, normals: Floats, workers: int, near: Floats | None = None
@@ -206,7 +206,7 @@ class Image:
         return np.maximum(-cosine, 0.0)
 
 
-def torn_faces(
+def discontinuous_faces(
     source_to_target: VertexMap, source: Shape, target: Shape, points: Floats, unit: float
 ) -> NDArray[np.bool_]:
     """(F_src,) True for a face whose image `points` (V_src, 3) is far longer than the face itself.

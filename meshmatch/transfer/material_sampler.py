@@ -10,18 +10,18 @@ from scipy.sparse.csgraph import connected_components
 
 from meshmatch.shapes.appearance import Alpha, Appearance, Material
 from meshmatch.shapes.shape import Floats, cross_product, squared_lengths
-from meshmatch.transfer.ground import Ground, duals
 from meshmatch.transfer.pyramid import Light, Pyramid, wrapped
+from meshmatch.transfer.surface_walk import SurfaceWalker, duals
 from meshmatch.transfer.texels import MOST_ROWS, rows_of, spans
 
 
-class Coat:
+class MaterialSampler:
     """The look of a shape: materials, images as pyramids, and how dense their texels lie.
 
     Parameters
     ----------
     look : Appearance
-    ground : Ground
+    walker : SurfaceWalker
         Of the same file; lengths are in its unit. For a cloud, whose points are its faces, the look has a material
         for each point.
 
@@ -33,10 +33,10 @@ class Coat:
         What the alpha of `colors` means.
     """
 
-    def __init__(self, look: Appearance, ground: Ground) -> None:
+    def __init__(self, look: Appearance, walker: SurfaceWalker) -> None:
         self.materials = look.materials
         self._material = look.material
-        self._faces = ground.faces
+        self._faces = walker.faces
         self._colors = None if look.colors is None else list(look.colors.T.astype(np.float32, order="C"))
         used = [self.materials[k] for k in np.unique(look.material).tolist()]
         self.alpha, self.cutoff, self._hard = _meaning(used, look.colors)
@@ -47,8 +47,8 @@ class Coat:
         held = np.array(["clamp" in m.wrap for m in self.materials])[look.material]
         uv[held] = look.uv[held]
         self._uv = [list(uv[:, :, k].T.astype(np.float32, order="C")) for k in range(2)]
-        self.chart = _charts(ground, look, pictured)
-        self._density = _densities(ground, self.materials, look.material, look.uv)
+        self.chart = _charts(walker, look, pictured)
+        self._density = _densities(walker, self.materials, look.material, look.uv)
         self._pyramids = self._build(look)
 
     def _build(self, look: Appearance) -> list[Pyramid | None]:
@@ -139,7 +139,7 @@ def known_texels(material: Material, uv: Floats) -> NDArray[np.bool_] | None:
     found = spans(corners)
     for _, column, row in found.expanded():
         known[wrapped(row, height, material.wrap[1]), wrapped(column, width, material.wrap[0])] = True
-    # Triangles that hold no centre of a texel still name some; they count where nothing near is known.
+    # Triangles that hold no center of a texel still name some; they count where nothing near is known.
     small = np.ones(len(uv), bool)
     small[found.face] = False
     at = _texels_at(corners[small].mean(axis=1), material, known.shape)
@@ -157,7 +157,7 @@ def _texels_at(
 
 
 def _densities(
-    ground: Ground, materials: tuple[Material, ...], material: NDArray[np.int64], uv: Floats
+    walker: SurfaceWalker, materials: tuple[Material, ...], material: NDArray[np.int64], uv: Floats
 ) -> NDArray[np.float32]:
     """(F,) texels of its image that lie along a unit of length on each face.
 
@@ -166,13 +166,13 @@ def _densities(
     """
     sizes = np.array([(0, 0) if m.image is None else m.image.shape[1::-1] for m in materials], np.float64)
     corners = uv * sizes[material][:, None]
-    a, b, c = (ground.verts[ground.faces[:, k]] for k in range(3))
+    a, b, c = (walker.verts[walker.faces[:, k]] for k in range(3))
     first, second = duals(b - a, c - a)
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     u, v = (one[:, k : k + 1] * first + two[:, k : k + 1] * second for k in range(2))
     density = reach_of(u, v)
     plain = sizes[material][:, 0] == 0
-    density[plain] = 1.0 / np.sqrt(2.0 * np.maximum(ground.areas[plain], 1e-12))
+    density[plain] = 1.0 / np.sqrt(2.0 * np.maximum(walker.areas[plain], 1e-12))
     return density.astype(np.float32)
 
 
@@ -185,20 +185,20 @@ def reach_of(first: Floats, second: Floats) -> Floats:
     return np.maximum(np.sqrt(area), longest / 2)
 
 
-def _charts(ground: Ground, look: Appearance, pictured: NDArray[np.bool_]) -> NDArray[np.int32]:
+def _charts(walker: SurfaceWalker, look: Appearance, pictured: NDArray[np.bool_]) -> NDArray[np.int32]:
     """(F,) faces joined over edges where material and texture coordinates agree; without an image, by material."""
-    F = len(ground.faces)
+    F = len(walker.faces)
     joined = []
     for k in range(3):
-        face = np.flatnonzero(ground.opposite[:, k] >= 0)
+        face = np.flatnonzero(walker.opposite[:, k] >= 0)
         other, edge = (
-            ground.opposite[face, k].astype(np.int64),
-            ground.opposite_edge[face, k].astype(np.int64),
+            walker.opposite[face, k].astype(np.int64),
+            walker.opposite_edge[face, k].astype(np.int64),
         )
         rows = np.arange(len(face))
         ends, theirs = ((k + 1) % 3, (k + 2) % 3), ((edge + 1) % 3, (edge + 2) % 3)
         # the other face runs along the edge the other way round, unless it is turned over
-        same_way = ground.same[face, ends[0]] == ground.same[other, theirs[0]]
+        same_way = walker.same[face, ends[0]] == walker.same[other, theirs[0]]
         agree = look.material[face] == look.material[other]
         for i in (0, 1):
             corner = np.where(same_way, theirs[i], theirs[1 - i])

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from meshmatch.fitting.fit import Fit
-from meshmatch.maps.place import place
+from meshmatch.maps.template_footpoints import place
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Floats, Shape
 
 
-class Rider:
+class SurfaceBinding:
     """Every vertex of a shape rides on its place on the fitted template.
 
     What lies between the vertex and its place is kept, and turns with the template: so the pose of the fit gives back

@@ -18,7 +18,7 @@ from meshmatch.fitting.network_fit import Candidate
 from meshmatch.fitting.nodes import vertex_areas
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
-from meshmatch.shapes.cloud import stray_points
+from meshmatch.shapes.cloud import outlier_points
 from meshmatch.shapes.shape import Shape
 
 _ROUNDS = 3
@@ -32,12 +32,12 @@ Lay = Callable[[Scan, Candidate], Candidate]
 
 
 @lru_cache(maxsize=4)
-def without_strays(shape: Shape) -> Shape:
+def without_outliers(shape: Shape) -> Shape:
     """A cloud without the points that lie apart from their neighbours; any other shape as it is.
 
     A stray among neighbours bends their normals and turns the signs of whole regions, and it counts as surface.
     """
-    stray = stray_points(shape.verts, _APART) if shape.is_cloud else np.zeros(0, bool)
+    stray = outlier_points(shape.verts, _APART) if shape.is_cloud else np.zeros(0, bool)
     return Shape(shape.verts[~stray], shape.faces, shape.name) if stray.any() else shape
 
 
@@ -66,14 +66,14 @@ def settle(system: NodeSystem, scan: Scan, candidate: Candidate, lay: Lay) -> tu
         resting = vertex_areas(system.verts, system.faces).sum()
         step = np.sqrt(vertex_areas(moved, system.faces).sum() / resting)
         step = np.clip(step, 1 / _LARGEST_CHANGE / total, _LARGEST_CHANGE / total)
-        far = cKDTree(moved @ candidate.rotation.T + candidate.centre).query(scan.points)[0] > _FAR
+        far = cKDTree(moved @ candidate.rotation.T + candidate.center).query(scan.points)[0] > _FAR
         keep = ~(far & lonely)
         total *= step
         scan, lonely = (
             replace(scan, points=scan.points[keep] / step, normals=scan.normals[keep]),
             lonely[keep],
         )
-        start = Candidate(candidate.rotation, candidate.centre / step, candidate.vectors, np.inf)
+        start = Candidate(candidate.rotation, candidate.center / step, candidate.vectors, np.inf)
         candidate = lay(scan, start)
         if keep.all() and abs(step - 1) < 0.005:
             break

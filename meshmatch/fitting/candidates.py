@@ -34,7 +34,7 @@ _STRANGERS, _POOL = 3, 24
 Reading = TypeVar("Reading")
 
 
-class Judge:
+class CandidateScorer:
     """Scores fits of one scan: the lower the better.
 
     ``roughness`` (0..1, see `Shape.roughness`) of a cloud: normals estimated from noise say little, and squares tell a
@@ -123,7 +123,7 @@ def choose(
 
 def lying(system: NodeSystem, candidate: Candidate) -> np.ndarray:
     """Template vertices (V, 3) of a candidate in the scan frame."""
-    return system.moved(candidate.vectors) @ candidate.rotation.T + candidate.centre
+    return system.moved(candidate.vectors) @ candidate.rotation.T + candidate.center
 
 
 def differ(here: np.ndarray, there: np.ndarray, far: float = _FAR) -> bool:

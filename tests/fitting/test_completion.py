@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.experiments.partial import part_of
 from meshmatch.experiments.protocols import load_set
-from meshmatch.fitting.complete import completed, seen, seen_area
+from meshmatch.fitting.completion import completed, seen, seen_area
 from meshmatch.fitting.fit_shape import fit_shape, node_system
 from meshmatch.fitting.network_fit import Candidate
 from meshmatch.fitting.part import PartReading

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Floats, Ints, Shape
-from meshmatch.transfer.coat import reach_of
-from meshmatch.transfer.ground import Faces, Ground, Near, duals
+from meshmatch.transfer.material_sampler import reach_of
+from meshmatch.transfer.surface_walk import Faces, Near, SurfaceWalker, duals
 
 # A triangle is torn if an edge of its image is this many times as long as usual, and a little more (sqrt(area)).
 _STRETCH, _SLACK = 3.0, 0.02
@@ -16,12 +16,12 @@ _STRETCH, _SLACK = 3.0, 0.02
 _FAR = 0.1
 
 
-class Footing:
+class TexelLocator:
     """Where the target's triangles lie on the source, and where each point of their texels does.
 
     Parameters
     ----------
-    ground : Ground
+    walker : SurfaceWalker
         The source.
     target : Shape
     back : VertexMap
@@ -38,10 +38,10 @@ class Footing:
         Size of a texel on the source.
     """
 
-    def __init__(self, ground: Ground, target: Shape, back: VertexMap, corners: Floats) -> None:
-        self.ground = ground
+    def __init__(self, walker: SurfaceWalker, target: Shape, back: VertexMap, corners: Floats) -> None:
+        self.walker = walker
         self._sure = back.confidence.astype(np.float32)
-        image, start = images_of(ground, back)
+        image, start = images_of(walker, back)
         self._faces, self._verts = target.faces, target.verts
         self._corners = list(np.ascontiguousarray(target.faces.T))
         self._image = image
@@ -98,11 +98,11 @@ class Footing:
         begin = self._begin(face, corner)
         if start is not None:
             begin = np.where(start >= 0, start, begin)
-        place, held, distance = self.ground.slide(points, begin)
+        place, held, distance = self.walker.closest(points, begin)
         far = np.flatnonzero(distance > _FAR * self._size.take(face))
         for k in (1, 2) if len(far) else ():
             other = self._begin(face[far], (corner[far] + k) % 3)
-            there, weigh, gap = self.ground.slide(points[:, far], other)
+            there, weigh, gap = self.walker.closest(points[:, far], other)
             better = gap < distance[far]
             rows = far[better]
             place[rows], held[:, rows], distance[rows] = there[better], weigh[:, better], gap[better]
@@ -131,12 +131,12 @@ class Footing:
         return np.asarray(points.T, np.float32)
 
 
-def images_of(ground: Ground, back: VertexMap) -> tuple[Floats, Ints]:
+def images_of(walker: SurfaceWalker, back: VertexMap) -> tuple[Floats, Ints]:
     """(V_tgt, 3) where each vertex of the target lies on the source, and (V_tgt,) a face of the source there."""
-    image = ground.verts[back.index]
+    image = walker.verts[back.index]
     inside = np.flatnonzero(back.face >= 0)
-    image[inside] = ground.places(back.face[inside], back.barycentric[inside])
-    return image, np.where(back.face >= 0, back.face, ground.face_of_vertex(back.index))
+    image[inside] = walker.places(back.face[inside], back.barycentric[inside])
+    return image, np.where(back.face >= 0, back.face, walker.face_of_vertex(back.index))
 
 
 def _inverse(corners: Floats) -> Floats:

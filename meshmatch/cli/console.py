@@ -11,14 +11,14 @@ from meshmatch.errors import OutputError
 from meshmatch.outputs import plain_text
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    import rich.console
 
 # What is going on, on which shape, and which share (0..1) of it is done.
 Report = Callable[[str, str, float], None]
 
 
 @dataclass(frozen=True)
-class Voice:
+class Console:
     """Words on stderr. With ``quiet`` only warnings and errors are heard."""
 
     quiet: bool = False
@@ -41,7 +41,7 @@ class Voice:
     @contextmanager
     def progress(self) -> Iterator[Report]:
         """A bar for each shape, drawn while the block runs and gone afterwards; nothing if nobody watches."""
-        console = _console()
+        console = _terminal()
         if self.quiet or not console.is_terminal:
             yield lambda what, name, share: None
             return
@@ -68,13 +68,13 @@ class Voice:
 
         color = {"error": "bold red", "warning": "bold yellow", "hint": "dim"}.get(label, "bold")
         words = Text(f"{label}: ", style=color) if label else Text()
-        _console().print(words.append(plain_text(text), style="default"), soft_wrap=True, highlight=False)
+        _terminal().print(words.append(plain_text(text), style="default"), soft_wrap=True, highlight=False)
 
 
-def _console() -> "Console":
-    from rich.console import Console
+def _terminal() -> "rich.console.Console":
+    from rich.console import Console as Terminal
 
-    return Console(stderr=True)  # made anew: it then follows a stderr that was redirected since
+    return Terminal(stderr=True)  # made anew: it then follows a stderr that was redirected since
 
 
 def print_json(record: Mapping[str, Any]) -> None:

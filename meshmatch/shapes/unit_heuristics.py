@@ -19,7 +19,7 @@ def long_axis(shape: Shape) -> str | None:
     return "xyz"[int(order[2])]
 
 
-def person_unit(shape: Shape) -> str | None:
+def guess_unit(shape: Shape) -> str | None:
     """The unit in which the shape would be as long as a standing person; None if there is none."""
     length = float((shape.bounds[1] - shape.bounds[0]).max())
     for name, metres in _UNITS.items():

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from meshmatch.models.deformer import NetworkConfig
-from meshmatch.templates.gather import prepared_words
 from meshmatch.templates.registered import FEW
+from meshmatch.templates.unregistered import prepared_words
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import LossConfig
 from meshmatch.training.run import Recipe

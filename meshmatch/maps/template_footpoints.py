@@ -9,8 +9,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from meshmatch.fitting.candidates import torn
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.readings import torn
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.topology import edges_of

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from meshmatch.fitting.candidates import CandidateScorer, averaged, choose, differ, lying
 from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.network_fit import Candidate
-from meshmatch.fitting.readings import Judge, averaged, choose, differ, lying
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.shapes.shape import Shape
@@ -39,7 +39,7 @@ def folded(system: NodeSystem, residual: float = 0.03) -> Candidate:
 
 
 def test_a_right_fit_tears_nothing_and_a_folded_one_much(system: NodeSystem, scan: Scan) -> None:
-    judge = Judge(system, scan)
+    judge = CandidateScorer(system, scan)
     whole = judge.torn(scan, still(system).vectors)
     assert whole < 0.02  # a template is coarse: neighbours may have vertices apart
     torn = judge.torn(scan, folded(system).vectors)
@@ -56,7 +56,7 @@ def test_the_same_pose_in_another_frame_is_no_other_reading(system: NodeSystem) 
     assert np.allclose(lying(system, here), system.verts)
     assert not differ(lying(system, here), lying(system, there))
     assert differ(lying(system, here), lying(system, folded(system)))
-    assert differ(lying(system, here), lying(system, replace(here, centre=np.array([0.2, 0, 0]))))
+    assert differ(lying(system, here), lying(system, replace(here, center=np.array([0.2, 0, 0]))))
 
 
 def test_what_looked_worse_at_first_wins_at_the_end(system: NodeSystem, scan: Scan) -> None:
@@ -70,7 +70,7 @@ def test_what_looked_worse_at_first_wins_at_the_end(system: NodeSystem, scan: Sc
         return replace(candidate, residual=0.02 if whole else candidate.residual)
 
     told: list[float] = []
-    judge = Judge(system, scan)
+    judge = CandidateScorer(system, scan)
     readings = [wrong, replace(wrong, residual=0.031), right]
     best = choose(
         readings, 2, fitted, lambda c: judge.score(scan, c), lambda c: lying(system, c), told.append
@@ -106,7 +106,7 @@ def test_of_a_rough_cloud_positions_alone_are_judged_and_squares(system: NodeSys
     shifted = replace(still(system), vectors=np.full((system.K, 3), [0.02, 0, 0]))
     apart = np.linalg.norm(system.verts[:, None] + [0.02, 0, 0] - scan.points, axis=2)
     wanted = np.sqrt(0.5 * np.square(apart.min(1)).mean() + 0.5 * np.square(apart.min(0)).mean())
-    rough, smooth, half = (Judge(system, scan, share) for share in (1.0, 0.0, 0.5))
+    rough, smooth, half = (CandidateScorer(system, scan, share) for share in (1.0, 0.0, 0.5))
     assert rough.scatter(scan, shifted.vectors) == pytest.approx(wanted)
     torn = 0.1 * rough.torn(scan, shifted.vectors)
     assert rough.score(scan, shifted) == pytest.approx(wanted + torn)

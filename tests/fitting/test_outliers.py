@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
+from meshmatch.fitting.candidates import CandidateScorer
+from meshmatch.fitting.cloud_scale import without_outliers
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fit_shape import fit_shape, node_system, take_samples
 from meshmatch.fitting.network_fit import one_way_residual, two_way_residual
-from meshmatch.fitting.readings import Judge
 from meshmatch.fitting.scan import Scan
-from meshmatch.fitting.settle import without_strays
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.pipeline import register, usable
 from meshmatch.shapes.files import load_shape
@@ -44,10 +44,12 @@ def test_strays_are_left_out_and_surface_is_not(system: NodeSystem) -> None:
     points = sample_surface(surface, 900, np.random.default_rng(0)).points
     away = np.random.default_rng(1).standard_normal((40, 3))
     strays = away / np.linalg.norm(away, axis=1)[:, None] * np.linspace(0.6, 0.9, 40)[:, None]
-    kept = {tuple(point) for point in without_strays(Shape(np.concatenate([points, strays]), NO_FACES)).verts}
+    kept = {
+        tuple(point) for point in without_outliers(Shape(np.concatenate([points, strays]), NO_FACES)).verts
+    }
     assert sum(tuple(point) in kept for point in strays) < 15
     assert sum(tuple(point) in kept for point in points) > 0.97 * len(points)
-    assert without_strays(surface) is surface
+    assert without_outliers(surface) is surface
 
 
 def test_only_clouds_have_strays(system: NodeSystem) -> None:
@@ -55,8 +57,8 @@ def test_only_clouds_have_strays(system: NodeSystem) -> None:
     verts = np.array(system.verts)
     verts[7] *= 5
     mesh, cloud = Shape(verts, system.faces), Shape(verts, NO_FACES, "thorn")
-    assert without_strays(mesh) is mesh
-    left = without_strays(cloud)
+    assert without_outliers(mesh) is mesh
+    left = without_outliers(cloud)
     assert left.name == "thorn"
     assert tuple(verts[7]) not in {tuple(point) for point in left.verts}
 
@@ -67,7 +69,7 @@ def test_a_sparse_region_is_not_stray() -> None:
     corner = np.array([30.5, 0.0, 0.0])
     coarse = corner + 4 * np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0), [0.0]), -1).reshape(-1, 3)
     inside = (coarse[:, 0] > 40) & (coarse[:, 0] < 70) & (coarse[:, 1] > 6) & (coarse[:, 1] < 38)
-    left = {tuple(point) for point in without_strays(Shape(np.concatenate([fine, coarse]), NO_FACES)).verts}
+    left = {tuple(point) for point in without_outliers(Shape(np.concatenate([fine, coarse]), NO_FACES)).verts}
     assert all(tuple(point) in left for point in coarse[inside])
 
 
@@ -100,9 +102,13 @@ def test_residuals_and_tears_ignore_a_side_that_is_not_known(system: NodeSystem)
         right = residual(system, scan, still)
         assert residual(system, flipped, still) > 2 * right
         assert residual(system, Scan(scan.points, -scan.normals, signed=False), still) == pytest.approx(right)
-    assert Judge(system, flipped).torn(flipped, still) != Judge(system, scan).torn(scan, still)
+    assert CandidateScorer(system, flipped).torn(flipped, still) != CandidateScorer(system, scan).torn(
+        scan, still
+    )
     unsure = Scan(scan.points, -scan.normals, signed=False)
-    assert Judge(system, unsure).torn(unsure, still) == Judge(system, scan).torn(scan, still)
+    assert CandidateScorer(system, unsure).torn(unsure, still) == CandidateScorer(system, scan).torn(
+        scan, still
+    )
 
 
 def test_a_cloud_is_tried_as_a_part_only_where_it_leaves_the_template_bare(

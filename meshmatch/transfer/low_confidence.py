@@ -52,7 +52,7 @@ def vertex_graph(shape: Shape) -> csr_array:
 
 
 def face_graph(shape: Shape) -> csr_array:
-    """(F, F) sparse, symmetric: distances between the centres of faces that share an edge."""
+    """(F, F) sparse, symmetric: distances between the centers of faces that share an edge."""
     corners = same_rows(shape.verts)[shape.faces]
     a, b = corners.ravel(), corners[:, [1, 2, 0]].ravel()
     key = np.minimum(a, b) * shape.V + np.maximum(a, b)
@@ -125,7 +125,7 @@ def diffuse(graph: csr_array, known: NDArray[np.bool_], values: Floats) -> tuple
     return out, ask
 
 
-def settle_values(
+def resolve_values(
     values: Floats,
     confidence: Floats,
     target: Shape,
@@ -150,7 +150,7 @@ def settle_values(
     return values, Doubt(N, int(low.sum()))
 
 
-def settle_weights(
+def resolve_weights(
     weights: csr_array, confidence: Floats, target: Shape, least: float, fill: bool, most: int
 ) -> tuple[csr_array, Doubt]:
     """Skin weights (V, J) of the target with those in doubt filled in, or kept; rows still sum to 1.
@@ -173,7 +173,7 @@ def settle_weights(
     return sparse_rows(csr_array(kept + new), most), Doubt(N, int(low.sum()), 0, int(filled.sum()))
 
 
-def settle_labels(
+def resolve_labels(
     labels: Ints, confidence: Floats, target: Shape, least: float, blank: bool, fill: bool, on_faces: bool
 ) -> tuple[Ints, Doubt]:
     """Labels (V,) or (F,) of the target with those in doubt left blank (-1), taken from the nearest sure

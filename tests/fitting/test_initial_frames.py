@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fit_shape import fit_shape
-from meshmatch.fitting.placing import placed, scan_frame
+from meshmatch.fitting.initial_frames import placed, scan_frame
 from meshmatch.models.deformer import NetworkConfig
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.gather import template_radius
+from meshmatch.templates.unregistered import template_radius
 from tests.fitting.eggs import bent_egg, egg_model, scan_of
 
 PLAIN = NetworkConfig(code=16, width=32, depth=1, basis=24, align_basis=0, corrections=0)
@@ -38,7 +38,7 @@ def test_a_searched_category_asks_its_network() -> None:
 def test_a_given_orientation_is_taken_as_it_is() -> None:
     model = wanting("none")
     [only] = placed(model, scan_of(turned_template(model, [0, 0, 1.0]))) or []
-    assert np.array_equal(only.rotation, np.eye(3)) and not only.centre.any()
+    assert np.array_equal(only.rotation, np.eye(3)) and not only.center.any()
     fit = fit_shape(model, turned_template(model, [0, 0, 0.2]), QUICK)
     assert (fit.up, fit.front) == ("+y", "+z")
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from meshmatch.cli.console import Console
 from meshmatch.cli.truth import load_truth
-from meshmatch.cli.voice import Voice
 from meshmatch.errors import OptionError
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def _template(path: Path) -> "Template | None":
         return None  # a missing shape is told as such
 
 
-def compose(asked: Asked, subjects: list[Subject], names: list[str], look: "Look", voice: Voice) -> Drawn:
+def compose(asked: Asked, subjects: list[Subject], names: list[str], look: "Look", voice: Console) -> Drawn:
     """The panels that were asked for."""
     if asked.map is not None:
         return _of_map(asked, subjects, (names[0], names[1]), look)
@@ -203,7 +203,7 @@ def _of_map(asked: Asked, subjects: list[Subject], names: tuple[str, str], look:
     return Drawn(panels, look, "matched places in one colour")
 
 
-def _of_fit(asked: Asked, subject: Subject, name: str, look: "Look", voice: Voice) -> Drawn:
+def _of_fit(asked: Asked, subject: Subject, name: str, look: "Look", voice: Console) -> Drawn:
     import numpy as np
 
     from meshmatch.render.fitted import distances, fit_panels

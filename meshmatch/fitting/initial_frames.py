@@ -19,7 +19,7 @@ from meshmatch.fitting.orientation import (
 from meshmatch.fitting.scan import Scan
 from meshmatch.shapes.align import ALIGNS, Oriented, align
 from meshmatch.shapes.shape import Frame, Shape
-from meshmatch.templates.gather import SCALES, template_radius, template_samples, unit_frame
+from meshmatch.templates.unregistered import SCALES, template_radius, template_samples, unit_frame
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
@@ -43,7 +43,7 @@ def placed(model: TrainedModel, scan: Scan) -> list[Hypothesis] | None:
     if how == "none":
         return [Hypothesis(np.eye(3), np.zeros(3), 1.0)]
     found = align(Oriented(scan.points, scan.normals), template_samples(model.template), how, _TURNS)
-    return [Hypothesis(each.rotation, each.centre, 1.0 / len(found)) for each in found]
+    return [Hypothesis(each.rotation, each.center, 1.0 / len(found)) for each in found]
 
 
 def frames_to_try(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypothesis]:
@@ -97,7 +97,7 @@ def frames_of_part(model: TrainedModel, scan: Scan, config: FitConfig, wide: boo
 def _along(frames: list[Hypothesis]) -> list[Hypothesis]:
     """Every frame with its origin at several places along its own up axis."""
     return [
-        Hypothesis(frame.rotation, frame.centre + apart * frame.rotation[:, 1], frame.votes)
+        Hypothesis(frame.rotation, frame.center + apart * frame.rotation[:, 1], frame.votes)
         for frame in frames
         for apart in _ALONG
     ]

@@ -11,7 +11,10 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Frame, Shape
-from meshmatch.templates.gather import (
+from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.prepare import prepare_folder
+from meshmatch.templates.template import load_template
+from meshmatch.templates.unregistered import (
     find_known,
     is_registered,
     most_typical,
@@ -20,9 +23,6 @@ from meshmatch.templates.gather import (
     template_radius,
     unit_frame,
 )
-from meshmatch.templates.nodes import NodeConfig
-from meshmatch.templates.prepare import prepare_folder
-from meshmatch.templates.template import load_template
 from tests.conftest import icosphere
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.35)
