@@ -16,7 +16,7 @@ PACKAGE = ROOT / "meshmatch"
 # From the ground up. A room imports itself and what stands before it. `interpolation` takes its shapes the pipeline's
 # way, and `experiments` measures the pipeline: both stand after it.
 ROOMS = (
-    *("errors", "threads", "outputs"),
+    *("errors", "threads", "outputs", "progress"),
     *(
         "shapes",
         "templates",
@@ -31,7 +31,7 @@ ROOMS = (
     ),
     *("pipeline", "interpolation", "experiments", "cli", "__main__"),
 )
-GROUND = ("errors", "threads", "outputs")
+GROUND = ("errors", "threads", "outputs", "progress")
 
 # Which rooms know which third-party library.
 OWNERS = {
