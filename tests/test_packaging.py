@@ -48,9 +48,13 @@ def test_the_wheel_holds_every_file_of_the_templates_folder_as_it_is(wheel: zipf
         assert wheel.read(f"meshmatch/_templates/{path.relative_to(folder).as_posix()}") == path.read_bytes()
 
 
-def test_the_wheel_holds_every_module_and_nothing_else(wheel: zipfile.ZipFile) -> None:
+def test_the_wheel_holds_every_module_but_experiments_and_nothing_else(wheel: zipfile.ZipFile) -> None:
     code = {name for name in wheel.namelist() if name.endswith(".py")}
-    assert code == {path.relative_to(ROOT).as_posix() for path in (ROOT / "meshmatch").rglob("*.py")}
+    modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "meshmatch").rglob("*.py")}
+    experiments = {name for name in modules if name.startswith("meshmatch/experiments/")}
+    assert experiments
+    assert code == modules - experiments
+    assert not [name for name in wheel.namelist() if "experiments" in name]
     tops = {name.split("/")[0] for name in wheel.namelist()}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"meshmatch"}
 
@@ -86,6 +90,12 @@ def test_pymeshlab_comes_only_when_asked_for(wheel: zipfile.ZipFile) -> None:
     required = [line for line in metadata(wheel).get_all("Requires-Dist", []) if "pymeshlab" in line]
     assert len(required) == 1
     assert required[0].endswith("extra == 'meshlab'")
+
+
+def test_no_module_of_the_wheel_imports_experiments() -> None:
+    for path in (ROOT / "meshmatch").rglob("*.py"):
+        if "experiments" not in path.parts:
+            assert "meshmatch.experiments" not in path.read_text(encoding="utf-8"), path
 
 
 def test_a_checkout_finds_its_templates() -> None:
