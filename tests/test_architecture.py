@@ -1,37 +1,34 @@
-"""The house rules: who imports whom, who knows which library, what an import may cost."""
+"""The house rules: who imports whom, who knows which library, what an import may cost, how long things may be.
+
+Each test names all offenders at once.
+"""
 
 import ast
+import inspect
 import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
+import typer
+
+from meshmatch.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "meshmatch"
 
-# From the ground up. A room imports itself and what stands before it. `interpolation` takes its shapes the pipeline's
-# way, and `experiments` measures the pipeline: both stand after it.
-ROOMS = (
-    *("errors", "threads", "outputs", "progress"),
-    *(
-        "shapes",
-        "templates",
-        "fields",
-        "models",
-        "training",
-        "fitting",
-        "maps",
-        "transfer",
-        "render",
-        "collections",
-    ),
-    *("pipeline", "interpolation", "experiments", "cli", "__main__"),
-)
+# From the ground up: a room imports itself and what stands before it. `experiments` measures what `api` composes.
 GROUND = ("errors", "threads", "outputs", "progress")
+ROOMS = (
+    *GROUND,
+    *("arrays", "geometry", "shapes", "templates", "fields", "models", "training", "fitting"),
+    *("maps", "transfer", "render", "pipeline", "interpolation", "api", "experiments", "cli", "__main__"),
+)
 
 # Which rooms know which third-party library.
 OWNERS = {
@@ -39,19 +36,23 @@ OWNERS = {
     "anny": {"training"},
     "embreex": {"render"},
     "fast_simplification": {"shapes"},
+    "jaxtyping": {"arrays"},
+    "matplotlib": {"render"},
     "meshmonk": {"experiments"},
     "platformdirs": {"models", "training", "experiments"},
     "pyFM": {"experiments"},
+    "pydantic": {"models"},
     "pymeshlab": {"shapes"},
     "rich": {"experiments", "cli"},
     "robust_laplacian": {"templates", "maps"},
     "safetensors": {"templates", "models", "training"},
     "scipy": {
-        *("shapes", "templates", "models", "training", "fitting", "maps", "transfer", "render"),
+        *("geometry", "shapes", "templates", "models", "training", "fitting", "maps", "transfer", "render"),
         "experiments",
     },
-    "torch": {"fields", "models", "training", "fitting", "experiments"},
-    "trimesh": {"shapes", "experiments"},
+    "threadpoolctl": {"threads"},
+    "torch": {"arrays", "fields", "models", "training", "fitting", "experiments"},
+    "trimesh": {"shapes", "fitting", "experiments"},
     "typer": {"cli"},
     "xatlas": {"transfer"},
 }
@@ -61,23 +62,36 @@ DISTRIBUTIONS = {
     "pyFM": "pyfmaps",
     "robust_laplacian": "robust-laplacian",
 }
-HEAVY = ("torch", "trimesh", "pymeshlab", "scipy", "safetensors")
+EXTRAS = ("meshlab", "bodies", "bench", "plots")  # what the package imports only where it is installed
+HEAVY = {"torch", "trimesh", "pymeshlab", "scipy", "safetensors", "matplotlib"}
+NO_TORCH = ("geometry", "shapes", "templates", "maps", "transfer", "render")
 FORBIDDEN_NAMES = {"utils", "util", "common", "helpers", "helper", "base", "misc"}
 
 
-def modules() -> list[Path]:
-    return sorted(PACKAGE.rglob("*.py"))
+class Import(NamedTuple):
+    name: str  # a module, or a module and a name in it
+    at_load: bool
 
 
-def room_of(path: Path) -> str:
+@cache
+def trees() -> dict[str, ast.Module]:
+    """Every module of the package by its dotted name."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        found[name] = ast.parse(path.read_text(encoding="utf-8"), str(path))
+    return found
+
+
+def room_of(module: str) -> str:
     """The first part of a module's name below the package; "" for the package's own file."""
-    first = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-    return "" if first == "__init__" else first
+    return module.partition(".")[2].partition(".")[0]
 
 
-def imports(source: str) -> Iterator[tuple[str, bool]]:
-    """Every imported module's full name, and whether the import runs when the module is loaded."""
-    tree = ast.parse(source)
+@cache
+def imports(tree: ast.Module) -> tuple[Import, ...]:
+    """Everything imported, and whether the import runs when the module is loaded."""
     inside = {
         id(node)
         for outer in ast.walk(tree)
@@ -85,106 +99,189 @@ def imports(source: str) -> Iterator[tuple[str, bool]]:
         or (isinstance(outer, ast.If) and "TYPE_CHECKING" in ast.unparse(outer.test))
         for node in ast.walk(outer)
     }
+    found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from ((alias.name, id(node) not in inside) for alias in node.names)
+            found += [Import(alias.name, id(node) not in inside) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "imports are absolute"
-            assert node.module is not None
-            if node.module == "meshmatch":  # `from meshmatch import pipeline` names a room
-                yield from ((f"meshmatch.{alias.name}", id(node) not in inside) for alias in node.names)
-            else:
-                yield node.module, id(node) not in inside
+            found += [Import(f"{node.module}.{alias.name}", id(node) not in inside) for alias in node.names]
+    return tuple(found)
 
 
-def downward(room: str, source: str) -> list[str]:
-    """Imports of `source`, in `room`, of rooms that stand after it."""
+def downward(room: str, tree: ast.Module) -> list[str]:
+    """Imports of a module in `room` of rooms that stand after it."""
     bad = []
-    for name, _ in imports(source):
-        parts = name.split(".")
-        if parts[0] != "meshmatch" or len(parts) == 1 or parts[1] == "__version__":
-            continue
-        if parts[1] not in ROOMS or ROOMS.index(parts[1]) > ROOMS.index(room):
+    for name, _ in imports(tree):
+        other = room_of(name)
+        ours = name.split(".")[0] == "meshmatch" and other not in ("", "__version__")
+        if ours and (other not in ROOMS or ROOMS.index(other) > ROOMS.index(room)):
             bad.append(name)
     return bad
 
 
-def third_party(source: str) -> set[str]:
-    names = {name.split(".")[0] for name, _ in imports(source)}
+def third_party(tree: ast.Module) -> set[str]:
+    names = {name.split(".")[0] for name, _ in imports(tree)}
     return names - set(sys.stdlib_module_names) - {"meshmatch", "numpy"}
 
 
+def circles(modules: dict[str, ast.Module]) -> list[str]:
+    """Modules that import each other, whether when loaded or inside functions."""
+    edges: dict[str, set[str]] = {}
+    for module, tree in modules.items():
+        targets = set()
+        for name, _ in imports(tree):
+            target = name if name in modules else name.rpartition(".")[0]
+            if target in modules and target not in (module, "meshmatch"):
+                targets.add(target)
+        edges[module] = targets
+    while True:  # what imports nothing that is left, or is imported by nothing that is left, is in no circle
+        imported = set().union(*edges.values()) if edges else set()
+        kept = {module for module, targets in edges.items() if targets and module in imported}
+        if len(kept) == len(edges):
+            return sorted(kept)
+        edges = {module: edges[module] & kept for module in kept}
+
+
+def functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
+    yield from (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+
+
+def parameters(function: ast.FunctionDef) -> int:
+    """How many a caller may give; `self` is none."""
+    given = function.args
+    names = [each.arg for each in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+    return len(names) - (names[:1] in (["self"], ["cls"]))
+
+
+def verbs(program: typer.Typer) -> Iterator[Callable[..., object]]:
+    """The functions behind the commands."""
+    yield from (command.callback for command in program.registered_commands if command.callback is not None)
+    for group in program.registered_groups:
+        if group.typer_instance is not None:
+            yield from verbs(group.typer_instance)
+
+
+def long_lists(modules: dict[str, ast.Module], verbs: Container[str], limit: int = 8) -> list[str]:
+    """Functions with too many parameters; the options of a verb are its interface and do not count."""
+    return [
+        f"{name}: {parameters(function)} parameters"
+        for module, tree in modules.items()
+        for function in functions(tree)
+        if parameters(function) > limit and (name := f"{module}.{function.name}") not in verbs
+    ]
+
+
+def lines_of(function: Callable[..., object]) -> int:
+    return len(inspect.getsource(function).splitlines())
+
+
+def long_modules(folder: Path, limit: int = 320) -> list[str]:
+    """Modules of more lines than that: each is asking to be two."""
+    lines = {path: path.read_text(encoding="utf-8").count("\n") for path in folder.rglob("*.py")}
+    return [f"{path.relative_to(folder)}: {count} lines" for path, count in lines.items() if count > limit]
+
+
+def loaded_by(statement: str) -> set[str]:
+    """Top-level modules that a fresh interpreter has loaded after a statement."""
+    code = f"{statement}\nimport sys\nprint(' '.join({{name.split('.')[0] for name in sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())
+
+
+def all_modules(room: str) -> str:
+    """A statement that imports every module of a room."""
+    return "\n".join(f"import {module}" for module in trees() if room_of(module) == room)
+
+
+def none(offenders: Iterable[str]) -> None:
+    """There are no offenders; otherwise all of them are named."""
+    found = sorted(offenders)
+    assert not found, "\n".join(["", *found])
+
+
 def test_every_module_stands_in_a_room() -> None:
-    assert {room_of(path) for path in modules()} - {""} <= set(ROOMS)
+    assert {room_of(module) for module in trees()} - {""} <= set(ROOMS)
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_point_up(path: Path) -> None:
-    room = room_of(path)
-    source = path.read_text(encoding="utf-8")
-    if not room:
-        assert [name for name, _ in imports(source) if name.startswith("meshmatch")] == []
-    else:
-        assert downward(room, source) == []
+def test_imports_point_up() -> None:
+    rooms = {module: tree for module, tree in trees().items() if room_of(module)}
+    none(f"{module}: {bad}" for module, tree in rooms.items() for bad in downward(room_of(module), tree))
 
 
 def test_the_rule_sees_an_import_that_points_down() -> None:
-    assert downward("shapes", "from meshmatch.fitting.fit import Fit") == ["meshmatch.fitting.fit"]
-    assert downward("fitting", "def f():\n    import meshmatch.maps.build") == ["meshmatch.maps.build"]
-    assert downward("maps", "from meshmatch import pipeline") == ["meshmatch.pipeline"]
-    assert downward("maps", "from meshmatch.fitting.fit import Fit") == []
+    def asked(room: str, source: str) -> list[str]:
+        return downward(room, ast.parse(source))
+
+    assert asked("shapes", "from meshmatch.fitting.fit import Fit") == ["meshmatch.fitting.fit.Fit"]
+    assert asked("fitting", "def f():\n    import meshmatch.maps.build") == ["meshmatch.maps.build"]
+    assert asked("maps", "from meshmatch import api") == ["meshmatch.api"]
+    assert asked("maps", "from meshmatch.fitting.fit import Fit") == []
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_a_library_is_known_by_its_owners_alone(path: Path) -> None:
-    room = room_of(path)
-    found = third_party(path.read_text(encoding="utf-8"))
-    assert {name for name in found if room not in OWNERS.get(name, set())} == set()
+@pytest.mark.xfail(strict=False, reason="not all of it holds yet")
+def test_no_module_imports_in_a_circle() -> None:
+    none(circles(trees()))
 
 
-@pytest.mark.parametrize("room", GROUND)
-def test_the_ground_is_standard_library_alone(room: str) -> None:
-    names = {name.split(".")[0] for name, _ in imports((PACKAGE / f"{room}.py").read_text(encoding="utf-8"))}
-    assert names <= set(sys.stdlib_module_names) | {"meshmatch"}
+def test_the_rule_sees_a_circle() -> None:
+    sources = {
+        "p.a": "from p.b import x",
+        "p.b": "def f():\n    from p import c",
+        "p.c": "import p.a, p.d",
+        "p.d": "import os",
+        "p.e": "import p.a",
+    }
+    assert circles({name: ast.parse(source) for name, source in sources.items()}) == ["p.a", "p.b", "p.c"]
+
+
+def test_a_library_is_known_by_its_owners_alone() -> None:
+    found = ((module, name) for module, tree in trees().items() for name in sorted(third_party(tree)))
+    strangers = [
+        f"{module}: {name}" for module, name in found if room_of(module) not in OWNERS.get(name, set())
+    ]
+    none(strangers)
+
+
+def test_the_ground_is_standard_library_alone_when_loaded() -> None:
+    for room in GROUND:
+        for tree in (tree for module, tree in trees().items() if room_of(module) == room):
+            names = {name.split(".")[0] for name, at_load in imports(tree) if at_load}
+            assert names <= set(sys.stdlib_module_names) | {"meshmatch"}, room
 
 
 def test_pymeshlab_is_known_by_one_module_and_only_when_asked() -> None:
     found = {
-        (path.name, at_load)
-        for path in modules()
-        for name, at_load in imports(path.read_text(encoding="utf-8"))
-        if name.split(".")[0] == "pymeshlab"
+        (module, each.at_load)
+        for module, tree in trees().items()
+        for each in imports(tree)
+        if each.name.split(".")[0] == "pymeshlab"
     }
-    assert found == {("pymeshlab_filters.py", False)}
+    assert found == {("meshmatch.shapes.pymeshlab_filters", False)}
+
+
+def bare(requirements: Iterable[str]) -> set[str]:
+    return {re.split(r"[<>=!~\[; ]", item)[0] for item in requirements}
 
 
 def test_dependencies_are_those_that_are_imported() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-
-    def bare(requirements: list[str]) -> set[str]:
-        return {re.split(r"[<>=!~\[; ]", item)[0] for item in requirements}
-
-    extras = project["optional-dependencies"]
-    used = set().union(*(third_party(path.read_text(encoding="utf-8")) for path in modules()))
-    used = {DISTRIBUTIONS.get(name, name) for name in used} | {"numpy"}
-    optional = bare(extras["meshlab"]) | bare(extras["bodies"]) | bare(extras["bench"])
-    assert bare(project["dependencies"]) == used - optional
-    assert optional <= used
+    used = {DISTRIBUTIONS.get(name, name) for name in set().union(*map(third_party, trees().values()))} | {
+        "numpy"
+    }
+    core = bare(project["dependencies"])
+    optional = bare(item for extra in EXTRAS for item in project["optional-dependencies"].get(extra, ()))
+    assert used == core | optional
+    assert core & optional == set()
 
 
 def test_no_drawer_without_a_name() -> None:
-    names = {part.removesuffix(".py") for path in modules() for part in path.relative_to(PACKAGE).parts}
-    assert names & FORBIDDEN_NAMES == set()
-
-
-def long_modules(folder: Path, most: int = 320) -> list[str]:
-    """Modules of more than `most` lines: each is asking to be two."""
-    lines = {path: path.read_text(encoding="utf-8").count("\n") for path in folder.rglob("*.py")}
-    return [f"{path.relative_to(folder)}: {count} lines" for path, count in lines.items() if count > most]
+    assert {part for module in trees() for part in module.split(".")} & FORBIDDEN_NAMES == set()
 
 
 def test_no_module_is_too_long() -> None:
-    assert long_modules(PACKAGE) == []
+    none(long_modules(PACKAGE))
 
 
 def test_the_rule_sees_a_module_that_is_too_long(tmp_path: Path) -> None:
@@ -193,28 +290,42 @@ def test_the_rule_sees_a_module_that_is_too_long(tmp_path: Path) -> None:
     assert long_modules(tmp_path) == ["long.py: 321 lines"]
 
 
-def loaded_by(statement: str) -> set[str]:
-    """Top-level modules that a fresh interpreter has loaded after a statement."""
-    code = f"{statement}\nimport sys\nprint('\\n'.join({{name.split('.')[0] for name in sys.modules}}))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    return set(done.stdout.split())
+@pytest.mark.xfail(strict=False, reason="not all of it holds yet")
+def test_no_list_of_parameters_is_too_long() -> None:
+    none(long_lists(trees(), {f"{verb.__module__}.{verb.__name__}" for verb in verbs(app)}))
+
+
+def test_the_rule_sees_a_list_that_is_too_long() -> None:
+    words = ", ".join("abcdefghi")
+    source = f"class C:\n def f(self, {words[:-3]}): ...\n def g(self, {words}): ...\ndef verb({words}): ..."
+    assert long_lists({"m": ast.parse(source)}, {"m.verb"}) == ["m.g: 9 parameters"]
+
+
+@pytest.mark.xfail(strict=False, reason="not all of it holds yet")
+def test_no_verb_is_too_long() -> None:
+    """Its options included: a verb asks, calls the library and prints."""
+    none(f"{verb.__name__}: {lines} lines" for verb in verbs(app) if (lines := lines_of(verb)) > 80)
 
 
 @pytest.mark.parametrize(
-    "module",
-    ["meshmatch", "meshmatch.cli", "meshmatch.cli.app", "meshmatch.models.registry", "meshmatch.models.card"],
-)
-def test_light_modules_load_nothing_heavy(module: str) -> None:
-    assert loaded_by(f"import {module}") & {*HEAVY, "numpy", "rich"} == set()
-
-
-def test_help_loads_nothing_heavy() -> None:
-    statement = (
+    "statement",
+    [
+        "import meshmatch.cli.app, meshmatch.models.registry, meshmatch.models.card",
         "import contextlib, io\n"
         "from meshmatch.cli import main\n"
-        "with contextlib.redirect_stdout(io.StringIO()): main(['--help'])"
-    )
-    assert loaded_by(statement) & {*HEAVY, "numpy", "rich"} == set()
+        "with contextlib.redirect_stdout(io.StringIO()): main(['--help'])",
+    ],
+    ids=["commands and cards", "--help"],
+)
+def test_light_modules_load_nothing_heavy(statement: str) -> None:
+    assert loaded_by(statement) & (HEAVY | {"numpy", "rich"}) == set()
+
+
+@pytest.mark.xfail(strict=False, reason="not all of it holds yet")
+def test_what_needs_no_network_loads_no_torch() -> None:
+    """Nobody waits for it, or for another heavy library that not every call needs, to carry a map or draw."""
+    found = loaded_by("\n".join(all_modules(room) for room in NO_TORCH))
+    none(found & {"torch", "matplotlib", "trimesh", "pymeshlab"})
 
 
 def test_the_interpreter_test_sees_a_heavy_import() -> None:
