@@ -78,6 +78,10 @@ def test_the_wheel_holds_the_viewer_with_the_licence_of_three(wheel: zipfile.Zip
 def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile) -> None:
     said = metadata(wheel)
     assert said["License-Expression"] == "Apache-2.0"
+    assert said["Author"] == "The meshmatch maintainers"
+    urls = {line.split(", ")[0] for line in said.get_all("Project-URL", [])}
+    assert urls == {"Homepage", "Documentation", "Changelog", "Issues"}
+    assert "meshmatch/py.typed" in wheel.namelist()
     assert said["Requires-Python"] == ">=3.11"
     assert said["Version"] == importlib.import_module("meshmatch").__version__
     (points,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
