@@ -10,7 +10,7 @@ __version__ = "0.1.0"
 
 _PUBLIC = {
     "Fit": "meshmatch.fitting.fit",
-    "Frame": "meshmatch.shapes.shape",
+    "Frame": "meshmatch.geometry.frames",
     "MeshmatchError": "meshmatch.errors",
     "Shape": "meshmatch.shapes.shape",
     "VertexMap": "meshmatch.maps.vertex_map",

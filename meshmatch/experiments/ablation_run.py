@@ -30,10 +30,10 @@ from meshmatch.experiments.distances import default_folder
 from meshmatch.experiments.iterations import memory, timed
 from meshmatch.experiments.protocols import BenchSet, load_set
 from meshmatch.experiments.report import circumstances
+from meshmatch.geometry.frames import Frame
 from meshmatch.models.registry import find_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.pipeline import read_model
-from meshmatch.shapes.shape import Frame
 
 BODIES = 5
 """How many bodies figure 6 is measured on."""

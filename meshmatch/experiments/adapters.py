@@ -20,14 +20,17 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
 from meshmatch.fitting.latent import LatentRefineConfig
+from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.surface import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.pipeline import map_between, read_model, usable
-from meshmatch.shapes.align import Oriented, align
+from meshmatch.shapes.align import align
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 
 _SAMPLES = 2400
 MONK_UNIT = 100.0
@@ -40,7 +43,7 @@ class Placed:
 
     whole: Shape
     thin: Shape
-    samples: Oriented
+    samples: OrientedPoints
 
 
 def placed(shape: Shape, seed: int = 0, faces: int | None = None) -> Placed:
@@ -49,13 +52,13 @@ def placed(shape: Shape, seed: int = 0, faces: int | None = None) -> Placed:
     drawn = sample_surface(shape, _SAMPLES, np.random.default_rng(seed))
     whole = Shape(frame.apply(shape.verts), shape.faces, shape.name, invalid=shape.invalid)
     thin = whole if faces is None or whole.is_cloud else decimate(whole, faces)
-    return Placed(whole, thin, Oriented(frame.apply(drawn.points), drawn.normals))
+    return Placed(whole, thin, OrientedPoints(frame.apply(drawn.points), drawn.normals))
 
 
 def turn_to(source: Placed, target: Placed) -> Frame:
     """The rigid motion that lays a source on a target."""
     best = align(source.samples, target.samples, "rigid")[0]
-    return Frame(1.0, best.rotation.T, best.center)
+    return best.pose.frame
 
 
 def nearest_map(source: Shape, target: Shape, moved: np.ndarray, there: Placed) -> VertexMap:
@@ -70,7 +73,7 @@ def carried(source: Placed, moved: np.ndarray) -> np.ndarray:
     thin = source.thin
     surface = Surface(thin.verts, thin.faces, thin.vertex_normals)
     foot = surface.query(source.whole.verts, source.whole.vertex_normals)
-    return np.einsum("nk,nkd->nd", foot.barycentric, moved[thin.faces[foot.face]])
+    return interpolate(moved, thin.faces[foot.face], foot.barycentric)
 
 
 def need_meshes(name: str, *shapes: Shape) -> None:

@@ -21,10 +21,11 @@ from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.build import build_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.pipeline import read_model, usable
-from meshmatch.shapes.align import Align, Oriented, align
+from meshmatch.shapes.align import Align, align
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -230,14 +231,14 @@ def nearest_all(
     seen, places = {}, {}
     for name, shape in shapes.items():
         samples = sample_surface(shape, 2400, np.random.default_rng(0))
-        seen[name] = Oriented(frames[name].apply(samples.points), samples.normals)
+        seen[name] = OrientedPoints(frames[name].apply(samples.points), samples.normals)
         places[name] = frames[name].apply(shape.verts)
     trees = {name: cKDTree(points) for name, points in places.items()}
     found = {}
     for source, target in pairs or spread_pairs(shapes):
         tell(f"aligning {source} to {target}")
         best = align(seen[source], seen[target], how)[0]
-        moved = (places[source] - best.center) @ best.rotation
+        moved = best.pose.to_local(places[source])
         distance, index = trees[target].query(moved)
         found[source, target] = (index, np.exp(-distance / 0.03))
     return found

@@ -24,14 +24,15 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fit_shape import fit_shape as lay_template
 from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.latent import LatentRefineConfig, refine_code
-from meshmatch.fitting.network_fit import Candidate, lay_on, rigid_motion
+from meshmatch.fitting.network_fit import Candidate, lay_on
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
 from meshmatch.fitting.scan import Scan
+from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.maps.evaluate import CM_PER_UNIT, LOST_CM
 from meshmatch.models.trained import TrainedModel
 from meshmatch.pipeline import read_model, usable
 from meshmatch.shapes.sampling import sample_surface
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 
 METHODS = ("none", "code", "chamfer", "nodes")
 """Refinements: none; of the code with the cell's regularisers, or without; Gauss-Newton on the nodes."""
@@ -137,8 +138,7 @@ def begin(model: TrainedModel, one: Subject, reference: str, measure: Measure) -
     theirs, ours = read_model(reference).template, model.template
     turn = Frame(1.0, np.eye(3), np.zeros(3))
     if theirs.shape.V == ours.shape.V and np.array_equal(theirs.core, ours.core):
-        R, t = rigid_motion(theirs.shape.verts[theirs.core], ours.shape.verts[ours.core])
-        turn = Frame(1.0, R, -R.T @ t)
+        turn = kabsch(ours.shape.verts[ours.core], theirs.shape.verts[theirs.core]).frame
     scan = Scan(turn.apply(one.scan.points), one.scan.normals @ turn.rotation.T)
     rng = np.random.default_rng(measure.seed)
     found = lay_on(model.network, node_system(model), ours.core, scan, np.eye(3), np.zeros(3), rng)

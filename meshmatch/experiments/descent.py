@@ -19,9 +19,10 @@ from meshmatch.experiments.cell_errors import Measure, Start, refined, refinemen
 from meshmatch.experiments.cells import BASE, Cell, Setting
 from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.latent import LatentRefineConfig
-from meshmatch.fitting.network_fit import lay_on, rigid_motion
+from meshmatch.fitting.network_fit import lay_on
 from meshmatch.fitting.nodes import NodeRefineConfig
 from meshmatch.fitting.scan import Scan
+from meshmatch.geometry.frames import kabsch
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -90,9 +91,11 @@ def _start(model: TrainedModel, verts: np.ndarray, measure: Measure) -> tuple[St
     places = frame.apply(verts)
     samples = sample_surface(shape, measure.samples, np.random.default_rng(measure.seed))
     scan = Scan(frame.apply(samples.points), samples.normals @ frame.rotation.T)
-    R, t = rigid_motion(template.shape.verts[template.core], places[template.core])
+    pose = kabsch(template.shape.verts[template.core], places[template.core])
     rng = np.random.default_rng(measure.seed)
-    found = lay_on(model.network, node_system(model), template.core, scan, R, t, rng, rounds=1)
+    found = lay_on(
+        model.network, node_system(model), template.core, scan, pose.rotation, pose.center, rng, rounds=1
+    )
     local = scan.turned(found.rotation, found.center)
     return Start(frame, local, found), (places - found.center) @ found.rotation
 

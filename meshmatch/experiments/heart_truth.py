@@ -11,8 +11,9 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 
 from meshmatch.experiments.category import Pair
+from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.maps.surface import Surface
-from meshmatch.maps.template_footpoints import at_footpoints, vertex_normals
+from meshmatch.maps.template_footpoints import at_footpoints
 from meshmatch.outputs import make_folder
 from meshmatch.render.picture import Look, Panel, render_shapes
 from meshmatch.render.scales import label_colors

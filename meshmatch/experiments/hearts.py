@@ -49,9 +49,10 @@ from meshmatch.experiments.category import (
 from meshmatch.experiments.heart_truth import chamber_picture, heart_errors, save_registered, through
 from meshmatch.experiments.report import columns, publish, status_of
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.geometry.frames import Frame
 from meshmatch.outputs import make_folder
 from meshmatch.pipeline import usable
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.prepare import prepare_folder
 from meshmatch.templates.template import Template

@@ -26,10 +26,11 @@ from rich.table import Table
 from meshmatch.errors import InputError
 from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.frames import Frame
 from meshmatch.maps.evaluate import LOST_CM
 from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.pipeline import map_between, register
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.threads import set_threads
 
 FILE = "faust_outliers.npy"

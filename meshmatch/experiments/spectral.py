@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.experiments.adapters import library, need_meshes
+from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.surface import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.decimate import decimate
@@ -65,7 +66,7 @@ class ZoomOutMatcher:
             mesh.process(k=self.last, robust=True)
         surface = Surface(thin.verts, thin.faces, thin.vertex_normals)
         foot = surface.query(whole.verts, whole.vertex_normals)
-        at = np.einsum("nk,nkd->nd", foot.barycentric, mesh.eigenvectors[thin.faces[foot.face]])
+        at = interpolate(mesh.eigenvectors, thin.faces[foot.face], foot.barycentric)
         return Spectrum(mesh, at, cKDTree(whole.verts).query(thin.verts)[1])
 
     def map(self, source: Shape, source_fit: Spectrum, target: Shape, target_fit: Spectrum) -> VertexMap:

@@ -27,10 +27,10 @@ from rich.table import Table
 
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.report import circumstances, status_of, wide_console
+from meshmatch.geometry.topology import edge_keys
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.topology import edge_keys
 from meshmatch.templates.location import bundled_folder
 
 

@@ -28,6 +28,7 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
+from meshmatch.arrays import Floats
 from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.experiments.speed import Cost, cost_of, keep_to_cores, sized
 from meshmatch.fitting.dense import dense_shape
@@ -41,7 +42,7 @@ from meshmatch.shapes.duplicates import seams
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.sampling import sample_surface
-from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import to_srgb
 from meshmatch.shapes.textured_files import save_textured
 from meshmatch.templates.location import bundled_folder

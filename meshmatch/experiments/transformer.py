@@ -16,6 +16,7 @@ from torch import nn
 
 from meshmatch.errors import ModelError
 from meshmatch.fitting.orientation import standing_grid
+from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.surface import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.checkpoint import load_weights
@@ -183,7 +184,7 @@ class TransMatcher:
         faces = _loaded(self.folder).template.shape.faces
         still = np.zeros_like(source_fit.points)  # no normals: nearest in space alone
         foot = Surface(source_fit.points, faces, still).query(source.verts, np.zeros_like(source.verts))
-        moved = np.einsum("nk,nkd->nd", foot.barycentric, target_fit.points[faces[foot.face]])
+        moved = interpolate(target_fit.points, faces[foot.face], foot.barycentric)
         return VertexMap.between(source, target, cKDTree(target.verts).query(moved)[1])
 
 

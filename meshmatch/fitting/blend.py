@@ -16,7 +16,8 @@ from meshmatch.fields.field import PointField
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_shape import node_system, take_samples
 from meshmatch.fitting.turning import FieldPath, Path, RotationBlend, StretchBlend, polar
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.geometry.frames import Frame
+from meshmatch.shapes.shape import Shape
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel

@@ -17,10 +17,8 @@ from scipy.spatial import cKDTree
 from meshmatch.fitting.network_fit import Candidate
 from meshmatch.fitting.scan import Scan, with_normals
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.geometry.topology import is_discontinuous
 
-# Neighbours on a shape are torn apart where they belong this much further apart on the resting template (units of
-# sqrt(area)) than they are, stretched by this factor.
-_TEAR, _STRETCH = 0.06, 3.0
 _NEIGHBOURS = 6
 _TORN_COST = 0.1  # residual that a map torn everywhere is worse by
 _CAP = 0.1  # beyond it a distance says no more
@@ -71,12 +69,7 @@ class CandidateScorer:
         scan, tree = scan.facing(moved, normals), cKDTree(with_normals(moved, normals))
         belongs = self._system.verts[tree.query(with_normals(scan.points, scan.normals))[1]]
         length = np.linalg.norm(scan.points[self._from] - scan.points[self._to], axis=1)
-        return float(torn(belongs[self._from], belongs[self._to], length).mean())
-
-
-def torn(here: np.ndarray, there: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """(N,) whether places of the resting template (N, 3) are much further apart than their points, by lengths (N,)."""
-    return np.asarray(np.linalg.norm(here - there, axis=1) >= _TEAR + _STRETCH * length)
+        return float(is_discontinuous(belongs[self._from], belongs[self._to], length).mean())
 
 
 def choose(

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.fitting.network_fit import Candidate
-from meshmatch.fitting.nodes import vertex_areas
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.shapes.cloud import outlier_points
 from meshmatch.shapes.shape import Shape
 

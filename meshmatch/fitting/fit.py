@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshmatch.shapes.shape import Frame
+from meshmatch.geometry.frames import Frame
 
 # Mean two-way residual (units of sqrt(area)) up to which a fit is called good, and fair.
 GOOD_RESIDUAL = 0.0285

@@ -26,10 +26,11 @@ from meshmatch.fitting.part import cost, fit_part
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.verdict import cloud_allowance, empty_share, judge, unexplained
+from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.topology import open_edges
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
-from meshmatch.shapes.shape import Frame, Shape
-from meshmatch.shapes.topology import open_edges
+from meshmatch.shapes.shape import Shape
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel

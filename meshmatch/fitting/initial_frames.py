@@ -17,8 +17,10 @@ from meshmatch.fitting.orientation import (
     with_flips,
 )
 from meshmatch.fitting.scan import Scan
-from meshmatch.shapes.align import ALIGNS, Oriented, align
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.shapes.align import ALIGNS, align
+from meshmatch.shapes.shape import Shape
 from meshmatch.templates.unregistered import SCALES, template_radius, template_samples, unit_frame
 
 if TYPE_CHECKING:
@@ -42,8 +44,8 @@ def placed(model: TrainedModel, scan: Scan) -> list[Hypothesis] | None:
         return None
     if how == "none":
         return [Hypothesis(np.eye(3), np.zeros(3), 1.0)]
-    found = align(Oriented(scan.points, scan.normals), template_samples(model.template), how, _TURNS)
-    return [Hypothesis(each.rotation, each.center, 1.0 / len(found)) for each in found]
+    found = align(OrientedPoints(scan.points, scan.normals), template_samples(model.template), how, _TURNS)
+    return [Hypothesis(each.pose.rotation, each.pose.center, 1.0 / len(found)) for each in found]
 
 
 def frames_to_try(model: TrainedModel, scan: Scan, config: FitConfig) -> list[Hypothesis]:

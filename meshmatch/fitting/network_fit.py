@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.fitting.mirror import Mirror
 from meshmatch.fitting.scan import Scan, with_normals
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.geometry.frames import kabsch
 from meshmatch.models.deformer import Deformer
 
 _VARIANT_POINTS = (700, 1400)
@@ -30,15 +31,6 @@ class Candidate:
     center: np.ndarray
     vectors: np.ndarray
     residual: float
-
-
-def rigid_motion(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Best rigid motion target ~ R source + t (Kabsch); rows are points."""
-    a, b = source.mean(0), target.mean(0)
-    U, _, Vh = np.linalg.svd((target - b).T @ (source - a))
-    U[:, 2] *= np.sign(np.linalg.det(U @ Vh))
-    R = U @ Vh
-    return R, b - R @ a
 
 
 def two_way_residual(
@@ -107,8 +99,8 @@ def lay_on(
         local = scan.turned(rotation, center)
         vectors = predict(model, local, draws, rng)
         if turn < rounds - 1:
-            R, t = rigid_motion(system.verts[core], system.moved(vectors)[core])
-            rotation, center = rotation @ R, rotation @ t + center
+            step = kabsch(system.verts[core], system.moved(vectors)[core])
+            rotation, center = rotation @ step.rotation, rotation @ step.center + center
     return Candidate(rotation, center, vectors, two_way_residual(system, local, vectors, stride))
 
 

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.fitting.scan import PAIR_WEIGHT, Scan, with_normals
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.geometry.triangles import vertex_areas
 
 _SHARERS = 16  # vertices of the template that share a point, at most
 
@@ -199,10 +200,3 @@ def add_landmarks(
 def robust_weight(offset: np.ndarray, scale: float) -> np.ndarray:
     """Geman-McClure weight of offsets (N, 3)."""
     return 1.0 / np.square(1.0 + np.square(offset).sum(1) / scale**2)
-
-
-def vertex_areas(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """A third of the area of the faces around each vertex (V,)."""
-    a, b, c = (verts[faces[:, k]] for k in range(3))
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return np.bincount(faces.reshape(-1), np.repeat(area / 3, 3), len(verts))

@@ -6,6 +6,7 @@ import numpy as np
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.triangles import unit, vertex_normals
 from meshmatch.maps.scatter import expected, is_scattered, land, noise_of
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.maps.template_footpoints import (
@@ -13,8 +14,6 @@ from meshmatch.maps.template_footpoints import (
     closest,
     in_core_frame,
     place,
-    unit,
-    vertex_normals,
 )
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.repair import Repaired

@@ -27,7 +27,7 @@ from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.maps.mat_file import read_mat
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.arrays import read_npy, read_npz
+from meshmatch.shapes.array_files import read_npy, read_npz
 from meshmatch.shapes.shape import Shape
 
 CSV_COLUMNS = ("source_vertex", "target_vertex", "face", "w0", "w1", "w2", "confidence")

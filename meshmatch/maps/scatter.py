@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.nodes import vertex_areas
+from meshmatch.geometry.triangles import interpolate, triangle_areas, vertex_areas
 from meshmatch.maps.surface import RESTING_WEIGHT, Footpoints
 from meshmatch.maps.template_footpoints import in_core_frame
 from meshmatch.shapes.shape import Shape
@@ -62,7 +62,7 @@ def expected(
         share = priors[index] * np.exp(-0.5 * closer / noise**2)
         share /= share.sum(1, keepdims=True)
         for mean, value in zip(means, every, strict=True):
-            mean[part] = np.einsum("nk,nkd->nd", share, value[index])
+            mean[part] = interpolate(value, index, share)
         around = np.square(every[0][index] - means[0][part][:, None]).sum(2)
         variance[part] = (share * around).sum(1)
     return means, variance
@@ -95,9 +95,6 @@ def _samples(fit: Fit):
     centers = csr_matrix((np.full(3 * F, 1 / 3), (rows, fit.faces.reshape(-1))), (F, T))
     area = vertex_areas(fit.points, fit.faces)  # a third of each face to each of its corners
     # Half of a face's area is its center's.
-    return vstack([identity(T), centers]).tocsr(), np.concatenate([0.5 * area, 0.5 * _face_areas(fit)])
-
-
-def _face_areas(fit: Fit) -> np.ndarray:
-    a, b, c = (fit.points[fit.faces[:, k]] for k in range(3))
-    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    return vstack([identity(T), centers]).tocsr(), np.concatenate(
+        [0.5 * area, 0.5 * triangle_areas(fit.points, fit.faces)]
+    )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from meshmatch.shapes.shape import squared_lengths
+from meshmatch.geometry.triangles import blend, closest_on_triangles, squared_lengths
 
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area): enough to tell
 # the sides of a thin wall. More would drag points along the surface to where it bends the same way.
@@ -84,7 +84,7 @@ class Surface:
         corners = self.verts[self.faces[face]]  # N 3 3
         asked = np.repeat(points, counts, axis=0)
         weights = closest_on_triangles(asked, corners[:, 0], corners[:, 1], corners[:, 2])
-        squared = squared_lengths(np.einsum("nk,nkd->nd", weights, corners) - asked)
+        squared = squared_lengths(blend(corners, weights) - asked)
         # The first of the nearest of each query's faces.
         nearest = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, first), counts))
         best = nearest[np.searchsorted(nearest, first)]
@@ -102,39 +102,3 @@ def _faces_around(faces: np.ndarray, V: int) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(corner, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=V))])
     return start, order // 3
-
-
-def closest_on_triangles(points: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Barycentric weights (N, 3) of the closest point of triangle (a, b, c)[n] to points[n].
-
-    The plane's foot where it lies inside, else the closest point of the nearest edge.
-    """
-    ab, ac, ap = b - a, c - a, points - a
-    d00, d01, d11 = _dot(ab, ab), _dot(ab, ac), _dot(ac, ac)
-    d20, d21 = _dot(ap, ab), _dot(ap, ac)
-    scale = np.maximum(d00 * d11 - d01 * d01, 1e-300)
-    v = (d11 * d20 - d01 * d21) / scale
-    w = (d00 * d21 - d01 * d20) / scale
-    inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (d00 * d11 - d01 * d01 > 1e-14 * d00 * d11)
-    result = np.stack([1 - v - w, v, w], 1)
-    out = np.flatnonzero(~inside)
-    if len(out):
-        corners, asked = (a[out], b[out], c[out]), points[out]
-        best = np.full(len(out), np.inf)
-        for i, j in ((0, 1), (1, 2), (2, 0)):
-            along = corners[j] - corners[i]
-            t = _dot(asked - corners[i], along) / np.maximum(_dot(along, along), 1e-300)
-            t = np.clip(t, 0, 1)
-            squared = squared_lengths(corners[i] + t[:, None] * along - asked)
-            closer = squared < best
-            best = np.where(closer, squared, best)
-            rows = out[closer]
-            result[rows] = 0.0
-            result[rows, i] = 1 - t[closer]
-            result[rows, j] = t[closer]
-    return result
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N,) products of rows; several times as fast as summing along an axis of three."""
-    return np.einsum("ni,ni->n", a, b)

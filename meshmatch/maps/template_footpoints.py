@@ -9,11 +9,11 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from meshmatch.fitting.candidates import torn
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.topology import edges_of, is_discontinuous
+from meshmatch.geometry.triangles import interpolate, vertex_normals
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.topology import edges_of
 
 # A piece between tears is believed if it has this share of the surface.
 _BELIEVED = 0.06
@@ -95,7 +95,7 @@ def small_pieces(edges: np.ndarray, length: np.ndarray, resting: np.ndarray, are
     area : (V,) around each vertex; lengths are in units of the square root of the whole
     """
     V = len(resting)
-    whole = ~torn(resting[edges[:, 0]], resting[edges[:, 1]], length)
+    whole = ~is_discontinuous(resting[edges[:, 0]], resting[edges[:, 1]], length)
     if whole.all():
         return np.zeros(V, bool)
     kept = edges[whole]
@@ -125,7 +125,7 @@ def surroundings(edges: np.ndarray, resting: np.ndarray, doubted: np.ndarray) ->
 
 def at_footpoints(foot: Footpoints, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Values (V, D) of the vertices at footpoints: (N, D)."""
-    return np.einsum("nk,nkd->nd", foot.barycentric, values[faces[foot.face]])
+    return interpolate(values, faces[foot.face], foot.barycentric)
 
 
 def in_core_frame(shape: Shape, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
@@ -133,18 +133,3 @@ def in_core_frame(shape: Shape, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     if shape.is_cloud:
         return fit.frame.apply(shape.verts), np.zeros_like(shape.verts)
     return fit.frame.apply(shape.verts), shape.vertex_normals @ fit.frame.rotation.T
-
-
-def vertex_normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted unit vertex normals (V, 3)."""
-    a, b, c = (verts[faces[:, k]] for k in range(3))
-    face_vectors = np.cross(b - a, c - a)
-    summed = np.stack(
-        [np.bincount(faces.reshape(-1), np.repeat(face_vectors[:, k], 3), len(verts)) for k in range(3)], 1
-    )
-    return unit(summed)
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Rows scaled to length one; zeros stay zeros."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-20)

@@ -12,7 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.shapes.topology import same_rows
+from meshmatch.geometry.topology import same_rows
+from meshmatch.geometry.triangles import vertex_normals
 
 FloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
@@ -117,13 +118,8 @@ def mesh_surface(verts: FloatArray, faces: IntArray, paint: Paint, chosen: IntAr
     """
     if chosen is not None:
         faces, paint = faces[chosen], SomeFaces(paint, chosen)
-    corners = verts[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     twin = same_rows(np.asarray(verts, np.float64))
-    at = twin[faces].ravel()
-    sums = np.stack([np.bincount(at, np.repeat(across[:, k], 3), len(verts)) for k in range(3)], axis=1)
-    lengths = np.sqrt(np.einsum("vi,vi->v", sums, sums))
-    normals = (sums / np.where(lengths > 0, lengths, 1.0)[:, None])[twin]
+    normals = vertex_normals(verts, twin[faces])[twin]
     return Surface(verts, faces, normals, paint)
 
 

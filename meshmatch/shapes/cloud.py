@@ -6,8 +6,8 @@ A cloud of more than `LARGEST` points is judged by a random part of it, so that 
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.shapes.orientation import agreeing_flips
-from meshmatch.shapes.shape import Floats, Ints
 
 LARGEST = 20_000
 

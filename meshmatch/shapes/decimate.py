@@ -4,9 +4,10 @@ from typing import Literal
 
 import numpy as np
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError, OptionError
-from meshmatch.shapes.shape import Floats, Ints, Shape
-from meshmatch.shapes.topology import edges_of, is_watertight
+from meshmatch.geometry.topology import edges_of, is_watertight
+from meshmatch.shapes.shape import Shape
 
 Quality = Literal["fast", "pymeshlab"]
 _AGGRESSIVENESS = (3.0, 4.0, 2.5, 5.0)

@@ -3,8 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.shapes.shape import Floats, Ints, squared_lengths
-from meshmatch.shapes.topology import edge_keys, open_edges, same_rows
+from meshmatch.arrays import Floats, Ints
+from meshmatch.geometry.topology import edge_keys, open_edges, same_rows
+from meshmatch.geometry.triangles import squared_lengths
 
 
 def seams(verts: Floats, faces: Ints) -> Ints:

@@ -2,8 +2,10 @@
 
 import numpy as np
 
+from meshmatch.arrays import Floats
 from meshmatch.errors import InputError
-from meshmatch.shapes.shape import Floats, Frame, Shape
+from meshmatch.geometry.frames import Frame
+from meshmatch.shapes.shape import Shape
 
 
 def sqrt_area_frame(shape: Shape) -> Frame:

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.shapes.shape import Floats, Ints
-from meshmatch.shapes.topology import Edges, directed_edges
+from meshmatch.arrays import Floats, Ints
+from meshmatch.geometry.topology import Edges, directed_edges
 
 
 def agreeing_flips(

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.shapes.shape import Floats, Ints, squared_lengths
-from meshmatch.shapes.topology import face_parts
+from meshmatch.arrays import Floats, Ints
+from meshmatch.geometry.topology import face_parts
+from meshmatch.geometry.triangles import squared_lengths
 
 OUTLIER_SHARE = 0.02
 """A part with less than this share of the largest part's area is stray."""

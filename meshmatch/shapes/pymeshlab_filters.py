@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import OptionError
-from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.shapes.shape import Shape
 
 _COLLAPSE = "meshing_decimation_quadric_edge_collapse"
 _REMESH = "meshing_isotropic_explicit_remeshing"

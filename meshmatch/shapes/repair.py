@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
+from meshmatch.geometry.topology import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
 from meshmatch.shapes.duplicates import duplicate_faces, flat_faces, seams
 from meshmatch.shapes.orientation import turn_faces
 from meshmatch.shapes.parts import find_parts
-from meshmatch.shapes.shape import Floats, Ints, Shape
-from meshmatch.shapes.topology import edges_of, same_rows
+from meshmatch.shapes.shape import Shape
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.shapes.shape import Shape
 
 
 @dataclass(frozen=True, eq=False)

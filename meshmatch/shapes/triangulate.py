@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.sampling import farthest_points
-from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.shapes.shape import Shape
 
 _NEIGHBOURS = 16
 _LONGEST = 3.0  # of an edge, against the usual reach of a point's sixth neighbour

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshmatch.shapes.align import Align, rigid_motion
+from meshmatch.geometry.frames import kabsch
+from meshmatch.shapes.align import Align
 from meshmatch.shapes.repair import Repaired
 
 FEW = 100
@@ -43,5 +44,5 @@ def turned(stack: np.ndarray, like: np.ndarray) -> Align:
     """How few registered shapes (N, V, 3) are turned to the template's vertices (V, 3)."""
     if len(stack) >= FEW:
         return "none"
-    cosines = [(np.trace(rigid_motion(like, verts.astype(np.float64))[0]) - 1) / 2 for verts in stack]
+    cosines = [(np.trace(kabsch(like, verts.astype(np.float64)).rotation) - 1) / 2 for verts in stack]
     return "near" if min(cosines) > np.cos(np.radians(_ALIKE)) else "rigid"

@@ -14,13 +14,15 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.align import ALIGNS, Align, Oriented, align, residual
-from meshmatch.shapes.arrays import read_npy
+from meshmatch.shapes.align import ALIGNS, Align, align, residual
+from meshmatch.shapes.array_files import read_npy
 from meshmatch.shapes.normalise import sqrt_area_frame, unit_sphere_frame
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.sampling import sample_surface
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 
 Scale = Literal["area", "sphere"]
@@ -67,10 +69,10 @@ def template_radius(template: Template) -> float:
     return float(np.linalg.norm(template.shape.verts, axis=1).max())
 
 
-def template_samples(template: Template, P: int = 3000, seed: int = 0) -> Oriented:
+def template_samples(template: Template, P: int = 3000, seed: int = 0) -> OrientedPoints:
     """What shapes are aligned to."""
     samples = sample_surface(template.shape, P, np.random.default_rng(seed))
-    return Oriented(samples.points, samples.normals)
+    return OrientedPoints(samples.points, samples.normals)
 
 
 def most_typical(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int) -> int:
@@ -80,14 +82,14 @@ def most_typical(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int
     """
     pool = [k for k, one in enumerate(shapes) if not one.shape.is_cloud] or list(range(len(shapes)))
     pool = [pool[k] for k in np.unique(np.linspace(0, len(pool) - 1, min(len(pool), _COMPARED)).astype(int))]
-    seen: list[Oriented] = []
+    seen: list[OrientedPoints] = []
     for k in pool:
         shape = shapes[k].shape
         samples = sample_surface(shape, 800, np.random.default_rng(seed))
-        part = Oriented(unit_frame(shape, scale, 0.5).apply(samples.points), samples.normals)
+        part = OrientedPoints(unit_frame(shape, scale, 0.5).apply(samples.points), samples.normals)
         if seen:
             best = align(part, seen[0], how)[0]
-            part = part.moved(best.rotation, best.center)
+            part = part.to_local(best.pose)
         seen.append(part)
     apart = np.zeros((len(seen), len(seen)))
     for i in range(len(seen)):
@@ -133,12 +135,12 @@ def gather(
     for number, one in enumerate(shapes):
         frame = unit_frame(one.shape, scale, radius)
         samples = sample_surface(one.shape, P, rng)
-        part = Oriented(frame.apply(samples.points), samples.normals)
+        part = OrientedPoints(frame.apply(samples.points), samples.normals)
         best = align(part, target, how)[0]
-        part = part.moved(best.rotation, best.center)
+        part = part.to_local(best.pose)
         points.append(part.points)
         normals.append(part.normals)
-        frames.append(frame.compose(Frame(1.0, best.rotation.T, best.center)))
+        frames.append(frame.compose(best.pose.frame))
         far.append(best.residual)
         places = known[number]
         if L and places is not None:

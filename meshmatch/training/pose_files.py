@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from meshmatch.errors import InputError, OptionError
-from meshmatch.shapes.arrays import read_npz
+from meshmatch.shapes.array_files import read_npz
 from meshmatch.training.rig import Rig
 from meshmatch.training.rotations import rotation_from_vector
 from meshmatch.training.skeleton import forward_kinematics

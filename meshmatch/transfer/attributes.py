@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.shapes.shape import Shape
 
 NO_LABEL = -1
 

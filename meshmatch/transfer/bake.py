@@ -14,10 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Floats
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Alpha
 from meshmatch.shapes.images import Pixels
-from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import bytes_of
 from meshmatch.transfer.material_sampler import MaterialSampler
 from meshmatch.transfer.pyramid import fill

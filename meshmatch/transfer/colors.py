@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from meshmatch.arrays import Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import to_linear, to_srgb
 from meshmatch.transfer.value_files import Values, save_values
 

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
+from meshmatch.geometry.topology import edges_of
+from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.template_footpoints import small_pieces, surroundings
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
-from meshmatch.shapes.shape import Floats, Ints, Shape
-from meshmatch.shapes.topology import edges_of
+from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import ClosestPlaces, MappedMesh, on_vertex
 
 _ROUNDS = 2
@@ -148,8 +150,8 @@ def places_on(source: Shape, places: ClosestPlaces) -> Floats:
     """(N, 3) the points themselves, in the source's frame."""
     points = source.verts[places.vertex]
     inside = places.face >= 0
-    corners = source.verts[source.faces[places.face[inside]]]
-    points[inside] = np.einsum("nk,nkd->nd", places.barycentric[inside], corners)
+    corners = source.faces[places.face[inside]]
+    points[inside] = interpolate(source.verts, corners, places.barycentric[inside])
     return points
 
 

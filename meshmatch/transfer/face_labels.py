@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_array
 
+from meshmatch.arrays import Floats, Ints
+from meshmatch.geometry.triangles import interpolate, triangle_areas
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import (
     faces_at_vertices,
     most_votes,
@@ -39,10 +41,7 @@ def carry_face_labels(
     """
     around = _around_corners(back, source, target, labels, on_faces)
     found = most_votes(around)
-    corners = back.points(source)[target.faces]  # F 3 3
-    area = 0.5 * np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = triangle_areas(back.points(source), target.faces)
     usual = _face_area_around(source)[back.index[target.faces]].mean(axis=1)
     ask = np.flatnonzero((np.diff(around.indptr) != 1) | (area > _LARGE * usual))
     if not len(ask):
@@ -129,7 +128,7 @@ def _normals(back: VertexMap, source: Shape) -> Floats:
     normals = own[back.index]
     inside = back.face >= 0
     corners = source.faces[back.face[inside]]
-    normals[inside] = np.einsum("nk,nkd->nd", back.barycentric[inside], own[corners])
+    normals[inside] = interpolate(own, corners, back.barycentric[inside])
     return normals
 
 

@@ -21,11 +21,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from meshmatch.arrays import Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.arrays import existing, read_npy
+from meshmatch.shapes.array_files import existing, read_npy
 from meshmatch.shapes.palette import label_colors
-from meshmatch.shapes.shape import Ints, Shape
+from meshmatch.shapes.shape import Shape
 
 On = Literal["vertices", "faces"]
 Label = int | str

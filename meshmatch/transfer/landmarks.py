@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
+from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.direction import target_normals
 from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces
 
@@ -158,8 +160,8 @@ def carry_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks:
     if len(inside):
         corners = source.faces[landmarks.face[inside]]
         share = landmarks.barycentric[inside]
-        mean = np.einsum("nk,nkd->nd", share, points[corners])
-        facing = np.einsum("nk,nkd->nd", share, target_normals(target)[forward.index[corners]])
+        mean = interpolate(points, corners, share)
+        facing = interpolate(target_normals(target), forward.index[corners], share)
         places = MappedMesh(VertexMap.identity(target), target, target).query(mean, facing)
         vertex[inside], face[inside], weights[inside] = places.vertex, places.face, places.barycentric
         confidence[inside] = np.einsum("nk,nk->n", share, forward.confidence[corners])
@@ -171,7 +173,7 @@ def _on_surface(
 ) -> Landmarks:
     points = shape.verts[vertex]
     inside = face >= 0
-    points[inside] = np.einsum("nk,nkd->nd", weights[inside], shape.verts[shape.faces[face[inside]]])
+    points[inside] = interpolate(shape.verts, shape.faces[face[inside]], weights[inside])
     return Landmarks(names, points, vertex, face, weights, confidence)
 
 

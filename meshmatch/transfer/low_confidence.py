@@ -11,8 +11,9 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
-from meshmatch.shapes.shape import Floats, Ints, Shape
-from meshmatch.shapes.topology import edges_of, same_rows
+from meshmatch.arrays import Floats, Ints
+from meshmatch.geometry.topology import edges_of, same_rows
+from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import sparse_rows
 
 _NEIGHBOURS = 8

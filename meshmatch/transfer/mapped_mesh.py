@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from meshmatch.maps.surface import closest_on_triangles
+from meshmatch.arrays import Floats, Ints
+from meshmatch.geometry.topology import edges_of
+from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.shape import Floats, Ints, Shape, squared_lengths
-from meshmatch.shapes.topology import edges_of
+from meshmatch.shapes.shape import Shape
 
 # Distance to the image (units of sqrt(area)) at which confidence has fallen to about 0.37, as in maps.
 SCALE = 0.03
@@ -124,7 +125,7 @@ class MappedMesh:
         about = None if near is None else np.asarray(near, np.float64) / self._source_unit
         item, weights, _ = self._search(points, facing, workers, about)
         corners = self.corners[item]
-        foot = np.einsum("nk,nkd->nd", weights, self.points[corners])
+        foot = interpolate(self.points, corners, weights)
         distance = np.sqrt(squared_lengths(foot - points))
         beyond = np.maximum(distance - self._gap, 0.0)
         confidence = np.einsum("nk,nk->n", weights, self.confidence[corners])
@@ -152,7 +153,7 @@ class MappedMesh:
                 return
             found, costs = self._costs(points[rows], normals[rows], items)
             if near is not None:
-                place = np.einsum("nk,nkd->nd", found, self._source[self.corners[items]])
+                place = interpolate(self._source, self.corners[items], found)
                 costs = costs + (_NEAR * self.unit) ** 2 * squared_lengths(place - near[rows])
             order = np.lexsort((items, costs, rows))
             first = order[np.flatnonzero(np.diff(rows[order], prepend=-1))]
@@ -249,5 +250,5 @@ def _normals_at(found: VertexMap, target: Shape) -> Floats:
     normals = target.vertex_normals[found.index]
     inside = found.face >= 0
     corners = target.faces[found.face[inside]]
-    normals[inside] = np.einsum("nk,nkd->nd", found.barycentric[inside], target.vertex_normals[corners])
+    normals[inside] = interpolate(target.vertex_normals, corners, found.barycentric[inside])
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

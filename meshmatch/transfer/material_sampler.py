@@ -8,8 +8,9 @@ from scipy.ndimage import maximum_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from meshmatch.arrays import Floats
+from meshmatch.geometry.triangles import cross_product, squared_lengths
 from meshmatch.shapes.appearance import Alpha, Appearance, Material
-from meshmatch.shapes.shape import Floats, cross_product, squared_lengths
 from meshmatch.transfer.pyramid import Light, Pyramid, wrapped
 from meshmatch.transfer.surface_walk import SurfaceWalker, duals
 from meshmatch.transfer.texels import MOST_ROWS, rows_of, spans

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from meshmatch.arrays import Floats
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.template_footpoints import place
 from meshmatch.shapes.repair import Repaired
-from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.shape import Shape
 
 
 class SurfaceBinding:
@@ -46,4 +48,4 @@ class SurfaceBinding:
         return Shape(verts, self._shape.faces, name, self._shape.colors, self._shape.invalid)
 
     def _on(self, points: Floats) -> Floats:
-        return np.asarray(np.einsum("nk,nkd->nd", self._weights, points[self._corners]))
+        return interpolate(points, self._corners, self._weights)

@@ -10,9 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from meshmatch.maps.surface import closest_on_triangles
-from meshmatch.shapes.shape import Floats, Ints, Shape, cross_product, squared_lengths
-from meshmatch.shapes.topology import same_rows
+from meshmatch.arrays import Floats, Ints
+from meshmatch.geometry.topology import same_rows
+from meshmatch.geometry.triangles import (
+    blend,
+    closest_on_triangles,
+    interpolate,
+    squared_lengths,
+    triangle_areas,
+)
+from meshmatch.shapes.shape import Shape
 
 _INSIDE = np.float32(-1e-5)
 _STEPS, _STEPS_AGAIN = 32, 12
@@ -37,7 +44,7 @@ class SurfaceWalker:
         self.same = same_rows(shape.verts)[shape.faces]  # corners by place: seams cut nothing apart
         self.opposite, self.opposite_edge = _neighbours(shape.faces, self.same)
         a, b, c = (self.verts[shape.faces[:, k]] for k in range(3))
-        self.areas = 0.5 * np.sqrt(squared_lengths(cross_product(b - a, c - a)))
+        self.areas = triangle_areas(self.verts, shape.faces)
         first, second = duals(b - a, c - a)
         self._flat = (first == 0).all(axis=1) & (second == 0).all(axis=1)
         self._table = list(np.concatenate([a, first, second], axis=1).T.astype(np.float32, order="C"))
@@ -54,7 +61,7 @@ class SurfaceWalker:
 
     def places(self, face: NDArray[np.integer], weights: NDArray[np.floating]) -> Floats:
         """(N, 3) points of faces (N,) by weights (N, 3)."""
-        return np.asarray(np.einsum("nk,nkd->nd", weights, self.verts[self.faces[face]]))
+        return interpolate(self.verts, self.faces[face], weights)
 
     def closest(self, points: Near, face: Faces) -> tuple[Faces, Near, Near]:
         """The closest place on the surface, as far as sliding gets.
@@ -88,7 +95,7 @@ class SurfaceWalker:
             corners = self.verts[self.faces[face[outside]]]
             asked = points[:, outside].T.astype(np.float64)
             held = closest_on_triangles(asked, corners[:, 0], corners[:, 1], corners[:, 2])
-            foot = np.einsum("nk,nkd->nd", held, corners)
+            foot = blend(corners, held)
             weights[:, outside] = held.T
             distance[outside] = np.sqrt(squared_lengths(foot - asked))
         np.maximum(weights, 0, out=weights)

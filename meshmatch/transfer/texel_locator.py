@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.material_sampler import reach_of
 from meshmatch.transfer.surface_walk import Faces, Near, SurfaceWalker, duals
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.shapes.shape import Floats, Ints
+from meshmatch.arrays import Floats, Ints
 
 _AT_ONCE = 1 << 21  # texels
 MOST_ROWS = 40_000_000

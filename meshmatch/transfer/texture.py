@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from meshmatch.arrays import Floats
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.formats.textured import Textured
-from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.bake import Baked, Choices, bake
 from meshmatch.transfer.material_sampler import MaterialSampler
 from meshmatch.transfer.surface_walk import walker_of

@@ -11,8 +11,9 @@ from typing import Literal
 import numpy as np
 import xatlas
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError, OptionError
-from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.texels import MOST_ROWS, faces_on, rows_of
 
 Keep = Literal["auto", "keep", "new"]

@@ -18,9 +18,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Floats
 from meshmatch.errors import InputError, OptionError
-from meshmatch.shapes.arrays import existing, read_npy
-from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.array_files import existing, read_npy
+from meshmatch.shapes.shape import Shape
 
 _HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy or .csv"
 

@@ -23,7 +23,7 @@ from scipy.sparse import csr_array
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.arrays import existing, read_npz
+from meshmatch.shapes.array_files import existing, read_npz
 from meshmatch.shapes.shape import Shape
 
 _FORMAT = "meshmatch skin weights 1"

@@ -15,11 +15,12 @@ from meshmatch import pipeline
 from meshmatch.errors import InputError, OutputError
 from meshmatch.fields.mls import build_field
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.frames import Frame
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import Template
 from tests.cli.conftest import Run

@@ -12,6 +12,7 @@ from PIL import Image
 
 from meshmatch import pipeline
 from meshmatch.cli.picture_options import Asked
+from meshmatch.geometry.frames import Frame
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render import picture as drawing
@@ -19,7 +20,7 @@ from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look
 from meshmatch.render.scales import UNKNOWN, Scale, Swatches
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from tests.cli.conftest import Answer, Run
 from tests.shapes.painted import encoded, quarters, write_square_obj

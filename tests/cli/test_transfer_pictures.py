@@ -188,7 +188,7 @@ def test_after_a_match_shapes_are_turned_as_their_fits_say(
 ) -> None:
     from types import SimpleNamespace
 
-    from meshmatch.shapes.shape import Frame
+    from meshmatch.geometry.frames import Frame
     from meshmatch.transfer.direction import pull_back
 
     a, b = load_shape("a.ply"), load_shape("b.ply")

@@ -12,10 +12,11 @@ from PIL import Image
 from meshmatch import pipeline
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.frames import Frame
 from meshmatch.maps.files import MAP_SUFFIXES, save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from tests.cli.conftest import Run
 
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])

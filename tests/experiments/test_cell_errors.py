@@ -25,8 +25,8 @@ from meshmatch.experiments.protocols import load_set
 from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.nodes import NodeRefineConfig
+from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.normalise import sqrt_area_frame
-from meshmatch.shapes.shape import Frame
 from tests.experiments.egg_cells import prepare_eggs
 from tests.experiments.small_bench import BODY, build, order
 from tests.fitting.eggs import egg_model, write_model

@@ -10,8 +10,9 @@ import pytest
 from meshmatch.experiments import outliers
 from meshmatch.experiments.outliers import load_clouds, main
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 
 P = 40
 

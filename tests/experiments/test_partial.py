@@ -10,8 +10,9 @@ from meshmatch.experiments import partial
 from meshmatch.experiments.partial import main, part_of, seen_faces
 from meshmatch.experiments.protocols import load_set
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
 from tests.experiments.small_bench import build, truth
 

@@ -13,9 +13,10 @@ from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.nodes import NodeRefineConfig
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import sample_surface
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import egg_model
 
 TURNS = Rotation.random(4, random_state=np.random.default_rng(0)).as_matrix()

@@ -14,8 +14,9 @@ from meshmatch.fitting.blend import Blend
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.turning import RotationBlend, StretchBlend, _spanning_order, polar
+from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import egg_model
 
 HALF = np.array([0.5, 0.5])

@@ -17,9 +17,10 @@ from meshmatch.fitting.landmarks import template_vertices
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.verdict import judge
+from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import bent_egg, egg_model, scan_of, write_model
 
 QUICK = FitConfig(

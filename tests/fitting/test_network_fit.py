@@ -6,9 +6,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.fit_shape import node_system
-from meshmatch.fitting.network_fit import Candidate, lay_on, predict, rigid_motion, two_way_residual, variants
+from meshmatch.fitting.network_fit import Candidate, lay_on, predict, two_way_residual, variants
 from meshmatch.fitting.scan import Scan, with_normals
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.geometry.frames import kabsch
 from meshmatch.models.trained import TrainedModel
 from tests.fitting.eggs import bent_egg, egg_model, gentle_vectors, scan_of
 
@@ -26,21 +27,6 @@ def system(model: TrainedModel) -> NodeSystem:
 @pytest.fixture(scope="module")
 def scan(model: TrainedModel) -> Scan:
     return scan_of(model.template.shape, 300)
-
-
-def test_a_rigid_motion_is_found_again() -> None:
-    rng = np.random.default_rng(0)
-    source = rng.normal(size=(9, 3))
-    R, t = Rotation.random(random_state=3).as_matrix(), rng.normal(size=3)
-    found_R, found_t = rigid_motion(source, source @ R.T + t)
-    assert np.allclose(found_R, R)
-    assert np.allclose(found_t, t)
-
-
-def test_a_mirror_image_gets_a_rotation_all_the_same() -> None:
-    source = np.random.default_rng(1).normal(size=(9, 3))
-    R, _ = rigid_motion(source, source * [-1, 1, 1])
-    assert np.linalg.det(R) == pytest.approx(1)
 
 
 def test_the_residual_is_that_of_a_plain_loop(system: NodeSystem, scan: Scan, model: TrainedModel) -> None:
@@ -86,8 +72,7 @@ def test_laying_on_again_moves_the_frame_to_where_the_core_went(
     # the template's core in the new frame lies, in the scan's, where the first prediction put it, rigidly
     there = system.moved(first.vectors)[core] @ R.T + c
     laid = system.verts[core] @ second.rotation.T + second.center
-    best_R, best_t = rigid_motion(system.verts[core], there)
-    assert np.allclose(laid, system.verts[core] @ best_R.T + best_t)
+    assert np.allclose(laid, kabsch(system.verts[core], there).to_world(system.verts[core]))
 
 
 def test_without_a_tilt_every_reading_is_the_networks_own(

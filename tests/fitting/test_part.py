@@ -14,11 +14,12 @@ from meshmatch.fitting.network_fit import Candidate, one_way_residual
 from meshmatch.fitting.part import SHARES, cost
 from meshmatch.fitting.scan import Scan
 from meshmatch.fitting.verdict import empty_share, judge
+from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.pipeline import map_between, read_model
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from tests.fitting.eggs import egg_model
 

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.frames import Frame
 from meshmatch.maps.build import build_map
 from meshmatch.shapes.repair import repair
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from tests.maps.solids import bumpy_sphere
 
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.frames import Frame
 from meshmatch.maps import build
 from meshmatch.maps.scatter import expected, is_scattered, land, noise_of
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 
 NO_FACES = np.empty((0, 3), np.int64)
 

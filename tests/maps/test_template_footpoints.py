@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.frames import Frame
 from meshmatch.maps.template_footpoints import medians, neighbours, place, small_pieces, surroundings
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 
 # A chain of ten vertices, one apart; where they belong is where they are.
 CHAIN = np.stack([np.arange(9), np.arange(1, 10)], 1)

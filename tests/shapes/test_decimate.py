@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.geometry.topology import edges_of, is_watertight
 from meshmatch.shapes import decimate as module
 from meshmatch.shapes import pymeshlab_filters
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.topology import edges_of, is_watertight
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1750.0])

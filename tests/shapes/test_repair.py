@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError
+from meshmatch.geometry.topology import edges_of, is_watertight, same_rows
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.topology import edges_of, is_watertight, same_rows
 
 
 def join(*shapes: Shape, **more: object) -> Shape:
@@ -366,7 +366,7 @@ def test_same_rows_against_the_slow_way() -> None:
 
 
 def test_same_rows_survives_a_collision(monkeypatch: pytest.MonkeyPatch) -> None:
-    from meshmatch.shapes import topology
+    from meshmatch.geometry import topology
 
     monkeypatch.setattr(topology, "_hash", lambda rows: np.zeros(len(rows), np.uint64))
     rows = np.array([[2, 0, 0], [1, 0, 0], [2, 0, 0], [1, 0, 0]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 
 
 def test_cube_by_hand(cube: Shape) -> None:
@@ -116,54 +116,3 @@ def test_invalid_vertices_have_no_area(cube: Shape) -> None:
     assert shape.area == pytest.approx(0.5 * (~touching).sum())
     np.testing.assert_allclose(shape.face_areas[touching], 0)
     assert Shape(cube.verts, cube.faces, invalid=np.zeros(8, bool)).invalid is None
-
-
-def turned(seed: int) -> np.ndarray:
-    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    return q * np.sign(np.linalg.det(q))
-
-
-def test_frame_by_hand() -> None:
-    quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])  # x to y
-    frame = Frame(2.0, quarter, [1, 0, 0])
-    np.testing.assert_allclose(frame.apply([3, 0, 0]), [0, 1, 0], atol=1e-15)
-    np.testing.assert_allclose(frame.undo([0, 1, 0]), [3, 0, 0], atol=1e-15)
-    np.testing.assert_allclose(frame.apply_vectors([2, 0, 0]), [0, 1, 0], atol=1e-15)
-    np.testing.assert_allclose(frame.undo_vectors([0, 1, 0]), [2, 0, 0], atol=1e-15)
-
-
-@pytest.mark.parametrize("scale", [1e-6, 0.3, 1750.0])
-def test_frame_laws(scale: float) -> None:
-    rng = np.random.default_rng(1)
-    frame = Frame(scale, turned(2), rng.normal(size=3) * scale)
-    other = Frame(2.5, turned(3), rng.normal(size=3))
-    points = rng.normal(size=(5, 4, 3)) * scale
-    np.testing.assert_allclose(frame.undo(frame.apply(points)), points, rtol=0, atol=1e-12 * scale)
-    np.testing.assert_allclose(frame.apply(frame.undo(points)), points, rtol=0, atol=1e-12 * max(scale, 1))
-    composed = frame.compose(other)
-    np.testing.assert_allclose(composed.apply(points), other.apply(frame.apply(points)), atol=1e-10)
-    np.testing.assert_allclose(
-        composed.undo(points), frame.undo(other.undo(points)), rtol=1e-9, atol=1e-9 * scale
-    )
-    same = frame.compose(Frame.identity())
-    np.testing.assert_allclose(same.apply(points), frame.apply(points), atol=1e-12)
-    np.testing.assert_array_equal(Frame.identity().apply(points), points)
-    difference = frame.undo_vectors(points[0, 0]) - (frame.undo(points[0, 0]) - frame.undo([0, 0, 0]))
-    np.testing.assert_allclose(difference, 0, atol=1e-12 * max(scale**2, scale))
-
-
-@pytest.mark.parametrize(
-    ("scale", "rotation", "center"),
-    [
-        (0.0, np.eye(3), np.zeros(3)),
-        (-1.0, np.eye(3), np.zeros(3)),
-        (np.nan, np.eye(3), np.zeros(3)),
-        (1.0, np.diag([1, 1, -1]), np.zeros(3)),
-        (1.0, 2 * np.eye(3), np.zeros(3)),
-        (1.0, np.eye(4), np.zeros(3)),
-        (1.0, np.eye(3), [0, 0, np.inf]),
-    ],
-)
-def test_frame_refuses(scale: float, rotation: np.ndarray, center: np.ndarray) -> None:
-    with pytest.raises(InputError, match="frame"):
-        Frame(scale, rotation, center)

@@ -8,7 +8,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError, OutputError
-from meshmatch.maps.surface import closest_on_triangles
+from meshmatch.geometry.triangles import closest_on_triangles
 from meshmatch.shapes import textured_files
 from meshmatch.shapes.appearance import load_appearance, load_coordinates
 from meshmatch.shapes.files import load_shape

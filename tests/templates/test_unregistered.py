@@ -8,9 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import repair
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.prepare import prepare_folder
 from meshmatch.templates.template import load_template

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from meshmatch.maps.surface import closest_on_triangles
+from meshmatch.geometry.triangles import closest_on_triangles
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import OptionError
-from meshmatch.maps.surface import Surface, closest_on_triangles
+from meshmatch.geometry.triangles import closest_on_triangles
+from meshmatch.maps.surface import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape

@@ -5,8 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.repair import repair
-from meshmatch.shapes.shape import Frame, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.surface_binding import SurfaceBinding
 from tests.conftest import icosphere
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from meshmatch.maps.surface import closest_on_triangles
+from meshmatch.geometry.triangles import closest_on_triangles
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.surface_walk import PointWalker, SurfaceWalker, duals, walker_of
 

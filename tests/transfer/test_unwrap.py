@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.geometry.topology import face_parts
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.topology import face_parts
 from meshmatch.transfer import unwrap
 from meshmatch.transfer.texels import faces_on, grown
 from meshmatch.transfer.unwrap import atlas_of, unwrapped

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.duplicates import seams
-from meshmatch.shapes.shape import Floats, Ints, Shape
+from meshmatch.shapes.shape import Shape
 
 MOST = 150_000
 """Vertices up to which a shape is drawn whole."""

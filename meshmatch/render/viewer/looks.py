@@ -8,11 +8,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Floats
 from meshmatch.render.viewer.drawn import Drawn
 from meshmatch.render.viewer.packing import to_bytes
 from meshmatch.render.viewer.skins import make_skin
 from meshmatch.shapes.appearance import Appearance
-from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import LINEAR_OF_BYTE, to_srgb
 
 SideName = Literal["source", "target"]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch import __version__
+from meshmatch.arrays import Floats
 from meshmatch.errors import OptionError
 from meshmatch.outputs import replace_on_success
 from meshmatch.render.colors import CLAY
@@ -17,7 +18,7 @@ from meshmatch.render.viewer.drawn import MOST, draw
 from meshmatch.render.viewer.packing import pack, small_integers, to_bytes, to_shorts, to_signed_bytes
 from meshmatch.render.viewer.page import assemble, check_page, plain_text
 from meshmatch.shapes.duplicates import seams
-from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.shape import Shape
 
 MOST_PLACES = 4_000_000
 """Vertices times frames up to which a shape is drawn whole."""

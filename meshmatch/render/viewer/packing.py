@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.shapes.shape import Floats
+from meshmatch.arrays import Floats
 
 _KINDS = {
     "u1": "Uint8Array",

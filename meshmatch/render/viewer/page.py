@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch import __version__
+from meshmatch.arrays import Floats
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import replace_on_success
@@ -27,7 +28,7 @@ from meshmatch.render.viewer.drawn import MOST, Drawn, draw
 from meshmatch.render.viewer.looks import Looks, dress
 from meshmatch.render.viewer.packing import pack, small_integers, to_bytes, to_shorts, to_signed_bytes
 from meshmatch.render.viewer.placement import Box, boxes, upright
-from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.direction import check_map
 
 PAGE_SUFFIXES = (".html", ".htm")

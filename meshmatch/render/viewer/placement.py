@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Floats
+from meshmatch.geometry.topology import edges_of
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import facing, facing_alike
 from meshmatch.render.viewer.drawn import Drawn
-from meshmatch.shapes.shape import Floats, Shape
-from meshmatch.shapes.topology import edges_of
+from meshmatch.shapes.shape import Shape
 
 _PAIRS = 20_000
 _ODD = 3.0  # more than this between the sizes drawn, and the map is no guide to them

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from meshmatch.arrays import Floats
 from meshmatch.errors import InputError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.viewer.looks import Looks
 from meshmatch.shapes.appearance import Appearance, Material
-from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.bake import Choices
 from meshmatch.transfer.texture import colors_of_vertices, transfer_texture
 from meshmatch.transfer.unwrap import atlas_of

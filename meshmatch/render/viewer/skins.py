@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from meshmatch.arrays import Ints
+from meshmatch.geometry.topology import same_rows
 from meshmatch.render.viewer.packing import small_integers, to_bytes
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.images import Pixels, png_bytes
-from meshmatch.shapes.shape import Ints
 from meshmatch.shapes.srgb import to_srgb
-from meshmatch.shapes.topology import same_rows
 
 LARGEST = 2048
 """Pixels along an image's longer side; a larger one is made smaller."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.arrays import read_npy as read_array
+from meshmatch.shapes.array_files import read_npy as read_array
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged
 from meshmatch.shapes.formats.text import columns, numbers, words_per_line
 from meshmatch.shapes.shape import Shape

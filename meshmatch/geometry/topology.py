@@ -1,12 +1,17 @@
 """Which rows, edges and faces belong together: sorting instead of loops, for a million of them."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.shapes.shape import Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 
+# Neighbours are discontinuous if their images are further apart than this (sqrt(area)) plus so many times their own
+# distance. Set by hand.
+_GAP, _STRETCH = 0.06, 3.0
 _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 
 
@@ -133,3 +138,13 @@ def _hash(rows: NDArray[np.float64] | Ints) -> NDArray[np.uint64]:
         total *= _MIX[k % 3]
         total ^= total >> np.uint64(29)
     return total
+
+
+def is_discontinuous(
+    here: Float[Floats, "N 3"], there: Float[Floats, "N 3"], length: Float[Floats, " N"]
+) -> Bool[Bools, " N"]:
+    """Whether images of neighbours lie much further apart than the neighbours do, as at a tear of the map.
+
+    ``length`` is the distance of the neighbours; all are in units of sqrt(area).
+    """
+    return np.asarray(np.linalg.norm(here - there, axis=1) >= _GAP + _STRETCH * length)

@@ -1,0 +1,1 @@
+"""Geometry of plain arrays: frames, triangles, oriented points, topology."""

@@ -1,0 +1,136 @@
+"""Similarities between coordinate systems, rigid poses, and the best rigid motion between points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from meshmatch.arrays import Float, Floats, read_only
+from meshmatch.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A similarity: the way from a file's own coordinates into a model's, and back.
+
+    Parameters
+    ----------
+    scale : float
+        Length in the file that becomes 1. Positive.
+    rotation : (3, 3) float64
+        Applied after centering; orthonormal, determinant +1.
+    center : (3,) float64
+        The file's point that becomes the origin.
+    """
+
+    scale: float
+    rotation: Float[Floats, "3 3"]
+    center: Float[Floats, 3]
+
+    def __post_init__(self) -> None:
+        rotation = read_only(self.rotation, np.float64, "a frame's rotation")
+        center = read_only(self.center, np.float64, "a frame's center")
+        if rotation.shape != (3, 3) or center.shape != (3,):
+            raise InputError(
+                f"a frame needs a (3, 3) rotation and a (3,) center, not {rotation.shape}, {center.shape}"
+            )
+        if not (np.isfinite(self.scale) and self.scale > 0 and np.isfinite(center).all()):
+            raise InputError(
+                f"a frame's scale must be positive and finite, not {self.scale}", "has the shape any size?"
+            )
+        proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
+        if not proper:
+            raise InputError("a frame's rotation must be orthonormal with determinant +1")
+        object.__setattr__(self, "scale", float(self.scale))
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "center", center)
+
+    @classmethod
+    def identity(cls) -> Frame:
+        """The frame that changes nothing."""
+        return cls(1.0, np.eye(3), np.zeros(3))
+
+    def apply(self, points: ArrayLike) -> Float[Floats, "... 3"]:
+        """Points (..., 3) of the file, in the model's frame: ``((points - center) @ rotation.T) / scale``."""
+        return ((np.asarray(points, np.float64) - self.center) @ self.rotation.T) / self.scale
+
+    def undo(self, points: ArrayLike) -> Float[Floats, "... 3"]:
+        """Points (..., 3) of the model's frame, back in the file's."""
+        return (np.asarray(points, np.float64) * self.scale) @ self.rotation + self.center
+
+    def apply_vectors(self, vectors: ArrayLike) -> Float[Floats, "... 3"]:
+        """Displacements (..., 3) of the file, in the model's frame: turned and scaled, not moved."""
+        return (np.asarray(vectors, np.float64) @ self.rotation.T) / self.scale
+
+    def undo_vectors(self, vectors: ArrayLike) -> Float[Floats, "... 3"]:
+        """Displacements (..., 3) of the model's frame, back in the file's."""
+        return (np.asarray(vectors, np.float64) * self.scale) @ self.rotation
+
+    def compose(self, outer: Frame) -> Frame:
+        """This frame first, then `outer`: ``self.compose(outer).apply(x) = outer.apply(self.apply(x))``."""
+        return Frame(self.scale * outer.scale, outer.rotation @ self.rotation, self.undo(outer.center))
+
+
+@dataclass(frozen=True, eq=False)
+class RigidPose:
+    """Where a body's own (local) coordinates lie in the world: world = rotation local + center.
+
+    Parameters
+    ----------
+    rotation : (3, 3) float64
+        Orthonormal, determinant +1.
+    center : (3,) float64
+        The world's point that is the local origin.
+    """
+
+    rotation: Float[Floats, "3 3"]
+    center: Float[Floats, 3]
+
+    @classmethod
+    def identity(cls) -> RigidPose:
+        """Local coordinates that are the world's."""
+        return cls(np.eye(3), np.zeros(3))
+
+    def to_local(self, points: Float[Floats, "... 3"]) -> Float[Floats, "... 3"]:
+        """Points of the world in local coordinates."""
+        return (points - self.center) @ self.rotation
+
+    def to_world(self, points: Float[Floats, "... 3"]) -> Float[Floats, "... 3"]:
+        """Points of local coordinates in the world."""
+        return points @ self.rotation.T + self.center
+
+    def __matmul__(self, inner: RigidPose) -> RigidPose:
+        """The pose of what has pose ``inner`` in this pose's local coordinates."""
+        return RigidPose(self.rotation @ inner.rotation, self.rotation @ inner.center + self.center)
+
+    @property
+    def frame(self) -> Frame:
+        """The same as a `Frame` from the world into local coordinates."""
+        return Frame(1.0, self.rotation.T, self.center)
+
+    def angle_to(self, other: RigidPose) -> float:
+        """Angle between the rotations of two poses, degrees."""
+        cosine = (np.trace(self.rotation.T @ other.rotation) - 1) / 2
+        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def kabsch(
+    source: Float[Floats, "N 3"], target: Float[Floats, "N 3"], weights: Float[Floats, " N"] | None = None
+) -> RigidPose:
+    """Best rigid motion by least squares (Kabsch 1976): ``pose.to_world(source)`` is close to ``target``.
+
+    Weights are not negative; without them all points count the same.
+    """
+    if weights is None:
+        a, b = source.mean(0), target.mean(0)
+        spread = (target - b).T @ (source - a)
+    else:
+        weights = weights / max(weights.sum(), 1e-30)
+        a, b = weights @ source, weights @ target
+        spread = (target - b).T @ (weights[:, None] * (source - a))
+    U, _, Vh = np.linalg.svd(spread)
+    U[:, 2] *= np.sign(np.linalg.det(U @ Vh))
+    R = U @ Vh
+    return RigidPose(R, b - R @ a)

@@ -1,0 +1,85 @@
+"""Points with normals, and trees in which surfaces back to back are apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.geometry.frames import RigidPose
+
+# How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area). Set by hand.
+NORMAL_WEIGHT = 0.15
+# The same where points are paired for refinement: sheets are apart by then, and a normal that bends a little more must
+# not drag its point along the surface.
+PAIR_WEIGHT = 0.06
+# Points that far from a reference learn nothing from it about their normals.
+_REACH = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class OrientedPoints:
+    """Samples of a surface: points with unit normals.
+
+    Parameters
+    ----------
+    points, normals : (P, 3) float64
+    signed : bool
+        False if the normals are estimated, as a cloud's are: which side is out is then a guess, wrong for whole regions
+        where points are few and noisy.
+    weights : (P,) float64, optional
+        How far each point is trusted: 1 fully, 0 not at all.
+    """
+
+    points: Float[Floats, "P 3"]
+    normals: Float[Floats, "P 3"]
+    signed: bool = True
+    weights: Float[Floats, " P"] | None = None
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Over points and normals together, see `with_normals`."""
+        return cKDTree(with_normals(self.points, self.normals))
+
+    @cached_property
+    def pair_tree(self) -> cKDTree:
+        """The same, normals counting less (`PAIR_WEIGHT`)."""
+        return cKDTree(with_normals(self.points, self.normals, PAIR_WEIGHT))
+
+    def to_local(self, pose: RigidPose) -> OrientedPoints:
+        """The same samples in the local coordinates of a pose."""
+        return replace(self, points=pose.to_local(self.points), normals=self.normals @ pose.rotation)
+
+    def first(self, count: int) -> OrientedPoints:
+        """The first samples."""
+        return self._rows(slice(count))
+
+    def thinned(self, P: int) -> OrientedPoints:
+        """About P of the samples, evenly taken from their order, which must be random."""
+        return self._rows(slice(None, None, max(1, len(self.points) // P)))
+
+    def facing(self, points: Float[Floats, "N 3"], normals: Float[Floats, "N 3"]) -> OrientedPoints:
+        """The same samples; normals without a sure sign are turned to agree with those of the nearest points given."""
+        if self.signed:
+            return self
+        tree = cKDTree(with_normals(points, normals))
+        out, back = (
+            tree.query(with_normals(self.points, sign * self.normals), distance_upper_bound=_REACH)[0]
+            for sign in (1, -1)
+        )
+        turned = np.where((back < out)[:, None], -self.normals, self.normals)
+        return replace(self, normals=turned, signed=True)
+
+    def _rows(self, rows: slice) -> OrientedPoints:
+        weights = None if self.weights is None else self.weights[rows]
+        return replace(self, points=self.points[rows], normals=self.normals[rows], weights=weights)
+
+
+def with_normals(
+    points: Float[Floats, "P 3"], normals: Float[Floats, "P 3"], weight: float = NORMAL_WEIGHT
+) -> Float[Floats, "P 6"]:
+    """Six-dimensional positions in which surfaces back to back are apart."""
+    return np.concatenate([points, weight * normals], 1)

@@ -1,0 +1,48 @@
+"""Points with normals: moved, thinned, turned to face as others do."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from meshmatch.geometry.frames import RigidPose
+from meshmatch.geometry.oriented import NORMAL_WEIGHT, OrientedPoints, with_normals
+from meshmatch.geometry.topology import is_discontinuous
+
+
+def ball(signed: bool = True) -> OrientedPoints:
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return OrientedPoints(points, points.copy(), signed, np.linspace(0, 1, 300))
+
+
+def test_a_pose_moves_points_and_turns_normals() -> None:
+    pose = RigidPose(Rotation.from_rotvec([0, 0, 1.0]).as_matrix(), np.array([1.0, 0, 0]))
+    moved = ball().to_local(pose)
+    assert np.allclose(pose.to_world(moved.points), ball().points)
+    assert np.allclose(moved.normals @ pose.rotation.T, ball().normals)
+    assert moved.weights is not None and moved.weights[-1] == 1
+
+
+def test_thinning_keeps_every_third_with_its_weight() -> None:
+    thin = ball().thinned(100)
+    assert np.array_equal(thin.points, ball().points[::3])
+    assert thin.weights is not None and np.array_equal(thin.weights, np.linspace(0, 1, 300)[::3])
+    assert np.array_equal(ball().first(7).normals, ball().normals[:7])
+
+
+def test_normals_back_to_back_are_apart() -> None:
+    here = np.zeros((1, 3))
+    up = np.array([[0.0, 0, 1]])
+    assert np.allclose(np.linalg.norm(with_normals(here, up) - with_normals(here, -up)), 2 * NORMAL_WEIGHT)
+
+
+def test_unsigned_normals_face_as_their_surroundings_do() -> None:
+    wrong = OrientedPoints(ball().points, -ball().normals, signed=False)
+    turned = wrong.facing(ball().points, ball().normals)
+    assert turned.signed and np.allclose(turned.normals, ball().normals)
+    sure = OrientedPoints(ball().points, -ball().normals)
+    assert sure.facing(ball().points, ball().normals) is sure
+
+
+def test_images_far_apart_of_near_neighbours_are_discontinuous() -> None:
+    here, there = np.zeros((3, 3)), np.array([[0.08, 0, 0], [0.1, 0, 0], [0.1, 0, 0]])
+    assert is_discontinuous(here, there, np.array([0.01, 0.01, 0.02])).tolist() == [False, True, False]

@@ -1,0 +1,62 @@
+"""Areas, normals and values of triangles; the closest point against a search."""
+
+import numpy as np
+import pytest
+
+from meshmatch.geometry.triangles import (
+    blend,
+    closest_on_triangles,
+    cross_product,
+    interpolate,
+    squared_lengths,
+    triangle_areas,
+    triangle_normals,
+    vertex_areas,
+    vertex_normals,
+)
+
+# A right triangle of area 2 in the plane z = 0, and one of area 6 upright on its long side.
+VERTS = np.array([[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, -6]])
+FACES = np.array([[0, 1, 2], [1, 0, 3]])
+
+
+def test_areas_and_normals_by_hand() -> None:
+    assert np.allclose(triangle_areas(VERTS, FACES), [2, 6])
+    assert np.allclose(triangle_normals(VERTS, FACES), [[0, 0, 1], [0, -1, 0]])
+    assert np.allclose(vertex_areas(VERTS, FACES), [8 / 3, 8 / 3, 2 / 3, 2])
+    mean = np.array([0.0, -3, 1]) / np.sqrt(10)  # area-weighted
+    assert np.allclose(vertex_normals(VERTS, FACES), [mean, mean, [0, 0, 1], [0, -1, 0]])
+
+
+def test_a_flat_triangle_and_a_lone_vertex_have_no_normal() -> None:
+    verts = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 9, 9]])
+    assert not triangle_normals(verts, np.array([[0, 1, 2]])).any()
+    assert not vertex_normals(verts, np.array([[0, 1, 2]])).any()
+    assert vertex_areas(verts, np.array([[0, 1, 2]])).tolist() == [0, 0, 0, 0]
+
+
+def test_products_agree_with_numpys() -> None:
+    a, b = np.random.default_rng(0).normal(size=(2, 50, 3))
+    assert np.allclose(cross_product(a, b), np.cross(a, b))
+    assert np.allclose(squared_lengths(a), np.linalg.norm(a, axis=1) ** 2)
+
+
+def test_values_between_corners() -> None:
+    weights = np.array([[0.5, 0.5, 0], [0, 0, 1]])
+    assert np.allclose(interpolate(VERTS, FACES, weights), [[1, 0, 0], [0, 0, -6]])
+    assert np.allclose(blend(VERTS[FACES], weights), [[1, 0, 0], [0, 0, -6]])
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_no_point_of_the_triangle_is_closer(flat: bool) -> None:
+    rng = np.random.default_rng(4)
+    corners = rng.normal(size=(40, 3, 3))
+    if flat:
+        corners[:, 2] = 0.3 * corners[:, 0] + 0.7 * corners[:, 1]
+    points = 2 * rng.normal(size=(40, 3))
+    weights = closest_on_triangles(points, *corners.swapaxes(0, 1))
+    assert (weights >= -1e-12).all() and np.allclose(weights.sum(1), 1)
+    distance = np.linalg.norm(blend(corners, weights) - points, axis=1)
+    tried = rng.dirichlet(np.ones(3), 500)
+    nearest = np.linalg.norm(np.einsum("tk,nkd->ntd", tried, corners) - points[:, None], axis=2).min(1)
+    assert (distance <= nearest + 1e-9).all()
