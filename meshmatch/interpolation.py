@@ -136,7 +136,7 @@ def interpolate(
         The user's files or choices; see `meshmatch.errors`.
     """
     began = time.monotonic()
-    check_choices(frames, start, stop, mesh, place)
+    check_bake_options(frames, start, stop, mesh, place)
     loaded = read_model(model)
     shapes = [as_shape(shape) for shape in (source, *through, target)]
     clean = [usable(shape) for shape in shapes]
@@ -207,7 +207,7 @@ def save_folder(path: str | Path, result: Interpolation, kind: str = "ply") -> l
     return names
 
 
-def check_choices(frames: int, start: float, stop: float, mesh: str, place: str) -> None:
+def check_bake_options(frames: int, start: float, stop: float, mesh: str, place: str) -> None:
     """Refuse what no sequence can be made of (`OptionError`)."""
     if frames < 2:
         raise OptionError(f"{frames} shapes are no sequence", "ask for at least 2")

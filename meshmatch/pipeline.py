@@ -27,7 +27,7 @@ from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import set_threads
-from meshmatch.transfer.direction import check_map, pull_back
+from meshmatch.transfer.inverse_map import check_map, invert_map
 
 # What is going on, on which shape, and which share of it is done.
 Progress = Callable[[str, str, float], None]
@@ -127,7 +127,7 @@ def match(
         fits, known = honour_pairs(loaded, clean, fits, landmarks, config)
     alone = (fits[0], fits[1])
     fits = agreed_fits(loaded, [part.shape for part in clean], fits, config, known)
-    found = build_map(clean[0], fits[0], clean[1], fits[1], workers=workers, alone=alone)
+    found = build_map(clean[0], fits[0], clean[1], fits[1], workers=workers, before_agreement=alone)
     notes = tuple(
         f"{shape.name}: {note}" for shape, part in zip(shapes, clean, strict=True) for note in part.notes
     )
@@ -188,7 +188,9 @@ def map_between(
         shapes = [usable(shape).shape for shape in (source, target)]
         fits = agreed_fits(read_model(model), shapes, fits, FitConfig(seed=source_fit.seed))
     alone = (source_fit, target_fit)
-    return build_map(usable(source), fits[0], usable(target), fits[1], workers=workers, alone=alone)
+    return build_map(
+        usable(source), fits[0], usable(target), fits[1], workers=workers, before_agreement=alone
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +244,7 @@ def carry(
         found = map if isinstance(map, VertexMap) else load_map(map)
         label = "the map" if isinstance(map, VertexMap) else Path(map).name
         forward = check_map(found, source, target, label)
-        return CarryResult(pull_back(forward, source, target, workers), forward, None)
+        return CarryResult(invert_map(forward, source, target, workers), forward, None)
     result = match(
         source,
         target,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from meshmatch.pipeline import MatchResult
     from meshmatch.render.carried import Scene
     from meshmatch.shapes.shape import Shape
-    from meshmatch.transfer.low_confidence import Doubt
+    from meshmatch.transfer.low_confidence import LowConfidence
 
 Source = Annotated[Path, typer.Argument(metavar="SRC", help="The shape that has it.")]
 Target = Annotated[Path, typer.Argument(metavar="TGT", help="The shape that gets it.")]
@@ -161,10 +161,10 @@ def _from_file(request: Request, source: "Shape", target: "Shape") -> Maps | Non
     if request.map is None:
         return None
     from meshmatch.maps.files import load_map
-    from meshmatch.transfer.direction import check_map, pull_back
+    from meshmatch.transfer.inverse_map import check_map, invert_map
 
     forward = check_map(load_map(request.map), source, target, request.map.name)
-    return Maps(pull_back(forward, source, target, request.threads), forward)
+    return Maps(invert_map(forward, source, target, request.threads), forward)
 
 
 def _by_matching(request: Request, voice: Console, source: "Shape", target: "Shape") -> Maps:
@@ -216,7 +216,7 @@ def map_record(request: Request, result: Maps, used: "VertexMap") -> dict[str, A
     return record
 
 
-def tell_doubt(voice: Console, doubt: "Doubt", least: float, what: str = "vertices") -> None:
+def tell_doubt(voice: Console, doubt: "LowConfidence", least: float, what: str = "vertices") -> None:
     """How much was in doubt, and what became of it, in words."""
     if not doubt.low:
         return
@@ -233,7 +233,7 @@ def tell_doubt(voice: Console, doubt: "Doubt", least: float, what: str = "vertic
     )
 
 
-def doubt_record(doubt: "Doubt", least: float) -> dict[str, Any]:
+def doubt_record(doubt: "LowConfidence", least: float) -> dict[str, Any]:
     """The same for --json."""
     return {
         "min_confidence": least,

@@ -36,10 +36,12 @@ def info(
 
 
 def _reader(file: Path) -> Callable[[Path], Record]:
+    from meshmatch.maps import MAP_SUFFIXES
+
     suffix = file.suffix.lower()
     if suffix == ".safetensors":
         return _template
-    if suffix in (".npz", ".csv", ".txt", ".mat", ".json") or (suffix == ".npy" and _is_list(file)):
+    if suffix in MAP_SUFFIXES and (suffix != ".npy" or _is_list(file)):
         return _map
     return _shape
 

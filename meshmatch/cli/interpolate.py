@@ -100,7 +100,7 @@ def interpolate(
         locate_model(model)
         from meshmatch import interpolation
 
-        interpolation.check_choices(frames, start, stop, mesh, place)
+        interpolation.check_bake_options(frames, start, stop, mesh, place)
         shapes = [load_shape(file) for file in files]
         with voice.progress() as report:
             result = interpolation.interpolate(

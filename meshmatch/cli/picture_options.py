@@ -174,7 +174,7 @@ def _clay(shape: "Shape") -> "np.ndarray":
 def _of_map(asked: Asked, subjects: list[Subject], names: tuple[str, str], look: "Look") -> Drawn:
     from meshmatch.maps.files import load_map
     from meshmatch.render import matched
-    from meshmatch.transfer.direction import check_map
+    from meshmatch.transfer.inverse_map import check_map
 
     assert asked.map is not None
     source, target = subjects[0].shape, subjects[1].shape

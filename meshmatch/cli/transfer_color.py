@@ -57,8 +57,8 @@ def transfer_color(
     from meshmatch.errors import OptionError
     from meshmatch.shapes.files import load_shape
     from meshmatch.transfer import colors
-    from meshmatch.transfer.attributes import carry_values
-    from meshmatch.transfer.low_confidence import resolve_values
+    from meshmatch.transfer.attributes import pull_values
+    from meshmatch.transfer.low_confidence import replace_low_values
     from meshmatch.transfer.value_files import (
         Values,
         check_values_suffix,
@@ -85,8 +85,8 @@ def transfer_color(
         if empty is not None and values is None:
             empty = colors.light(empty)
         result = carrying.find_maps(request, voice, a, b)
-        carried = carry_values(result.back, a, given.numbers)
-        carried, doubt = resolve_values(
+        carried = pull_values(result.back, a, given.numbers)
+        carried, doubt = replace_low_values(
             carried, result.back.confidence.astype(np.float64), b, min_confidence, empty, fill
         )
         if values is None:

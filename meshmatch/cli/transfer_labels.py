@@ -63,10 +63,10 @@ def transfer_labels(
 
     from meshmatch.errors import OptionError
     from meshmatch.shapes.files import load_shape
-    from meshmatch.transfer.attributes import carry_labels
-    from meshmatch.transfer.face_labels import carry_face_labels, of_faces
+    from meshmatch.transfer.attributes import pull_labels
+    from meshmatch.transfer.face_labels import of_faces, pull_face_labels
     from meshmatch.transfer.label_files import check_labels_suffix, load_labels, named, save_labels
-    from meshmatch.transfer.low_confidence import resolve_labels
+    from meshmatch.transfer.low_confidence import replace_low_labels
 
     request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
     carrying.check_request(request, fill, blank)
@@ -84,11 +84,11 @@ def transfer_labels(
         result = carrying.find_maps(request, voice, a, b)
         confidence = result.back.confidence.astype(np.float64)
         if kind == "faces":
-            found = carry_face_labels(result.back, a, b, given.codes, given.on == "faces", threads)
+            found = pull_face_labels(result.back, a, b, given.codes, given.on == "faces", threads)
             confidence = of_faces(confidence, b)
         else:
-            found = carry_labels(result.back, a, given.codes, given.on == "faces")
-        found, doubt = resolve_labels(
+            found = pull_labels(result.back, a, given.codes, given.on == "faces")
+        found, doubt = replace_low_labels(
             found, confidence, b, min_confidence, blank is not None, fill, kind == "faces"
         )
         carried = named(found, given, kind, blank)

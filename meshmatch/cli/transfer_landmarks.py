@@ -48,7 +48,7 @@ def transfer_landmarks(
 
     from meshmatch.shapes.files import load_shape
     from meshmatch.transfer.landmark_files import check_landmarks_suffix, load_landmarks, save_landmarks
-    from meshmatch.transfer.landmarks import carry_landmarks
+    from meshmatch.transfer.landmarks import push_landmarks
 
     request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
     carrying.check_request(request)
@@ -64,7 +64,7 @@ def transfer_landmarks(
                 "of its size: the nearest point of the surface was taken"
             )
         result = carrying.find_maps(request, voice, a, b)
-        found = carry_landmarks(result.forward, a, b, given)
+        found = push_landmarks(result.forward, a, b, given)
         save_landmarks(temporary, found)
     low = np.flatnonzero(found.confidence < min_confidence)
     for k in low[:10].tolist():

@@ -13,7 +13,7 @@ from meshmatch.cli.console import Console, print_json
 if TYPE_CHECKING:
     from meshmatch.shapes.appearance import Appearance
     from meshmatch.shapes.shape import Shape
-    from meshmatch.transfer.bake import Choices
+    from meshmatch.transfer.bake import BakeOptions
     from meshmatch.transfer.unwrap import Atlas
 
 
@@ -98,13 +98,13 @@ def transfer_texture(
     from meshmatch.shapes.appearance import load_appearance
     from meshmatch.shapes.files import load_shape
     from meshmatch.shapes.textured_files import files_of
-    from meshmatch.transfer.bake import Choices
-    from meshmatch.transfer.texture import check_choices
+    from meshmatch.transfer.bake import BakeOptions
+    from meshmatch.transfer.texture import check_bake_options
 
     request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
     carrying.check_request(request, fill, blank)
-    choices = Choices(size, samples, padding, min_confidence, fill, _color(blank), threads)
-    check_choices(choices)
+    choices = BakeOptions(size, samples, padding, min_confidence, fill, _color(blank), threads)
+    check_bake_options(choices)
     _check_suffix(output)
     voice = Console(quiet)
     a, b = load_shape(source), load_shape(target)
@@ -192,21 +192,21 @@ def _paint(
     shapes: "tuple[Shape, Shape]",
     look: "Appearance",
     result: carrying.Maps,
-    choices: "Choices",
+    choices: "BakeOptions",
     voice: Console,
 ) -> dict[str, Any]:
     """Write the target with vertex colours."""
     import numpy as np
 
     from meshmatch.transfer import colors
-    from meshmatch.transfer.low_confidence import resolve_values
+    from meshmatch.transfer.low_confidence import replace_low_values
     from meshmatch.transfer.texture import colors_of_vertices
 
     source, target = shapes
     found = colors_of_vertices(source, look, target, result.back)
     empty = None if choices.blank is None else colors.light(np.array(choices.blank))
     confidence = result.back.confidence.astype(np.float64)
-    found, doubt = resolve_values(found, confidence, target, choices.min_confidence, empty, choices.fill)
+    found, doubt = replace_low_values(found, confidence, target, choices.min_confidence, empty, choices.fill)
     colors.save(path, target, found)
     carrying.tell_doubt(voice, doubt, choices.min_confidence)
     return carrying.doubt_record(doubt, choices.min_confidence)
@@ -219,7 +219,7 @@ def _bake(
     look: "Appearance",
     result: carrying.Maps,
     atlas: "Atlas",
-    choices: "Choices",
+    choices: "BakeOptions",
     voice: Console,
 ) -> dict[str, Any]:
     """Write the target with a texture."""

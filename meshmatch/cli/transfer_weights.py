@@ -48,8 +48,8 @@ def transfer_weights(
 
     from meshmatch.errors import InputError
     from meshmatch.shapes.files import load_shape
-    from meshmatch.transfer.attributes import carry_weights
-    from meshmatch.transfer.low_confidence import resolve_weights
+    from meshmatch.transfer.attributes import pull_weights
+    from meshmatch.transfer.low_confidence import replace_low_weights
     from meshmatch.transfer.weight_files import SkinWeights, check_weights_suffix, load_weights, save_weights
 
     request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
@@ -64,8 +64,8 @@ def transfer_weights(
         given = load_weights(weights or source, a)
         result = carrying.find_maps(request, voice, a, b)
         confidence = result.back.confidence.astype(np.float64)
-        carried = carry_weights(result.back, a, given.matrix, influences)
-        carried, doubt = resolve_weights(carried, confidence, b, min_confidence, fill, influences)
+        carried = pull_weights(result.back, a, given.matrix, influences)
+        carried, doubt = replace_low_weights(carried, confidence, b, min_confidence, fill, influences)
         save_weights(temporary, SkinWeights(carried, given.names))
     carrying.tell_doubt(voice, doubt, min_confidence)
     bare = int((np.diff(carried.indptr) == 0).sum())

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.evaluate import CM_PER_UNIT
-from meshmatch.maps.template_footpoints import place
+from meshmatch.maps.template_footpoints import template_footpoints
 from meshmatch.outputs import make_folder
 from meshmatch.pipeline import as_shape, read_model, register, usable
 from meshmatch.render.figures import Panel
@@ -37,7 +37,7 @@ _FAR_CM = 5.0
 
 def scan_panels(name: str, shape: Shape, fit: Fit, labels: np.ndarray) -> list[Panel]:
     """A scan, coloured by the parts (V_template,) where its vertices belong, and the template as it lies on it."""
-    belongs = place(shape, fit)[1]
+    belongs = template_footpoints(shape, fit)[1]
     part = labels[cKDTree(fit.resting).query(belongs)[1]]
     laid = Shape(fit.frame.undo(fit.points), fit.faces, name)
     turn = fit.frame.rotation

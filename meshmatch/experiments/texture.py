@@ -47,11 +47,11 @@ from meshmatch.shapes.srgb import to_srgb
 from meshmatch.shapes.textured_files import save_textured
 from meshmatch.templates.location import bundled_folder
 from meshmatch.threads import set_threads
-from meshmatch.transfer.bake import Choices
+from meshmatch.transfer.bake import BakeOptions
 from meshmatch.transfer.mapped_mesh import MappedMesh
 from meshmatch.transfer.material_sampler import MaterialSampler
 from meshmatch.transfer.surface_walk import SurfaceWalker
-from meshmatch.transfer.texture import Worn, transfer_texture
+from meshmatch.transfer.texture import BakedMesh, transfer_texture
 from meshmatch.transfer.unwrap import atlas_of
 
 POINTS = 200_000
@@ -133,20 +133,20 @@ def colors_at(shape: Shape, look: Appearance, points: Floats) -> Floats:
     return np.asarray(to_srgb(found[:3].T))
 
 
-def look_of(worn: Worn) -> Appearance:
+def look_of(worn: BakedMesh) -> Appearance:
     """The look that a baked texture gives."""
     material = Material(image=worn.baked.image, alpha=worn.baked.alpha, wrap=("clamp", "clamp"))
     return Appearance((material,), np.zeros(len(worn.mesh.faces), np.int64), worn.mesh.uv)
 
 
-def measure(name: str, trip: Trip, choices: Choices, keep: Path | None) -> dict[str, object]:
+def measure(name: str, trip: Trip, choices: BakeOptions, keep: Path | None) -> dict[str, object]:
     """Carry there and back, and compare."""
     rng = np.random.default_rng(0)
     samples = sample_surface(trip.source, POINTS, rng).points
 
     def carried(
         source: Shape, look: Appearance, target: Shape, back: VertexMap, own: Floats | None = None
-    ) -> Worn:
+    ) -> BakedMesh:
         atlas = atlas_of(target, own, choices.size, choices.padding)
         return transfer_texture(source, look, target, back, atlas, choices)
 
@@ -194,7 +194,7 @@ def clock(folder: Path, threads: int) -> dict[str, object]:
 
 
 def run(
-    cases: Sequence[str], folder: Path, choices: Choices, keep: Path | None, timed: bool
+    cases: Sequence[str], folder: Path, choices: BakeOptions, keep: Path | None, timed: bool
 ) -> dict[str, object]:
     """Measure cases by name; prints a table and a JSON line, whose record is returned too."""
     kept = keep_to_cores(2)
@@ -242,7 +242,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
     parser.add_argument("--size", type=int, default=2048, help="texels a side [%(default)s]")
     parser.add_argument(
-        "--samples", type=int, default=Choices().samples, help="as of the command [%(default)s]"
+        "--samples", type=int, default=BakeOptions().samples, help="as of the command [%(default)s]"
     )
     parser.add_argument("--threads", type=int, default=2, help="of baking [%(default)s]")
     parser.add_argument("--keep", type=Path, help="a folder for the textured shapes, to look at them")
@@ -254,7 +254,7 @@ def main(words: Sequence[str] | None = None) -> int:
     if options.threads < 1:
         parser.error("--threads begins at 1")
     set_threads(1)
-    choices = replace(Choices(), size=options.size, samples=options.samples, workers=options.threads)
+    choices = replace(BakeOptions(), size=options.size, samples=options.samples, workers=options.threads)
 
     def work() -> None:
         if options.keep is not None:

@@ -1,6 +1,4 @@
-"""Maps between shapes: the noun, its files, its distances and its errors. Arrays in, arrays out."""
+"""Maps between shapes: the type, its files, geodesic distances and errors. Arrays only, no torch."""
 
-from meshmatch.maps.files import MAP_SUFFIXES, load_map, save_map
-from meshmatch.maps.vertex_map import VertexMap
-
-__all__ = ["MAP_SUFFIXES", "VertexMap", "load_map", "save_map"]
+MAP_SUFFIXES = (".npy", ".npz", ".csv", ".txt", ".mat", ".json")
+"""What `meshmatch.maps.files` reads and writes; here, because a command asks before it loads NumPy."""

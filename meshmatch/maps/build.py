@@ -7,13 +7,13 @@ import numpy as np
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.triangles import unit, vertex_normals
-from meshmatch.maps.scatter import expected, is_scattered, land, noise_of
+from meshmatch.maps.noisy_clouds import expectation, is_noisy, most_likely_points, noise_level
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.maps.template_footpoints import (
     at_footpoints,
-    closest,
+    closest_footpoints,
     in_core_frame,
-    place,
+    template_footpoints,
 )
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.repair import Repaired
@@ -34,7 +34,7 @@ def build_map(
     target: Repaired,
     target_fit: Fit,
     workers: int = 1,
-    alone: tuple[Fit, Fit] | None = None,
+    before_agreement: tuple[Fit, Fit] | None = None,
 ) -> VertexMap:
     """Carry every source vertex through the template to the target.
 
@@ -46,7 +46,7 @@ def build_map(
     ----------
     source, target : Repaired
         The shapes as they were fitted; the map is of their *original* vertices.
-    alone : (Fit, Fit), optional
+    before_agreement : (Fit, Fit), optional
         Both fits before they agreed on how the template stretches: where that moved them much, confidence is low.
 
     Raises
@@ -60,8 +60,10 @@ def build_map(
             "fit both shapes with the same model",
         )
     landed, confidence = carry(source.shape, source_fit, target.shape, target_fit, workers)
-    if alone is not None:
-        confidence = confidence * steadiness(source.shape, (source_fit, target_fit), alone, workers)
+    if before_agreement is not None:
+        confidence = confidence * agreement_confidence(
+            source.shape, (source_fit, target_fit), before_agreement, workers
+        )
     worst = max(source_fit, target_fit, key=lambda fit: _ORDER[fit.verdict])
     if worst.verdict == "poor":
         confidence = _POOR * confidence
@@ -89,27 +91,29 @@ def carry(
     source: Shape, source_fit: Fit, target: Shape, target_fit: Fit, workers: int = 1
 ) -> tuple[Footpoints, np.ndarray]:
     """Where on the target every source vertex lands, and a confidence in 0..1."""
-    if is_scattered(source):
-        foot = closest(source, source_fit, workers)
-        points, noise = in_core_frame(source, source_fit)[0], noise_of(foot.distance)
-        (moved, belongs), _ = expected(points, source_fit, noise, [target_fit.points, source_fit.resting])
+    if is_noisy(source):
+        foot = closest_footpoints(source, source_fit, workers)
+        points, noise = in_core_frame(source, source_fit)[0], noise_level(foot.distance)
+        (moved, belongs), _ = expectation(points, source_fit, noise, [target_fit.points, source_fit.resting])
     else:
-        foot, belongs = place(source, source_fit, workers)
+        foot, belongs = template_footpoints(source, source_fit, workers)
         moved = at_footpoints(foot, source_fit.faces, target_fit.points)
-    if is_scattered(target):
-        noise = noise_of(closest(target, target_fit, workers).distance)
-        landed = land(target, target_fit, noise, moved, belongs, workers)
+    if is_noisy(target):
+        noise = noise_level(closest_footpoints(target, target_fit, workers).distance)
+        landed = most_likely_points(target, target_fit, noise, moved, belongs, workers)
     else:
         landed = _closest(foot, source_fit, moved, belongs, target, target_fit, workers)
     confidence = np.exp(-np.square(foot.distance / _FIT_SCALE) - np.square(landed.distance / _FIT_SCALE))
     return landed, confidence
 
 
-def steadiness(source: Shape, fits: tuple[Fit, Fit], alone: tuple[Fit, Fit], workers: int = 1) -> np.ndarray:
+def agreement_confidence(
+    source: Shape, fits: tuple[Fit, Fit], before_agreement: tuple[Fit, Fit], workers: int = 1
+) -> np.ndarray:
     """How little (V,), in 0..1, the two fits moved under each source vertex when they had to agree."""
-    foot = place(source, fits[0], workers)[0]
+    foot = template_footpoints(source, fits[0], workers)[0]
     moved = np.zeros(len(foot.face))
-    for fit, before in zip(fits, alone, strict=True):
+    for fit, before in zip(fits, before_agreement, strict=True):
         moved += np.linalg.norm(at_footpoints(foot, fit.faces, fit.points - before.points), axis=1)
     return np.asarray(np.exp(-np.square(moved / _AGREED_SCALE)))
 
@@ -126,7 +130,7 @@ def _closest(
     """Closest points of the target that face as the template does there and belong to the same place of it."""
     facing = unit(at_footpoints(foot, source_fit.faces, vertex_normals(target_fit.points, target_fit.faces)))
     points, normals = in_core_frame(target, target_fit)
-    resting = place(target, target_fit, workers)[1]
+    resting = template_footpoints(target, target_fit, workers)[1]
     if target.is_cloud:
         facing = np.zeros_like(facing)
     return Surface(points, target.faces, normals, resting).query(moved, facing, workers, belongs)

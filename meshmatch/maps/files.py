@@ -2,8 +2,8 @@
 it.
 
 =====  ===========================================================================================
-.npy   ``index`` alone: int64 ``(V_src,)``, 0-based
-.txt   ``index`` alone: one number a line, 0-based, no header
+.npy   ``index`` before_agreement: int64 ``(V_src,)``, 0-based
+.txt   ``index`` before_agreement: one number a line, 0-based, no header
 .csv   a row per source vertex: source_vertex, target_vertex, face, w0, w1, w2, confidence
 .npz   everything
 .mat   everything, and ``matlab_index`` = index + 1 for programs that count from 1
@@ -44,7 +44,7 @@ def save_map(path: str | Path, vertex_map: VertexMap) -> None:
     Raises
     ------
     OptionError
-        The suffix is none of `MAP_SUFFIXES`.
+        Unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`.
     OutputError
         The file cannot be written.
     """
@@ -55,7 +55,7 @@ def save_map(path: str | Path, vertex_map: VertexMap) -> None:
 
 
 def check_suffix(path: str | Path) -> str:
-    """The suffix in small letters, if it is one of `MAP_SUFFIXES`; `OptionError` otherwise. Cheap: ask before
+    """The suffix in small letters, if maps have it; `OptionError` otherwise. Cheap: ask before
     work.
     """
     suffix = Path(path).suffix.lower()
@@ -78,7 +78,7 @@ def load_map(path: str | Path, source: Shape | None = None, target: Shape | None
         The file is missing, damaged or holds no map; or it does not fit the shapes: wrong length for the
         source, an index outside the target, or the map of the opposite direction.
     OptionError
-        The suffix is none of `MAP_SUFFIXES`.
+        Unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`.
     """
     path = Path(path)
     suffix = check_suffix(path)
@@ -285,5 +285,3 @@ _FORMATS: dict[str, tuple[Callable[[Path, VertexMap], None], Callable[[Path], Ve
     ".mat": (_write_mat, _read_mat),
     ".json": (_write_json, _read_json),
 }
-MAP_SUFFIXES = tuple(_FORMATS)
-"""The suffixes that `save_map` and `load_map` know."""

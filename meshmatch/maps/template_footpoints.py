@@ -25,7 +25,7 @@ _CHUNK = 16_384  # points at a time
 
 
 @lru_cache(maxsize=4)
-def place(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndarray]:
+def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndarray]:
     """Points of the template as fitted for every vertex, and the same on the resting template (V, 3).
 
     The closest point in space jumps to another limb where two of them touch. Neighbours on the shape that
@@ -35,22 +35,22 @@ def place(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndar
     """
     points, normals = in_core_frame(shape, fit)
     template_normals = vertex_normals(fit.points, fit.faces)
-    foot = closest(shape, fit, workers)
+    foot = closest_footpoints(shape, fit, workers)
     resting = at_footpoints(foot, fit.faces, fit.resting)
     knowing = Surface(fit.points, fit.faces, template_normals, fit.resting)
     if shape.is_cloud:
         near = neighbours(points, shape.roughness)
         for _ in range(_ROUNDS):
-            foot = knowing.query(points, normals, workers, medians(resting, near))
+            foot = knowing.query(points, normals, workers, neighbour_medians(resting, near))
             resting = at_footpoints(foot, fit.faces, fit.resting)
         return foot, resting
     edges = edges_of(shape.faces).vertices
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     for _ in range(_ROUNDS):
-        doubted = small_pieces(edges, length, resting, shape.vertex_areas)
+        doubted = small_islands(edges, length, resting, shape.vertex_areas)
         if not doubted.any():
             break
-        around = surroundings(edges, resting, doubted)
+        around = surrounding_values(edges, resting, doubted)
         ask = np.flatnonzero(doubted & np.isfinite(around).all(1))
         if not len(ask):
             break
@@ -61,7 +61,7 @@ def place(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, np.ndar
     return foot, resting
 
 
-def closest(shape: Shape, fit: Fit, workers: int = 1) -> Footpoints:
+def closest_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> Footpoints:
     """Closest points of the template as fitted, of those that face the same way as the vertices of a shape."""
     points, normals = in_core_frame(shape, fit)
     return Surface(fit.points, fit.faces, vertex_normals(fit.points, fit.faces)).query(
@@ -75,7 +75,7 @@ def neighbours(points: np.ndarray, roughness: float) -> np.ndarray:
     return np.asarray(cKDTree(points).query(points, min(k, len(points)))[1])
 
 
-def medians(values: np.ndarray, near: np.ndarray) -> np.ndarray:
+def neighbour_medians(values: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Median (V, D), coordinate by coordinate, of values (V, D) over neighbours (V, k)."""
     found = np.empty_like(values)
     for low in range(0, len(values), _CHUNK):
@@ -84,7 +84,7 @@ def medians(values: np.ndarray, near: np.ndarray) -> np.ndarray:
     return found
 
 
-def small_pieces(edges: np.ndarray, length: np.ndarray, resting: np.ndarray, area: np.ndarray) -> np.ndarray:
+def small_islands(edges: np.ndarray, length: np.ndarray, resting: np.ndarray, area: np.ndarray) -> np.ndarray:
     """(V,) True on small pieces between tears: edges whose ends belong much further apart than they are.
 
     Parameters
@@ -104,7 +104,7 @@ def small_pieces(edges: np.ndarray, length: np.ndarray, resting: np.ndarray, are
     return (np.bincount(piece, area) < _BELIEVED * area.sum())[piece]
 
 
-def surroundings(edges: np.ndarray, resting: np.ndarray, doubted: np.ndarray) -> np.ndarray:
+def surrounding_values(edges: np.ndarray, resting: np.ndarray, doubted: np.ndarray) -> np.ndarray:
     """Resting positions with the doubted ones replaced by the average of their surroundings; NaN out of reach."""
     V = len(resting)
     ones = np.ones(len(edges))

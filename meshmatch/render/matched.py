@@ -18,8 +18,8 @@ from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import UNKNOWN, Scale
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.attributes import carry_values
-from meshmatch.transfer.direction import pull_back
+from meshmatch.transfer.attributes import pull_values
+from meshmatch.transfer.inverse_map import invert_map
 
 FloatArray = NDArray[np.float64]
 Rotations = tuple[FloatArray | None, FloatArray | None]
@@ -102,13 +102,13 @@ def same_side(
 
 def carried_colors(colors: FloatArray, vertex_map: VertexMap, source: Shape, target: Shape) -> FloatArray:
     """Colours ``(V_tgt, 3)`` of the target, from those ``(V_src, 3)`` of the source's vertices."""
-    return brought(colors, vertex_map, pull_back(vertex_map, source, target), source)
+    return brought(colors, vertex_map, invert_map(vertex_map, source, target), source)
 
 
 def brought(colors: FloatArray, forward: VertexMap, back: VertexMap, source: Shape) -> FloatArray:
     """`carried_colors` where the map back is at hand; grey where nothing of the source was matched to near."""
     reached = back.confidence > _REACHED * forward.confidence[back.index]
-    return np.where(reached[:, None], carry_values(back, source, colors), UNKNOWN)
+    return np.where(reached[:, None], pull_values(back, source, colors), UNKNOWN)
 
 
 def confidence_panels(
@@ -121,7 +121,7 @@ def confidence_panels(
 ) -> tuple[list[Panel], Scale]:
     """Source and target in the heat of the map's confidence, and its scale: dark is doubt."""
     turns = same_side(source, target, vertex_map, rotations, look or Look())
-    back = pull_back(vertex_map, source, target)
+    back = invert_map(vertex_map, source, target)
     scale = Scale(0.0, 1.0, "confidence of the map", reverse=True)
     names = labels or (source.name, target.name)
     panels = [

@@ -36,7 +36,7 @@ def weights_of(back: VertexMap, source: Shape) -> csr_array:
     return matrix
 
 
-def carry_values(back: VertexMap, source: Shape, values: NDArray[np.float64]) -> Floats:
+def pull_values(back: VertexMap, source: Shape, values: NDArray[np.float64]) -> Floats:
     """Numbers (V_src,) or (V_src, D) on the target: (V_tgt,) or (V_tgt, D).
 
     Interpolated between the corners of the source's face. A value that is not finite takes no part, unless it
@@ -52,7 +52,7 @@ def carry_values(back: VertexMap, source: Shape, values: NDArray[np.float64]) ->
     return np.where(share >= 0.5, sums / np.maximum(share, 0.5), np.nan)
 
 
-def carry_labels(back: VertexMap, source: Shape, labels: Ints, on_faces: bool = False) -> Ints:
+def pull_labels(back: VertexMap, source: Shape, labels: Ints, on_faces: bool = False) -> Ints:
     """Labels of the target's vertices: those with most weight around their places on the source.
 
     Parameters
@@ -112,7 +112,7 @@ def most_votes(votes: csr_array) -> Ints:
     return result
 
 
-def carry_weights(back: VertexMap, source: Shape, weights: csr_array, most: int = 4) -> csr_array:
+def pull_weights(back: VertexMap, source: Shape, weights: csr_array, most: int = 4) -> csr_array:
     """Skin weights (V_src, J) on the target (V_tgt, J): interpolated, at most `most` a vertex, rows sum to 1.
 
     A vertex of which every source vertex is without weights stays without.

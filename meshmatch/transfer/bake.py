@@ -34,7 +34,7 @@ _CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
-class Choices:
+class BakeOptions:
     """How a texture is baked.
 
     Parameters
@@ -93,7 +93,7 @@ def bake(
     target: Shape,
     back: VertexMap,
     uv: Floats,
-    choices: Choices,
+    choices: BakeOptions,
     tell: Callable[[float], None] = lambda share: None,
 ) -> Baked:
     """Paint an atlas of the target.
@@ -190,7 +190,7 @@ def _store(pixels: Pixels, at: NDArray[np.int64], colors: NDArray[np.float32]) -
 
 
 def _settle(
-    image: Pixels, painted: NDArray[np.bool_], low: NDArray[np.bool_], choices: Choices, alpha: Alpha
+    image: Pixels, painted: NDArray[np.bool_], low: NDArray[np.bool_], choices: BakeOptions, alpha: Alpha
 ) -> Alpha:
     """Fill in what is not painted, and do with what is in doubt as was chosen; what alpha then means."""
     pixels = image.reshape(-1, 4)

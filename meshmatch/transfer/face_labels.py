@@ -15,7 +15,7 @@ from meshmatch.transfer.attributes import (
     one_hot,
     vertex_votes,
 )
-from meshmatch.transfer.direction import target_normals
+from meshmatch.transfer.inverse_map import target_normals
 from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces
 
 # A face is cut into so many rows of small triangles, whose centers vote: its square of points.
@@ -24,7 +24,7 @@ _ROWS = 3
 _LARGE = 4.0
 
 
-def carry_face_labels(
+def pull_face_labels(
     back: VertexMap, source: Shape, target: Shape, labels: Ints, on_faces: bool, workers: int = 1
 ) -> Ints:
     """Labels (F_tgt,) of the target's faces from those of the source's vertices or faces.

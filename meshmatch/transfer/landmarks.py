@@ -12,7 +12,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.direction import target_normals
+from meshmatch.transfer.inverse_map import target_normals
 from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces
 
 # A landmark this far from the surface (of the diagonal) is not meant for this shape.
@@ -137,7 +137,7 @@ def joined(parts: list[Landmarks]) -> Landmarks:
     return Landmarks(tuple(name for part in parts for name in part.names), *arrays)
 
 
-def carry_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: Landmarks) -> Landmarks:
+def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: Landmarks) -> Landmarks:
     """Landmarks of the source on the target, exactly on its surface.
 
     A vertex goes where the map puts it. A point of a face goes to the surface nearest to the mean of where its

@@ -20,7 +20,7 @@ _NEIGHBOURS = 8
 
 
 @dataclass(frozen=True)
-class Doubt:
+class LowConfidence:
     """How much of a result is in doubt, and what became of it.
 
     Parameters
@@ -126,14 +126,14 @@ def diffuse(graph: csr_array, known: NDArray[np.bool_], values: Floats) -> tuple
     return out, ask
 
 
-def resolve_values(
+def replace_low_values(
     values: Floats,
     confidence: Floats,
     target: Shape,
     least: float,
     blank: Floats | float | None = None,
     fill: bool = False,
-) -> tuple[Floats, Doubt]:
+) -> tuple[Floats, LowConfidence]:
     """Values (V, D) of the target with those below the least confidence left blank, filled in, or kept.
 
     Values that are nan are always in doubt: the source had none there.
@@ -143,17 +143,17 @@ def resolve_values(
     N = len(low)
     if fill:
         out, filled = diffuse(vertex_graph(target), ~low, flat)
-        return out.reshape(values.shape), Doubt(N, int(low.sum()), 0, int(filled.sum()))
+        return out.reshape(values.shape), LowConfidence(N, int(low.sum()), 0, int(filled.sum()))
     if blank is not None:
         out = flat.copy()
         out[low] = blank
-        return out.reshape(values.shape), Doubt(N, int(low.sum()), int(low.sum()))
-    return values, Doubt(N, int(low.sum()))
+        return out.reshape(values.shape), LowConfidence(N, int(low.sum()), int(low.sum()))
+    return values, LowConfidence(N, int(low.sum()))
 
 
-def resolve_weights(
+def replace_low_weights(
     weights: csr_array, confidence: Floats, target: Shape, least: float, fill: bool, most: int
-) -> tuple[csr_array, Doubt]:
+) -> tuple[csr_array, LowConfidence]:
     """Skin weights (V, J) of the target with those in doubt filled in, or kept; rows still sum to 1.
 
     Vertices without weights are always in doubt.
@@ -161,7 +161,7 @@ def resolve_weights(
     low = (confidence < least) | (np.diff(weights.indptr) == 0)
     N = len(low)
     if not fill or not low.any():
-        return weights, Doubt(N, int(low.sum()))
+        return weights, LowConfidence(N, int(low.sum()))
     graph = vertex_graph(target)
     # Dense numbers only where they are needed: of the vertices in doubt and those beside them.
     some = np.flatnonzero(low | (np.asarray(graph @ low.astype(np.float64)) > 0))
@@ -171,12 +171,12 @@ def resolve_weights(
     kept = csr_array(diags_array((~filled).astype(np.float64)) @ weights)
     row, column = np.nonzero(np.where(done[:, None], dense, 0.0) > 0)
     new = csr_array((dense[row, column], (some[row], column)), shape=weights.shape)
-    return sparse_rows(csr_array(kept + new), most), Doubt(N, int(low.sum()), 0, int(filled.sum()))
+    return sparse_rows(csr_array(kept + new), most), LowConfidence(N, int(low.sum()), 0, int(filled.sum()))
 
 
-def resolve_labels(
+def replace_low_labels(
     labels: Ints, confidence: Floats, target: Shape, least: float, blank: bool, fill: bool, on_faces: bool
-) -> tuple[Ints, Doubt]:
+) -> tuple[Ints, LowConfidence]:
     """Labels (V,) or (F,) of the target with those in doubt left blank (-1), taken from the nearest sure
     vertex or face along the surface, or kept.
     """
@@ -186,7 +186,7 @@ def resolve_labels(
         nearest = nearest_known(face_graph(target) if on_faces else vertex_graph(target), ~low)
         ask = low & (nearest >= 0)
         out[ask] = labels[nearest[ask]]
-        return out, Doubt(N, int(low.sum()), int((out < 0).sum()), int(ask.sum()))
+        return out, LowConfidence(N, int(low.sum()), int((out < 0).sum()), int(ask.sum()))
     if blank:
         out[low] = -1
-    return out, Doubt(N, int(low.sum()), int((out < 0).sum()))
+    return out, LowConfidence(N, int(low.sum()), int((out < 0).sum()))

@@ -37,7 +37,7 @@ _CHUNK, _FIRST, _MOST = 8192, 12, 512
 
 
 @dataclass(frozen=True, eq=False)
-class ClosestPlaces:
+class MappedFootpoints:
     """Where N points of the target lie on the source.
 
     Parameters
@@ -67,7 +67,7 @@ class MappedMesh:
     Parameters
     ----------
     source_to_target : VertexMap
-        Made for these two shapes; see `meshmatch.transfer.direction.check_map`.
+        Made for these two shapes; see `meshmatch.transfer.inverse_map.check_map`.
     """
 
     def __init__(self, source_to_target: VertexMap, source: Shape, target: Shape) -> None:
@@ -108,8 +108,8 @@ class MappedMesh:
         normals: Floats | None = None,
         workers: int = 1,
         near: Floats | None = None,
-    ) -> ClosestPlaces:
-        """ClosestPlaces on the source of (N, 3) points on the target, in its file's frame.
+    ) -> MappedFootpoints:
+        """Points on the source of (N, 3) points on the target, in its file's frame.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class MappedMesh:
         face = self.face[item]
         vertex = corners[np.arange(N), weights.argmax(axis=1)]
         weights[face < 0] = (1.0, 0.0, 0.0)
-        return ClosestPlaces(vertex, face, weights, confidence, distance)
+        return MappedFootpoints(vertex, face, weights, confidence, distance)
 
     def _search(
         self, points: Floats, normals: Floats, workers: int, near: Floats | None = None

@@ -7,7 +7,7 @@ import numpy as np
 from meshmatch.arrays import Floats
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.template_footpoints import place
+from meshmatch.maps.template_footpoints import template_footpoints
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 
@@ -29,7 +29,7 @@ class SurfaceBinding:
 
     def __init__(self, part: Repaired, fit: Fit, turns: Floats, workers: int = 1) -> None:
         self._shape = part.original
-        foot, _ = place(part.shape, fit, workers)
+        foot, _ = template_footpoints(part.shape, fit, workers)
         rows = part.original_to_repaired
         self._corners, self._weights = fit.faces[foot.face[rows]], foot.barycentric[rows]
         offset = fit.frame.apply(part.original.verts) - self._on(fit.points)

@@ -13,7 +13,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.formats.textured import Textured
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.bake import Baked, Choices, bake
+from meshmatch.transfer.bake import Baked, BakeOptions, bake
 from meshmatch.transfer.material_sampler import MaterialSampler
 from meshmatch.transfer.surface_walk import walker_of
 from meshmatch.transfer.texel_locator import images_of
@@ -24,14 +24,14 @@ LARGEST = 8192
 
 
 @dataclass(frozen=True, eq=False)
-class Worn:
+class BakedMesh:
     """The target with its texture, ready to be written (`meshmatch.shapes.textured_files`)."""
 
     mesh: Textured
     baked: Baked
 
 
-def check_choices(choices: Choices) -> None:
+def check_bake_options(choices: BakeOptions) -> None:
     """Refuse sizes that cannot be (`OptionError`)."""
     if not 16 <= choices.size <= LARGEST:
         raise OptionError(
@@ -52,9 +52,9 @@ def transfer_texture(
     target: Shape,
     back: VertexMap,
     atlas: Atlas,
-    choices: Choices = Choices(),  # noqa: B008  # frozen
+    choices: BakeOptions = BakeOptions(),  # noqa: B008  # frozen
     tell: Callable[[float], None] = lambda share: None,
-) -> Worn:
+) -> BakedMesh:
     """Bake the look of a source for a target mesh.
 
     Parameters
@@ -71,9 +71,9 @@ def transfer_texture(
     Raises
     ------
     OptionError
-        Choices that cannot be.
+        Sizes that are out of range.
     """
-    check_choices(choices)
+    check_bake_options(choices)
     ground = walker_of(source)
     coat = MaterialSampler(_of_faces(look, source), ground)
     uv = atlas.uv
@@ -82,7 +82,7 @@ def transfer_texture(
         target, uv = Shape(target.verts, target.faces[sound], target.name), uv[sound]
     baked = bake(coat, ground, target, back, uv, choices, tell)
     mesh = Textured(target.verts, target.faces, uv, baked.alpha, baked.cutoff)
-    return Worn(mesh, baked)
+    return BakedMesh(mesh, baked)
 
 
 def colors_of_vertices(source: Shape, look: Appearance, target: Shape, back: VertexMap) -> Floats:

@@ -189,7 +189,7 @@ def test_after_a_match_shapes_are_turned_as_their_fits_say(
     from types import SimpleNamespace
 
     from meshmatch.geometry.frames import Frame
-    from meshmatch.transfer.direction import pull_back
+    from meshmatch.transfer.inverse_map import invert_map
 
     a, b = load_shape("a.ply"), load_shape("b.ply")
     forward = load_map("ab.npz", a, b)
@@ -200,7 +200,7 @@ def test_after_a_match_shapes_are_turned_as_their_fits_say(
         for s in (1.0, -1.0)
     ]
     match = SimpleNamespace(notes=(), source_fit=fits[0], target_fit=fits[1], seconds=1.0)
-    result = SimpleNamespace(back=pull_back(forward, a, b), forward=forward, match=match)
+    result = SimpleNamespace(back=invert_map(forward, a, b), forward=forward, match=match)
     monkeypatch.setattr(pipeline, "carry", lambda *_, **__: result)
     well(run(*call("transfer-color", "--picture", "p.png", map=None)))
     for panel, made in zip(drawn.panels, fits, strict=True):

@@ -13,7 +13,8 @@ from meshmatch import pipeline
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.frames import Frame
-from meshmatch.maps.files import MAP_SUFFIXES, save_map
+from meshmatch.maps import MAP_SUFFIXES
+from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape

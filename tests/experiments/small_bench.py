@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from meshmatch.errors import InputError
-from meshmatch.maps import VertexMap
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes import Shape, save_shape
 from tests.maps.solids import bumpy_sphere
 

@@ -96,6 +96,6 @@ def test_words_that_cannot_be(capsys: pytest.CaptureFixture[str], monkeypatch: p
 def test_the_cow_loses_next_to_nothing(bench: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(texture, "POINTS", 5000)
     trip = texture.trip_of("spot", bench)
-    record = texture.measure("spot", trip, texture.Choices(size=512, workers=1), None)
+    record = texture.measure("spot", trip, texture.BakeOptions(size=512, workers=1), None)
     assert isinstance(record["there and back"], dict)
     assert record["there and back"]["psnr"] > 31

@@ -32,11 +32,13 @@ def test_where_a_fit_moved_it_is_not_believed() -> None:
         elsewhere = replace(fit, points=unit.verts + np.where(high, moved, 0.0)[:, None] * [1.0, 0, 0])
         before = [fit, fit]
         before[number] = elsewhere
-        found = build_map(part, fit, part, fit, alone=(before[0], before[1]))
+        found = build_map(part, fit, part, fit, before_agreement=(before[0], before[1]))
         assert np.allclose(found.confidence[high], np.exp(-((moved / 0.05) ** 2)), atol=1e-6)
         assert np.allclose(found.confidence[~high], 1)
         assert np.array_equal(found.index, sure.index)
-    assert np.array_equal(build_map(part, fit, part, fit, alone=(fit, fit)).confidence, sure.confidence)
+    assert np.array_equal(
+        build_map(part, fit, part, fit, before_agreement=(fit, fit)).confidence, sure.confidence
+    )
 
 
 def test_both_fits_count_where_the_source_lies() -> None:
@@ -48,7 +50,7 @@ def test_both_fits_count_where_the_source_lies() -> None:
     high = unit.verts[:, 2] > 0.1
     before = replace(fit, points=unit.verts + np.where(high, 0.03, 0.0)[:, None] * [1.0, 0, 0])
     before_there = replace(other, points=turned.verts + np.where(high, 0.02, 0.0)[:, None] * [0, 1.0, 0])
-    found = build_map(repair(unit), fit, repair(turned), other, alone=(before, before_there))
+    found = build_map(repair(unit), fit, repair(turned), other, before_agreement=(before, before_there))
     assert np.allclose(found.confidence[high], np.exp(-1.0), atol=1e-6)
     assert np.allclose(found.confidence[~high], 1)
 

@@ -7,10 +7,10 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import InputError, OptionError
-from meshmatch.maps import VertexMap
 from meshmatch.maps.curve import draw_curves
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors, coverage, distortion, evaluate_map, map_errors
 from meshmatch.maps.geodesics import GeodesicDistances
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes import Shape
 from tests.maps.solids import bumpy_sphere, grid
 

@@ -9,7 +9,9 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from meshmatch.errors import InputError, OptionError, OutputError
-from meshmatch.maps import MAP_SUFFIXES, VertexMap, load_map, save_map
+from meshmatch.maps import MAP_SUFFIXES, files
+from meshmatch.maps.files import load_map, save_map
+from meshmatch.maps.vertex_map import VertexMap
 from tests.maps.test_vertex_map import A, B, C, random_map
 
 CARRIES = {
@@ -212,3 +214,7 @@ def test_a_shape_that_has_changed_is_mentioned(tmp_path: Path) -> None:
     found = load_map(tmp_path / "map.npz", moved, B)
     assert any("another version of the source" in reason for reason in found.reasons)
     assert found.source_hash == moved.hash
+
+
+def test_the_list_of_suffixes_is_that_of_the_formats() -> None:
+    assert tuple(files._FORMATS) == MAP_SUFFIXES

@@ -10,7 +10,8 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from meshmatch.errors import InputError
-from meshmatch.maps import load_map, mat_file, save_map
+from meshmatch.maps import mat_file
+from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.mat_file import read_mat
 from tests.maps.test_vertex_map import A, B, random_map
 

@@ -5,7 +5,13 @@ import pytest
 
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.frames import Frame
-from meshmatch.maps.template_footpoints import medians, neighbours, place, small_pieces, surroundings
+from meshmatch.maps.template_footpoints import (
+    neighbour_medians,
+    neighbours,
+    small_islands,
+    surrounding_values,
+    template_footpoints,
+)
 from meshmatch.shapes.shape import Shape
 
 # A chain of ten vertices, one apart; where they belong is where they are.
@@ -16,31 +22,31 @@ ALONG = np.stack([np.arange(10.0), np.zeros(10), np.zeros(10)], 1)
 def test_a_small_piece_between_tears_is_doubted() -> None:
     area, length = np.full(10, 0.1), np.full(9, 0.01)
     resting = 0.01 * ALONG
-    assert not small_pieces(CHAIN, length, resting, area).any()
+    assert not small_islands(CHAIN, length, resting, area).any()
     astray = resting.copy()
     astray[4] += 1.0
-    assert small_pieces(CHAIN, length, astray, 0.05 * area / area.sum() + (np.arange(10) != 4)).tolist() == [
+    assert small_islands(CHAIN, length, astray, 0.05 * area / area.sum() + (np.arange(10) != 4)).tolist() == [
         k == 4 for k in range(10)
     ]
     # a piece as large as a tenth of the surface is believed
-    assert not small_pieces(CHAIN, length, astray, area).any()
+    assert not small_islands(CHAIN, length, astray, area).any()
 
 
 def test_surroundings_fill_from_the_rim() -> None:
     doubted = np.zeros(10, bool)
     doubted[3:6] = True
-    around = surroundings(CHAIN, ALONG, doubted)
+    around = surrounding_values(CHAIN, ALONG, doubted)
     assert np.allclose(around[~doubted], ALONG[~doubted])
     assert np.allclose(around[4, 0], 4.0, atol=0.2)
-    alone = surroundings(CHAIN, ALONG, np.ones(10, bool))
+    alone = surrounding_values(CHAIN, ALONG, np.ones(10, bool))
     assert np.isnan(alone).all()
 
 
 def test_medians_by_hand() -> None:
     values = np.array([[0.0, 5], [1, 5], [9, 5], [2, 5]])
     near = np.array([[0, 1, 2], [1, 0, 3], [2, 3, 1], [3, 1, 0]])
-    assert medians(values, near)[:, 0].tolist() == [1, 1, 2, 1]
-    assert (medians(values, near)[:, 1] == 5).all()
+    assert neighbour_medians(values, near)[:, 0].tolist() == [1, 1, 2, 1]
+    assert (neighbour_medians(values, near)[:, 1] == 5).all()
 
 
 @pytest.mark.parametrize(("roughness", "count"), [(0.0, 9), (0.5, 9), (1.0, 15)])
@@ -77,6 +83,6 @@ def test_points_that_noise_carries_across_return() -> None:
     sunk = rng.choice(400, 25, replace=False)
     points[sunk, 2] = 0.04
     shape = Shape(points, np.empty((0, 3), np.int64), "sheet")
-    foot, belongs = place(shape, fit)
+    foot, belongs = template_footpoints(shape, fit)
     assert (belongs[:, 2] > 0.9).all()
     assert np.allclose(fit.points[fit.faces[foot.face]].mean(1)[:, 2], 0.1)

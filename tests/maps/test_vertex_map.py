@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.maps import VertexMap
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes import Shape
 from tests.maps.solids import bumpy_sphere, grid
 

@@ -9,14 +9,14 @@ from scipy.sparse import csr_array
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import (
-    carry_labels,
-    carry_values,
-    carry_weights,
     most_votes,
+    pull_labels,
+    pull_values,
+    pull_weights,
     sparse_rows,
     weights_of,
 )
-from meshmatch.transfer.direction import pull_back
+from meshmatch.transfer.inverse_map import invert_map
 from tests.conftest import icosphere
 from tests.transfer.known import split
 
@@ -42,21 +42,21 @@ def test_by_hand() -> None:
         "", "", np.array([2, 0]), face=np.array([0, -1]), barycentric=np.array([[0.2, 0.3, 0.5], [1, 0, 0]])
     )
     assert weights_of(back, triangle).toarray().tolist() == [[0.2, 0.3, 0.5], [1, 0, 0]]
-    assert np.allclose(carry_values(back, triangle, np.array([10.0, 20, 40])), [28, 10])
-    assert carry_labels(back, triangle, np.array([1, 1, 0])).tolist() == [0, 1]  # one half each: the lower
-    assert carry_labels(back, triangle, np.array([0, 0, 1])).tolist() == [0, 0]
-    assert carry_labels(back, triangle, np.array([-1, 3, -1])).tolist() == [3, -1]
-    assert carry_labels(back, triangle, np.array([7]), on_faces=True).tolist() == [7, 7]
+    assert np.allclose(pull_values(back, triangle, np.array([10.0, 20, 40])), [28, 10])
+    assert pull_labels(back, triangle, np.array([1, 1, 0])).tolist() == [0, 1]  # one half each: the lower
+    assert pull_labels(back, triangle, np.array([0, 0, 1])).tolist() == [0, 0]
+    assert pull_labels(back, triangle, np.array([-1, 3, -1])).tolist() == [3, -1]
+    assert pull_labels(back, triangle, np.array([7]), on_faces=True).tolist() == [7, 7]
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 1000), st.floats(-1e6, 1e6, allow_subnormal=False))
 def test_constants_stay_constant_and_values_between_their_ends(seed: int, constant: float) -> None:
     back = random_map(seed)
-    same = carry_values(back, COARSE, np.full((COARSE.V, 2), constant))
+    same = pull_values(back, COARSE, np.full((COARSE.V, 2), constant))
     assert np.allclose(same, constant, rtol=1e-12, atol=1e-300)
     values = np.random.default_rng(seed).normal(size=COARSE.V)
-    carried = carry_values(back, COARSE, values)
+    carried = pull_values(back, COARSE, values)
     assert values.min() - 1e-12 <= carried.min() <= carried.max() <= values.max() + 1e-12
 
 
@@ -64,26 +64,26 @@ def test_the_identity_carries_exactly(sphere: Shape) -> None:
     rng = np.random.default_rng(0)
     same = VertexMap.identity(sphere)
     values = rng.normal(size=(sphere.V, 3))
-    assert np.array_equal(carry_values(same, sphere, values), values)
+    assert np.array_equal(pull_values(same, sphere, values), values)
     labels = rng.integers(-1, 6, sphere.V)
-    assert np.array_equal(carry_labels(same, sphere, labels), labels)
+    assert np.array_equal(pull_labels(same, sphere, labels), labels)
     weights = sparse_rows(csr_array(rng.random((sphere.V, 9))), 4)
-    assert abs(carry_weights(same, sphere, weights) - weights).max() < 1e-15
+    assert abs(pull_weights(same, sphere, weights) - weights).max() < 1e-15
 
 
 def test_linear_values_are_carried_exactly_to_a_finer_copy() -> None:
-    back = pull_back(FORWARD, COARSE, FINE)
-    assert np.abs(carry_values(back, COARSE, COARSE.verts) - FINE.verts).max() < 1e-12
+    back = invert_map(FORWARD, COARSE, FINE)
+    assert np.abs(pull_values(back, COARSE, COARSE.verts) - FINE.verts).max() < 1e-12
 
 
 def test_values_that_are_missing_do_not_spread() -> None:
     values = COARSE.verts[:, 0].copy()
     values[3] = np.nan
-    carried = carry_values(BACK, COARSE, values)
+    carried = pull_values(BACK, COARSE, values)
     share = weights_of(BACK, COARSE).toarray()[:, 3]
     assert np.array_equal(np.isnan(carried), share > 0.5)
     clean = share == 0
-    assert np.array_equal(carried[clean], carry_values(BACK, COARSE, COARSE.verts[:, 0])[clean])
+    assert np.array_equal(carried[clean], pull_values(BACK, COARSE, COARSE.verts[:, 0])[clean])
     assert (share == 0.5).any()  # the middle of an edge takes the end that is there
     assert np.isinf(values).sum() == 0
 
@@ -92,9 +92,9 @@ def test_values_that_are_missing_do_not_spread() -> None:
 @given(st.integers(0, 1000), st.booleans())
 def test_a_label_is_never_invented(seed: int, on_faces: bool) -> None:
     labels = np.random.default_rng(seed).choice([0, 3, 40], COARSE.F if on_faces else COARSE.V)
-    found = carry_labels(random_map(seed), COARSE, labels, on_faces)
+    found = pull_labels(random_map(seed), COARSE, labels, on_faces)
     assert set(found) <= {0, 3, 40}
-    alone = carry_labels(random_map(seed), COARSE, np.full_like(labels, 5), on_faces)
+    alone = pull_labels(random_map(seed), COARSE, np.full_like(labels, 5), on_faces)
     assert (alone == 5).all()
 
 
@@ -104,15 +104,15 @@ def test_a_vertex_takes_the_label_of_most_area_around_it() -> None:
     fan = Shape(verts, np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4]]), "fan")
     back = VertexMap("", "", np.array([0]))
     assert fan.face_areas.argmax() == 0
-    assert carry_labels(back, fan, np.array([2, 1, 1]), on_faces=True).tolist() == [2]
+    assert pull_labels(back, fan, np.array([2, 1, 1]), on_faces=True).tolist() == [2]
 
 
 def test_labels_there_and_back_mostly_return(sphere: Shape) -> None:
     fine, forward, _ = split(sphere)
     labels = (sphere.verts[:, 0] * 4).astype(int) + 4
-    there = carry_labels(pull_back(forward, sphere, fine), sphere, labels)
+    there = pull_labels(invert_map(forward, sphere, fine), sphere, labels)
     _, _, down = split(sphere)
-    home = carry_labels(pull_back(down, fine, sphere), fine, there)
+    home = pull_labels(invert_map(down, fine, sphere), fine, there)
     assert (home == labels).mean() > 0.99
     assert (there[sphere.V :] != labels[0]).any()
 
@@ -128,7 +128,7 @@ def test_weights_stay_sparse_and_sum_to_one(seed: int, most: int) -> None:
     rng = np.random.default_rng(seed)
     weights = sparse_rows(csr_array(rng.random((COARSE.V, 12)) * (rng.random((COARSE.V, 12)) < 0.4)), 12)
     bare = np.flatnonzero(np.diff(weights.indptr) == 0)
-    carried = carry_weights(random_map(seed), COARSE, weights, most)
+    carried = pull_weights(random_map(seed), COARSE, weights, most)
     count, total = np.diff(carried.indptr), np.asarray(carried.sum(axis=1)).ravel()
     assert count.max() <= most
     assert np.allclose(total[count > 0], 1, atol=1e-12)
@@ -145,6 +145,6 @@ def test_the_heaviest_joints_are_kept() -> None:
 
 @pytest.mark.parametrize("dtype", [np.int32, np.float32])
 def test_other_kinds_of_numbers_are_carried_too(dtype: type) -> None:
-    carried = carry_values(BACK, COARSE, np.arange(COARSE.V).astype(dtype))
+    carried = pull_values(BACK, COARSE, np.arange(COARSE.V).astype(dtype))
     assert carried.dtype == np.float64
     assert np.array_equal(carried[: COARSE.V], np.arange(COARSE.V))

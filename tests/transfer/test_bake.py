@@ -14,7 +14,7 @@ from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import bytes_of, to_linear, to_srgb
 from meshmatch.transfer import texel_locator
-from meshmatch.transfer.bake import Baked, Choices
+from meshmatch.transfer.bake import Baked, BakeOptions
 from meshmatch.transfer.texels import faces_on
 from meshmatch.transfer.texture import colors_of_vertices, transfer_texture
 from meshmatch.transfer.unwrap import Atlas, atlas_of, unwrapped
@@ -23,7 +23,7 @@ from tests.transfer.known import split
 
 SQUARE = Shape(CORNERS, FACES, "square")
 OWN = UV[FACES]
-SMALL = Choices(size=32, padding=2, workers=1)
+SMALL = BakeOptions(size=32, padding=2, workers=1)
 
 
 def wearing(image: np.ndarray, uv: np.ndarray = OWN, **rest: object) -> Appearance:
@@ -43,7 +43,7 @@ def worn(
     target: Shape,
     back: VertexMap | None = None,
     uv: np.ndarray | None = None,
-    choices: Choices = SMALL,
+    choices: BakeOptions = SMALL,
 ) -> Baked:
     atlas = atlas_of(target, None, choices.size, choices.padding) if uv is None else Atlas(uv, True)
     back = VertexMap.identity(target) if back is None else back
@@ -366,7 +366,7 @@ def test_thresholds_of_alpha() -> None:
     assert four.image[25, 25, 3] == 90 and four.image[5, 5, 3] == 255
 
 
-# Doubt
+# LowConfidence
 
 
 def doubtful() -> VertexMap:

@@ -5,8 +5,8 @@ import pytest
 
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.direction import pull_back
-from meshmatch.transfer.face_labels import carry_face_labels, lattice, of_faces
+from meshmatch.transfer.face_labels import lattice, of_faces, pull_face_labels
+from meshmatch.transfer.inverse_map import invert_map
 from tests.conftest import icosphere
 from tests.transfer.known import split
 
@@ -26,13 +26,13 @@ def test_the_points_of_a_face_are_spread_evenly(rows: int) -> None:
 
 def test_the_identity_carries_exactly() -> None:
     labels = np.random.default_rng(0).integers(0, 7, COARSE.F)
-    same = carry_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces=True)
+    same = pull_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces=True)
     assert np.array_equal(same, labels)
 
 
 def test_a_finer_copy_gets_each_face_four_times() -> None:
     labels = np.random.default_rng(1).integers(0, 7, COARSE.F)
-    found = carry_face_labels(pull_back(FORWARD, COARSE, FINE), COARSE, FINE, labels, on_faces=True)
+    found = pull_face_labels(invert_map(FORWARD, COARSE, FINE), COARSE, FINE, labels, on_faces=True)
     assert np.array_equal(found, np.tile(labels, 4))
 
 
@@ -40,7 +40,7 @@ def test_a_coarser_copy_takes_the_vote_of_its_four_parts() -> None:
     """Three quarters of each face have one label, the middle has another that every corner misses."""
     labels = np.repeat([1, 1, 1, 0], COARSE.F)
     labels[:50] = 2  # and one part in four differs on some
-    found = carry_face_labels(pull_back(BACK, FINE, COARSE), FINE, COARSE, labels, on_faces=True)
+    found = pull_face_labels(invert_map(BACK, FINE, COARSE), FINE, COARSE, labels, on_faces=True)
     assert (found == 1).all()
 
 
@@ -63,14 +63,14 @@ def test_a_large_face_asks_its_inside() -> None:
     near = np.linalg.norm(verts[:, None] - verts[ends], axis=2).min(axis=1) < 2.5
     labels[near] = 0
     back = VertexMap.between(large, sheet, ends)
-    assert carry_face_labels(back, sheet, large, labels, on_faces=False).tolist() == [1]
+    assert pull_face_labels(back, sheet, large, labels, on_faces=False).tolist() == [1]
     by_face = np.where(near[faces].any(axis=1), 0, 1)
-    assert carry_face_labels(back, sheet, large, by_face, on_faces=True).tolist() == [1]
+    assert pull_face_labels(back, sheet, large, by_face, on_faces=True).tolist() == [1]
 
 
 def test_labels_of_vertices_give_those_of_faces() -> None:
     labels = (COARSE.verts[:, 2] > 0).astype(int)
-    found = carry_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces=False)
+    found = pull_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces=False)
     votes = labels[COARSE.faces].sum(axis=1)
     assert np.array_equal(found, (votes >= 2).astype(int))
 
@@ -79,7 +79,7 @@ def test_a_cloud_labels_faces_too() -> None:
     points = Shape(COARSE.verts, np.empty((0, 3), int), "points")
     back = VertexMap.between(COARSE, points, np.arange(COARSE.V))
     labels = (COARSE.verts[:, 2] > 0).astype(int)
-    found = carry_face_labels(back, points, COARSE, labels, on_faces=False)
+    found = pull_face_labels(back, points, COARSE, labels, on_faces=False)
     sure = np.abs(labels[COARSE.faces].sum(axis=1) - 1.5) > 1
     assert np.array_equal(found[sure], labels[COARSE.faces[sure, 0]])
     assert set(found) == {0, 1}
@@ -94,17 +94,17 @@ def test_a_torn_face_goes_with_its_corners(sphere: Shape) -> None:
     labels = np.full(sphere.V, 2)
     labels[ring], labels[far] = 0, 1
     back = VertexMap.between(sphere, sphere, index)
-    found = carry_face_labels(back, sphere, sphere, labels, on_faces=False)
+    found = pull_face_labels(back, sphere, sphere, labels, on_faces=False)
     assert (found[(sphere.faces == 0).any(axis=1)] == 0).all()
 
 
 @pytest.mark.parametrize("on_faces", [False, True])
 def test_what_has_no_label_stays_without(on_faces: bool) -> None:
     labels = np.full(COARSE.F if on_faces else COARSE.V, -1)
-    found = carry_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces)
+    found = pull_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces)
     assert (found == -1).all()
     labels[0] = 4
-    some = carry_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces)
+    some = pull_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces)
     assert set(some) == {-1, 4} if on_faces else {4} <= set(some) <= {-1, 4}
 
 

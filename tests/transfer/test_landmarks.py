@@ -12,7 +12,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.landmark_files import LANDMARK_SUFFIXES, load_landmarks, save_landmarks
-from meshmatch.transfer.landmarks import Landmarks, at_faces, at_points, at_vertices, carry_landmarks, joined
+from meshmatch.transfer.landmarks import Landmarks, at_faces, at_points, at_vertices, joined, push_landmarks
 from tests.conftest import icosphere
 from tests.transfer.known import split
 
@@ -37,7 +37,7 @@ def on_surface(shape: Shape, landmarks: Landmarks) -> None:
 
 def test_the_identity_moves_nothing() -> None:
     given = some()
-    found = carry_landmarks(VertexMap.identity(COARSE), COARSE, COARSE, given)
+    found = push_landmarks(VertexMap.identity(COARSE), COARSE, COARSE, given)
     assert np.abs(found.points - given.points).max() < 1e-12
     assert np.array_equal(found.vertex, given.vertex)
     assert found.names == given.names
@@ -46,7 +46,7 @@ def test_the_identity_moves_nothing() -> None:
 
 
 def test_on_a_finer_copy_they_lie_at_the_same_points() -> None:
-    found = carry_landmarks(FORWARD, COARSE, FINE, some())
+    found = push_landmarks(FORWARD, COARSE, FINE, some())
     assert np.abs(found.points - some().points).max() < 1e-12
     on_surface(FINE, found)
 
@@ -54,14 +54,14 @@ def test_on_a_finer_copy_they_lie_at_the_same_points() -> None:
 def test_on_a_coarser_copy_too() -> None:
     rng = np.random.default_rng(1)
     given = at_faces(FINE, np.arange(0, FINE.F, 7), rng.dirichlet([1, 1, 1], len(range(0, FINE.F, 7))))
-    found = carry_landmarks(BACK, FINE, COARSE, given)
+    found = push_landmarks(BACK, FINE, COARSE, given)
     assert np.abs(found.points - given.points).max() < 1e-12
     on_surface(COARSE, found)
 
 
 def test_they_lie_on_the_surface_where_the_map_is_bent(sphere: Shape) -> None:
     index = np.linalg.norm(COARSE.verts[:, None] - sphere.verts, axis=2).argmin(axis=1)
-    found = carry_landmarks(VertexMap.between(COARSE, sphere, index), COARSE, sphere, some())
+    found = push_landmarks(VertexMap.between(COARSE, sphere, index), COARSE, sphere, some())
     on_surface(sphere, found)
     assert np.linalg.norm(found.points, axis=1).min() > 0.98
     assert (found.points * some().points).sum(axis=1).min() > 0.9
@@ -73,7 +73,7 @@ def test_a_torn_face_sends_its_landmark_with_the_heaviest_corner(sphere: Shape) 
     index[first] = np.argmin(sphere.verts @ sphere.verts[first])
     torn = VertexMap.between(sphere, sphere, index)
     given = at_faces(sphere, np.array([3]), np.array([[0.3, 0.6, 0.1]]))
-    found = carry_landmarks(torn, sphere, sphere, given)
+    found = push_landmarks(torn, sphere, sphere, given)
     assert found.vertex.tolist() == [second]
     assert np.array_equal(found.points[0], sphere.verts[second])
 
@@ -81,7 +81,7 @@ def test_a_torn_face_sends_its_landmark_with_the_heaviest_corner(sphere: Shape) 
 def test_confidence_is_that_of_the_map() -> None:
     sure = np.linspace(0, 1, COARSE.V).astype(np.float32)
     given = some()
-    found = carry_landmarks(replace(FORWARD, confidence=sure), COARSE, FINE, given)
+    found = push_landmarks(replace(FORWARD, confidence=sure), COARSE, FINE, given)
     assert np.allclose(found.confidence[:2], sure[[5, 0]])
     expected = (given.barycentric[2:] * sure[COARSE.faces[given.face[2:]]]).sum(axis=1)
     assert np.allclose(found.confidence[2:], expected)
@@ -90,7 +90,7 @@ def test_confidence_is_that_of_the_map() -> None:
 def test_onto_a_cloud(sphere: Shape) -> None:
     points = Shape(FINE.verts, np.empty((0, 3), int), "points")
     forward = VertexMap.between(COARSE, points, np.arange(COARSE.V))
-    found = carry_landmarks(forward, COARSE, points, some())
+    found = push_landmarks(forward, COARSE, points, some())
     assert (found.face == -1).all()
     nearest = np.linalg.norm(some().points[:, None] - FINE.verts, axis=2).argmin(axis=1)
     assert np.array_equal(found.vertex, nearest)

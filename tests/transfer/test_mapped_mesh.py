@@ -1,4 +1,4 @@
-"""ClosestPlaces on the source of points near its image."""
+"""Points on the source of points near its image."""
 
 import numpy as np
 import pytest
@@ -95,7 +95,9 @@ def test_whole_maps_are_not_torn_whatever_the_units(size: float) -> None:
     coarse = Shape(shape.verts * size, shape.faces)
     for found, a, b in ((forward, coarse, fine), (back, fine, coarse)):
         assert not discontinuous_faces(found, a, b, found.points(b), float(np.sqrt(b.area))).any()
-    rounded = VertexMap.between(fine, coarse, back.index)  # to vertices alone: each by up to half an edge
+    rounded = VertexMap.between(
+        fine, coarse, back.index
+    )  # to vertices before_agreement: each by up to half an edge
     assert not discontinuous_faces(
         rounded, fine, coarse, rounded.points(coarse), float(np.sqrt(coarse.area))
     ).any()

@@ -29,7 +29,7 @@ from meshmatch.render.viewer.looks import Looks, dress
 from meshmatch.render.viewer.packing import pack, small_integers, to_bytes, to_shorts, to_signed_bytes
 from meshmatch.render.viewer.placement import Box, boxes, upright
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.direction import check_map
+from meshmatch.transfer.inverse_map import check_map
 
 PAGE_SUFFIXES = (".html", ".htm")
 # Control characters, ends of lines, and marks that turn the direction of writing.

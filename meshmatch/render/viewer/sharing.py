@@ -10,7 +10,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.viewer.looks import Looks
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.bake import Choices
+from meshmatch.transfer.bake import BakeOptions
 from meshmatch.transfer.texture import colors_of_vertices, transfer_texture
 from meshmatch.transfer.unwrap import atlas_of
 
@@ -55,7 +55,7 @@ def _carried(
 ) -> Appearance:
     """A look of `owner` on `wearer`, by a map from `wearer` to `owner`: baked, or as colours of vertices."""
     if look.textured and 0 < wearer.F <= MOST_FACES:
-        choices = Choices(size=TEXELS, padding=4, workers=workers)
+        choices = BakeOptions(size=TEXELS, padding=4, workers=workers)
         try:
             atlas = atlas_of(wearer, coordinates, choices.size, choices.padding)
             baked = transfer_texture(owner, look, wearer, back, atlas, choices).baked

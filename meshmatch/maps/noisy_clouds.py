@@ -24,17 +24,17 @@ _NARROW, _WIDE = 0.006, 0.03  # bounds of the noise, units of sqrt(area)
 _CHUNK = 8192  # points at a time
 
 
-def is_scattered(shape: Shape) -> bool:
+def is_noisy(shape: Shape) -> bool:
     """Whether a shape's points are worth asking this way."""
     return shape.roughness >= _ROUGH
 
 
-def noise_of(distance: np.ndarray) -> float:
+def noise_level(distance: np.ndarray) -> float:
     """Standard deviation of noise, from distances (N,) between points and a surface: robust against strays."""
     return float(np.clip(np.median(distance) / 0.6745, _NARROW, _WIDE))
 
 
-def expected(
+def expectation(
     points: np.ndarray, fit: Fit, noise: float, values: Sequence[np.ndarray]
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Means of values at the template over where points may belong, and how far the first of these scatter.
@@ -68,7 +68,7 @@ def expected(
     return means, variance
 
 
-def land(
+def most_likely_points(
     target: Shape, fit: Fit, noise: float, moved: np.ndarray, belongs: np.ndarray, workers: int = 1
 ) -> Footpoints:
     """The points of a cloud that most likely lie where ``moved`` (N, 3) says, resting at ``belongs`` (N, 3).
@@ -76,7 +76,7 @@ def land(
     Least is the expected squared distance: between the means, and what the target's point scatters besides.
     """
     there = in_core_frame(target, fit)[0]
-    (mean, resting), variance = expected(there, fit, noise, [fit.points, fit.resting])
+    (mean, resting), variance = expectation(there, fit, noise, [fit.points, fit.resting])
     tree = cKDTree(np.column_stack([mean, RESTING_WEIGHT * resting, np.sqrt(variance)]))
     sought = np.column_stack([moved, RESTING_WEIGHT * belongs, np.zeros(len(moved))])
     vertex = tree.query(sought, workers=workers)[1].astype(np.int64)

@@ -8,7 +8,7 @@ import pytest
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps import build
-from meshmatch.maps.scatter import expected, is_scattered, land, noise_of
+from meshmatch.maps.noisy_clouds import expectation, is_noisy, most_likely_points, noise_level
 from meshmatch.shapes.shape import Shape
 
 NO_FACES = np.empty((0, 3), np.int64)
@@ -29,10 +29,10 @@ def plate(side: int = 21, height: float = 0.0) -> Fit:
 
 def test_the_noise_is_that_of_the_distances_whatever_a_few_strays_do() -> None:
     apart = np.abs(0.015 * np.random.default_rng(0).standard_normal(4000))
-    assert noise_of(apart) == pytest.approx(0.015, rel=0.06)
+    assert noise_level(apart) == pytest.approx(0.015, rel=0.06)
     apart[:200] = 3.0
-    assert noise_of(apart) == pytest.approx(0.015, rel=0.12)
-    assert (noise_of(0 * apart), noise_of(apart + 9)) == (0.006, 0.03)
+    assert noise_level(apart) == pytest.approx(0.015, rel=0.12)
+    assert (noise_level(0 * apart), noise_level(apart + 9)) == (0.006, 0.03)
 
 
 def test_means_are_those_of_a_plain_loop() -> None:
@@ -43,7 +43,7 @@ def test_means_are_those_of_a_plain_loop() -> None:
     areas = np.full(len(fit.faces), 1 / 32)
     prior = np.concatenate([np.bincount(fit.faces.reshape(-1), np.repeat(areas / 3, 3)), areas]) / 2
     asked = np.array([[0.4, 0.3, 0.1], [1.2, 0.5, 0]])
-    (mean, other), variance = expected(asked, fit, 0.2, [values, fit.points])
+    (mean, other), variance = expectation(asked, fit, 0.2, [values, fit.points])
     for n, point in enumerate(asked):
         apart = np.linalg.norm(samples - point, axis=1)
         near = np.argsort(apart)[:48]
@@ -57,7 +57,7 @@ def test_means_are_those_of_a_plain_loop() -> None:
 
 def test_a_point_far_from_everything_has_a_mean_all_the_same() -> None:
     fit = plate()
-    (mean,), variance = expected(np.array([[0.5, 0.5, 40.0]]), fit, 0.01, [fit.points])
+    (mean,), variance = expectation(np.array([[0.5, 0.5, 40.0]]), fit, 0.01, [fit.points])
     assert np.allclose(mean, [[0.5, 0.5, 0]], atol=0.05) and np.isfinite(variance).all()
 
 
@@ -70,7 +70,7 @@ def test_of_two_points_as_near_the_better_known_one_is_chosen() -> None:
     )
     cloud = Shape(np.array([[0.5, 0.52, 0.05], [0.5, 0.45, 0.0]]), NO_FACES)
     sought = np.array([[0.5, 0.5, 0.02]])
-    found = land(cloud, fit, 0.02, sought, sought)
+    found = most_likely_points(cloud, fit, 0.02, sought, sought)
     assert found.vertex.tolist() == [1]
     assert found.distance == pytest.approx(np.hypot(0.05, 0.02))
     assert found.face.tolist() == [-1] and found.barycentric.tolist() == [[1, 0, 0]]
@@ -94,10 +94,10 @@ def test_noise_costs_a_map_less_than_closest_points_do(monkeypatch: pytest.Monke
     limb = rolled(flat.points[:, :2] * [2 * np.pi, 1], across)
     fit = replace(flat, points=limb, resting=limb)
     source, target = noisy(clean, 0.015, 2), noisy(clean, 0.015, 3)
-    assert is_scattered(source) and is_scattered(target) and not is_scattered(noisy(clean, 0.0, 1))
+    assert is_noisy(source) and is_noisy(target) and not is_noisy(noisy(clean, 0.0, 1))
     errors = []
-    for scattered in (is_scattered, lambda shape: False):
-        monkeypatch.setattr(build, "is_scattered", scattered)
+    for scattered in (is_noisy, lambda shape: False):
+        monkeypatch.setattr(build, "is_noisy", scattered)
         landed, confidence = build.carry(source, fit, target, fit)
         errors.append(np.linalg.norm(clean[landed.vertex] - clean, axis=1).mean())
         assert ((confidence > 0) & (confidence <= 1)).all()

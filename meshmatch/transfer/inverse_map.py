@@ -10,10 +10,10 @@ from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.topology import edges_of
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.template_footpoints import small_pieces, surroundings
+from meshmatch.maps.template_footpoints import small_islands, surrounding_values
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import ClosestPlaces, MappedMesh, on_vertex
+from meshmatch.transfer.mapped_mesh import MappedFootpoints, MappedMesh, on_vertex
 
 _ROUNDS = 2
 
@@ -78,7 +78,7 @@ def _agrees(hashes: tuple[str, str], counts: tuple[int, int], source: Shape, tar
     return named and counts[0] == source.V and counts[1] in (UNKNOWN, target.V)
 
 
-def pull_back(source_to_target: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
+def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
     """A map from target to source, from one from source to target.
 
     The source's vertices at their matched points, with the source's faces, are an image of the source on the
@@ -118,7 +118,7 @@ def pull_back(source_to_target: VertexMap, source: Shape, target: Shape, workers
 
 
 def _ask_neighbours(
-    image: MappedMesh, found: ClosestPlaces, source: Shape, target: Shape, normals: Floats, workers: int
+    image: MappedMesh, found: MappedFootpoints, source: Shape, target: Shape, normals: Floats, workers: int
 ) -> None:
     """Correct small pieces of the target that lie elsewhere on the source than all around them.
 
@@ -130,12 +130,12 @@ def _ask_neighbours(
     edges = edges_of(target.faces).vertices
     unit, source_unit = (float(np.sqrt(shape.area)) or 1.0 for shape in (target, source))
     length = np.linalg.norm(target.verts[edges[:, 0]] - target.verts[edges[:, 1]], axis=1) / unit
-    at = places_on(source, found) / source_unit
+    at = points_on(source, found) / source_unit
     for _ in range(_ROUNDS):
-        doubted = small_pieces(edges, length, at, target.vertex_areas / unit**2)
+        doubted = small_islands(edges, length, at, target.vertex_areas / unit**2)
         if not doubted.any():
             return
-        around = surroundings(edges, at, doubted)
+        around = surrounding_values(edges, at, doubted)
         ask = np.flatnonzero(doubted & np.isfinite(around).all(axis=1))
         if not len(ask):
             return
@@ -143,10 +143,10 @@ def _ask_neighbours(
         again = image.query(target.verts[ask], normals[ask], workers, near)
         for name in ("vertex", "face", "barycentric", "confidence", "distance"):
             getattr(found, name)[ask] = getattr(again, name)
-        at[ask] = places_on(source, again) / source_unit
+        at[ask] = points_on(source, again) / source_unit
 
 
-def places_on(source: Shape, places: ClosestPlaces) -> Floats:
+def points_on(source: Shape, places: MappedFootpoints) -> Floats:
     """(N, 3) the points themselves, in the source's frame."""
     points = source.verts[places.vertex]
     inside = places.face >= 0

@@ -11,7 +11,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
-from meshmatch.transfer.direction import check_map, pull_back
+from meshmatch.transfer.inverse_map import check_map, invert_map
 from tests.conftest import icosphere
 from tests.transfer.known import brute_force, split
 
@@ -25,7 +25,7 @@ def dancer() -> Shape:
 
 
 def test_the_identity_turned_round_is_the_identity(sphere: Shape) -> None:
-    back = pull_back(VertexMap.identity(sphere), sphere, sphere)
+    back = invert_map(VertexMap.identity(sphere), sphere, sphere)
     assert np.array_equal(back.index, np.arange(sphere.V))
     assert (back.confidence == 1).all()
     assert np.array_equal(back.points(sphere), sphere.verts)
@@ -37,7 +37,7 @@ def test_an_identity_written_with_faces_is_one_too(sphere: Shape) -> None:
     face[sphere.faces[::-1].ravel()] = np.repeat(np.arange(sphere.F)[::-1], 3)
     weights = (sphere.faces[face] == np.arange(sphere.V)[:, None]).astype(float)
     written = VertexMap.between(sphere, sphere, np.arange(sphere.V), face=face, barycentric=weights)
-    back = pull_back(written, sphere, sphere)
+    back = invert_map(written, sphere, sphere)
     assert np.array_equal(back.points(sphere), sphere.verts)
     assert (back.confidence == 1).all()
 
@@ -46,7 +46,7 @@ def test_an_identity_written_with_faces_is_one_too(sphere: Shape) -> None:
 def test_a_finer_copy_finds_its_exact_places(coarse: str, dancer: Shape) -> None:
     shape = COARSE if coarse == "sphere" else dancer
     fine, forward, known = split(shape)
-    back = pull_back(forward, shape, fine)
+    back = invert_map(forward, shape, fine)
     assert np.abs(back.points(shape) - known.points(shape)).max() < 1e-9 * shape.diagonal
     assert back.confidence.min() > 0.999
     assert (back.source, back.target) == (fine.name, shape.name)
@@ -54,7 +54,7 @@ def test_a_finer_copy_finds_its_exact_places(coarse: str, dancer: Shape) -> None
 
 
 def test_a_coarser_copy_takes_its_own_vertices() -> None:
-    back = pull_back(BACK, FINE, COARSE)
+    back = invert_map(BACK, FINE, COARSE)
     assert np.array_equal(back.index, np.arange(COARSE.V))
     assert np.abs(back.points(FINE) - COARSE.verts).max() < 1e-12
 
@@ -64,7 +64,7 @@ def test_the_closest_points_are_those_of_asking_every_triangle() -> None:
     source, target = COARSE, Shape(icosphere(2).verts, icosphere(2).faces, "other")
     index = np.linalg.norm(source.verts[:, None] - target.verts, axis=2).argmin(axis=1)
     moved = VertexMap.between(source, target, index, confidence=rng.uniform(0.6, 1, source.V))
-    back = pull_back(moved, source, target)
+    back = invert_map(moved, source, target)
     image = target.verts[index]
     distance, _ = brute_force(target.verts, image, source.faces)
     corners = source.faces[back.face]
@@ -77,7 +77,7 @@ def test_the_closest_points_are_those_of_asking_every_triangle() -> None:
 def test_where_vertices_pile_up_the_middle_one_is_taken(sphere: Shape) -> None:
     """A bare list of vertices puts a patch of a fine source on each vertex of a coarse target."""
     index = np.linalg.norm(sphere.verts[:, None] - COARSE.verts, axis=2).argmin(axis=1)
-    back = pull_back(VertexMap("", "", index), sphere, COARSE)
+    back = invert_map(VertexMap("", "", index), sphere, COARSE)
     away = np.linalg.norm(back.points(sphere) - COARSE.verts, axis=1)
     patch = np.linalg.norm(sphere.verts - COARSE.verts[index], axis=1).max()
     assert patch > 0.25
@@ -89,7 +89,7 @@ def test_what_nothing_maps_onto_has_no_confidence(sphere: Shape) -> None:
     kept = np.isin(sphere.faces, upper).all(axis=1)
     number = np.cumsum(np.isin(np.arange(sphere.V), upper)) - 1
     half = Shape(sphere.verts[upper], number[sphere.faces[kept]], "half")
-    back = pull_back(VertexMap.between(half, sphere, upper), half, sphere)
+    back = invert_map(VertexMap.between(half, sphere, upper), half, sphere)
     assert back.confidence[upper].min() > 0.999
     assert back.confidence[sphere.verts[:, 2] < -0.5].max() < 0.01
     assert np.array_equal(back.points(half)[upper], half.verts)
@@ -100,7 +100,7 @@ def test_a_triangle_torn_between_two_places_carries_nothing(torus: Shape) -> Non
     index = np.arange(torus.V)
     far = int(np.argmax(np.linalg.norm(torus.verts - torus.verts[0], axis=1)))
     index[0] = far
-    back = pull_back(VertexMap.between(torus, torus, index), torus, torus)
+    back = invert_map(VertexMap.between(torus, torus, index), torus, torus)
     rest = np.setdiff1d(np.arange(torus.V), [0, far])
     assert np.array_equal(back.index[rest], rest)
     own = np.linalg.norm(back.points(torus)[0] - torus.verts[0])
@@ -136,7 +136,7 @@ def test_the_sheet_that_faces_the_same_way_wins() -> None:
     source, target = shell(1), shell(3)
     few, many = source.V // 2, target.V // 2
     index = np.concatenate([np.arange(few), many + np.arange(few)])  # a finer sphere begins with the coarser
-    back = pull_back(VertexMap.between(source, target, index), source, target)
+    back = invert_map(VertexMap.between(source, target, index), source, target)
     assert ((back.index < few) == (np.arange(target.V) < many)).all()
 
 
@@ -151,7 +151,7 @@ def test_small_pieces_on_the_wrong_sheet_ask_their_neighbours() -> None:
     flat = source.verts * [1, 1, 0.01]
     flat[40, 2] = 0.0
     target = Shape(flat, source.faces, "touching")
-    back = pull_back(
+    back = invert_map(
         VertexMap.between(source, target, index, confidence=np.full(source.V, 0.99)), source, target
     )
     assert ((back.index < half) == (index < half)).all()
@@ -161,7 +161,7 @@ def test_clouds_take_the_nearest_mapped_point(sphere: Shape) -> None:
     points = Shape(sphere.verts, np.empty((0, 3), int), "points")
     some = np.arange(0, sphere.V, 2)
     fewer = Shape(sphere.verts[some], np.empty((0, 3), int), "fewer")
-    back = pull_back(VertexMap.between(fewer, points, some), fewer, points)
+    back = invert_map(VertexMap.between(fewer, points, some), fewer, points)
     nearest = np.linalg.norm(points.verts[:, None] - fewer.verts, axis=2)
     assert np.allclose(np.linalg.norm(back.points(fewer) - points.verts, axis=1), nearest.min(axis=1))
     assert (back.face == -1).all()
@@ -173,20 +173,20 @@ def test_a_vertex_without_a_position_carries_no_confidence(sphere: Shape) -> Non
     invalid[5] = True
     broken = Shape(sphere.verts, sphere.faces, "broken", None, invalid)
     forward = VertexMap.between(sphere, broken, np.arange(sphere.V))
-    back = pull_back(forward, sphere, broken)
+    back = invert_map(forward, sphere, broken)
     assert back.confidence[5] == 0
     assert np.delete(back.confidence, 5).min() > 0.99
 
 
 def test_verdict_and_reasons_stay() -> None:
     poor = replace(FORWARD, verdict="poor", reasons=("it is upside down",))
-    back = pull_back(poor, COARSE, FINE)
+    back = invert_map(poor, COARSE, FINE)
     assert (back.verdict, back.reasons) == ("poor", ("it is upside down",))
 
 
 def test_low_confidence_is_carried_back() -> None:
     half = replace(FORWARD, confidence=np.full(COARSE.V, 0.6))
-    assert np.allclose(pull_back(half, COARSE, FINE).confidence, 0.6, atol=0.01)
+    assert np.allclose(invert_map(half, COARSE, FINE).confidence, 0.6, atol=0.01)
 
 
 def test_a_bare_map_learns_its_ends() -> None:
