@@ -61,7 +61,7 @@ def load_shape(path: str | Path) -> Shape:
     data = read_bytes(path)
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
         raw = _READERS[suffix](path, data)
-    return _shape(plain_text(path.name), raw)
+    return Shape.with_invalid(raw.verts, raw.faces, plain_text(path.name), raw.colors)
 
 
 def read_bytes(path: Path) -> bytes:
@@ -117,20 +117,6 @@ def save_shape(path: str | Path, shape: Shape) -> None:
         raise OptionError(f"a {suffix} file cannot hold faces", "choose .ply, .obj, .off, .stl or .glb")
     with replace_on_success(path) as temporary:
         _WRITERS[suffix](temporary, shape)
-
-
-def _shape(name: str, raw: Raw) -> Shape:
-    if len(raw.verts) == 0:
-        raise InputError(f"{name} holds no vertices", "is it a mesh or a point cloud at all?")
-    # squared areas must not overflow; a position of 1e60 is no position either
-    usable = np.asarray((np.abs(raw.verts) < 1e60).all(axis=1))
-    if usable.all():
-        return Shape(raw.verts, raw.faces, name, raw.colors)
-    if not usable.any():
-        raise InputError(f"{name}: no vertex has a finite position (all NaN)", "export it again")
-    verts = raw.verts.copy()
-    verts[~usable] = verts[usable].mean(axis=0)
-    return Shape(verts, raw.faces, name, raw.colors, ~usable)
 
 
 def _similar(path: Path) -> str:

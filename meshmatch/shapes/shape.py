@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, frozen, read
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import average_normals, share_areas, squared_lengths, triangle_vectors, unit
 from meshmatch.shapes.cloud import estimate_normals, local_areas, roughness
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,38 @@ class Shape:
             if invalid.shape != (len(verts),):
                 raise InputError(f"{label}: invalid must be an array of ({len(verts)},), not {invalid.shape}")
             object.__setattr__(self, "invalid", invalid if invalid.any() else None)
+
+    @classmethod
+    def with_invalid(
+        cls,
+        verts: Float[Floats, "V 3"],
+        faces: Int[Ints, "F 3"],
+        name: str,
+        colors: Float[Floats, "V 4"] | None = None,
+    ) -> Shape:
+        """A shape some of whose positions may be NaN or infinite: these are marked in `invalid`, and moved to the
+        centroid of the others.
+
+        Raises
+        ------
+        InputError
+            As for the class; or no position is finite.
+        """
+        if len(verts) == 0:
+            raise InputError(
+                f"{name or 'the shape'} holds no vertices", "is it a mesh or a point cloud at all?"
+            )
+        # Squared areas must not overflow: a position of 1e60 is invalid too.
+        usable = np.asarray((np.abs(verts) < 1e60).all(axis=1))
+        if usable.all():
+            return cls(verts, faces, name, colors)
+        if not usable.any():
+            raise InputError(
+                f"{name or 'the shape'}: no vertex has a finite position (all NaN)", "export it again"
+            )
+        verts = verts.copy()
+        verts[~usable] = verts[usable].mean(axis=0)
+        return cls(verts, faces, name, colors, ~usable)
 
     @property
     def V(self) -> int:
@@ -164,6 +200,16 @@ class Shape:
         digest = hashlib.sha256(self.verts.data)
         digest.update(self.faces.data if len(self.faces) else b"")
         return digest.hexdigest()[:16]
+
+    def to_trimesh(self) -> Trimesh:
+        """The shape as a `trimesh.Trimesh`, vertices and faces in the same order; a cloud as one without faces.
+
+        Invalid vertices keep their stand-in positions; colours become 8-bit vertex colours.
+        """
+        from trimesh import Trimesh
+
+        colors = None if self.colors is None else np.rint(255 * np.clip(self.colors, 0, 1)).astype(np.uint8)
+        return Trimesh(self.verts.copy(), self.faces.copy(), vertex_colors=colors, process=False)
 
     def __repr__(self) -> str:
         kind = "cloud" if self.is_cloud else f"{self.F} faces"

@@ -1,0 +1,65 @@
+"""Shapes from what users hold: paths, arrays, and meshes of other libraries."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from meshmatch.errors import InputError
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.shape import Shape
+
+_HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
+
+
+def as_shape(source: Any, name: str = "") -> Shape:
+    """The shape that is meant: a `Shape` as it is, a file read, everything else copied.
+
+    Parameters
+    ----------
+    source
+        A path; a `Shape`; a pair of vertices (V, 3) and triangles (F, 3); an array (N, 3) of points; or an object
+        with ``vertices`` and, unless it is a cloud, ``faces`` (trimesh) or ``triangles`` (Open3D). Vertex colours of
+        a `trimesh.Trimesh` are kept.
+    name : str
+        For messages, where the source has no name of its own.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or the source is none of these.
+    """
+    if isinstance(source, Shape):
+        return source
+    if isinstance(source, str | os.PathLike):
+        return load_shape(os.fspath(source))
+    if hasattr(source, "vertices"):
+        faces = getattr(source, "faces", getattr(source, "triangles", None))
+        return _from_arrays(source.vertices, faces, name, _trimesh_colors(source))
+    if isinstance(source, tuple | list) and len(source) == 2 and np.ndim(source[0]) == 2:
+        return _from_arrays(source[0], source[1], name)
+    if hasattr(source, "__array__") or isinstance(source, tuple | list):
+        return _from_arrays(source, None, name)
+    raise InputError(f"cannot make a shape of {type(source).__name__}", _HINT)
+
+
+def _from_arrays(verts: Any, faces: Any, name: str, colors: Any = None) -> Shape:
+    try:
+        verts = np.array(verts, np.float64)
+        faces = np.empty((0, 3), np.int64) if faces is None else np.asarray(faces)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name or 'the shape'}: not an array of numbers ({error})", _HINT) from error
+    if verts.ndim != 2 or verts.shape[1] != 3:
+        raise InputError(
+            f"{name or 'the shape'}: vertices must be an array of (V, 3), not {verts.shape}", _HINT
+        )
+    return Shape.with_invalid(verts, faces, name, colors)
+
+
+def _trimesh_colors(mesh: Any) -> Any:
+    visual: Any = getattr(mesh, "visual", None)
+    if getattr(visual, "kind", None) != "vertex":
+        return None
+    return np.asarray(visual.vertex_colors, np.float64) / 255.0
