@@ -14,21 +14,38 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def dead_links(text: str, folder: Path) -> list[str]:
+def anchors(text: str) -> set[str]:
+    """What links to headings of a page are called."""
+    headings = re.findall(
+        r"^#+ (.*)$", re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL), re.MULTILINE
+    )
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def dead_links(text: str, page: Path) -> list[str]:
     """Local targets of links and pictures that do not exist."""
-    targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", text)
-    local = [target for target in targets if not target.startswith(("http:", "https:", "mailto:"))]
-    return [target for target in local if not (folder / target).exists()]
+    dead = []
+    for target in re.findall(r"\]\(([^)\s]+)[^)]*\)", text):
+        name, _, anchor = target.partition("#")
+        if not name.startswith(("http:", "https:", "mailto:")):
+            file = page.parent / name if name else page
+            if not file.exists() or (anchor and anchor not in anchors(file.read_text(encoding="utf-8"))):
+                dead.append(target)
+    return dead
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_and_pictures_lead_somewhere(page: Path) -> None:
-    assert dead_links(page.read_text(encoding="utf-8"), page.parent) == []
+def test_links_and_pictures_lead_somewhere() -> None:
+    pages = [*PAGES, ROOT / ".github" / "CONTRIBUTING.md"]
+    assert [
+        f"{page.name}: {dead}" for page in pages for dead in dead_links(page.read_text("utf-8"), page)
+    ] == []
 
 
 def test_a_dead_link_is_noticed(tmp_path: Path) -> None:
-    (tmp_path / "here.md").touch()
-    assert dead_links("[a](here.md#part) ![b](gone.png) [c](https://example.org)", tmp_path) == ["gone.png"]
+    (tmp_path / "here.md").write_text("# A (`part`) of it\n```text\n# no heading\n```\n")
+    text = "[a](here.md#a-part-of-it) ![b](gone.png) [c](https://example.org) [d](here.md#no-heading) [e](#f)"
+    (tmp_path / "page.md").touch()
+    assert dead_links(text, tmp_path / "page.md") == ["gone.png", "here.md#no-heading", "#f"]
 
 
 def test_the_readme_matches_the_two_shapes_that_ship() -> None:
