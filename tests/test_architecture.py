@@ -27,7 +27,7 @@ GROUND = ("errors", "threads", "outputs", "progress")
 ROOMS = (
     *GROUND,
     *("arrays", "geometry", "shapes", "templates", "fields", "models", "training", "fitting"),
-    *("maps", "transfer", "render", "pipeline", "interpolation", "api", "experiments", "cli", "__main__"),
+    *("maps", "transfer", "render", "pipeline", "api", "experiments", "cli", "__main__"),
 )
 
 # Which rooms know which third-party library.

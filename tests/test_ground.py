@@ -5,6 +5,8 @@ import os
 import pickle
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,7 @@ import meshmatch
 from meshmatch import errors
 from meshmatch.errors import InputError, MeshmatchError, OutputError
 from meshmatch.outputs import folder_on_success, replace_on_success
-from meshmatch.threads import set_threads
+from meshmatch.threads import set_threads, thread_limit
 
 
 def test_error_has_a_line_and_a_hint() -> None:
@@ -173,3 +175,60 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "full" / "mine.txt").read_text() == "mine"
     assert (tmp_path / "late" / "theirs.txt").read_text() == "came in between"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "full", "late"]
+
+
+def counts() -> dict[str, int]:
+    """Threads of every BLAS that is loaded, and of torch."""
+    import torch
+    from threadpoolctl import threadpool_info
+
+    found = {
+        each["filepath"]: each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"
+    }
+    return found | {"torch": torch.get_num_threads()}
+
+
+@pytest.fixture
+def three_threads() -> Iterator[dict[str, int]]:
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    before = torch.get_num_threads()
+    with threadpool_limits(3, user_api="blas"):
+        torch.set_num_threads(3)
+        yield counts()
+    torch.set_num_threads(before)
+
+
+def test_a_limit_of_threads_is_given_back(three_threads: dict[str, int]) -> None:
+    assert set(three_threads.values()) == {3}
+    with thread_limit(1):
+        assert set(counts().values()) == {1}
+        with thread_limit(2):
+            assert set(counts().values()) == {2}
+        assert set(counts().values()) == {1}
+    assert counts() == three_threads
+    with pytest.raises(KeyError), thread_limit(1):
+        raise KeyError
+    assert counts() == three_threads
+    with pytest.raises(ValueError, match="at least one"), thread_limit(0):
+        pass
+
+
+def test_limits_of_threads_may_overlap(three_threads: dict[str, int]) -> None:
+    """The first call ends while the second runs; whoever ends last gives back what the first found."""
+    entered, leave = threading.Event(), threading.Event()
+
+    def second() -> None:
+        with thread_limit(2):
+            entered.set()
+            assert leave.wait(10)
+
+    other = threading.Thread(target=second)
+    with thread_limit(1):
+        other.start()
+        assert entered.wait(10)
+    assert counts()["torch"] == 3
+    leave.set()
+    other.join()
+    assert counts() == three_threads

@@ -10,7 +10,7 @@ from meshmatch.cli.console import Console, print_json
 from meshmatch.cli.output_paths import check_apart, check_png, claimed
 
 if TYPE_CHECKING:
-    from meshmatch.interpolation import Interpolation
+    from meshmatch.api.interpolation import Interpolation
 
 _HINT = "is it the model's category? try --up and --front, or leave out --strict to look at it"
 
@@ -98,28 +98,22 @@ def interpolate(
     claim = folder_on_success if kind == "folder" else replace_on_success
     with claimed(plot) as plotted, claim(output) as temporary:
         locate_model(model)
-        from meshmatch import interpolation
+        from meshmatch.api import interpolation
+        from meshmatch.fitting.fit_config import FitConfig
 
-        interpolation.check_bake_options(frames, start, stop, mesh, place)
+        choices_of_sequence = interpolation.InterpolationOptions(start, stop, mesh, blend, place)
+        config = FitConfig(
+            refine=refine, seed=seed, up=up, front=front, partial=options.partial_choice(partial)
+        )
         shapes = [load_shape(file) for file in files]
         with voice.progress() as report:
             result = interpolation.interpolate(
-                shapes[0],
-                shapes[-1],
+                shapes,
                 frames,
-                through=shapes[1:-1],
-                start=start,
-                stop=stop,
-                mesh=mesh,
-                way=blend,
-                place=place,
+                options=choices_of_sequence,
                 model=model,
-                refine=refine,
-                seed=seed,
-                up=up,
-                front=front,
-                partial=options.partial_choice(partial),
-                workers=threads,
+                config=config,
+                threads=threads,
                 progress=report,
             )
         poor = [file.name for file, fit in zip(files, result.fits, strict=True) if fit.verdict == "poor"]

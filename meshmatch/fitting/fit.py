@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshmatch.geometry.frames import Frame
+from meshmatch.shapes.repair import Repaired
 
 # Mean two-way residual (units of sqrt(area)) up to which a fit is called good, and fair.
 GOOD_RESIDUAL = 0.0285
@@ -44,6 +45,10 @@ class Fit:
     seed : int
     partial : bool
         The shape was taken for a part: the residual is from the shape to the template only.
+    repaired : Repaired, optional
+        The shape itself, with the way back to the vertices of its file.
+    notes : tuple of str
+        What was changed in the shape before fitting, and which choices were replaced.
     """
 
     template_hash: str
@@ -61,6 +66,8 @@ class Fit:
     seconds: float
     seed: int
     partial: bool = False
+    repaired: Repaired | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def points_in_file(self) -> np.ndarray:

@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 
+
+@runtime_checkable
+class HasVertices(Protocol):
+    """A mesh or a point cloud of another library: ``vertices`` (V, 3) and, for a mesh, ``faces`` (F, 3)."""
+
+    @property
+    def vertices(self) -> ArrayLike: ...
+
+
+ShapeLike: TypeAlias = Shape | str | Path | NDArray[np.generic] | tuple[ArrayLike, ArrayLike] | HasVertices
+"""A shape; its file; points (N, 3); vertices and faces, ((V, 3), (F, 3)); or an object with ``vertices``."""
+
 _HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
 
 
-def as_shape(source: Any, name: str = "") -> Shape:
+def as_shape(source: ShapeLike, name: str = "") -> Shape:
     """The shape that is meant: a `Shape` as it is, a file read, everything else copied.
 
     Parameters
@@ -35,7 +49,7 @@ def as_shape(source: Any, name: str = "") -> Shape:
         return source
     if isinstance(source, str | os.PathLike):
         return load_shape(os.fspath(source))
-    if hasattr(source, "vertices"):
+    if isinstance(source, HasVertices):
         faces = getattr(source, "faces", getattr(source, "triangles", None))
         return _from_arrays(source.vertices, faces, name, _trimesh_colors(source))
     if isinstance(source, tuple | list) and len(source) == 2 and np.ndim(source[0]) == 2:

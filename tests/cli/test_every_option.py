@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
-from meshmatch import interpolation, pipeline
+from meshmatch import pipeline
+from meshmatch.api import interpolation
 from meshmatch.cli.app import app
 from meshmatch.errors import InputError
 from meshmatch.maps.files import save_map
@@ -68,7 +69,7 @@ def test_the_net_catches_an_option_that_nobody_passes() -> None:
 def test_interpolate_hands_partial_on(
     run: Run, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, flag: str | None, word: str
 ) -> None:
-    heard: dict[str, object] = {}
+    heard: dict[str, Any] = {}
 
     def stop(*_: object, **choices: object) -> None:
         heard.update(choices)
@@ -77,7 +78,7 @@ def test_interpolate_hands_partial_on(
     monkeypatch.setattr(interpolation, "interpolate", stop)
     out = two[0].with_name("between")
     answer = run("interpolate", *two, "-o", out, *([] if flag is None else [flag]))
-    assert (answer.status, heard["partial"]) == (1, word)
+    assert (answer.status, heard["config"].partial) == (1, word)
     assert not out.exists()
 
 

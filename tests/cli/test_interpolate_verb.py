@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from meshmatch import interpolation
+from meshmatch.api import interpolation
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
@@ -124,7 +124,7 @@ def test_files_of_different_units_stay_with_the_first(run: Run, eggs: Path, tmp_
 
 def test_a_shape_and_itself(eggs: Path) -> None:
     a = load_shape(eggs / "a.ply")
-    result = interpolation.interpolate(a, a, 3, model=eggs / "model", workers=1)
+    result = interpolation.interpolate([a, a], 3, model=eggs / "model", threads=1)
     assert all(np.abs(step.shape.verts - a.verts).max() < 1e-6 * a.diagonal for step in result.steps)
     assert result.to_target < 1e-6
 
@@ -163,12 +163,12 @@ def test_bad_choices_write_nothing(
 
 def test_one_shape_is_no_sequence(run: Run, eggs: Path) -> None:
     assert run("interpolate", eggs / "a.ply", eggs / "b.ply", "-o", "x", "-n", 1).status == 2
-    with pytest.raises(interpolation.OptionError, match="no sequence"):
-        interpolation.interpolate(eggs / "a.ply", eggs / "b.ply", 1)
-    with pytest.raises(interpolation.OptionError, match="no mesh"):
-        interpolation.interpolate(eggs / "a.ply", eggs / "b.ply", mesh="hat")  # type: ignore[arg-type]
-    with pytest.raises(interpolation.OptionError, match="no place"):
-        interpolation.interpolate(eggs / "a.ply", eggs / "b.ply", place="moon")  # type: ignore[arg-type]
+    with pytest.raises(interpolation.OptionError, match="at least two shapes to make, not 1"):
+        interpolation.interpolate([eggs / "a.ply", eggs / "b.ply"], 1)
+    with pytest.raises(interpolation.OptionError, match="invalid mesh 'hat'"):
+        interpolation.InterpolationOptions(mesh="hat")  # type: ignore[arg-type]
+    with pytest.raises(interpolation.OptionError, match="invalid place 'moon'"):
+        interpolation.InterpolationOptions(place="moon")  # type: ignore[arg-type]
 
 
 def test_strict_wants_fits_that_are_not_poor(run: Run, eggs: Path, tmp_path: Path, torus: Shape) -> None:

@@ -1,0 +1,82 @@
+"""What users hand in: models and shapes, checked."""
+
+from __future__ import annotations
+
+import os
+import threading
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from meshmatch.errors import InputError
+from meshmatch.shapes.cloud import on_a_line
+from meshmatch.shapes.repair import Repaired, repair
+from meshmatch.shapes.shape import Shape
+
+if TYPE_CHECKING:
+    from meshmatch.models.trained import TrainedModel
+
+MINIMUM_FACES = 50
+MINIMUM_POINTS = 100
+
+_loading = threading.Lock()
+
+
+def as_model(model: TrainedModel | str | Path) -> TrainedModel:
+    """A model, loaded once if it is given by its name or folder (and again if its files have changed since).
+
+    Raises
+    ------
+    ModelError
+        There is none of this name, or its files are damaged.
+    """
+    if not isinstance(model, str | Path):
+        return model
+    from meshmatch.models.registry import WEIGHTS, locate_model
+
+    folder = locate_model(model)
+    try:
+        changed = os.stat(folder / WEIGHTS).st_mtime_ns
+    except OSError:
+        changed = 0  # the reader says what is missing
+    with _loading:
+        return _loaded(folder.resolve(), changed)
+
+
+@lru_cache(maxsize=2)
+def _loaded(folder: Path, changed: int) -> TrainedModel:
+    from meshmatch.models.trained import load_model
+
+    return load_model(folder)
+
+
+def validated(shape: Shape) -> Repaired:
+    """Repair a shape and refuse what cannot be fitted.
+
+    Raises
+    ------
+    InputError
+        Too few faces or points, no extent, or two large parts far apart.
+    """
+    clean = repair(shape)
+    fixed = clean.shape
+    name = shape.name or "the shape"
+    if fixed.is_cloud and fixed.V < MINIMUM_POINTS:
+        places = "position" if fixed.V == 1 else "positions"
+        raise InputError(
+            f"{name} has only {fixed.V} distinct point {places}", f"at least {MINIMUM_POINTS} are needed"
+        )
+    if not fixed.is_cloud and fixed.F < MINIMUM_FACES:
+        raise InputError(
+            f"{name} has only {fixed.F} usable triangles", f"at least {MINIMUM_FACES} are needed"
+        )
+    if fixed.is_cloud and on_a_line(fixed.verts):
+        raise InputError(f"{name} has no surface: all its points lie on a line", "is it a point cloud?")
+    if not fixed.area > 0:
+        raise InputError(f"{name} has no surface area", "are all its points the same, or on a line?")
+    if clean.far_parts:
+        raise InputError(
+            f"{name} contains {clean.far_parts + 1} large parts far apart",
+            "save each object in a file of its own",
+        )
+    return clean

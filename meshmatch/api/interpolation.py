@@ -1,0 +1,254 @@
+"""A sequence of shapes between two or more."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from meshmatch.api.matching import Matcher
+from meshmatch.api.results import shape_of
+from meshmatch.errors import OptionError
+from meshmatch.fitting.agree import agreed_fits
+from meshmatch.fitting.blend import WAYS, Blend, Deviation, Way
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.maps.surface import Surface
+from meshmatch.maps.template_footpoints import in_core_frame
+from meshmatch.models.trained import TrainedModel
+from meshmatch.outputs import folder_on_success
+from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.convert import ShapeLike
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Floats, Shape
+from meshmatch.threads import thread_limit
+from meshmatch.transfer.surface_binding import SurfaceBinding
+
+Mesh = Literal["source", "template"]
+Place = Literal["auto", "files", "source"]
+MESHES: tuple[Mesh, ...] = get_args(Mesh)
+PLACES: tuple[Place, ...] = get_args(Place)
+EARLIEST, LATEST = -1.0, 2.0
+"""Times between which a sequence may run: the source is at 0, the target at 1."""
+FORMATS = ("ply", "obj", "off", "glb")
+"""Of the files in a folder."""
+LIST = "frames.json"
+_HAIR = 1e-9
+_ALIKE = 1.5  # sizes of files in one unit differ by less
+
+
+@dataclass(frozen=True)
+class InterpolationOptions:
+    """What a sequence of shapes shows.
+
+    Parameters
+    ----------
+    start, stop : float
+        Times of the first and the last shape, from -1 to 2; beyond 0 and 1 the motion goes on.
+    mesh : {"source", "template"}
+        Move the source's own mesh, or the template's.
+    way : {"field", "codes"}
+        Blend the rotation and stretch of the field everywhere, or the network's codes.
+    place : {"auto", "files", "source"}
+        See `Interpolation`; "auto" is "files" where the sizes of the shapes differ by less than a half.
+
+    Raises
+    ------
+    OptionError
+        An unknown choice, or times out of range.
+    """
+
+    start: float = 0.0
+    stop: float = 1.0
+    mesh: Mesh = "source"
+    way: Way = "field"
+    place: Place = "auto"
+
+    def __post_init__(self) -> None:
+        if not EARLIEST <= self.start < self.stop <= LATEST:
+            raise OptionError(
+                f"a sequence cannot run from {self.start:g} to {self.stop:g}",
+                f"the source is at 0 and the target at 1; times go from {EARLIEST:g} to {LATEST:g}, the earlier first",
+            )
+        for name, value, choices in (
+            ("mesh", self.mesh, MESHES),
+            ("way", self.way, WAYS),
+            ("place", self.place, PLACES),
+        ):
+            if value not in choices:
+                raise OptionError(f"invalid {name} {value!r}", f"choose one of {', '.join(choices)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One shape of a sequence: the source at time 0, the target at 1.
+
+    ``rotation`` (3, 3) leads into a frame with the template's axes, for pictures.
+    """
+
+    time: float
+    shape: Shape
+    deviation: Deviation
+    rotation: np.ndarray
+
+    @property
+    def record(self) -> dict[str, float]:
+        """Time and deviations, for JSON."""
+        return {"time": round(self.time, 9)} | {
+            key: round(value, 6) for key, value in asdict(self.deviation).items()
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Interpolation:
+    """A sequence of shapes with the same vertices and faces.
+
+    Attributes
+    ----------
+    steps : tuple of Step
+    fits : tuple of Fit
+        Of the source, of the shapes on the way, of the target.
+    times : tuple of float
+        When each of these is met.
+    place : {"files", "source"}
+        Where the shapes lie: from where the source's file has it to where the target's has it, or all in the frame and
+        unit of the source.
+    to_target : float
+        Mean distance of the carried vertices at time 1 to the target's surface, in units of sqrt(area).
+    seconds : float
+    notes : tuple of str
+        What repair did.
+    """
+
+    steps: tuple[Step, ...]
+    fits: tuple[Fit, ...]
+    times: tuple[float, ...]
+    place: Place
+    to_target: float
+    seconds: float
+    notes: tuple[str, ...]
+
+
+def interpolate(
+    shapes: Sequence[ShapeLike],
+    frames: int = 9,
+    *,
+    options: InterpolationOptions | None = None,
+    model: str | Path | TrainedModel = "human",
+    config: FitConfig | Sequence[FitConfig] | None = None,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> Interpolation:
+    """The shapes between two shapes: from the first at time 0 to the last at time 1.
+
+    Parameters
+    ----------
+    shapes : sequence of shapes
+        At least two, each as in `match`; those in between are passed at even times.
+    frames : int
+        How many shapes to make, at least 2, at even times.
+    options : InterpolationOptions, optional
+        Times, what moves, how it is blended and where it lies.
+    model, config, threads, progress
+        See `match`; a sequence of configs has one for each shape.
+
+    Raises
+    ------
+    MeshmatchError
+        A shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
+    """
+    began = time.monotonic()
+    options = options or InterpolationOptions()
+    for count, what in ((len(shapes), "two shapes to go between"), (frames, "two shapes to make")):
+        if count < 2:
+            raise OptionError(f"a sequence needs at least {what}, not {count}")
+    matcher = Matcher(model, None, threads, progress)
+    fits = matcher.fit_all(shapes, config)
+    notes = tuple(dict.fromkeys(note for fit in fits for note in fit.notes))
+    with thread_limit(1):
+        repaired = [shape_of(fit).shape for fit in fits]
+        first = config if isinstance(config, FitConfig) or config is None else config[0]
+        fits = agreed_fits(matcher.model, repaired, fits, first)
+        blend = Blend(matcher.model, fits, None, repaired, options.way)
+        steps, place, distance = _steps(
+            blend, fits, np.linspace(options.start, options.stop, frames), options, matcher
+        )
+    return Interpolation(
+        steps, tuple(fits), tuple(blend.times.tolist()), place, distance, time.monotonic() - began, notes
+    )
+
+
+def _steps(
+    blend: Blend, fits: Sequence[Fit], moments: Floats, options: InterpolationOptions, matcher: Matcher
+) -> tuple[tuple[Step, ...], Place, float]:
+    """The shapes, where they lie, and how far the mesh is from the target at time 1."""
+    binding = None
+    if options.mesh == "source":
+        binding = SurfaceBinding(shape_of(fits[0]), fits[0], blend.turns(fits[0].vectors), matcher.threads)
+    place = options.place if options.place != "auto" else _usual_place(fits)
+
+    def seen(moment: float) -> tuple[np.ndarray, np.ndarray]:
+        """Node vectors and carried vertices, core frame."""
+        vectors = blend.vectors(moment)
+        points = blend.points(vectors)
+        return vectors, points if binding is None else binding.at(points, blend.turns(vectors))
+
+    def step(number: int, moment: float) -> Step:
+        vectors, verts = seen(moment)
+        frame = blend.frame(moment) if place == "files" else fits[0].frame
+        name = f"{number:03d}"
+        placed = frame.undo(verts)
+        shape = Shape(placed, fits[0].faces, name) if binding is None else binding.shape(placed, name)
+        if matcher.progress is not None:
+            matcher.progress("frames", "sequence", (number + 1) / len(moments))
+        return Step(moment, shape, blend.deviation(moment, vectors), frame.rotation)
+
+    for met in blend.times:  # which rounding may have missed by a hair
+        moments[np.abs(moments - met) < _HAIR] = met
+    steps = tuple(step(number, moment) for number, moment in enumerate(moments.tolist()))
+    return steps, place, _distance(seen(1.0)[1], shape_of(fits[-1]).shape, fits[-1])
+
+
+def save_folder(path: str | Path, result: Interpolation, kind: str = "ply") -> list[str]:
+    """Write each shape of a sequence into a new folder, and a list of them: ``frame-000.ply`` ..., ``frames.json``.
+
+    Returns
+    -------
+    list of str
+        The names of the shapes' files, in order.
+
+    Raises
+    ------
+    OptionError
+        The format is none of `FORMATS`.
+    OutputError
+        The folder holds something, or cannot be written.
+    """
+    if kind not in FORMATS:
+        raise OptionError(f"shapes of a sequence are not written as {kind}", f"choose {', '.join(FORMATS)}")
+    names = [f"frame-{number:03d}.{kind}" for number in range(len(result.steps))]
+    with folder_on_success(path) as folder:
+        for name, step in zip(names, result.steps, strict=True):
+            save_shape(folder / name, step.shape)
+        frames = [{"file": name} | step.record for name, step in zip(names, result.steps, strict=True)]
+        words = {"times_of_the_shapes": list(result.times), "place": result.place, "frames": frames}
+        (folder / LIST).write_text(json.dumps(words, indent=1) + "\n", encoding="utf-8")
+    return names
+
+
+def _usual_place(fits: Sequence[Fit]) -> Place:
+    """Files of different units have no place in common."""
+    sizes = [fit.frame.scale for fit in fits]
+    return "files" if max(sizes) < _ALIKE * min(sizes) else "source"
+
+
+def _distance(verts: np.ndarray, target: Shape, fit: Fit) -> float:
+    """Mean distance of vertices (N, 3) to a shape, in the core frame of its fit."""
+    own, normals = in_core_frame(target, fit)
+    found = Surface(own, target.faces, np.zeros_like(normals)).query(verts, np.zeros_like(verts))
+    return float(found.distance.mean())

@@ -1,0 +1,297 @@
+"""From shapes to fits, and from fits to maps: `match`, `register`, and `Matcher` for many shapes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.results import MatchResult, map_of_fits, shape_of
+from meshmatch.errors import OptionError
+from meshmatch.fitting.agree import agreed_fits
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig, check_landmarks
+from meshmatch.fitting.fit_shape import fit_shape
+from meshmatch.fitting.landmarks import honour_pairs
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.trained import TrainedModel
+from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.convert import ShapeLike, as_shape
+from meshmatch.shapes.repair import Repaired
+from meshmatch.threads import thread_limit
+
+LandmarkPairs = tuple[ArrayLike, ArrayLike]
+"""Corresponding points: vertices of the source (N,), vertices of the target (N,)."""
+THREADS = 2
+"""Unless said otherwise: the two shapes of a match are fitted beside each other, each on one thread."""
+
+
+class Matcher:
+    """One model, for many shapes: fit each of them once, then map between any two of the fits.
+
+    Parameters
+    ----------
+    model : str, path or TrainedModel
+        Name in the registry, model folder, or a model that `load_model` returned.
+    config : FitConfig
+        How shapes are fitted, for all of them.
+    threads : int, optional
+        How many shapes are fitted beside each other, each on one thread of the numerical libraries; 2 by default. One
+        shape alone is fitted on one thread by default, and on more if they are asked for, which may change the last
+        bits. Afterwards the libraries have their threads back.
+    progress : callable, optional
+        Called with the stage, the name of the shape and the share of the stage that is done (0..1).
+
+    Examples
+    --------
+    >>> matcher = meshmatch.Matcher("human")
+    >>> fits = [matcher.fit(path) for path in paths]
+    >>> maps = {(a, b): matcher.map(fits[a], fits[b]) for a, b in pairs}
+
+    Raises
+    ------
+    ModelError
+        There is no such model, or it is damaged.
+    """
+
+    def __init__(
+        self,
+        model: str | Path | TrainedModel = "human",
+        config: FitConfig | None = None,
+        threads: int | None = None,
+        progress: ProgressCallback | None = None,
+    ) -> None:
+        self.model = as_model(model)
+        self.config = config or FitConfig()
+        self.threads = checked_threads(threads)
+        self._asked_threads = threads or 1
+        self.progress = progress
+
+    def fit(self, shape: ShapeLike, config: FitConfig | None = None) -> Fit:
+        """Fit the model's template to one shape.
+
+        Parameters
+        ----------
+        config : FitConfig, optional
+            For this shape alone, such as its own up axis.
+
+        Raises
+        ------
+        MeshmatchError
+            The shape cannot be read or fitted, or the choices contradict each other.
+        """
+        return self.fit_all([shape], config)[0]
+
+    def fit_all(
+        self, shapes: Sequence[ShapeLike], config: FitConfig | Sequence[FitConfig] | None = None
+    ) -> list[Fit]:
+        """Fit the template to several shapes, some beside each other; where one fails, the others stop.
+
+        Parameters
+        ----------
+        config : FitConfig or sequence of FitConfig, optional
+            One for all shapes, or one for each.
+        """
+        clean = [validated(as_shape(shape)) for shape in shapes]
+        return self._fit_all(clean, self._configs(config, len(clean)))
+
+    def map(self, source: Fit, target: Fit, *, agree: bool = True) -> VertexMap:
+        """The map from the shape of one fit to the shape of another.
+
+        Parameters
+        ----------
+        source, target : Fit
+            From this matcher, or another one of the same model.
+        agree : bool
+            Let both fits agree on how the template stretches first, as `match` does: the more accurate map, and a
+            confidence that knows where they disagreed. Without it fits are only composed: a tenth of a second
+            instead of some seconds.
+
+        Raises
+        ------
+        OptionError
+            A fit of another template, or one that does not know its shape.
+        """
+        with thread_limit(1):
+            fits = self._agreed((source, target)) if agree else (source, target)
+            return map_of_fits(fits, (source, target), self.threads)
+
+    def match(
+        self,
+        source: ShapeLike,
+        target: ShapeLike,
+        config: FitConfig | Sequence[FitConfig] | None = None,
+        landmarks: LandmarkPairs | None = None,
+    ) -> MatchResult:
+        """Fit both shapes and map one to the other; see `match` for the parameters."""
+        began = time.monotonic()
+        clean = [validated(as_shape(source, "source")), validated(as_shape(target, "target"))]
+        configs = self._configs(config, 2)
+        if landmarks is not None:
+            _check_landmarks(self.model, configs)
+        with thread_limit(1):
+            fits = self._fit_all(clean, configs)
+            known = None
+            if landmarks is not None:
+                pairs = np.asarray(landmarks[0]), np.asarray(landmarks[1])
+                honoured, known = honour_pairs(self.model, clean, fits, pairs, configs[0])
+                fits = [self._finished(*each) for each in zip(honoured, clean, configs, strict=True)]
+            before = fits[0], fits[1]
+            agreed = self._agreed(before, configs[0], known)
+            found = map_of_fits(agreed, before, self.threads)
+        notes = tuple(dict.fromkeys((*fits[0].notes, *fits[1].notes)))
+        return MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads)
+
+    def _configs(self, config: FitConfig | Sequence[FitConfig] | None, count: int) -> list[FitConfig]:
+        config = config or self.config
+        configs = [config] * count if isinstance(config, FitConfig) else list(config)
+        if len(configs) != count:
+            raise OptionError(f"{count} shapes need one FitConfig, or {count} of them, not {len(configs)}")
+        return configs
+
+    def _fit_all(self, clean: Sequence[Repaired], configs: Sequence[FitConfig]) -> list[Fit]:
+        stop = threading.Event()
+        names = [part.shape.name for part in clean]
+        labels = [
+            f"{name} ({number + 1})" if names.count(name) > 1 else name for number, name in enumerate(names)
+        ]
+
+        def one(number: int) -> Fit:
+            def report(stage: str, share: float) -> None:
+                if stop.is_set():
+                    raise CancelledError
+                if self.progress is not None:
+                    self.progress(stage, labels[number], share)
+
+            try:
+                found = fit_shape(self.model, clean[number].shape, configs[number], None, report)
+            except BaseException:
+                stop.set()
+                raise
+            return self._finished(found, clean[number], configs[number])
+
+        # one fit alone may have all threads that were asked for; several have one each
+        inner = self._asked_threads if len(clean) == 1 else 1
+        with thread_limit(inner), ThreadPoolExecutor(max(1, min(self.threads, len(clean)))) as pool:
+            futures = [pool.submit(one, number) for number in range(len(clean))]
+            try:
+                wait(futures, return_when=FIRST_EXCEPTION)
+            except BaseException:
+                stop.set()  # Ctrl-C: the fits end at their next report
+                raise
+        errors = [error for future in futures if (error := future.exception()) is not None]
+        for error in sorted(errors, key=lambda error: isinstance(error, CancelledError)):
+            raise error
+        return [future.result() for future in futures]
+
+    def _finished(self, fit: Fit, clean: Repaired, config: FitConfig) -> Fit:
+        """The fit with its shape, and with what its user should know."""
+        notes = [f"{clean.shape.name}: {note}" for note in clean.notes]
+        if config.refine == "nodes" and not self.model.has_nodes:
+            notes.append(
+                f"model {self.model.card.name} is pointwise and has no nodes: its code was refined instead"
+            )
+        return replace(fit, repaired=clean, notes=tuple(notes))
+
+    def _agreed(
+        self,
+        fits: tuple[Fit, Fit],
+        config: FitConfig | None = None,
+        known: list[tuple[np.ndarray, np.ndarray]] | None = None,
+    ) -> tuple[Fit, Fit]:
+        for fit in fits:
+            if fit.template_hash != self.model.template.hash:
+                raise OptionError(
+                    f"this fit is of another template ({fit.template_hash}, not {self.model.template.hash})",
+                    f"fit the shape with the model {self.model.card.name}",
+                )
+        config = config or replace(self.config, seed=fits[0].seed)
+        shapes = [shape_of(fit).shape for fit in fits]
+        first, second = agreed_fits(self.model, shapes, list(fits), config, known)
+        return first, second
+
+
+def match(
+    source: ShapeLike,
+    target: ShapeLike,
+    *,
+    model: str | Path | TrainedModel = "human",
+    config: FitConfig | Sequence[FitConfig] | None = None,
+    landmarks: LandmarkPairs | None = None,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> MatchResult:
+    """Match two shapes: for every vertex of the source its vertex on the target.
+
+    Parameters
+    ----------
+    source, target : path, Shape, (N, 3) array, (vertices, faces), or an object with .vertices and .faces
+        Meshes or point clouds of the model's category, in any unit, orientation and resolution.
+    model : str, path or TrainedModel
+        Name in the registry, model folder, or a model that `load_model` returned.
+    config : FitConfig or a pair of them, optional
+        How shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes.
+    landmarks : (source vertices (N,), target vertices (N,)), optional
+        Known pairs, which the map then honours; only with ``refine="nodes"``.
+    threads, progress
+        See `Matcher`.
+
+    Returns
+    -------
+    MatchResult
+        ``result.map.index[i]`` is the vertex of the target matched to vertex i of the source.
+
+    Raises
+    ------
+    MeshmatchError
+        A shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
+    """
+    return Matcher(model, None, threads, progress).match(source, target, config, landmarks)
+
+
+def register(
+    shape: ShapeLike,
+    *,
+    model: str | Path | TrainedModel = "human",
+    config: FitConfig | None = None,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> Fit:
+    """Fit the model's template to one shape; see `match` for the parameters.
+
+    Returns
+    -------
+    Fit
+        ``fit.points_in_file`` are the template's vertices on the shape, in its own frame and unit; all fits of a
+        model have the same vertices and triangles in the same order.
+
+    Raises
+    ------
+    MeshmatchError
+        As `match`.
+    """
+    return Matcher(model, config, threads, progress).fit(shape)
+
+
+def checked_threads(threads: int | None) -> int:
+    """The number of threads that is meant (`OptionError` if it is below 1)."""
+    if threads is not None and threads < 1:
+        raise OptionError(f"threads must be 1 or more, not {threads}")
+    return THREADS if threads is None else threads
+
+
+def _check_landmarks(model: TrainedModel, configs: Sequence[FitConfig]) -> None:
+    for config in configs:
+        if config.refine != "nodes":
+            raise OptionError(
+                f"landmarks need refine='nodes', not {config.refine!r}",
+                "leave out the landmarks, or choose nodes",
+            )
+    check_landmarks(model)

@@ -1,0 +1,109 @@
+"""What matching gives back, and the map in both directions that transfers follow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from meshmatch.errors import OptionError
+from meshmatch.fitting.fit import Fit
+from meshmatch.maps.build import build_map
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.repair import Repaired
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import thread_limit
+from meshmatch.transfer.inverse_map import check_map, invert_map
+
+
+@dataclass(frozen=True, eq=False)
+class MatchResult:
+    """What `match` found.
+
+    Attributes
+    ----------
+    map : VertexMap
+        From source to target: ``map.index[i]`` is the vertex of the target matched to vertex i of the source.
+    source_fit, target_fit : Fit
+        The template fitted to each shape, after both fits agreed on how it stretches.
+    seconds : float
+        Wall time.
+    notes : tuple of str
+        What was changed in the shapes before fitting, and which choices were replaced.
+    before_agreement : (Fit, Fit)
+        The same fits before they agreed; where agreement moved them much, a map is not to be trusted.
+    threads : int
+        Used for `backward` too.
+    """
+
+    map: VertexMap
+    source_fit: Fit
+    target_fit: Fit
+    seconds: float
+    notes: tuple[str, ...]
+    before_agreement: tuple[Fit, Fit]
+    threads: int = 1
+
+    def backward(self) -> VertexMap:
+        """The map from target to source, made from the same fits: what pulls values from the source to the target."""
+        source, target = self.before_agreement
+        with thread_limit(1):
+            return map_of_fits((self.target_fit, self.source_fit), (target, source), self.threads)
+
+
+@dataclass(frozen=True, eq=False)
+class MapPair:
+    """The maps between two shapes in both directions.
+
+    Attributes
+    ----------
+    source, target : Shape
+    forward : VertexMap
+        From source to target.
+    match : MatchResult, optional
+        Where the shapes were matched; without it the backward map is the inverse of the forward map.
+    threads : int
+    """
+
+    source: Shape
+    target: Shape
+    forward: VertexMap
+    match: MatchResult | None = None
+    threads: int = 1
+
+    @cached_property
+    def backward(self) -> VertexMap:
+        """From target to source."""
+        if self.match is not None:
+            return self.match.backward()
+        with thread_limit(1):
+            return invert_map(self.forward, self.source, self.target, self.threads)
+
+
+def checked_pair(
+    found: VertexMap, source: Shape, target: Shape, threads: int = 1, label: str = "the map"
+) -> MapPair:
+    """A map at hand as a pair; `InputError` where it belongs to other shapes or has the opposite direction."""
+    return MapPair(source, target, check_map(found, source, target, label), None, threads)
+
+
+def map_of_fits(fits: tuple[Fit, Fit], before_agreement: tuple[Fit, Fit], threads: int = 1) -> VertexMap:
+    """The map from the shape of the first fit to that of the second.
+
+    Raises
+    ------
+    OptionError
+        The fits are of different templates, or do not know their shapes.
+    """
+    source, target = fits
+    return build_map(
+        shape_of(source), source, shape_of(target), target, workers=threads, before_agreement=before_agreement
+    )
+
+
+def shape_of(fit: Fit) -> Repaired:
+    """The repaired shape that a fit is of."""
+    if fit.repaired is None:
+        raise OptionError(
+            "this fit does not know its shape", "make it with meshmatch.register or Matcher.fit"
+        )
+    return fit.repaired

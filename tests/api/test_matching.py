@@ -1,0 +1,119 @@
+"""Fits once, maps as often as wanted; the whole road with the model that ships is in test_match.py."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import meshmatch
+from meshmatch.api import matching
+from meshmatch.api.matching import Matcher
+from meshmatch.api.results import MatchResult
+from meshmatch.errors import MeshmatchError, OptionError
+from meshmatch.shapes.shape import Shape
+
+SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
+
+
+@pytest.fixture(scope="module")
+def matcher() -> Matcher:
+    return Matcher("human")
+
+
+@pytest.fixture(scope="module")
+def result(matcher: Matcher) -> MatchResult:
+    return matcher.match(SAMPLES / "climber.ply", SAMPLES / "dancer.ply")
+
+
+def test_fits_made_once_give_the_map_of_match(matcher: Matcher, result: MatchResult) -> None:
+    fits = matcher.fit_all([SAMPLES / "climber.ply", SAMPLES / "dancer.ply"])
+    found = matcher.map(*fits)
+    assert np.array_equal(found.index, result.map.index)
+    assert np.array_equal(found.confidence, result.map.confidence)
+    assert np.array_equal(matcher.map(fits[1], fits[0]).confidence, result.backward().confidence)
+    # without agreement the map is another one, and knows less about what it got wrong
+    plain = matcher.map(*fits, agree=False)
+    assert 0.2 < (plain.index == found.index).mean() < 0.9
+    assert plain.confidence.mean() > found.confidence.mean() + 0.03
+
+
+def test_the_backward_map_doubts_what_the_forward_map_doubts(result: MatchResult) -> None:
+    forward, backward = result.map.confidence, result.backward().confidence
+    assert abs(float(forward.mean()) - float(backward.mean())) < 0.02
+    assert 0.002 < (backward < 0.3).mean() < 0.02  # 0.0002 where agreement is forgotten
+
+
+def test_fits_of_other_templates_or_without_shapes_are_refused(matcher: Matcher, result: MatchResult) -> None:
+    from dataclasses import replace
+
+    fit = result.source_fit
+    with pytest.raises(OptionError, match="another template") as caught:
+        matcher.map(replace(fit, template_hash="0" * 16), fit)
+    assert "human" in caught.value.hint
+    with pytest.raises(OptionError, match="does not know its shape"):
+        matcher.map(fit, replace(fit, repaired=None))
+
+
+@pytest.fixture
+def fits(monkeypatch: pytest.MonkeyPatch, sphere: Shape) -> Iterator[dict[str, Any]]:
+    """Fits that wait for each other: the one of "bad" fails when the other has begun."""
+    seen: dict[str, Any] = {"began": threading.Event(), "reports": 0, "ended": []}
+
+    def fit(model: object, shape: Shape, config: object, landmarks: object, progress: Any) -> None:
+        if shape.name == "bad":
+            assert seen["began"].wait(10)
+            raise OptionError("bad")
+        try:
+            for _ in range(1000):
+                seen["reports"] += 1
+                progress("orientation", 0.5)
+                seen["began"].set()
+                threading.Event().wait(0.01)
+        finally:
+            seen["ended"].append(shape.name)
+
+    monkeypatch.setattr(matching, "fit_shape", fit)
+    yield seen
+
+
+@pytest.mark.parametrize("order", [("bad", "good"), ("good", "bad")])
+def test_a_failed_fit_stops_the_other(
+    matcher: Matcher, fits: dict[str, Any], sphere: Shape, order: tuple[str, str]
+) -> None:
+    with pytest.raises(OptionError, match=r"^bad$"):
+        matcher.fit_all([Shape(sphere.verts, sphere.faces, name) for name in order])
+    assert fits["ended"] == ["good"]
+    assert fits["reports"] < 900
+
+
+def test_an_interrupt_stops_all_fits(
+    matcher: Matcher, fits: dict[str, Any], sphere: Shape, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        assert fits["began"].wait(10)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(matching, "wait", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        matcher.fit_all([Shape(sphere.verts, sphere.faces, name) for name in ("one", "two")])
+    assert fits["ended"] == ["one", "two"] or fits["ended"] == ["two", "one"]
+    assert fits["reports"] < 1800
+
+
+@pytest.mark.parametrize(
+    "wrong", [3, None, object(), np.zeros(5), (np.zeros((4, 2)), np.zeros((1, 3), int)), {"vertices": 1}]
+)
+def test_what_is_no_shape_is_refused_in_words(wrong: Any) -> None:
+    with pytest.raises(MeshmatchError) as caught:
+        meshmatch.register(wrong)
+    assert caught.value.hint
+
+
+def test_configs_and_threads_that_do_not_fit(matcher: Matcher, sphere: Shape) -> None:
+    with pytest.raises(OptionError, match="2 shapes need one FitConfig, or 2 of them, not 3"):
+        matcher.match(sphere, sphere, [meshmatch.FitConfig()] * 3)
+    with pytest.raises(OptionError, match="threads must be 1 or more"):
+        Matcher("human", threads=0)
