@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from functools import wraps
 from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -18,14 +22,22 @@ from meshmatch.models.deformer import Deformer, NetworkConfig
 from meshmatch.models.registry import find_model
 from meshmatch.templates.template import Template, load_template
 
+_DERIVING = threading.RLock()
+P = ParamSpec("P")
+Derived = TypeVar("Derived")
+
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """What fitting needs of a category. ``network`` is in evaluation mode, on the CPU."""
+    """What fitting needs of a category. ``network`` is in evaluation mode, on the CPU.
+
+    ``derived`` holds what was computed from the model alone, see `once_per_model`.
+    """
 
     card: ModelCard
     template: Template
     network: Deformer
+    derived: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
 
     def field(self, points: np.ndarray) -> PointField:
         """The field on points (P, 3) of the template's frame, with the kernel that the network was trained with.
@@ -42,6 +54,25 @@ class TrainedModel:
     def has_nodes(self) -> bool:
         """Whether its fits are node vectors, which can be solved for; a pointwise model has codes alone."""
         return has_nodes(self.network.config.field)
+
+
+def once_per_model(
+    derive: Callable[Concatenate[TrainedModel, P], Derived],
+) -> Callable[Concatenate[TrainedModel, P], Derived]:
+    """Let a function of a model (and of hashable arguments) compute once for each model, whatever threads ask for it.
+
+    The result lives as long as the model does.
+    """
+
+    @wraps(derive)
+    def once(model: TrainedModel, *args: P.args, **kwargs: P.kwargs) -> Derived:
+        key = (derive, args, tuple(sorted(kwargs.items())))
+        with _DERIVING:
+            if key not in model.derived:
+                model.derived[key] = derive(model, *args, **kwargs)
+            return model.derived[key]
+
+    return once
 
 
 def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
