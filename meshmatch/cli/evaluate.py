@@ -24,7 +24,10 @@ def evaluate(
         float, typer.Option(min=0.0, metavar="CM", help="Give the share of errors over this many cm.")
     ] = 15.0,
     curve: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Draw the cumulative error curve (needs the truth).")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Draw the cumulative error curve, .png, .svg or .pdf (needs the truth)."
+        ),
     ] = None,
     picture: Annotated[
         Path | None,
@@ -46,9 +49,9 @@ def evaluate(
     import numpy as np
 
     from meshmatch.errors import OptionError
-    from meshmatch.maps.curve import draw_curves
     from meshmatch.maps.evaluate import evaluate_map
     from meshmatch.maps.files import load_map
+    from meshmatch.render.charts import check_chart, draw_curves
     from meshmatch.shapes.files import load_shape
 
     told = truths.check_truth(truth, points)
@@ -56,8 +59,9 @@ def evaluate(
         raise OptionError("a curve of errors needs the truth", "give it with --truth or --points")
     if picture is not None and not told:
         raise OptionError("a picture of errors needs the truth", "give it with --truth or --points")
-    for drawn in (curve, picture):
-        check_png(drawn)
+    if curve is not None:
+        check_chart(curve)
+    check_png(picture)
     inputs = [map_file, source, target, truth, *(points or ())]
     check_apart([curve, picture], inputs)
     # Pictures that cannot be written are told before the geodesics.

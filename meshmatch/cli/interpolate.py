@@ -7,7 +7,7 @@ import typer
 
 from meshmatch.cli import options
 from meshmatch.cli.console import Console, print_json
-from meshmatch.cli.output_paths import check_apart, check_png, claimed
+from meshmatch.cli.output_paths import check_apart, claimed
 
 if TYPE_CHECKING:
     from meshmatch.api.interpolation import Interpolation
@@ -61,7 +61,10 @@ def interpolate(
     ] = "ply",
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="PNG", help="Plot how far each shape is from keeping volume and distances."),
+        typer.Option(
+            metavar="FILE",
+            help="Plot how far each shape is from keeping volume and distances: .png, .svg or .pdf.",
+        ),
     ] = None,
     model: options.Model = "human",
     refine: options.RefineOption = "nodes",
@@ -90,7 +93,10 @@ def interpolate(
     way = [] if through is None else through
     options.check_axes(up, front)
     kind = _kind(output)
-    check_png(plot)
+    if plot is not None:
+        from meshmatch.render.charts import check_chart
+
+        check_chart(plot)
     files = [source, *way, target]
     check_apart([output, plot], files)
     voice = Console(quiet)
@@ -178,14 +184,16 @@ def _write_page(path: Path, result: "Interpolation", met: dict[float, str]) -> N
 
 
 def _plot(path: Path, result: "Interpolation", met: dict[float, str]) -> None:
-    from meshmatch.render.lines import draw_lines
+    from meshmatch.render.charts import Chart, Line, draw_lines
 
+    times = [step.time for step in result.steps]
+    marks = {time: name for time, name in met.items() if times[0] <= time <= times[-1]}
     lines = {
-        "volume: |det F - det S|": [step.deviation.volume for step in result.steps],
-        "rigidity: |F'F - S'S|": [step.deviation.arap for step in result.steps],
+        "volume: |det F - det S|": Line(times, [step.deviation.volume for step in result.steps]),
+        "rigidity: |F'F - S'S|": Line(times, [step.deviation.arap for step in result.steps]),
     }
-    caption = "time; means over the surface, S is the stretch that the shapes have"
-    draw_lines(path, [step.time for step in result.steps], lines, caption, met)
+    xlabel = "time (S is the stretch that the shapes themselves have)"
+    draw_lines([Chart(xlabel, lines, marks=marks)], path, "mean deviation over the surface")
 
 
 def _tell(voice: Console, result: "Interpolation", files: list[Path], asked: str) -> None:

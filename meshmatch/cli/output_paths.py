@@ -32,14 +32,13 @@ def check_apart(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -
 
 
 def check_png(path: Path | None) -> None:
-    """Refuse a picture that is no PNG (`OptionError`)."""
+    """Refuse a picture that is not a PNG (`OptionError`)."""
     if path is not None and path.suffix.lower() != ".png":
         raise OptionError(f"{path.name}: a picture is a PNG", "end the name in .png")
 
 
 def check_writable(path: Path | None) -> None:
-    """Refuse a picture that is no PNG (`OptionError`) or cannot be written (`OutputError`), long before it is."""
-    check_png(path)
+    """Refuse a file that cannot be written (`OutputError`), long before it is."""
     if path is not None:
         with suppress(_Enough), replace_on_success(path):
             raise _Enough

@@ -11,7 +11,7 @@ import typer
 
 from meshmatch.cli import options
 from meshmatch.cli.console import Console, print_json
-from meshmatch.cli.output_paths import check_png, check_writable
+from meshmatch.cli.output_paths import check_writable
 from meshmatch.outputs import make_folder
 
 if TYPE_CHECKING:
@@ -118,7 +118,8 @@ def train(
     threads: options.Threads = 1,
     seed: options.Seed = 0,
     picture: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Draw the losses of this run over its steps.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw the losses of this run over its steps: .png, .svg or .pdf."),
     ] = None,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Start anew instead of going on from the folder's checkpoint.")
@@ -137,7 +138,10 @@ def train(
 
     set_threads(threads)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
-    check_png(picture)
+    if picture is not None:
+        from meshmatch.render.charts import check_chart
+
+        check_chart(picture)
     make_folder(output)
     check_writable(picture)
     from meshmatch.models.card import check_name
@@ -309,7 +313,7 @@ def _progress(voice: Console, picture: Path | None) -> "Iterator[Callable[[Progr
     if picture is not None and not seen:
         voice.say(f"{picture} was not drawn: the run ended before its first report")
     elif picture is not None:
-        from meshmatch.render.losses import draw_losses
+        from meshmatch.render.charts import draw_losses
 
         names = dict.fromkeys(name for now in seen for name in now.terms)
         terms = {name: [now.terms.get(name, float("nan")) for now in seen] for name in names}

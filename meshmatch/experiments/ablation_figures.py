@@ -14,8 +14,7 @@ from meshmatch.experiments.ablation_tables import number
 from meshmatch.experiments.cells import BASE, Cell
 from meshmatch.fields.choice import FIELDS
 from meshmatch.outputs import make_folder
-from meshmatch.render.bars import Bar, draw_bars
-from meshmatch.render.series import Panel, Series, draw_series
+from meshmatch.render.charts import Bar, Chart, Line, draw_bars, draw_lines
 from meshmatch.templates.nodes import STRATEGIES
 
 HELD_OUT = "held out"
@@ -104,11 +103,11 @@ def _against(
         if there:
             half = tuple((max(errors) - min(errors)) / 2 for _, errors in there)
             middle = tuple(fmean(errors) for _, errors in there)
-            lines[where] = Series(tuple(at for at, _ in there), middle, half)
+            lines[where] = Line(tuple(at for at, _ in there), middle, half)
     if not lines:
         return False
     make_folder(path.parent)
-    draw_series([Panel(across, lines, tuple(at for at, _ in cells), True)], path, _AXIS)
+    draw_lines([Chart(across, lines, tuple(at for at, _ in cells), True)], path, _AXIS)
     return True
 
 
@@ -131,17 +130,17 @@ def _figure6(known: Known, sets: Sequence[str], path: Path) -> bool:
         errors = np.array(line["errors_cm"])
         middle = tuple(errors.mean(1).tolist())
         off = tuple((errors.std(1) / np.sqrt(errors.shape[1])).tolist())
-        steps[name] = Series(tuple(float(each) for each in line["steps"]), middle, off)
-        seconds[name] = Series(tuple(line["seconds"][:1] and (0.0, *line["seconds"][1:])), middle, off)
+        steps[name] = Line(tuple(float(each) for each in line["steps"]), middle, off)
+        seconds[name] = Line(tuple(line["seconds"][:1] and (0.0, *line["seconds"][1:])), middle, off)
     most = max(max(series.x) for series in seconds.values())
     least = min(x for series in seconds.values() for x in series.x if x > 0)
     ticks = [10.0**power for power in range(-3, 4) if 0.5 * least <= 10.0**power <= 2 * most]
     panels = [
-        Panel("steps of refinement", steps, (0, 1, 3, 10, 30, 100, 300), True),
-        Panel("seconds of refinement of a body (processor)", seconds, (0.0, *ticks), True),
+        Chart("steps of refinement", steps, (0, 1, 3, 10, 30, 100, 300), True),
+        Chart("seconds of refinement of a body (processor)", seconds, (0.0, *ticks), True),
     ]
     make_folder(path.parent)
-    draw_series(panels, path, _AXIS)
+    draw_lines(panels, path, _AXIS)
     return True
 
 

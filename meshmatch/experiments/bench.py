@@ -28,11 +28,11 @@ from meshmatch.experiments.distances import default_folder
 from meshmatch.experiments.protocols import CLOUD_SET, SET_NAMES, BenchSet, Pair, load_set
 from meshmatch.experiments.report import circumstances, print_table, status_of
 from meshmatch.experiments.scores import SetScores, evaluate_set
-from meshmatch.maps.curve import draw_curves
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import make_folder
+from meshmatch.render.charts import draw_curves
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import set_threads
 
@@ -239,7 +239,7 @@ def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--cache", type=Path, help="folder of kept geodesic distances (10 GB for all sets)")
     parser.add_argument("--maps", type=Path, metavar="DIR", help="measure DIR/set/source-target.npy instead")
     parser.add_argument("--save-maps", type=Path, metavar="DIR", help="keep the maps there")
-    parser.add_argument("--curve", type=Path, metavar="PNG", help="draw the cumulative curves")
+    parser.add_argument("--curve", type=Path, metavar="FILE", help="draw the cumulative curves")
     return parser.parse_args(words)
 
 

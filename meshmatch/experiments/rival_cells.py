@@ -19,7 +19,7 @@ from meshmatch.experiments.protocols import BenchSet, Pair
 from meshmatch.experiments.report import circumstances, wide_console
 from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.geodesics import GEODESIC
-from meshmatch.render.bars import Bar, draw_bars
+from meshmatch.render.charts import Bar, draw_bars
 
 
 @dataclass(frozen=True)
@@ -170,5 +170,5 @@ def draw_cells(cells: Cells, rivals: Sequence[Rival], path: Path) -> None:
             groups[f"{name}: {scores['pairs']} of {shown[0][1]['of']} pairs"] = bars
     whole = [bar for bars in groups.values() for bar in bars if "failed" not in bar.words]
     longest = max((max(bar.value, bar.mark or 0.0) for bar in whole), default=0.0)
-    axis = "mean geodesic error, cm (target scaled to 1.9 square metres of skin); tick: median"
+    axis = "mean geodesic error, cm (target scaled to 1.9 m² of skin); tick: median"
     draw_bars(groups, path, axis, 1.1 * longest or None)

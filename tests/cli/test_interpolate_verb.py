@@ -134,7 +134,7 @@ def test_a_shape_and_itself(eggs: Path) -> None:
     [
         (("-o", "x.mp4"), "is not written as .mp4"),
         (("-o", "no/such/folder"), "there is no folder no/such"),
-        (("-o", "x.png", "--plot", "x.jpg"), "a picture is a PNG"),
+        (("-o", "x.png", "--plot", "x.jpg"), "unsupported chart format"),
         (("-o", "x.png", "--plot", "x.png"), "is an output of this command already"),
         (("-o", "x", "--from", 1, "--to", 0), "cannot run from 1 to 0"),
         (("-o", "x", "--to", 9), "cannot run from 0 to 9"),

@@ -192,14 +192,14 @@ def test_what_cannot_be_is_told(
 def test_the_losses_as_a_picture(
     run: Run, stub: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from meshmatch.render import losses
+    from meshmatch.render import charts
 
     drawn: dict[str, Any] = {}
 
     def kept(path: Path, steps: Any, terms: Any, validation: Any) -> None:
         drawn.update(path=path, steps=steps, terms=terms, validation=validation)
 
-    monkeypatch.setattr(losses, "draw_losses", kept)
+    monkeypatch.setattr(charts, "draw_losses", kept)
     picture = tmp_path / "mine" / "losses.png"  # in the folder that is made first
     answer = run("train", "-o", tmp_path / "mine", "--picture", picture, "--json")
     assert answer.status == 0, answer.err

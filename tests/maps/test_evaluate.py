@@ -1,13 +1,9 @@
-"""Errors, coverage and distortion by hand; the curve as a file."""
-
-from pathlib import Path
+"""Errors, coverage and distortion by hand."""
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from meshmatch.errors import InputError, OptionError
-from meshmatch.maps.curve import draw_curves
+from meshmatch.errors import InputError
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors, coverage, distortion, evaluate_map, map_errors
 from meshmatch.maps.geodesics import GeodesicDistances
 from meshmatch.maps.vertex_map import VertexMap
@@ -96,32 +92,3 @@ def test_evaluate_map() -> None:
         evaluate_map(VertexMap.identity(shape), shape, grid(1, 1))
     with pytest.raises(InputError, match="no faces"):
         evaluate_map(VertexMap.identity(cloud), cloud, cloud, target_points=truth)
-
-
-def pixels(path: Path) -> np.ndarray:
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"), dtype=int)
-
-
-def test_the_curve_is_a_picture_of_the_errors(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    for name, scale in (("good", 0.01), ("bad", 0.5)):
-        draw_curves({name: Errors(rng.random(500) * scale)}, tmp_path / f"{name}.png")
-    good, bad = pixels(tmp_path / "good.png"), pixels(tmp_path / "bad.png")
-    assert good.shape == (600, 900, 3)
-    blue = [(p[:, :, 2] - p[:, :, 0] > 100) for p in (good, bad)]
-    # Columns at the axis' right end: the good curve runs along the top, the bad one has not got there.
-    assert blue[0][20:40, 700:860].any()
-    assert not blue[1][20:40, 700:860].any()
-
-
-def test_curve_refusals(tmp_path: Path) -> None:
-    errors = Errors(np.zeros(3))
-    with pytest.raises(OptionError, match="PNG"):
-        draw_curves({"a": errors}, tmp_path / "a.pdf")
-    for curves, rest in (({}, {}), ({"a": errors}, {"limit": 0}), ({"a": errors}, {"unit": "inch"})):
-        with pytest.raises(OptionError, match="a curve needs"):
-            draw_curves(curves, tmp_path / "a.png", **rest)
-    assert not list(tmp_path.iterdir())
-    draw_curves({"a": errors, "b": errors}, tmp_path / "a.png", 8, unit="x100", size=(300, 200))
-    assert pixels(tmp_path / "a.png").shape == (200, 300, 3)
