@@ -27,7 +27,7 @@ from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import set_threads
-from meshmatch.transfer.inverse_map import check_map, invert_map
+from meshmatch.transfer.inverse_map import invert_map
 
 # What is going on, on which shape, and which share of it is done.
 Progress = Callable[[str, str, float], None]
@@ -243,7 +243,7 @@ def carry(
     if map is not None:
         found = map if isinstance(map, VertexMap) else load_map(map)
         label = "the map" if isinstance(map, VertexMap) else Path(map).name
-        forward = check_map(found, source, target, label)
+        forward = found.for_shapes(source, target, label)
         return CarryResult(invert_map(forward, source, target, workers), forward, None)
     result = match(
         source,

@@ -12,7 +12,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
-from meshmatch.transfer.inverse_map import check_map, invert_map
+from meshmatch.transfer.inverse_map import invert_map
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def checked_pair(
     found: VertexMap, source: Shape, target: Shape, threads: int = 1, label: str = "the map"
 ) -> MapPair:
     """A map at hand as a pair; `InputError` where it belongs to other shapes or has the opposite direction."""
-    return MapPair(source, target, check_map(found, source, target, label), None, threads)
+    return MapPair(source, target, found.for_shapes(source, target, label), None, threads)
 
 
 def map_of_fits(fits: tuple[Fit, Fit], before_agreement: tuple[Fit, Fit], threads: int = 1) -> VertexMap:

@@ -161,9 +161,9 @@ def _from_file(request: Request, source: "Shape", target: "Shape") -> Maps | Non
     if request.map is None:
         return None
     from meshmatch.maps.files import load_map
-    from meshmatch.transfer.inverse_map import check_map, invert_map
+    from meshmatch.transfer.inverse_map import invert_map
 
-    forward = check_map(load_map(request.map), source, target, request.map.name)
+    forward = load_map(request.map, source, target)
     return Maps(invert_map(forward, source, target, request.threads), forward)
 
 

@@ -174,11 +174,10 @@ def _clay(shape: "Shape") -> "np.ndarray":
 def _of_map(asked: Asked, subjects: list[Subject], names: tuple[str, str], look: "Look") -> Drawn:
     from meshmatch.maps.files import load_map
     from meshmatch.render import matched
-    from meshmatch.transfer.inverse_map import check_map
 
     assert asked.map is not None
     source, target = subjects[0].shape, subjects[1].shape
-    found = check_map(load_map(asked.map), source, target, asked.map.name)
+    found = load_map(asked.map, source, target)
     if asked.confidence:
         panels, scale = matched.confidence_panels(source, target, found, labels=names, look=look)
         record = {"confidence_mean": float(found.confidence.mean())}

@@ -85,7 +85,7 @@ def transfer_color(
         if empty is not None and values is None:
             empty = colors.light(empty)
         result = carrying.find_maps(request, voice, a, b)
-        carried = pull_values(result.back, a, given.numbers)
+        carried = pull_values(result.back, given.numbers)
         carried, doubt = replace_low_values(
             carried, result.back.confidence.astype(np.float64), b, min_confidence, empty, fill
         )

@@ -64,7 +64,7 @@ def transfer_weights(
         given = load_weights(weights or source, a)
         result = carrying.find_maps(request, voice, a, b)
         confidence = result.back.confidence.astype(np.float64)
-        carried = pull_weights(result.back, a, given.matrix, influences)
+        carried = pull_weights(result.back, given.matrix, influences)
         carried, doubt = replace_low_weights(carried, confidence, b, min_confidence, fill, influences)
         save_weights(temporary, SkinWeights(carried, given.names))
     carrying.tell_doubt(voice, doubt, min_confidence)

@@ -219,11 +219,7 @@ def evaluate_map(
         The map does not belong to these shapes, or the truth to them; the truth is given and the target is a
         cloud.
     """
-    if vertex_map.source_vertices != source.V or vertex_map.index.max() >= target.V:
-        raise InputError(
-            f"{vertex_map!r} does not fit {source.name or 'the source'} ({source.V} vertices) and "
-            f"{target.name or 'the target'} ({target.V})"
-        )
+    vertex_map = vertex_map.for_shapes(source, target)
     errors = stretched = None
     if target_points is not None:
         if source_points is None:

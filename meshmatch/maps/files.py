@@ -16,7 +16,6 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -68,15 +67,15 @@ def check_suffix(path: str | Path) -> str:
 
 
 def load_map(path: str | Path, source: Shape | None = None, target: Shape | None = None) -> VertexMap:
-    """Read a map, and check it against the shapes if they are given.
+    """Read a map, and check it against the shapes if they are given (`VertexMap.for_shapes`).
 
-    What the file does not carry is filled in from the shapes (names, counts, hashes) or stays unknown.
+    What the file does not contain is filled in from the shapes (names, counts, hashes) or stays unknown.
 
     Raises
     ------
     InputError
-        The file is missing, damaged or holds no map; or it does not fit the shapes: wrong length for the
-        source, an index outside the target, or the map of the opposite direction.
+        The file is missing or damaged, or holds no map; or the map was made for other shapes, or runs from
+        `target` to `source`.
     OptionError
         Unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`.
     """
@@ -96,56 +95,7 @@ def load_map(path: str | Path, source: Shape | None = None, target: Shape | None
             f"{path.name} does not hold a map that can be read: {error}",
             "is it damaged, or of another format?",
         ) from error
-    return _checked(found, path.name, source, target)
-
-
-def _checked(found: VertexMap, file: str, source: Shape | None, target: Shape | None) -> VertexMap:
-    if (
-        source is not None
-        and target is not None
-        and found.source_vertices != source.V == found.target_vertices
-    ):
-        raise _backwards(file, found, source, target)
-    if source is not None and found.source_vertices != source.V:
-        if target is not None and found.source_vertices == target.V and found.index.max() < source.V:
-            raise _backwards(file, found, source, target)
-        raise InputError(
-            f"{file} maps {found.source_vertices} vertices, but {source.name or 'the source'} has {source.V}",
-            "one entry is needed for each vertex of the source, in the order of its file",
-        )
-    if target is not None and found.target_vertices not in (UNKNOWN, target.V):
-        raise InputError(
-            f"{file} leads to a shape of {found.target_vertices} vertices, "
-            f"but {target.name or 'the target'} has {target.V}"
-        )
-    fill: dict[str, Any] = {}
-    reasons = list(found.reasons)
-    for side, shape in (("source", source), ("target", target)):
-        if shape is None:
-            continue
-        if getattr(found, f"{side}_hash") not in ("", shape.hash):
-            reasons.append(
-                f"the map was made for another version of the {side}: its vertices or faces have changed"
-            )
-        fill[f"{side}_vertices"] = shape.V
-        fill[f"{side}_hash"] = shape.hash
-        fill[side] = getattr(found, side) or shape.name
-    try:
-        made = replace(found, reasons=tuple(reasons), **fill)
-        if target is not None:
-            made.check_faces(target)
-    except MeshmatchError as error:
-        raise InputError(f"{file}: {error.message}", error.hint) from error
-    return made
-
-
-def _backwards(file: str, found: VertexMap, source: Shape, target: Shape) -> InputError:
-    a, b = source.name or "the source", target.name or "the target"
-    return InputError(
-        f"{file} runs the wrong way: it has {found.source_vertices} entries and {b} has {target.V} vertices, "
-        f"so it maps {b} to {a}",
-        f"swap the two shapes, or write the map from {a} to {b} ({DIRECTION})",
-    )
+    return found.for_shapes(source, target, path.name)
 
 
 def _record(m: VertexMap) -> dict[str, Any]:

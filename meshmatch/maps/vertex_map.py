@@ -1,17 +1,26 @@
-"""The noun of this room: where every vertex of one shape lies on another."""
+"""Where every vertex of one shape lies on another: `VertexMap`, the type that all other rooms pass around."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
 
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError
+from meshmatch.geometry.triangles import interpolate
 from meshmatch.shapes.shape import Shape
 
 DIRECTION = "index[i] is the vertex of the target matched to vertex i of the source"
 VERDICTS = ("good", "fair", "poor", "unknown")
 UNKNOWN = -1
+_OTHER_MESH = (
+    "match these two again; a map needs one entry for each vertex of the source, in the order of its file, and one "
+    "kept as .npy or .csv goes by the count of vertices alone"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,50 +29,53 @@ class VertexMap:
     vertex i of the source.*
 
     Valid once built; its arrays are read-only. `VertexMap.between` fills in names, counts and hashes from two
-    shapes.
+    shapes; `for_shapes` does so for a map that was read from a file.
 
     Parameters
     ----------
     source, target : str
         Names of the two shapes, for people.
-    index : (V_src,) int64
+    index : (V_source,) int64
         Target vertex of each source vertex.
-    face : (V_src,) int64, optional
+    face : (V_source,) int64, optional
         Target face in which the matched point lies; -1 where it is the vertex ``index[i]`` itself (always for
         a cloud).
-    barycentric : (V_src, 3) float64, optional
+    barycentric : (V_source, 3) float64, optional
         Weights of that face's corners: not negative, rows sum to 1. (1, 0, 0) where the face is -1.
-    confidence : (V_src,) float32, optional
-        0 (a guess) to 1 (sure). All 1 where nothing is known about it (see `verdict`).
+    confidence : (V_source,) float32, optional
+        0 (a guess) to 1 (certain). All 1 where nothing is known about it (see `verdict`).
     verdict : str
         "good", "fair" or "poor", of the map as a whole; "unknown" if it was read from a file that does not
         say.
     reasons : tuple of str
         Why it is not good, a line each.
     source_vertices, target_vertices : int
-        Vertex counts; -1 for a target's that is not known (a bare list of indices does not tell).
+        Vertex counts; -1 for an unknown target count (a plain list of indices does not contain it).
     source_hash, target_hash : str
         `Shape.hash` of both; empty where not known.
+    target_faces : (F_target, 3) int64, optional
+        The target's triangles, whose corners ``barycentric`` weights; not written to files.
 
     Raises
     ------
     InputError
-        Arrays of the wrong shape or kind, an index outside the target, weights that do not sum to 1, or a
-        verdict that is none.
+        Arrays of the wrong shape or kind, an index outside the target, weights that do not sum to 1, or an
+        unknown verdict.
     """
 
     source: str
     target: str
-    index: NDArray[np.int64]
-    face: NDArray[np.int64] = None  # type: ignore[assignment]  # an array once built
-    barycentric: NDArray[np.float64] = None  # type: ignore[assignment]
-    confidence: NDArray[np.float32] = None  # type: ignore[assignment]
+    index: Int[Ints, " V_source"]
+    face: Int[Ints, " V_source"] = None  # type: ignore[assignment]  # an array once built
+    barycentric: Float[Floats, "V_source 3"] = None  # type: ignore[assignment]
+    confidence: Float[Floats32, " V_source"] = None  # type: ignore[assignment]
     verdict: str = "unknown"
     reasons: tuple[str, ...] = ()
     source_vertices: int = UNKNOWN
     target_vertices: int = UNKNOWN
     source_hash: str = ""
     target_hash: str = ""
+    target_faces: Int[Ints, "F_target 3"] | None = None
 
     def __post_init__(self) -> None:
         label = f"the map {self.source or 'source'} -> {self.target or 'target'}"
@@ -115,8 +127,8 @@ class VertexMap:
         object.__setattr__(self, "source_vertices", size)
 
     @classmethod
-    def between(cls, source: Shape, target: Shape, index: ArrayLike, **rest: Any) -> "VertexMap":
-        """A map between two shapes at hand; `rest` are the other fields (face, barycentric, confidence,
+    def between(cls, source: Shape, target: Shape, index: ArrayLike, **rest: Any) -> VertexMap:
+        """A map between two shapes in memory; `rest` are the other fields (face, barycentric, confidence,
         verdict, ...).
 
         Raises
@@ -132,18 +144,66 @@ class VertexMap:
             target_vertices=target.V,
             source_hash=source.hash,
             target_hash=target.hash,
+            target_faces=target.faces,
             **rest,
         )
-        made.check_faces(target)
+        made._check_faces(target)
         return made
 
     @classmethod
-    def identity(cls, shape: Shape) -> "VertexMap":
-        """Every vertex to itself, surely."""
+    def identity(cls, shape: Shape) -> VertexMap:
+        """Every vertex to itself, with confidence 1."""
         return cls.between(shape, shape, np.arange(shape.V), verdict="good")
 
-    def check_faces(self, target: Shape) -> None:
-        """Refuse faces that `target` does not have (`InputError`)."""
+    def for_shapes(self, source: Shape | None, target: Shape | None, label: str = "the map") -> VertexMap:
+        """This map, checked to be one from `source` to `target`, with names, counts and hashes filled in.
+
+        Vertex counts must agree, and hashes where the map has them: a map of another pose, or of a mesh that was
+        edited since, is refused. A shape that is None is not checked.
+
+        Raises
+        ------
+        InputError
+            The map was made for another mesh, runs from target to source, or names a vertex or a face that the
+            target does not have. The message calls it `label`.
+        """
+        sides = [("source", source), ("target", target)]
+        misfits = [self._misfit(side, shape) for side, shape in sides if shape is not None]
+        if source is not None and target is not None and any(misfits):
+            reversed_fits = not self._misfit("source", target) and not self._misfit("target", source)
+            if reversed_fits and self.index.max() < source.V:
+                a, b = source.name or "the source", target.name or "the target"
+                raise InputError(
+                    f"{label} runs the wrong way: from {b} to {a}, where one from {a} to {b} is needed",
+                    f"swap the two shapes, or match {a} to {b} ({DIRECTION})",
+                )
+        for misfit in misfits:
+            if misfit:
+                raise InputError(f"{label} was made for another {misfit}", _OTHER_MESH)
+        fill: dict[str, Any] = {}
+        for side, shape in sides:
+            if shape is not None:
+                name = getattr(self, side) or shape.name
+                fill |= {side: name, f"{side}_vertices": shape.V, f"{side}_hash": shape.hash}
+        try:
+            if target is not None:
+                fill["target_faces"] = target.faces
+                self._check_faces(target)
+            return replace(self, **fill)
+        except InputError as error:
+            raise InputError(f"{label}: {error.message}", error.hint) from error
+
+    def _misfit(self, side: str, shape: Shape) -> str:
+        """In what `shape` differs from the source or target that the map was made for; empty if in nothing."""
+        made_for, vertices = getattr(self, side), getattr(self, f"{side}_vertices")
+        digest, name = getattr(self, f"{side}_hash"), shape.name or f"the {side}"
+        if vertices not in (UNKNOWN, shape.V):
+            return f"{side}: {made_for or 'a mesh'} of {vertices} vertices, but {name} has {shape.V}"
+        if digest not in ("", shape.hash):
+            return f"{side}: {made_for or 'a mesh'} ({digest}), but {name} is {shape.hash}: vertices or faces differ"
+        return ""
+
+    def _check_faces(self, target: Shape) -> None:
         highest = int(self.face.max())
         if highest >= target.F:
             raise InputError(
@@ -151,8 +211,28 @@ class VertexMap:
                 f"has only {target.F} faces"
             )
 
-    def points(self, target: Shape) -> NDArray[np.float64]:
-        """The matched points ``(V_src, 3)`` on `target`, in its own frame.
+    @property
+    def on_vertex(self) -> Bool[Bools, " V_source"]:
+        """True where the matched point is a vertex of the target."""
+        return np.asarray((self.face < 0) | (self.barycentric.max(axis=1) >= 1.0 - 1e-12))
+
+    def corners(self) -> Int[Ints, "V_source 3"]:
+        """The three target vertices that ``barycentric`` weights; three times ``index`` where the face is -1.
+
+        Raises
+        ------
+        InputError
+            Points lie in faces, and the faces are not known: the map was read without its target.
+        """
+        if self.target_faces is None and self.face.max() >= 0:
+            raise InputError(
+                f"the faces that the map {_way(self)} leads to are unknown",
+                "read it with load_map(path, source, target)",
+            )
+        return corners_of(self.target_faces, self.face, self.index)
+
+    def points(self, target: Shape) -> Float[Floats, "V_source 3"]:
+        """The matched points on `target`, in its own frame and unit.
 
         Raises
         ------
@@ -165,14 +245,87 @@ class VertexMap:
                 f"but {target.name or 'the target'} has {target.V}"
             )
         _in_range(self.index, target.V, f"the map {_way(self)}")
-        self.check_faces(target)
-        points = target.verts[self.index]
-        inside = self.face >= 0
-        corners = target.verts[target.faces[self.face[inside]]]
-        points[inside] = np.einsum("nk,nki->ni", self.barycentric[inside], corners)
-        return points
+        self._check_faces(target)
+        return interpolate(target.verts, corners_of(target.faces, self.face, self.index), self.barycentric)
 
-    def compose(self, other: "VertexMap") -> "VertexMap":
+    def sparse(self) -> csr_array:
+        """(V_source, V_target) float64 matrix P of the map: ``P @ values`` is `apply`. Rows sum to 1.
+
+        Raises
+        ------
+        InputError
+            The map was read without its target, whose vertices or faces are unknown.
+        """
+        if self.target_vertices == UNKNOWN:
+            raise InputError(
+                f"the number of vertices that the map {_way(self)} leads to is unknown",
+                "read it with load_map(path, source, target)",
+            )
+        weight = self.barycentric.ravel()
+        kept = weight > 0
+        rows = np.repeat(np.arange(self.source_vertices), 3)[kept]
+        matrix = csr_array(
+            (weight[kept], (rows, self.corners().ravel()[kept])),
+            shape=(self.source_vertices, self.target_vertices),
+        )
+        matrix.sum_duplicates()
+        return matrix
+
+    def apply(self, values: ArrayLike) -> Floats:
+        """Values of the *target's* vertices, pulled back to the source: at each source vertex the value at its
+        matched point, interpolated between the corners of the target's face.
+
+        Parameters
+        ----------
+        values : (V_target,) or (V_target, D)
+
+        Returns
+        -------
+        (V_source,) or (V_source, D) float64
+
+        Raises
+        ------
+        InputError
+            Not one row for each vertex of the target; or as `sparse`.
+        """
+        values = np.asarray(values, np.float64)
+        matrix = self.sparse()
+        if values.ndim not in (1, 2) or len(values) != matrix.shape[1]:
+            raise InputError(
+                f"the map {_way(self)} needs values (V,) or (V, D) of the {matrix.shape[1]} vertices of its target, "
+                f"not an array of {values.shape}"
+            )
+        return np.asarray(matrix @ values)
+
+    def functional(
+        self, basis_source: ArrayLike, basis_target: ArrayLike
+    ) -> Float[Floats, "K_source K_target"]:
+        """The functional map C of this map (Ovsjanikov et al. 2012), which goes the other way: it takes coefficients
+        of a function on the *target* to those of the pulled-back function on the *source*.
+
+        ``basis_source @ C`` is the least-squares fit to ``apply(basis_target)``.
+
+        Parameters
+        ----------
+        basis_source : (V_source, K_source)
+            Linearly independent functions on the source's vertices, such as Laplacian eigenvectors, a column each.
+        basis_target : (V_target, K_target)
+            The same on the target.
+
+        Raises
+        ------
+        InputError
+            As `apply`, or the source's functions do not have a row for each of its vertices.
+        """
+        basis = np.asarray(basis_source, np.float64)
+        if basis.ndim != 2 or len(basis) != self.source_vertices:
+            raise InputError(
+                f"a basis of the source must be an array of ({self.source_vertices}, K), not {basis.shape}"
+            )
+        pulled = self.apply(basis_target).reshape(len(basis), -1)
+        return np.asarray(np.linalg.lstsq(basis, pulled, rcond=None)[0])
+
+    def compose(self, other: VertexMap) -> VertexMap:
         """This map, then `other`: from this source to the other's target.
 
         The point of a vertex is where `other` puts the vertex ``index[i]``; the confidence is the lower of
@@ -211,11 +364,23 @@ class VertexMap:
             target_vertices=other.target_vertices,
             source_hash=self.source_hash,
             target_hash=other.target_hash,
+            target_faces=other.target_faces,
         )
 
     def __repr__(self) -> str:
         target = "?" if self.target_vertices == UNKNOWN else self.target_vertices
         return f"VertexMap({_way(self)}, {self.source_vertices} -> {target} vertices, {self.verdict})"
+
+
+def corners_of(
+    faces: Int[Ints, "F 3"] | None, face: Int[Ints, " N"], vertex: Int[Ints, " N"]
+) -> Int[Ints, "N 3"]:
+    """Corners of faces (N,); where the face is -1, three times the vertex itself."""
+    corners = np.repeat(vertex[:, None], 3, axis=1)
+    inside = face >= 0
+    if faces is not None:
+        corners[inside] = faces[face[inside]]
+    return corners
 
 
 def _way(m: VertexMap) -> str:

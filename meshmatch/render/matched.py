@@ -108,7 +108,7 @@ def carried_colors(colors: FloatArray, vertex_map: VertexMap, source: Shape, tar
 def brought(colors: FloatArray, forward: VertexMap, back: VertexMap, source: Shape) -> FloatArray:
     """`carried_colors` where the map back is at hand; grey where nothing of the source was matched to near."""
     reached = back.confidence > _REACHED * forward.confidence[back.index]
-    return np.where(reached[:, None], pull_values(back, source, colors), UNKNOWN)
+    return np.where(reached[:, None], pull_values(back, colors), UNKNOWN)
 
 
 def confidence_panels(

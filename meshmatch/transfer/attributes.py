@@ -16,34 +16,19 @@ from meshmatch.shapes.shape import Shape
 NO_LABEL = -1
 
 
-def weights_of(back: VertexMap, source: Shape) -> csr_array:
-    """(V_tgt, V_src) sparse: how much of each source vertex goes into each target vertex; rows sum to 1.
+def pull_values(back: VertexMap, values: NDArray[np.float64]) -> Floats:
+    """Numbers (V_source,) or (V_source, D) on the target: (V_target,) or (V_target, D).
+
+    As `VertexMap.apply`, except that a value that is not finite takes no part, unless it has more than half of the
+    weight: then the result is nan.
 
     Parameters
     ----------
     back : VertexMap
         From target to source.
     """
-    V = back.source_vertices
-    inside = back.face >= 0
-    corners = np.repeat(back.index[:, None], 3, axis=1)
-    corners[inside] = source.faces[back.face[inside]]
-    rows = np.repeat(np.arange(V), 3)
-    kept = back.barycentric.ravel() > 0
-    entries = back.barycentric.ravel()[kept], (rows[kept], corners.ravel()[kept])
-    matrix = csr_array(entries, shape=(V, source.V))
-    matrix.sum_duplicates()
-    return matrix
-
-
-def pull_values(back: VertexMap, source: Shape, values: NDArray[np.float64]) -> Floats:
-    """Numbers (V_src,) or (V_src, D) on the target: (V_tgt,) or (V_tgt, D).
-
-    Interpolated between the corners of the source's face. A value that is not finite takes no part, unless it
-    has most of the weight: then the result is nan.
-    """
     values = np.asarray(values, np.float64)
-    matrix = weights_of(back, source)
+    matrix = back.sparse()
     finite = np.isfinite(values)
     if finite.all():
         return np.asarray(matrix @ values)
@@ -70,7 +55,7 @@ def pull_labels(back: VertexMap, source: Shape, labels: Ints, on_faces: bool = F
 
 def vertex_votes(back: VertexMap, source: Shape, labels: Ints, on_faces: bool = False) -> csr_array:
     """(V_tgt, labels) sparse: how much speaks for each label at each target vertex."""
-    places = face_weights(back, source) if on_faces else weights_of(back, source)
+    places = face_weights(back, source) if on_faces else back.sparse()
     return csr_array(places @ one_hot(labels))
 
 
@@ -112,12 +97,12 @@ def most_votes(votes: csr_array) -> Ints:
     return result
 
 
-def pull_weights(back: VertexMap, source: Shape, weights: csr_array, most: int = 4) -> csr_array:
+def pull_weights(back: VertexMap, weights: csr_array, most: int = 4) -> csr_array:
     """Skin weights (V_src, J) on the target (V_tgt, J): interpolated, at most `most` a vertex, rows sum to 1.
 
     A vertex of which every source vertex is without weights stays without.
     """
-    return sparse_rows(csr_array(weights_of(back, source) @ weights), most)
+    return sparse_rows(csr_array(back.sparse() @ weights), most)
 
 
 def sparse_rows(weights: csr_array, most: int) -> csr_array:

@@ -1,4 +1,4 @@
-"""Which way a map runs, and turning it round."""
+"""The inverse of a map: from one that takes the source to the target, one that takes the target to the source."""
 
 from __future__ import annotations
 
@@ -7,75 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from meshmatch.arrays import Floats, Ints
-from meshmatch.errors import InputError
 from meshmatch.geometry.topology import edges_of
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.template_footpoints import small_islands, surrounding_values
-from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import MappedFootpoints, MappedMesh, on_vertex
+from meshmatch.transfer.mapped_mesh import MappedFootpoints, MappedMesh
 
 _ROUNDS = 2
-
-_OTHER = "match these two again, or keep the map as .npy or .csv, which go by the count of vertices alone"
-
-
-def check_map(found: VertexMap, source: Shape, target: Shape, label: str = "the map") -> VertexMap:
-    """The map, if it is one from `source` to `target`, with what it did not know about them filled in.
-
-    Goes by the hashes of both shapes where the map has them, else by their counts of vertices.
-
-    Raises
-    ------
-    InputError
-        The map was made for another mesh, runs from target to source, or names a vertex or a face that the
-        target does not have.
-    """
-    a, b = source.name or "the source", target.name or "the target"
-    hashes, counts = (found.source_hash, found.target_hash), (found.source_vertices, found.target_vertices)
-    forward = _agrees(hashes, counts, source, target)
-    if not forward and _agrees(hashes, counts, target, source) and found.index.max() < source.V:
-        raise InputError(
-            f"{label} runs the wrong way: from {b} to {a}, where one from {a} to {b} is needed",
-            f"swap the two shapes, or match {a} to {b} ({DIRECTION})",
-        )
-    for side, shape, name in (("source", source, a), ("target", target, b)):
-        digest, count = getattr(found, f"{side}_hash"), getattr(found, f"{side}_vertices")
-        made_for = getattr(found, side)
-        if count not in (UNKNOWN, shape.V):
-            other = f"{made_for or 'another mesh'} of {count} vertices"
-            raise InputError(
-                f"{label} was made for another {side}: {other}, but {name} has {shape.V}",
-                "one entry is needed for each vertex of the source, in the order of its file"
-                if side == "source"
-                else _OTHER,
-            )
-        if digest not in ("", shape.hash):
-            other = f"{made_for or 'a mesh'} ({digest})"
-            raise InputError(
-                f"{label} was made for another {side}: {other}, but {name} is {shape.hash}: its vertices or "
-                "faces differ",
-                _OTHER,
-            )
-    try:
-        made = replace(
-            found,
-            source=found.source or source.name,
-            target=found.target or target.name,
-            source_vertices=source.V,
-            target_vertices=target.V,
-            source_hash=source.hash,
-            target_hash=target.hash,
-        )
-        made.check_faces(target)
-    except InputError as error:
-        raise InputError(f"{label}: {error.message}", error.hint) from error
-    return made
-
-
-def _agrees(hashes: tuple[str, str], counts: tuple[int, int], source: Shape, target: Shape) -> bool:
-    named = all(digest in ("", shape.hash) for digest, shape in zip(hashes, (source, target), strict=True))
-    return named and counts[0] == source.V and counts[1] in (UNKNOWN, target.V)
 
 
 def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
@@ -88,9 +27,9 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
     Raises
     ------
     InputError
-        As `check_map`.
+        As `VertexMap.for_shapes`.
     """
-    checked = check_map(source_to_target, source, target)
+    checked = source_to_target.for_shapes(source, target)
     if source.hash == target.hash and target.invalid is None and _is_identity(checked):
         return replace(checked, source=target.name, target=source.name)
     image = MappedMesh(checked, source, target)
@@ -171,7 +110,7 @@ def _middles(found: VertexMap, source: Shape, V: int) -> Ints:
     closest.
     """
     best = np.zeros(V)
-    rows = np.flatnonzero(on_vertex(found))
+    rows = np.flatnonzero(found.on_vertex)
     at = found.index[rows]
     np.maximum.at(best, at, found.confidence[rows])
     sure = found.confidence[rows] >= 0.5 * best[at]

@@ -67,7 +67,7 @@ class MappedMesh:
     Parameters
     ----------
     source_to_target : VertexMap
-        Made for these two shapes; see `meshmatch.transfer.inverse_map.check_map`.
+        Made for these two shapes; see `VertexMap.for_shapes`.
     """
 
     def __init__(self, source_to_target: VertexMap, source: Shape, target: Shape) -> None:
@@ -222,14 +222,9 @@ def discontinuous_faces(
     usual = image <= np.quantile(image, 0.95)
     whole = float(own[usual].sum())
     scale = float(image[usual].sum()) / whole if whole > 0 else 0.0
-    rounded = np.where(on_vertex(source_to_target), _edge_lengths(target)[source_to_target.index], 0.0)
+    rounded = np.where(source_to_target.on_vertex, _edge_lengths(target)[source_to_target.index], 0.0)
     allowed = _STRETCH * scale * own + rounded[source.faces] + rounded[around] + _SLACK * unit
     return np.asarray((image > allowed).any(axis=1))
-
-
-def on_vertex(found: VertexMap) -> NDArray[np.bool_]:
-    """(V_src,) True where the matched point is the vertex ``index[i]`` itself."""
-    return np.asarray((found.face < 0) | (found.barycentric.max(axis=1) >= 1.0 - 1e-12))
 
 
 def _edge_lengths(shape: Shape) -> Floats:

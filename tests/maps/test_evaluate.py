@@ -88,7 +88,7 @@ def test_evaluate_map() -> None:
     assert "mean_cm" not in blind.as_dict()
     cloud = Shape(shape.verts, np.zeros((0, 3), int), "dots")
     assert evaluate_map(VertexMap.identity(cloud), cloud, cloud).distortion is None
-    with pytest.raises(InputError, match="does not fit"):
+    with pytest.raises(InputError, match="made for another"):
         evaluate_map(VertexMap.identity(shape), shape, grid(1, 1))
     with pytest.raises(InputError, match="no faces"):
         evaluate_map(VertexMap.identity(cloud), cloud, cloud, target_points=truth)

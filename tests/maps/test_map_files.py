@@ -177,7 +177,9 @@ def test_missing_files_folders_and_suffixes(tmp_path: Path) -> None:
 def test_a_map_of_another_source_or_target(tmp_path: Path) -> None:
     path = tmp_path / "map.npy"
     np.save(path, np.zeros(7, dtype=int))
-    with pytest.raises(InputError, match="maps 7 vertices, but a has 12"):
+    with pytest.raises(
+        InputError, match=r"map\.npy was made for another source: a mesh of 7 vertices, but a has 12"
+    ):
         load_map(path, A, B)
     np.save(path, np.full(A.V, B.V + 5))
     with pytest.raises(InputError, match=r"map\.npy: .* only 16"):
@@ -187,10 +189,11 @@ def test_a_map_of_another_source_or_target(tmp_path: Path) -> None:
         load_map(path, A, B)
     assert "1-based" in caught.value.hint
     save_map(tmp_path / "map.json", random_map(A, C, 0))
-    with pytest.raises(InputError, match=rf"leads to a shape of {C.V} vertices, but b has 16"):
+    with pytest.raises(InputError, match=rf"another target: c of {C.V} vertices, but b has 16"):
         load_map(tmp_path / "map.json", A, B)
     record = json.loads((tmp_path / "map.json").read_text())
-    record["face"][0], record["target_vertices"] = 10_000, -1
+    record |= {"target_vertices": -1, "target_hash": ""}
+    record["face"][0] = 10_000
     record["index"] = [0] * A.V
     (tmp_path / "map.json").write_text(json.dumps(record))
     with pytest.raises(InputError, match="names face 10000"):
@@ -200,20 +203,18 @@ def test_a_map_of_another_source_or_target(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", MAP_SUFFIXES)
 def test_the_wrong_direction_is_named(tmp_path: Path, suffix: str) -> None:
     save_map(tmp_path / f"map{suffix}", random_map(B, A, 0))
-    with pytest.raises(
-        InputError, match="runs the wrong way: it has 16 entries and b has 16 vertices"
-    ) as caught:
+    with pytest.raises(InputError, match=rf"map\{suffix} runs the wrong way: from b to a") as caught:
         load_map(tmp_path / f"map{suffix}", A, B)
-    assert "so it maps b to a" in caught.value.message
     assert "swap" in caught.value.hint
 
 
-def test_a_shape_that_has_changed_is_mentioned(tmp_path: Path) -> None:
+def test_a_shape_that_has_changed_is_refused(tmp_path: Path) -> None:
     save_map(tmp_path / "map.npz", random_map(A, B, 0))
     moved = type(A)(A.verts * 2, A.faces, "a")
-    found = load_map(tmp_path / "map.npz", moved, B)
-    assert any("another version of the source" in reason for reason in found.reasons)
-    assert found.source_hash == moved.hash
+    with pytest.raises(InputError, match=rf"another source: a \({A.hash}\), but a is {moved.hash}"):
+        load_map(tmp_path / "map.npz", moved, B)
+    save_map(tmp_path / "map.npy", random_map(A, B, 0))
+    assert load_map(tmp_path / "map.npy", moved, B).source_hash == moved.hash
 
 
 def test_the_list_of_suffixes_is_that_of_the_formats() -> None:

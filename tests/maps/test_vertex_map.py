@@ -166,3 +166,55 @@ def test_maps_that_do_not_meet_are_not_joined() -> None:
         ab.compose(VertexMap("b", "x", np.arange(15)))
     with pytest.raises(InputError, match="matched to vertex"):
         VertexMap("a", "b", np.array([0, 20])).compose(VertexMap("b", "x", np.arange(15)))
+
+
+def test_apply_interpolates_on_the_target() -> None:
+    m = random_map(A, C, 5)
+    assert m.apply(C.verts) == pytest.approx(m.points(C))
+    one = m.apply(C.verts[:, 2])
+    assert one.shape == (A.V,)
+    assert one == pytest.approx(m.points(C)[:, 2])
+    assert np.array_equal(VertexMap.identity(A).apply(A.verts), A.verts)
+    ab, bc = random_map(A, B, 1), VertexMap.between(B, C, np.arange(B.V) % C.V)
+    whole = VertexMap.between(A, B, ab.index)  # vertices to vertices: one after the other is the composition
+    assert whole.apply(bc.apply(C.verts)) == pytest.approx(whole.compose(bc).apply(C.verts))
+
+
+def test_the_matrix_of_a_map() -> None:
+    m = random_map(A, C, 6)
+    matrix = m.sparse()
+    assert matrix.shape == (A.V, C.V)
+    assert matrix.sum(axis=1) == pytest.approx(np.ones(A.V))
+    values = np.random.default_rng(0).random((C.V, 2))
+    assert np.array_equal(matrix @ values, m.apply(values))
+    assert (VertexMap.identity(A).sparse().toarray() == np.eye(A.V)).all()
+
+
+def test_the_functional_map() -> None:
+    rng = np.random.default_rng(0)
+    bases = {shape.name: rng.normal(size=(shape.V, 5)) for shape in (A, B, C)}
+    assert VertexMap.identity(A).functional(bases["a"], bases["a"]) == pytest.approx(np.eye(5))
+    m = random_map(A, C, 7)
+    found = m.functional(bases["a"], bases["c"][:, :3])
+    assert found.shape == (5, 3)
+    # What least squares leaves over is orthogonal to the source's functions.
+    assert bases["a"].T @ (bases["a"] @ found - m.apply(bases["c"][:, :3])) == pytest.approx(np.zeros((5, 3)))
+    # With a whole basis nothing is lost, and composition turns round: C(ab then bc) = C(ab) C(bc).
+    eye = {shape.name: np.eye(shape.V) for shape in (A, B, C)}
+    ab, bc = VertexMap.between(A, B, np.arange(A.V)), random_map(B, C, 8)
+    both = ab.functional(eye["a"], eye["b"]) @ bc.functional(eye["b"], eye["c"])
+    assert ab.compose(bc).functional(eye["a"], eye["c"]) == pytest.approx(both)
+
+
+def test_what_a_bare_map_cannot_say() -> None:
+    with pytest.raises(InputError, match="number of vertices that the map a -> b leads to is unknown"):
+        VertexMap("a", "b", np.array([1, 0])).apply(np.ones(2))
+    inside = VertexMap("a", "b", np.array([1]), face=[0], barycentric=[[0.5, 0.5, 0]], target_vertices=3)
+    with pytest.raises(InputError, match="faces that the map a -> b leads to are unknown") as told:
+        inside.sparse()
+    assert "load_map" in told.value.hint
+    for wrong in (np.ones(A.V - 1), np.ones((A.V, 2, 2)), 3.0):
+        with pytest.raises(InputError, match="needs values"):
+            VertexMap.identity(A).apply(wrong)
+    with pytest.raises(InputError, match="a basis of the source must be an array"):
+        VertexMap.identity(A).functional(np.ones((3, 2)), np.ones((A.V, 2)))

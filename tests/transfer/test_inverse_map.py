@@ -11,7 +11,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
-from meshmatch.transfer.inverse_map import check_map, invert_map
+from meshmatch.transfer.inverse_map import invert_map
 from tests.conftest import icosphere
 from tests.transfer.known import brute_force, split
 
@@ -190,7 +190,7 @@ def test_low_confidence_is_carried_back() -> None:
 
 
 def test_a_bare_map_learns_its_ends() -> None:
-    made = check_map(VertexMap("", "", FORWARD.index), COARSE, FINE)
+    made = VertexMap("", "", FORWARD.index).for_shapes(COARSE, FINE)
     assert (made.source, made.target, made.target_vertices) == ("coarse.ply", "fine.ply", FINE.V)
     assert (made.source_hash, made.target_hash) == (COARSE.hash, FINE.hash)
 
@@ -203,16 +203,16 @@ def test_a_map_that_runs_the_wrong_way_is_told_so(known: str) -> None:
         "index alone": VertexMap("", "", BACK.index),
     }[known]
     with pytest.raises(InputError, match=r"m\.npz runs the wrong way: from fine\.ply to coarse\.ply") as told:
-        check_map(backwards, COARSE, FINE, "m.npz")
+        backwards.for_shapes(COARSE, FINE, "m.npz")
     assert "swap the two shapes" in told.value.hint
 
 
 def test_two_poses_of_one_mesh_are_told_apart_by_their_hashes() -> None:
     posed = Shape(COARSE.verts * [1, 2, 1], COARSE.faces, "posed.ply")
     there = VertexMap.between(COARSE, posed, np.arange(COARSE.V))
-    assert check_map(there, COARSE, posed) is not None
+    assert there.for_shapes(COARSE, posed) is not None
     with pytest.raises(InputError, match=r"wrong way: from coarse\.ply to posed\.ply"):
-        check_map(there, posed, COARSE)
+        there.for_shapes(posed, COARSE)
 
 
 def test_a_map_made_for_another_mesh_names_both() -> None:
@@ -220,22 +220,22 @@ def test_a_map_made_for_another_mesh_names_both() -> None:
     with pytest.raises(
         InputError, match=rf"another source: coarse\.ply .*{COARSE.hash}.*other\.ply is {other.hash}"
     ):
-        check_map(FORWARD, other, FINE, "m.npz")
+        FORWARD.for_shapes(other, FINE, "m.npz")
     moved = Shape(FINE.verts + 1, FINE.faces, "moved.ply")
     with pytest.raises(InputError, match=r"another target: fine\.ply .*moved\.ply is"):
-        check_map(FORWARD, COARSE, moved, "m.npz")
+        FORWARD.for_shapes(COARSE, moved, "m.npz")
 
 
 def test_a_map_of_another_count_names_both(sphere: Shape) -> None:
     with pytest.raises(InputError, match=r"another source: coarse\.ply of 42 vertices, but sphere3 has 642"):
-        check_map(FORWARD, sphere, FINE)
+        FORWARD.for_shapes(sphere, FINE)
     with pytest.raises(InputError, match=r"another target: fine\.ply of 162 vertices, but sphere3 has 642"):
-        check_map(FORWARD, COARSE, sphere)
+        FORWARD.for_shapes(COARSE, sphere)
 
 
 def test_an_index_or_face_outside_the_target_is_refused() -> None:
     with pytest.raises(InputError, match=r"m\.csv: .*only 162 vertices"):
-        check_map(VertexMap("", "", FORWARD.index + 150), COARSE, FINE, "m.csv")
+        VertexMap("", "", FORWARD.index + 150).for_shapes(COARSE, FINE, "m.csv")
     high = VertexMap("", "", FORWARD.index, face=np.full(COARSE.V, FINE.F))
     with pytest.raises(InputError, match=r"m\.csv: .*has only 320 faces"):
-        check_map(high, COARSE, FINE, "m.csv")
+        high.for_shapes(COARSE, FINE, "m.csv")

@@ -5,7 +5,7 @@ import pytest
 
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, on_vertex
+from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces
 from tests.conftest import icosphere
 from tests.maps.solids import bumpy_sphere
 from tests.transfer.known import brute_force, split
@@ -128,7 +128,7 @@ def test_places_on_vertices_are_known_as_such() -> None:
         face=np.array([-1, 4, 4]),
         barycentric=np.array([[1.0, 0, 0], [0, 1, 0], [0.5, 0.5, 0]]),
     )
-    assert on_vertex(found).tolist() == [True, True, False]
+    assert found.on_vertex.tolist() == [True, True, False]
 
 
 def test_a_map_of_everything_to_one_point_still_answers(sphere: Shape) -> None:

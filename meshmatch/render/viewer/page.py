@@ -29,7 +29,6 @@ from meshmatch.render.viewer.looks import Looks, dress
 from meshmatch.render.viewer.packing import pack, small_integers, to_bytes, to_shorts, to_signed_bytes
 from meshmatch.render.viewer.placement import Box, boxes, upright
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.inverse_map import check_map
 
 PAGE_SUFFIXES = (".html", ".htm")
 # Control characters, ends of lines, and marks that turn the direction of writing.
@@ -88,7 +87,7 @@ def write_page(
     """
     path = Path(path)
     check_page(path)
-    there, back = check_map(there, source, target), check_map(back, target, source, "the map back")
+    there, back = there.for_shapes(source, target), back.for_shapes(target, source, "the map back")
     shapes, maps = (source, target), (there, back)
     parts = draw(source, most), draw(target, most)
     turns = upright(source, target, there, rotations)
