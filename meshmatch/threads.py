@@ -7,16 +7,13 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from threadpoolctl import threadpool_limits
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 _lock = threading.Lock()
-_running: list[tuple[int, int]] = []  # thread and count of every block that is open, oldest first
-_before: tuple[threadpool_limits, int | None] | None = None  # what the first of them found: BLAS, torch
+_of_thread = threading.local()
+_open_blocks = 0
+_torch_before: int | None = None  # what the first of the open blocks found
 
 
 @contextmanager
@@ -24,39 +21,34 @@ def thread_limit(count: int) -> Iterator[None]:
     """Let the libraries that are loaded use `count` threads inside the block, and give the threads back after it.
 
     Two fits beside each other, each on one thread, are faster than each on all of them, above all where other work
-    runs too. Blocks may be nested, and may overlap in several threads: the last one restores what the first one found.
+    runs too. Blocks may be nested. Where they overlap in several threads, the BLAS libraries obey the first one.
 
     Raises
     ------
     ValueError
         `count` is below 1.
     """
-    global _before
+    global _open_blocks, _torch_before
     _check(count)
-    me = threading.get_ident()
-    with _lock:
-        previous = _limit_blas(count), _torch_threads()
-        if not _running:
-            _before = previous
-        _running.append((me, count))
-        _set_torch_threads(count)
-    try:
-        yield
-    finally:
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(count, user_api="blas"):
+        here = _torch_threads()
         with _lock:
-            _running.reverse()
-            _running.remove((me, count))
-            _running.reverse()
-            mine = [each for thread, each in _running if thread == me]
-            assert _before is not None
-            blas, torch_count = _before
-            if mine:
-                _limit_blas(mine[-1])
-            elif not _running:
-                blas.restore_original_limits()
-                _before = None
-            # torch keeps a number for each thread: this one must not stay behind with the small one
-            _set_torch_threads(mine[-1] if mine else torch_count)
+            if _open_blocks == 0:
+                _torch_before = here
+            _open_blocks += 1
+        _set_torch_threads(count)
+        nested = getattr(_of_thread, "depth", 0)
+        _of_thread.depth = nested + 1
+        try:
+            yield
+        finally:
+            _of_thread.depth = nested
+            with _lock:
+                _open_blocks -= 1
+                # torch gives a new thread the count that was set last: not that of a block elsewhere
+                _set_torch_threads(here if nested else _torch_before)
 
 
 def set_threads(count: int) -> None:
@@ -78,12 +70,6 @@ def set_threads(count: int) -> None:
 def _check(count: int) -> None:
     if count < 1:
         raise ValueError(f"at least one thread is needed, not {count}")
-
-
-def _limit_blas(count: int) -> threadpool_limits:
-    from threadpoolctl import threadpool_limits
-
-    return threadpool_limits(count, user_api="blas")
 
 
 def _torch_threads() -> int | None:

@@ -216,7 +216,7 @@ def test_a_limit_of_threads_is_given_back(three_threads: dict[str, int]) -> None
 
 
 def test_limits_of_threads_may_overlap(three_threads: dict[str, int]) -> None:
-    """The first call ends while the second runs; whoever ends last gives back what the first found."""
+    """The first block ends while another one runs elsewhere: afterwards all is as it was."""
     entered, leave = threading.Event(), threading.Event()
 
     def second() -> None:
