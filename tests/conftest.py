@@ -1,15 +1,59 @@
-"""Small shapes made of nothing but NumPy, and the evaluation data where it is there."""
+"""Small shapes made of nothing but NumPy, fits that tests share, and the evaluation data where it is there."""
 
 import os
-from collections.abc import Callable
+import pickle
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from hashlib import sha256
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: many small products
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: many small products, in several processes
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
 from meshmatch.shapes.shape import Shape
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Modules with slow tests first, so that no process is still busy with one when the others are done."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
+@pytest.fixture(scope="session")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all processes of one run share."""
+    own = tmp_path_factory.getbasetemp()
+    return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+
+
+@contextmanager
+def remembering(folder: Path) -> Iterator[None]:
+    """Fit no shape with the same model and choices twice: `folder` keeps the fits, for other tests and processes."""
+    from meshmatch.api import matching
+
+    fit_shape = matching.fit_shape
+
+    def remembered(model, shape, config, landmarks=None, progress=None):
+        key = (model.card.weights_sha256, model.template.hash, config, landmarks, shape.name)
+        file = folder / sha256(pickle.dumps((key, shape.verts, shape.faces))).hexdigest()
+        with FileLock(f"{file}.lock"):
+            if not file.exists():
+                file.write_bytes(pickle.dumps(fit_shape(model, shape, config, landmarks, progress)))
+            return pickle.loads(file.read_bytes())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(matching, "fit_shape", remembered)
+        yield
+
+
+@pytest.fixture
+def remembered_fits(run_folder: Path) -> Iterator[None]:
+    """For tests of what comes after a fit."""
+    with remembering(run_folder):
+        yield
 
 
 @pytest.fixture(scope="session")
