@@ -105,7 +105,7 @@ class Drawn:
 
 def load_subject(path: Path, asked: Asked) -> Subject:
     """Read a shape, or a template by its file or name, or that of a model."""
-    from meshmatch.shapes.appearance import find_appearance
+    from meshmatch.shapes.appearance_files import find_appearance
     from meshmatch.shapes.files import load_shape
 
     template = _template(path)

@@ -95,7 +95,7 @@ def transfer_texture(
     from meshmatch.cli.output_paths import check_apart
     from meshmatch.models.registry import locate_model
     from meshmatch.outputs import replace_on_success
-    from meshmatch.shapes.appearance import load_appearance
+    from meshmatch.shapes.appearance_files import load_appearance
     from meshmatch.shapes.files import load_shape
     from meshmatch.shapes.textured_files import files_of
     from meshmatch.transfer.bake import BakeOptions
@@ -123,7 +123,7 @@ def transfer_texture(
             result = carrying.find_maps(request, voice, a, b)
             record = _paint(temporary[0], (a, b), look, result, choices, voice)
         else:
-            from meshmatch.shapes.appearance import load_coordinates
+            from meshmatch.shapes.appearance_files import load_coordinates
             from meshmatch.transfer.unwrap import atlas_of
 
             began = monotonic()
@@ -137,7 +137,7 @@ def transfer_texture(
     voice.say(f"wrote {' '.join(str(file) for file in files)}: {request.names[1]} {what}")
     if picture is not None:
         from meshmatch.render.carried import looks_on_both
-        from meshmatch.shapes.appearance import find_appearance
+        from meshmatch.shapes.appearance_files import find_appearance
 
         worn = load_shape(output)
         shown = looks_on_both(a, worn, look, find_appearance(output, worn))

@@ -95,7 +95,7 @@ def _looks(
     """What the shapes wear. A look that cannot be read is no reason to show nothing."""
     from meshmatch.errors import InputError
     from meshmatch.render.viewer import share_look
-    from meshmatch.shapes.appearance import find_appearance, load_coordinates
+    from meshmatch.shapes.appearance_files import find_appearance, load_coordinates
 
     def read(path: Path, shape: "Shape") -> "tuple[Appearance | None, np.ndarray | None]":
         try:

@@ -36,7 +36,8 @@ from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import make_folder
 from meshmatch.pipeline import carry, read_model, register
-from meshmatch.shapes.appearance import Appearance, Material, load_appearance
+from meshmatch.shapes.appearance import Appearance, Material
+from meshmatch.shapes.appearance_files import load_appearance
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.duplicates import seams
 from meshmatch.shapes.files import load_shape, save_shape

@@ -12,7 +12,7 @@ from PIL import Image
 
 from meshmatch.errors import OutputError
 from meshmatch.outputs import folder_on_success, replace_on_success
-from meshmatch.shapes.appearance import load_appearance
+from meshmatch.shapes.appearance_files import load_appearance
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from tests.cli.conftest import Run

@@ -13,7 +13,8 @@ from meshmatch import pipeline
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes import textured_files
-from meshmatch.shapes.appearance import Appearance, load_appearance
+from meshmatch.shapes.appearance import Appearance
+from meshmatch.shapes.appearance_files import load_appearance
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.textured import Textured
 from meshmatch.shapes.images import png_bytes

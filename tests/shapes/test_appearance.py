@@ -9,7 +9,8 @@ import trimesh
 
 from meshmatch.errors import InputError
 from meshmatch.shapes import images
-from meshmatch.shapes.appearance import Appearance, load_appearance
+from meshmatch.shapes.appearance import Appearance
+from meshmatch.shapes.appearance_files import load_appearance
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.text import behind_slash
 from meshmatch.shapes.shape import Shape

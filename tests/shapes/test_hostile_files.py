@@ -9,7 +9,7 @@ import pytest
 
 from meshmatch.errors import InputError
 from meshmatch.shapes import load_shape
-from meshmatch.shapes.appearance import find_appearance
+from meshmatch.shapes.appearance_files import find_appearance
 from meshmatch.shapes.array_files import read_npy
 from meshmatch.shapes.formats import gltf
 from meshmatch.shapes.formats.gltf_skin import read_skin

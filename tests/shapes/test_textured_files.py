@@ -8,10 +8,11 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError, OutputError
+from meshmatch.geometry.topology import same_rows
 from meshmatch.geometry.triangles import closest_on_triangles
 from meshmatch.shapes import textured_files
-from meshmatch.shapes.appearance import load_appearance, load_coordinates
-from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.appearance_files import load_appearance, load_coordinates
+from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.textured import Textured, split_at_seams
 from meshmatch.shapes.images import png_bytes
 from meshmatch.shapes.shape import Shape
@@ -34,29 +35,30 @@ def ball(sphere: Shape) -> tuple[Textured, np.ndarray]:
 def test_vertices_are_split_at_seams_alone() -> None:
     uv = UV[FACES].copy()
     same = split_at_seams(Textured(CORNERS, FACES, uv))
-    np.testing.assert_array_equal(same[0], CORNERS)
+    np.testing.assert_array_equal(same[0], np.arange(len(CORNERS)))
     np.testing.assert_array_equal(same[1], UV)
     np.testing.assert_array_equal(same[2], FACES)
     uv[1, 0] = (0.5, 0.5)  # corner 0 now lies on two places
-    verts, places, faces = split_at_seams(Textured(CORNERS, FACES, uv))
-    np.testing.assert_array_equal(verts, [*CORNERS, CORNERS[0]])
+    vertex, places, faces = split_at_seams(Textured(CORNERS, FACES, uv))
+    np.testing.assert_array_equal(vertex, [*range(len(CORNERS)), 0])
     assert sorted(places[[0, 4]].tolist()) == [[0.0, 1.0], [0.5, 0.5]]
     np.testing.assert_array_equal(places[faces], uv)
 
 
 def test_split_vertices_keep_their_order_and_their_places(ball: tuple[Textured, np.ndarray]) -> None:
     mesh, _ = ball
-    verts, uv, faces = split_at_seams(mesh)
+    vertex, uv, faces = split_at_seams(mesh)
     V = len(mesh.verts)
-    np.testing.assert_array_equal(verts[:V], mesh.verts)
+    np.testing.assert_array_equal(vertex[:V], np.arange(V))
+    verts = mesh.verts[vertex]
     np.testing.assert_array_equal(verts[faces], mesh.verts[mesh.faces])
     np.testing.assert_allclose(uv[faces], mesh.uv, atol=1e-7)
     assert len(verts) == len(np.unique(np.concatenate([verts, uv], axis=1), axis=0))
 
 
 def test_vertices_without_a_face_stay() -> None:
-    verts, uv, _ = split_at_seams(Textured(np.concatenate([CORNERS, [[9, 9, 9]]]), FACES, UV[FACES]))
-    assert verts[4].tolist() == [9, 9, 9] and uv[4].tolist() == [0, 0]
+    vertex, uv, _ = split_at_seams(Textured(np.concatenate([CORNERS, [[9, 9, 9]]]), FACES, UV[FACES]))
+    assert vertex[4] == 4 and uv[4].tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
@@ -180,3 +182,32 @@ def test_the_sample_opens() -> None:
     image = look.materials[0].image
     assert image is not None and image.shape == (1024, 1024, 4)
     assert look.uv.min() >= 0 and look.uv.max() <= 1
+
+
+def stored_normals(path: Path) -> np.ndarray:
+    """The normals that a glb holds, as trimesh reads them; computed ones would not be among the cached."""
+    mesh = next(iter(trimesh.load_scene(path, process=False).geometry.values()))
+    assert "vertex_normals" in mesh._cache.cache
+    return np.asarray(mesh.vertex_normals)
+
+
+def test_a_glb_has_unit_normals_that_seams_share(tmp_path: Path, ball: tuple[Textured, np.ndarray]) -> None:
+    mesh, image = ball
+    save_textured(tmp_path / "a.glb", mesh, image)
+    shape = load_shape(tmp_path / "a.glb")
+    assert shape.V > len(mesh.verts)
+    normals = stored_normals(tmp_path / "a.glb")
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(normals, shape.verts, atol=0.02)  # of a unit sphere; copies of a vertex agree
+    first = same_rows(shape.verts)
+    np.testing.assert_array_equal(normals, normals[first])
+
+
+def test_normals_of_a_plain_glb_keep_sharp_edges(tmp_path: Path, cube: Shape) -> None:
+    """Corners that the file has apart stay sharp; a loose vertex gets a normal all the same."""
+    corners = cube.verts[cube.faces].reshape(-1, 3)
+    shape = Shape(np.concatenate([corners, [[9, 9, 9]]]), np.arange(len(corners)).reshape(-1, 3))
+    save_shape(tmp_path / "a.glb", shape)
+    normals = stored_normals(tmp_path / "a.glb")
+    np.testing.assert_allclose(normals[:-1], np.repeat(shape.face_normals, 3, axis=0), atol=1e-6)
+    assert normals[-1].tolist() == [0, 0, 1]

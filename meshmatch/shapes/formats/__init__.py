@@ -1,8 +1,14 @@
 """One module per file format: bytes to plain arrays, and a `Shape` to bytes.
 
-The readers are our own because the map must answer for every vertex that the file lists: libraries merge,
-split and reorder vertices on the way in (texture seams), and some allocate whatever a damaged header asks
-for.
+A map answers for every vertex of a file, so readers keep them all, in order, and never allocate what a header merely
+promises. STL goes through trimesh. The other readers are our own, because of what trimesh 5.2 does (measured):
+
+- ply: text takes 1.4 s instead of 0.4 s for 164,000 vertices; importing trimesh takes 0.7 s, and ply is what
+  benchmarks and scans come in. Triangle strips become points, and 16-bit colours lose their upper byte.
+- obj: a file with several materials becomes several meshes, each with all the vertices.
+- off: vertex colours are lost, a face that is cut short vanishes without a word, and files hold ten digits.
+- gltf: meshes come in another order than the scene's (`Rogue.glb`), skins are ignored, strips without indices fail.
+  Written vertex colours have 8 bits of linear light, too few for dark colours.
 """
 
 from dataclasses import dataclass

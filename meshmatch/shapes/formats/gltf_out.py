@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.geometry.topology import same_rows
+from meshmatch.geometry.triangles import dot, vertex_normals
 from meshmatch.shapes.formats.textured import Textured, split_at_seams
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import to_linear
@@ -20,6 +23,9 @@ _POINTS, _TRIANGLES = 0, 4
 _FLOAT, _UNSIGNED = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
 _LINEAR, _LINEAR_MIPS = 9729, 9987
+# Coincident vertices whose normals are further than this cosine (32 degrees) from their mean are an edge of the shape,
+# not a seam; a cube stays one. Set by hand.
+_SHARP = 0.85
 _WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
 
 
@@ -39,11 +45,11 @@ class _Buffer:
         self.at += len(self.parts[-1])
         return len(self.views) - 1
 
-    def array(self, values: NDArray[Any], kind: str, target: int = _VERTICES) -> int:
-        """The number of a new accessor of (N, width) floats, or of (N,) whole numbers."""
+    def array(self, values: NDArray[Any], kind: str, target: int = _VERTICES, box: bool = False) -> int:
+        """The number of a new accessor of (N, width) floats, or of (N,) whole numbers; positions need their box."""
         component = _UNSIGNED if values.dtype.kind == "u" else _FLOAT
         entry: dict[str, Any] = {"componentType": component, "type": kind, "count": len(values)}
-        if kind == "VEC3":  # positions: their box is required
+        if box:
             entry |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
         self.accessors.append({"bufferView": self.view(values.tobytes(), target=target), **entry})
         return len(self.accessors) - 1
@@ -52,7 +58,9 @@ class _Buffer:
 def write(path: Path, shape: Shape) -> None:
     """A mesh or a cloud; 32-bit floats, 32-bit indices, linear vertex colours."""
     buffer = _Buffer()
-    attributes = {"POSITION": buffer.array(shape.verts.astype("<f4"), "VEC3")}
+    attributes = {"POSITION": buffer.array(shape.verts.astype("<f4"), "VEC3", box=True)}
+    if not shape.is_cloud:
+        attributes["NORMAL"] = buffer.array(smooth_normals(shape.verts, shape.faces).astype("<f4"), "VEC3")
     if shape.colors is not None:
         light = np.concatenate([to_linear(shape.colors[:, :3]), shape.colors[:, 3:]], axis=1)
         attributes["COLOR_0"] = buffer.array(light.astype("<f4"), "VEC4")
@@ -67,11 +75,12 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
 
     The material is plain paint (metallic 0, roughness 1), seen from both sides; the sampler asks for mip levels.
     """
-    verts, uv, faces = split_at_seams(mesh)
+    vertex, uv, faces = split_at_seams(mesh)
     buffer = _Buffer()
     primitive = {
         "attributes": {
-            "POSITION": buffer.array(verts.astype("<f4"), "VEC3"),
+            "POSITION": buffer.array(mesh.verts[vertex].astype("<f4"), "VEC3", box=True),
+            "NORMAL": buffer.array(smooth_normals(mesh.verts, mesh.faces)[vertex].astype("<f4"), "VEC3"),
             "TEXCOORD_0": buffer.array(uv.astype("<f4"), "VEC2"),
         },
         "indices": buffer.array(faces.astype("<u4").reshape(-1), "SCALAR", _INDICES),
@@ -100,6 +109,18 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
         "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPS, **wrap}],
     }
     path.write_bytes(_glb(name, primitive, buffer, look))
+
+
+def smooth_normals(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Float[Floats, "V 3"]:
+    """Unit vertex normals; vertices at one place, as seams have them, share theirs unless they meet at an edge.
+
+    A vertex without a face gets the z axis: glTF wants unit length everywhere.
+    """
+    twin = same_rows(verts)
+    own, shared = vertex_normals(verts, faces), vertex_normals(verts, twin[faces])[twin]
+    normals = np.where((dot(own, shared) > _SHARP)[:, None], shared, own)
+    normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
+    return normals
 
 
 def _glb(name: str, primitive: dict[str, Any], buffer: _Buffer, rest: dict[str, Any]) -> bytes:

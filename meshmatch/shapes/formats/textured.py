@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from meshmatch.arrays import Float, Floats, Int, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,21 +28,19 @@ class Textured:
         What lies outside 0..1.
     """
 
-    verts: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    uv: NDArray[np.float64]
+    verts: Float[Floats, "V 3"]
+    faces: Int[Ints, "F 3"]
+    uv: Float[Floats, "F 3 2"]
     alpha: Literal["opaque", "mask", "blend"] = "opaque"
     cutoff: float = 0.5
     wrap: Literal["clamp", "repeat"] = "clamp"
 
 
-def split_at_seams(
-    mesh: Textured,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Positions, texture coordinates and faces where each vertex has one pair of coordinates.
+def split_at_seams(mesh: Textured) -> tuple[Int[Ints, " N"], Float[Floats, "N 2"], Int[Ints, "F 3"]]:
+    """Vertices with one pair of coordinates each: which vertex of the mesh each is, coordinates, and faces over them.
 
-    The first V vertices are those of the mesh in their order (zero coordinates where no face uses one); then come
-    the copies that seams need. Coordinates that are one 32-bit float are one.
+    The first V are those of the mesh in their order (zero coordinates where no face uses one); then come the copies
+    that seams need. Coordinates that are one 32-bit float are one.
     """
     V = len(mesh.verts)
     corner = mesh.faces.reshape(-1)
@@ -57,5 +56,4 @@ def split_at_seams(
     new[order] = number[fresh][group]
     uv = np.zeros((V + int(copies.sum()), 2), np.float64)
     uv[new] = pairs
-    verts = np.concatenate([mesh.verts, mesh.verts[corner[order][copies]]])
-    return verts, uv, new.reshape(-1, 3)
+    return np.concatenate([np.arange(V), corner[order][copies]]), uv, new.reshape(-1, 3)
