@@ -64,7 +64,7 @@ def transfer_labels(
     from meshmatch.errors import OptionError
     from meshmatch.shapes.files import load_shape
     from meshmatch.transfer.attributes import pull_labels
-    from meshmatch.transfer.face_labels import of_faces, pull_face_labels
+    from meshmatch.transfer.face_labels import mean_of_corners, pull_face_labels
     from meshmatch.transfer.label_files import check_labels_suffix, load_labels, named, save_labels
     from meshmatch.transfer.low_confidence import replace_low_labels
 
@@ -85,7 +85,7 @@ def transfer_labels(
         confidence = result.back.confidence.astype(np.float64)
         if kind == "faces":
             found = pull_face_labels(result.back, a, b, given.codes, given.on == "faces", threads)
-            confidence = of_faces(confidence, b)
+            confidence = mean_of_corners(confidence, b)
         else:
             found = pull_labels(result.back, a, given.codes, given.on == "faces")
         found, doubt = replace_low_labels(

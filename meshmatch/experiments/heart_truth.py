@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 from meshmatch.experiments.category import Pair
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.maps.surface import Surface
-from meshmatch.maps.template_footpoints import at_footpoints
 from meshmatch.outputs import make_folder
 from meshmatch.render.picture import Look, Panel, render_shapes
 from meshmatch.render.scales import label_colors
@@ -80,7 +79,7 @@ def registered(template: Shape, ids: np.ndarray, target: Shape, target_ids: np.n
     moved = verts + spline(verts)
     surface = Surface(there, target.faces, vertex_normals(there, target.faces))
     foot = surface.query(moved, vertex_normals(moved, template.faces))
-    return np.asarray(large * at_footpoints(foot, target.faces, there))
+    return np.asarray(large * foot.values(target.faces, there))
 
 
 def save_registered(

@@ -91,7 +91,7 @@ class Loss:
 
 def nearest_map(a: Shape, b: Shape) -> VertexMap:
     """From a to b, which lie in one place: the nearest points of b's surface that face the same way."""
-    image = MappedMesh(VertexMap.identity(b), b, b)
+    image = MappedMesh.of(b)
     places = image.query(a.verts, a.vertex_normals)
     return VertexMap.between(
         a, b, places.vertex, face=places.face, barycentric=places.barycentric, verdict="good"
@@ -127,7 +127,7 @@ def trip_of(name: str, folder: Path) -> Trip:
 
 def colors_at(shape: Shape, look: Appearance, points: Floats) -> Floats:
     """sRGB (N, 3) of a textured shape at its points nearest to given ones (N, 3)."""
-    places = MappedMesh(VertexMap.identity(shape), shape, shape).query(points, None)
+    places = MappedMesh.of(shape).query(points, None)
     coat = MaterialSampler(look, SurfaceWalker(shape))
     face = np.maximum(places.face, 0)
     found = coat.colors(face, places.barycentric.T.astype(np.float32), np.zeros(len(points), np.float32))

@@ -1,20 +1,28 @@
-"""Closest points on a surface among those that face the same way."""
+"""Closest points on a surface among those that face the same way.
+
+For many queries that lie near the surface, such as the vertices of a shape around a fitted template: the nearest vertex
+in a space of positions and normals, then the closest of its triangles. It is fast and knows the resting template, but
+not exact for triangles that are large beside the distance. `meshmatch.transfer.mapped_mesh` is exact whatever the size
+of the triangles; `meshmatch.transfer.surface_walk` starts from a known face and never changes to another sheet.
+"""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from meshmatch.geometry.triangles import blend, closest_on_triangles, squared_lengths
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.geometry.triangles import blend, closest_on_triangles, interpolate, squared_lengths
+from meshmatch.maps.vertex_map import corners_of
 
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area): enough to tell
-# the sides of a thin wall. More would drag points along the surface to where it bends the same way.
+# the sides of a thin wall. More would drag points along the surface to where it bends the same way. Set by hand.
 NORMAL_WEIGHT = 0.02
-# How much a distance on the resting template counts beside one in space.
+# How much a distance on the resting template counts beside one in space. Set by hand.
 RESTING_WEIGHT = 0.4
 # Queries at a time: what belongs to them then stays in the processor's cache.
 _CHUNK = 8192
@@ -22,12 +30,35 @@ _CHUNK = 8192
 
 @dataclass(frozen=True, eq=False)
 class Footpoints:
-    """Closest points of N queries: vertex (N,), face (N,) or -1, barycentric (N, 3), distance (N,)."""
+    """Closest points on a surface to N queries.
 
-    vertex: NDArray[np.int64]
-    face: NDArray[np.int64]
-    barycentric: NDArray[np.float64]
-    distance: NDArray[np.float64]
+    Parameters
+    ----------
+    vertex : (N,) int64
+        A vertex near the point: the corner with the largest weight, or the one that the search began with.
+    face : (N,) int64
+        -1 where the point is the vertex itself (always for a cloud).
+    barycentric : (N, 3) float64
+        Weights of the face's corners; (1, 0, 0) where the face is -1.
+    distance : (N,) float64
+        From each query, in the unit of the surface.
+    """
+
+    vertex: Int[Ints, " N"]
+    face: Int[Ints, " N"]
+    barycentric: Float[Floats, "N 3"]
+    distance: Float[Floats, " N"]
+
+    def values(self, faces: Int[Ints, "F 3"], values: Float[Floats, "V D"]) -> Float[Floats, "N D"]:
+        """Values of the surface's vertices, interpolated at the points."""
+        return interpolate(values, corners_of(faces, self.face, self.vertex), self.barycentric)
+
+    def updated(self, rows: Int[Ints, " M"], other: Self) -> Self:
+        """These points with M rows taken from `other`."""
+        arrays = {field.name: getattr(self, field.name).copy() for field in fields(self)}
+        for name, array in arrays.items():
+            array[rows] = getattr(other, name)
+        return replace(self, **arrays)
 
 
 class Surface:
@@ -36,15 +67,21 @@ class Surface:
     Parameters
     ----------
     verts : (V, 3)
-    faces : (F, 3), F = 0 for a cloud
-    normals : (V, 3) unit normals, zeros where unknown
+    faces : (F, 3)
+        F = 0 for a cloud.
+    normals : (V, 3)
+        Unit normals, zeros where unknown.
     resting : (V, 3), optional
-        Where on the resting template each vertex belongs. Queries that know the same then find the right one of
-        two sheets that touch, such as a hand on a thigh.
+        Where each vertex belongs on the resting template. Queries with a resting place of their own then find the
+        right one of two sheets that touch, such as a hand on a thigh.
     """
 
     def __init__(
-        self, verts: np.ndarray, faces: np.ndarray, normals: np.ndarray, resting: np.ndarray | None = None
+        self,
+        verts: Float[Floats, "V 3"],
+        faces: Int[Ints, "F 3"],
+        normals: Float[Floats, "V 3"],
+        resting: Float[Floats, "V 3"] | None = None,
     ) -> None:
         self.verts, self.faces = verts, faces
         self._start, self._around = _faces_around(faces, len(verts))
@@ -52,9 +89,13 @@ class Surface:
         self._tree = cKDTree(_features(verts, normals, resting)[self._used])
 
     def query(
-        self, points: np.ndarray, normals: np.ndarray, workers: int = 1, resting: np.ndarray | None = None
+        self,
+        points: Float[Floats, "N 3"],
+        normals: Float[Floats, "N 3"],
+        workers: int = 1,
+        resting: Float[Floats, "N 3"] | None = None,
     ) -> Footpoints:
-        """Closest points to (N, 3) points with normals (N, 3); ``resting`` (N, 3) if the surface has it."""
+        """Closest points to points with unit normals (zeros where unknown); ``resting`` if the surface has it."""
         N = len(points)
         vertex = np.empty(N, np.int64)
         face = np.full(N, -1, np.int64)
@@ -76,7 +117,8 @@ class Surface:
             weights[:, 0] = 1.0
         return Footpoints(vertex, face, weights, distance)
 
-    def _on_faces(self, points: np.ndarray, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _on_faces(self, points: Floats, vertex: Ints) -> tuple[Ints, Floats, Floats]:
+        """The closest of the faces around each vertex (N,), its weights (N, 3) and the distance (N,)."""
         counts = self._start[vertex + 1] - self._start[vertex]
         first = np.cumsum(counts) - counts
         within = np.arange(counts.sum()) - np.repeat(first, counts)
@@ -91,12 +133,12 @@ class Surface:
         return face[best], weights[best], np.sqrt(squared[best])
 
 
-def _features(points: np.ndarray, normals: np.ndarray, resting: np.ndarray | None) -> np.ndarray:
+def _features(points: Floats, normals: Floats, resting: Floats | None) -> Floats:
     parts = [points, NORMAL_WEIGHT * normals]
     return np.concatenate(parts if resting is None else [*parts, RESTING_WEIGHT * resting], 1)
 
 
-def _faces_around(faces: np.ndarray, V: int) -> tuple[np.ndarray, np.ndarray]:
+def _faces_around(faces: Ints, V: int) -> tuple[Ints, Ints]:
     """Faces at every vertex in compressed rows: start (V + 1,), face (3 F,)."""
     corner = faces.reshape(-1)
     order = np.argsort(corner, kind="stable")

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import upright
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
@@ -51,7 +50,7 @@ def fit_panels(
 
 def distances(shape: Shape, fitted: Shape) -> FloatArray:
     """Distance (V,) of each vertex of a shape to the surface of another; nan where it has no position."""
-    found = MappedMesh(VertexMap.identity(fitted), fitted, fitted).query(shape.verts).distance
+    found = MappedMesh.of(fitted).query(shape.verts).distance
     return found if shape.invalid is None else np.where(shape.invalid, np.nan, found)
 
 

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshmatch.arrays import Floats, Ints
-from meshmatch.geometry.topology import edges_of
-from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.template_footpoints import small_islands, surrounding_values
+from meshmatch.arrays import Int, Ints
+from meshmatch.maps.islands import reassign_islands
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.mapped_mesh import MappedFootpoints, MappedMesh
+from meshmatch.transfer.mapped_mesh import MappedFootpoints, MappedMesh, known_normals
 
 _ROUNDS = 2
+# Of the source vertices that meet on a target vertex, those with this share of the highest confidence count.
+_TRUSTED = 0.5
 
 
 def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
@@ -33,15 +33,33 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
     if source.hash == target.hash and target.invalid is None and _is_identity(checked):
         return replace(checked, source=target.name, target=source.name)
     image = MappedMesh(checked, source, target)
-    normals = target_normals(target)
+    normals = known_normals(target)
     found = image.query(target.verts, normals, workers)
-    chosen = _middles(checked, source, target.V)
-    several = np.flatnonzero(chosen >= 0)
-    found.vertex[several], found.face[several] = chosen[several], -1
-    found.barycentric[several] = (1.0, 0.0, 0.0)
-    found.confidence[several] = checked.confidence[chosen[several]]
-    _ask_neighbours(image, found, source, target, normals, workers)
-    confidence = found.confidence
+    central = _central_vertices(checked, source, target.V)
+    several = np.flatnonzero(central >= 0)
+    vertex = central[several]
+    found = found.updated(
+        several,
+        MappedFootpoints(
+            vertex,
+            np.full(len(several), -1),
+            np.tile([1.0, 0.0, 0.0], (len(several), 1)),
+            found.distance[several],
+            checked.confidence[vertex].astype(np.float64),
+        ),
+    )
+    if not target.is_cloud:
+        length, source_length = (float(np.sqrt(shape.area)) or 1.0 for shape in (target, source))
+        found, _ = reassign_islands(
+            target.verts / length,
+            target.faces,
+            target.vertex_areas,
+            found,
+            lambda places: places.values(source.faces, source.verts) / source_length,
+            lambda rows, near: image.query(target.verts[rows], normals[rows], workers, near * source_length),
+            _ROUNDS,
+        )
+    confidence = np.clip(found.confidence, 0.0, 1.0).astype(np.float32)
     if target.invalid is not None:
         confidence[target.invalid] = 0.0
     return VertexMap.between(
@@ -50,80 +68,37 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
         index=found.vertex,
         face=found.face,
         barycentric=found.barycentric,
-        confidence=np.clip(confidence, 0.0, 1.0).astype(np.float32),
+        confidence=confidence,
         verdict=checked.verdict,
         reasons=checked.reasons,
     )
-
-
-def _ask_neighbours(
-    image: MappedMesh, found: MappedFootpoints, source: Shape, target: Shape, normals: Floats, workers: int
-) -> None:
-    """Correct small pieces of the target that lie elsewhere on the source than all around them.
-
-    Where two sheets of the target touch, the closest point can be one of the other sheet. Such pieces ask again,
-    knowing where their neighbours lie. `found` is changed in place.
-    """
-    if target.is_cloud:
-        return
-    edges = edges_of(target.faces).vertices
-    unit, source_unit = (float(np.sqrt(shape.area)) or 1.0 for shape in (target, source))
-    length = np.linalg.norm(target.verts[edges[:, 0]] - target.verts[edges[:, 1]], axis=1) / unit
-    at = points_on(source, found) / source_unit
-    for _ in range(_ROUNDS):
-        doubted = small_islands(edges, length, at, target.vertex_areas / unit**2)
-        if not doubted.any():
-            return
-        around = surrounding_values(edges, at, doubted)
-        ask = np.flatnonzero(doubted & np.isfinite(around).all(axis=1))
-        if not len(ask):
-            return
-        near = around[ask] * source_unit
-        again = image.query(target.verts[ask], normals[ask], workers, near)
-        for name in ("vertex", "face", "barycentric", "confidence", "distance"):
-            getattr(found, name)[ask] = getattr(again, name)
-        at[ask] = points_on(source, again) / source_unit
-
-
-def points_on(source: Shape, places: MappedFootpoints) -> Floats:
-    """(N, 3) the points themselves, in the source's frame."""
-    points = source.verts[places.vertex]
-    inside = places.face >= 0
-    corners = source.faces[places.face[inside]]
-    points[inside] = interpolate(source.verts, corners, places.barycentric[inside])
-    return points
-
-
-def target_normals(target: Shape) -> np.ndarray:
-    """(V, 3) unit normals of a mesh; zeros for a cloud, whose signs are unsure."""
-    return np.zeros_like(target.verts) if target.is_cloud else target.vertex_normals
 
 
 def _is_identity(found: VertexMap) -> bool:
     return bool((found.index == np.arange(found.source_vertices)).all() and (found.face < 0).all())
 
 
-def _middles(found: VertexMap, source: Shape, V: int) -> Ints:
-    """(V_tgt,) the middle one of the several source vertices that meet on a target vertex; -1 elsewhere.
+def _central_vertices(found: VertexMap, source: Shape, V: int) -> Int[Ints, " V"]:
+    """Where several source vertices meet on a target vertex, the one nearest to their mean; -1 elsewhere.
 
-    A map of vertex numbers to a coarser target puts a patch of the source on each vertex, and any of them is
+    A map of vertex numbers to a coarser target puts a patch of the source on each vertex, and any of it would be
     closest.
     """
-    best = np.zeros(V)
+    highest = np.zeros(V)
     rows = np.flatnonzero(found.on_vertex)
     at = found.index[rows]
-    np.maximum.at(best, at, found.confidence[rows])
-    sure = found.confidence[rows] >= 0.5 * best[at]
+    np.maximum.at(highest, at, found.confidence[rows])
+    trusted = found.confidence[rows] >= _TRUSTED * highest[at]
     if source.invalid is not None:
-        sure &= ~source.invalid[rows]
-    rows, at = rows[sure], at[sure]
-    many = np.bincount(at, minlength=V)
+        trusted &= ~source.invalid[rows]
+    rows, at = rows[trusted], at[trusted]
+    count = np.bincount(at, minlength=V)
     sums = np.stack([np.bincount(at, source.verts[rows, k], V) for k in range(3)], axis=1)
-    middle = sums / np.maximum(many, 1)[:, None]
-    away = np.linalg.norm(source.verts[rows] - middle[at], axis=1)
-    order = np.lexsort((rows, away, at))
+    mean = sums / np.maximum(count, 1)[:, None]
+    distance = np.linalg.norm(source.verts[rows] - mean[at], axis=1)
+    order = np.lexsort((rows, distance, at))
     vertex, first = np.unique(at[order], return_index=True)
     chosen = np.full(V, -1, np.int64)
     chosen[vertex] = rows[order[first]]
-    chosen[many < 2] = -1
+    chosen[count < 2] = -1
     return chosen

@@ -12,8 +12,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.inverse_map import target_normals
-from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces
+from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals
 
 # A landmark this far from the surface (of the diagonal) is not meant for this shape.
 _ELSEWHERE = 0.25
@@ -87,7 +86,7 @@ def at_points(shape: Shape, points: Floats, names: tuple[str, ...] = ()) -> tupl
     bad = np.flatnonzero(~(np.abs(points) < 1e60).all(axis=1))
     if len(bad):
         raise InputError(f"landmark {names[bad[0]]} has no position: {points[bad[0]].tolist()}")
-    places = MappedMesh(VertexMap.identity(shape), shape, shape).query(points)
+    places = MappedMesh.of(shape).query(points)
     far = np.flatnonzero(places.distance > _ELSEWHERE * max(shape.diagonal, 1e-30))
     if len(far):
         raise InputError(
@@ -155,14 +154,14 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
     points = forward.points(target)
     inside = np.flatnonzero((landmarks.face >= 0) & (landmarks.barycentric.max(axis=1) < 1.0 - 1e-9))
     if len(inside):
-        torn = discontinuous_faces(forward, source, target, points, float(np.sqrt(target.area)) or 1.0)
+        torn = discontinuous_faces(forward, source, target)
         inside = inside[~torn[landmarks.face[inside]]]
     if len(inside):
         corners = source.faces[landmarks.face[inside]]
         share = landmarks.barycentric[inside]
         mean = interpolate(points, corners, share)
-        facing = interpolate(target_normals(target), forward.index[corners], share)
-        places = MappedMesh(VertexMap.identity(target), target, target).query(mean, facing)
+        facing = interpolate(known_normals(target), forward.index[corners], share)
+        places = MappedMesh.of(target).query(mean, facing)
         vertex[inside], face[inside], weights[inside] = places.vertex, places.face, places.barycentric
         confidence[inside] = np.einsum("nk,nk->n", share, forward.confidence[corners])
     return _on_surface(target, landmarks.names, vertex, face, weights, np.clip(confidence, 0, 1))

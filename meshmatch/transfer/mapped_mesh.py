@@ -1,8 +1,12 @@
 """The source as it lies on the target: every source vertex at its matched point, with the source's own faces.
 
-A point of the target finds its place on the source as the closest point of that image. Where several parts of
-the image pass by, the most trustworthy wins: facing the same way, confidently mapped, near, and never a triangle
-that the map has torn apart.
+A point of the target finds its place on the source as the closest point of that image. Where several parts of the
+image pass by, the most trustworthy wins: facing the same way, mapped with confidence, near, and never a triangle that
+the map has pulled apart.
+
+The search is exact for triangles of any size, which an image needs: a map stretches some and shrinks others, and
+leaves vertices without a triangle. `meshmatch.maps.surface` asks only the triangles around the nearest vertex, which is
+faster but misses large ones; `meshmatch.transfer.surface_walk` needs to know where a search begins.
 """
 
 from __future__ import annotations
@@ -10,55 +14,44 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.geometry.topology import edges_of
-from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths
-from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths, unit
+from meshmatch.maps.surface import Footpoints
+from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
 
-# Distance to the image (units of sqrt(area)) at which confidence has fallen to about 0.37, as in maps.
-SCALE = 0.03
-# How far a part of the image that faces the other way is pushed off, in units of sqrt(area).
+# All set by hand; lengths in units of sqrt(area).
+# Distance to the image at which confidence is 1/e = 0.37, as in maps.
+_DISTANCE_SCALE = 0.03
+# By how much a part of the image that faces the other way is further away than it is.
 _FACING = 0.15
 # How much a distance on the source counts beside one on the target, where it is known where a place should be.
 _NEAR = 0.2
-# Above this confidence the map is simply believed, and the closest point wins. A guess is pushed off, by little:
-# by 1.2 % of sqrt(area) where the map knows nothing, so that of parts that lie on one another the sure one wins.
-_BELIEVED, _DOUBT = 0.5, 0.003
-# An edge of the image may be this many times as long as the source's, and a little more (units of sqrt(area)).
+# Above this confidence the closest point wins. A less certain part of the image counts as further away, by little: by
+# 1.2 % of sqrt(area) where the map knows nothing, so that of parts that lie on one another the certain one wins.
+_TRUSTED, _UNCERTAIN = 0.5, 0.003
+# An edge of the image may be this many times as long as the source's, and a little more.
 _STRETCH, _SLACK = 3.0, 0.02
 # Triangles are searched by size, each class up to twice as large as the one before, and at most so many classes.
 _CLASSES = 12
 # Queries at a time; how many triangles are tried first, and at most.
-_CHUNK, _FIRST, _MOST = 8192, 12, 512
+_CHUNK, _FIRST, _MAX_TRIED = 8192, 12, 512
 
 
 @dataclass(frozen=True, eq=False)
-class MappedFootpoints:
-    """Where N points of the target lie on the source.
+class MappedFootpoints(Footpoints):
+    """Where N points of the target lie on the source; distances are to the image, in the unit of the target's file.
 
     Parameters
     ----------
-    vertex : (N,) int64
-        The source vertex nearest in weight.
-    face : (N,) int64
-        Source face; -1 where only the vertex is known (always for a cloud).
-    barycentric : (N, 3) float64
-        Weights of the face's corners; (1, 0, 0) where the face is -1.
     confidence : (N,) float64
         That of the map there, falling with the distance to the image.
-    distance : (N,) float64
-        Distance to the image, units of the target's file.
     """
 
-    vertex: Ints
-    face: Ints
-    barycentric: Floats
-    confidence: Floats
-    distance: Floats
+    confidence: Float[Floats, " N"]
 
 
 class MappedMesh:
@@ -70,12 +63,17 @@ class MappedMesh:
         Made for these two shapes; see `VertexMap.for_shapes`.
     """
 
+    @classmethod
+    def of(cls, shape: Shape) -> MappedMesh:
+        """A shape as it is, to find the closest points of its surface."""
+        return cls(VertexMap.identity(shape), shape, shape)
+
     def __init__(self, source_to_target: VertexMap, source: Shape, target: Shape) -> None:
         self.points = source_to_target.points(target)
         self.confidence = source_to_target.confidence.astype(np.float64)
         self.unit = float(np.sqrt(target.area)) or target.diagonal or 1.0
-        self.normals = _normals_at(source_to_target, target)
-        kept = np.flatnonzero(~discontinuous_faces(source_to_target, source, target, self.points, self.unit))
+        self.normals = normals_at(source_to_target, target)
+        kept = np.flatnonzero(~discontinuous_faces(source_to_target, source, target))
         lone = np.ones(source.V, bool)
         if source.invalid is not None:  # their places are stand-ins
             kept = kept[~source.invalid[source.faces[kept]].any(axis=1)]
@@ -84,14 +82,14 @@ class MappedMesh:
         self._source_unit = float(np.sqrt(source.area)) or source.diagonal or 1.0
         self._source = source.verts / self._source_unit
         single = np.flatnonzero(lone)
-        # Triangles, then the points that no triangle holds: those of a cloud, or between tears.
+        # Triangles, then the points that no triangle holds: those of a cloud, or between discontinuities.
         self.corners = np.concatenate([source.faces[kept], np.repeat(single[:, None], 3, axis=1)])
         self.face = np.concatenate([kept, np.full(len(single), -1)])
         held = self.points[self.corners]
         self._center = held.mean(axis=1)
         self._radius = np.sqrt(((held - self._center[:, None]) ** 2).sum(axis=2).max(axis=1))
         self._trees = self._by_size()
-        # A cloud has gaps between its points, which are no reason for doubt.
+        # A cloud has gaps between its points, which are no reason for low confidence.
         distinct = len(np.unique(self.points, axis=0)) if source.is_cloud else 1
         self._gap = self.unit / np.sqrt(distinct) if source.is_cloud else 0.0
 
@@ -104,10 +102,10 @@ class MappedMesh:
 
     def query(
         self,
-        points: Floats,
-        normals: Floats | None = None,
+        points: Float[Floats, "N 3"],
+        normals: Float[Floats, "N 3"] | None = None,
         workers: int = 1,
-        near: Floats | None = None,
+        near: Float[Floats, "N 3"] | None = None,
     ) -> MappedFootpoints:
         """Points on the source of (N, 3) points on the target, in its file's frame.
 
@@ -123,27 +121,27 @@ class MappedMesh:
         N = len(points)
         facing = np.zeros((N, 3)) if normals is None else np.asarray(normals, np.float64)
         about = None if near is None else np.asarray(near, np.float64) / self._source_unit
-        item, weights, _ = self._search(points, facing, workers, about)
+        item, weights = self._search(points, facing, workers, about)
         corners = self.corners[item]
         foot = interpolate(self.points, corners, weights)
         distance = np.sqrt(squared_lengths(foot - points))
         beyond = np.maximum(distance - self._gap, 0.0)
         confidence = np.einsum("nk,nk->n", weights, self.confidence[corners])
-        confidence = np.clip(confidence, 0, 1) * np.exp(-np.square(beyond / (SCALE * self.unit)))
-        against = self._against(facing, corners)
-        confidence *= np.exp(-np.square(_FACING / SCALE * against))
+        confidence = np.clip(confidence, 0, 1) * np.exp(-np.square(beyond / (_DISTANCE_SCALE * self.unit)))
+        opposed = self._opposed(facing, corners)
+        confidence *= np.exp(-np.square(_FACING / _DISTANCE_SCALE * opposed))
         face = self.face[item]
         vertex = corners[np.arange(N), weights.argmax(axis=1)]
         weights[face < 0] = (1.0, 0.0, 0.0)
-        return MappedFootpoints(vertex, face, weights, confidence, distance)
+        return MappedFootpoints(vertex, face, weights, distance, confidence)
 
     def _search(
         self, points: Floats, normals: Floats, workers: int, near: Floats | None = None
-    ) -> tuple[Ints, Floats, Floats]:
-        """The best item of each point, the weights of its corners, and its cost.
+    ) -> tuple[Ints, Floats]:
+        """The best item of each point, a triangle or a lone vertex, and the weights of its corners.
 
-        Centres come nearest first, so that a search ends where no further item can be better. That is exact
-        until `_MOST` items of a size have been tried for a point.
+        Centers come nearest first, so that a search ends where no further item can be better. That is exact
+        until `_MAX_TRIED` items of a size have been tried for a point.
         """
         N = len(points)
         best, item, weights = np.full(N, np.inf), np.zeros(N, np.int64), np.zeros((N, 3))
@@ -181,11 +179,11 @@ class MappedMesh:
                     lower = np.maximum(distance[row, column + done] - self._radius[items], 0.0)
                     worth = lower**2 <= best[rows[row]]
                     attempt(rows[row[worth]], items[worth])
-                    if ask >= min(len(which), _MOST):
+                    if ask >= min(len(which), _MAX_TRIED):
                         break
                     rows = rows[np.maximum(distance[:, -1] - largest, 0.0) ** 2 <= best[rows]]
-                    done, ask = ask, min(3 * ask, len(which), _MOST)
-        return item, weights, best
+                    done, ask = ask, min(3 * ask, len(which), _MAX_TRIED)
+        return item, weights
 
     def _costs(self, points: Floats, normals: Floats, items: Ints) -> tuple[Floats, Floats]:
         """Weights (N, 3) of the closest points of items (N,), and what they cost: squared lengths."""
@@ -194,12 +192,12 @@ class MappedMesh:
         weights = closest_on_triangles(points, a, b, c)
         foot = weights[:, :1] * a + weights[:, 1:2] * b + weights[:, 2:] * c
         sure = np.einsum("nk,nk->n", weights, self.confidence[corners])
-        doubt = np.log(_BELIEVED / np.clip(sure, 1e-6, _BELIEVED))
-        against = self._against(normals, corners)
+        doubt = np.log(_TRUSTED / np.clip(sure, 1e-6, _TRUSTED))
+        opposed = self._opposed(normals, corners)
         squared = squared_lengths(foot - points)
-        return weights, squared + self.unit**2 * (_DOUBT**2 * doubt + (_FACING * against) ** 2)
+        return weights, squared + self.unit**2 * (_UNCERTAIN**2 * doubt + (_FACING * opposed) ** 2)
 
-    def _against(self, normals: Floats, corners: Ints) -> Floats:
+    def _opposed(self, normals: Floats, corners: Ints) -> Floats:
         """(N,) 0 where one of three corners faces into one half of space with a normal, up to 1 where all of
         them face the opposite way. At a sharp edge their mean may face anywhere.
         """
@@ -208,22 +206,24 @@ class MappedMesh:
 
 
 def discontinuous_faces(
-    source_to_target: VertexMap, source: Shape, target: Shape, points: Floats, unit: float
-) -> NDArray[np.bool_]:
-    """(F_src,) True for a face whose image `points` (V_src, 3) is far longer than the face itself.
+    source_to_target: VertexMap, source: Shape, target: Shape
+) -> Bool[Bools, " F_source"]:
+    """True for a face whose image on the target is far longer than the face itself.
 
-    A map that names vertices alone moves each point by up to an edge of the target, which is allowed for.
+    A map to vertices alone moves each point by up to an edge of the target, which is allowed for.
     """
     if source.is_cloud:
         return np.zeros(0, bool)
+    points = source_to_target.points(target)
     around = source.faces[:, [1, 2, 0]]
     own = np.linalg.norm(source.verts[source.faces] - source.verts[around], axis=2)
     image = np.linalg.norm(points[source.faces] - points[around], axis=2)
     usual = image <= np.quantile(image, 0.95)
     whole = float(own[usual].sum())
     scale = float(image[usual].sum()) / whole if whole > 0 else 0.0
+    length = float(np.sqrt(target.area)) or target.diagonal or 1.0
     rounded = np.where(source_to_target.on_vertex, _edge_lengths(target)[source_to_target.index], 0.0)
-    allowed = _STRETCH * scale * own + rounded[source.faces] + rounded[around] + _SLACK * unit
+    allowed = _STRETCH * scale * own + rounded[source.faces] + rounded[around] + _SLACK * length
     return np.asarray((image > allowed).any(axis=1))
 
 
@@ -238,12 +238,15 @@ def _edge_lengths(shape: Shape) -> Floats:
     return total / np.maximum(np.bincount(ends, minlength=shape.V), 1)
 
 
-def _normals_at(found: VertexMap, target: Shape) -> Floats:
-    """(V_src, 3) the target's normals at the matched points; zeros on a cloud, whose signs are unsure."""
-    if target.is_cloud:
-        return np.zeros((found.source_vertices, 3))
-    normals = target.vertex_normals[found.index]
-    inside = found.face >= 0
-    corners = target.faces[found.face[inside]]
-    normals[inside] = interpolate(target.vertex_normals, corners, found.barycentric[inside])
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+def known_normals(shape: Shape) -> Float[Floats, "V 3"]:
+    """Unit vertex normals of a mesh; zeros for a cloud, where inside and outside may be confused."""
+    return np.zeros_like(shape.verts) if shape.is_cloud else shape.vertex_normals
+
+
+def normals_at(found: VertexMap, target: Shape) -> Float[Floats, "V_source 3"]:
+    """The target's unit normals at the matched points; zeros on a cloud."""
+    return unit(
+        interpolate(
+            known_normals(target), corners_of(target.faces, found.face, found.index), found.barycentric
+        )
+    )

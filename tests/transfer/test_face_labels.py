@@ -5,7 +5,7 @@ import pytest
 
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.face_labels import lattice, of_faces, pull_face_labels
+from meshmatch.transfer.face_labels import lattice, mean_of_corners, pull_face_labels
 from meshmatch.transfer.inverse_map import invert_map
 from tests.conftest import icosphere
 from tests.transfer.known import split
@@ -110,4 +110,6 @@ def test_what_has_no_label_stays_without(on_faces: bool) -> None:
 
 def test_confidence_of_faces() -> None:
     confidence = COARSE.verts[:, 0] / 2 + 0.5
-    assert np.allclose(of_faces(confidence, COARSE), COARSE.verts[COARSE.faces, 0].mean(axis=1) / 2 + 0.5)
+    assert np.allclose(
+        mean_of_corners(confidence, COARSE), COARSE.verts[COARSE.faces, 0].mean(axis=1) / 2 + 0.5
+    )

@@ -12,7 +12,7 @@ from tests.transfer.known import brute_force, split
 
 
 def own_image(shape: Shape) -> MappedMesh:
-    return MappedMesh(VertexMap.identity(shape), shape, shape)
+    return MappedMesh.of(shape)
 
 
 @pytest.mark.parametrize("reach", [0.01, 0.3, 3.0])
@@ -84,7 +84,7 @@ def test_faces_are_torn_where_their_image_is_far_longer(sphere: Shape) -> None:
     index = np.arange(sphere.V)
     index[7] = int(np.argmin(sphere.verts @ sphere.verts[7]))
     found = VertexMap.between(sphere, sphere, index)
-    torn = discontinuous_faces(found, sphere, sphere, found.points(sphere), float(np.sqrt(sphere.area)))
+    torn = discontinuous_faces(found, sphere, sphere)
     assert np.array_equal(np.flatnonzero(torn), np.flatnonzero((sphere.faces == 7).any(axis=1)))
 
 
@@ -94,13 +94,9 @@ def test_whole_maps_are_not_torn_whatever_the_units(size: float) -> None:
     fine, forward, back = split(Shape(shape.verts * size, shape.faces))
     coarse = Shape(shape.verts * size, shape.faces)
     for found, a, b in ((forward, coarse, fine), (back, fine, coarse)):
-        assert not discontinuous_faces(found, a, b, found.points(b), float(np.sqrt(b.area))).any()
-    rounded = VertexMap.between(
-        fine, coarse, back.index
-    )  # to vertices before_agreement: each by up to half an edge
-    assert not discontinuous_faces(
-        rounded, fine, coarse, rounded.points(coarse), float(np.sqrt(coarse.area))
-    ).any()
+        assert not discontinuous_faces(found, a, b).any()
+    rounded = VertexMap.between(fine, coarse, back.index)  # each vertex by up to half an edge
+    assert not discontinuous_faces(rounded, fine, coarse).any()
 
 
 def test_rounding_to_a_coarse_target_tears_nothing(sphere: Shape) -> None:
@@ -111,13 +107,13 @@ def test_rounding_to_a_coarse_target_tears_nothing(sphere: Shape) -> None:
     points = found.points(coarse)
     longest = np.linalg.norm(points[sphere.faces] - points[sphere.faces[:, [1, 2, 0]]], axis=2).max()
     assert longest > 5 * np.linalg.norm(np.diff(sphere.verts[sphere.faces[0, :2]], axis=0))
-    assert not discontinuous_faces(found, sphere, coarse, points, float(np.sqrt(coarse.area))).any()
+    assert not discontinuous_faces(found, sphere, coarse).any()
 
 
 def test_a_cloud_has_no_faces_to_tear(sphere: Shape) -> None:
     points = Shape(sphere.verts, np.empty((0, 3), int))
     found = VertexMap.identity(points)
-    assert discontinuous_faces(found, points, points, points.verts, 1.0).shape == (0,)
+    assert discontinuous_faces(found, points, points).shape == (0,)
 
 
 def test_places_on_vertices_are_known_as_such() -> None:
