@@ -39,7 +39,7 @@ class Parts:
 
 
 def find_parts(verts: Floats, faces: Ints, cross: Floats) -> Parts:
-    """CandidateScorer the connected parts of a mesh; `cross` (F, 3) is the normal of each face, twice its area long."""
+    """Judge the connected parts of a mesh; `cross` (F, 3) is the normal of each face, twice its area long."""
     part = face_parts(faces, len(verts))
     if part.max() == 0:
         return Parts(np.zeros(len(faces), bool), 0, 1, 0, 0.0)

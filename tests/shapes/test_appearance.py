@@ -12,7 +12,7 @@ from meshmatch.shapes import images
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.appearance_files import load_appearance
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats.text import behind_slash
+from meshmatch.shapes.formats.text import second_index
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import LINEAR_OF_BYTE, bytes_of, to_linear, to_srgb
 from tests.shapes.painted import CORNERS, FACES, UV, encoded, quarters, write_gltf, write_square_obj
@@ -183,8 +183,8 @@ def test_trimesh_reads_the_same_coordinates_and_images(tmp_path: Path) -> None:
 
 
 def test_the_second_numbers_of_faces() -> None:
-    assert behind_slash(b"1/2/3 4/5/6\n7//8 9 -1/-2/-3 12/ 3/44").split() == [
-        *(b"02", b"05", b"0", b"0", b"-2", b"0", b"044")
+    assert second_index(b"1/2/3 4/5/6\n7//8 9 -1/-2/-3 12/ 3/44").split() == [
+        *(b"2", b"5", b"0", b"0", b"-2", b"0", b"44")
     ]
 
 

@@ -47,6 +47,29 @@ def test_ply_lists_where_numbers_belong(tmp_path: Path, content: bytes, words: s
     refused(tmp_path / "a.ply", content, words)
 
 
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ("element vertex 3", *XYZ, "property float x"),
+        ("element vertex 3", *XYZ, "property list uchar float x"),
+        ("element vertex 3", *XYZ, "element tristrips 1", "property list int int v", "property int v"),
+    ],
+)
+def test_ply_properties_named_twice(tmp_path: Path, lines: tuple[str, ...]) -> None:
+    refused(tmp_path / "a.ply", ply(*lines, body="0 0 0 1\n" * 9), "twice")
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_ply_comments_may_name_the_end_of_the_header(tmp_path: Path, end: str) -> None:
+    content = ply("comment end_header", "comment made by end_header tool", "element vertex 3", *XYZ)
+    (tmp_path / "a.ply").write_bytes(content.replace(b"\n", end.encode()))
+    assert load_shape(tmp_path / "a.ply").V == 3
+
+
+def test_obj_cut_before_the_corners_of_a_face(tmp_path: Path) -> None:
+    refused(tmp_path / "a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf ", "a face has no corners")
+
+
 def test_ply_other_elements_may_be_anything(tmp_path: Path) -> None:
     """Only what is read has to be as it is read."""
     lines = ["element vertex 3", *XYZ, "element edge 1", "property int a", "element face 1"]

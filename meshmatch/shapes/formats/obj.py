@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged, fan
-from meshmatch.shapes.formats.text import columns, lines_of, numbers, without_slashes, words_per_line
+from meshmatch.shapes.formats.text import columns, first_index, lines_of, numbers, words_per_line
 from meshmatch.shapes.shape import Shape
 
 
@@ -71,16 +71,16 @@ def _faces(
     name: str, text: bytes, lines: NDArray[np.int64], vertex_lines: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     if b"/" in text:
-        text = without_slashes(text)  # position/texture/normal: the first alone
+        text = first_index(text)  # position/texture/normal: the first alone
+    sizes = words_per_line(text)
+    if len(sizes) < len(lines):
+        raise damaged(name, "a face has no corners")
     values = numbers(name, text)
     if len(values) == 0:
         return NO_FACES
     if not (np.abs(values) < 2**53).all() or (values != np.trunc(values)).any():
         raise damaged(name, "a face names a vertex that is not a whole number")
     corners = values.astype(np.int64)
-    sizes = words_per_line(text)
-    if len(sizes) < len(lines):
-        raise damaged(name, "a face has no corners")
     V = len(vertex_lines)
     if (corners == 0).any():
         raise damaged(name, "a face names vertex 0, but obj files count from 1")

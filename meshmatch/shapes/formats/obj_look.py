@@ -16,7 +16,7 @@ from meshmatch.errors import InputError
 from meshmatch.shapes.appearance import Alpha, Appearance, Material, Wrap, no_coordinates, vertex_colors_alone
 from meshmatch.shapes.formats import damaged, fan
 from meshmatch.shapes.formats.obj import joined_lines, with_old
-from meshmatch.shapes.formats.text import behind_slash, columns, lines_of, numbers, words_per_line
+from meshmatch.shapes.formats.text import columns, lines_of, numbers, second_index, words_per_line
 from meshmatch.shapes.images import ImageReader, Pixels
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import to_linear
@@ -109,12 +109,14 @@ def _coordinates(name: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[n
         width = int(min(counts.min(), 2))
         pairs[:, :width] = columns(numbers(name, text), counts, 0, width)
     if b"/" in faces_text:
-        values = numbers(name, behind_slash(faces_text))
+        values = numbers(name, second_index(faces_text))
         if not (np.abs(values) < 2**53).all():
             raise damaged(name, "a face names a texture coordinate that is not a number")
         index = values.astype(np.int64)
     else:
         index = np.zeros(int(sizes.sum()), np.int64)
+    if len(sizes) < len(face_lines):
+        raise damaged(name, "a face has no corners")
     if (index < 0).any():  # from the last one before the face backwards
         seen = np.repeat(np.searchsorted(vt_lines, face_lines), sizes)
         behind = index < 0

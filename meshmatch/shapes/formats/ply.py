@@ -1,5 +1,6 @@
 """Stanford PLY, text and binary of either byte order."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged, fan
-from meshmatch.shapes.formats.ply_body import BinaryBody, Element, Property, TextBody
+from meshmatch.shapes.formats.ply_body import Body, Element, Property
 from meshmatch.shapes.shape import Shape
 
 _TYPES = {
@@ -18,6 +19,7 @@ _TYPES = {
     "double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8",
 }  # fmt: skip
 _FACE_LISTS = ("vertex_indices", "vertex_index")
+_END = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:\r\n|[\r\n]|\Z)")
 _NUMBERS = ("x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a")
 
 
@@ -29,14 +31,13 @@ def read(path: Path, data: bytes) -> Raw:
     if "vertex" not in known:
         raise InputError(f"{name}: the header names no vertices", "is it a mesh or a point cloud at all?")
     wanted = [k for k, element in enumerate(elements) if element.name in ("vertex", "face", "tristrips")]
-    stream = TextBody(name, data[start:]) if order is None else BinaryBody(name, data, start, order)
+    body = Body(name, data, start, order)
     verts, faces, colors = None, NO_FACES, None
     for element in elements[: max(wanted) + 1]:
         if not element.properties:
             continue  # rows of nothing, however many
         _check_kinds(name, element)
-        stream.check(element)
-        table = stream.element(element)
+        table = body.element(element)
         if element.name == "vertex":
             if not {"x", "y", "z"} <= set(table):
                 raise InputError(
@@ -124,17 +125,15 @@ def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int]:
         raise InputError(
             f"{name} is not a ply file: it does not begin with 'ply'", "does the suffix fit the content?"
         )
-    mark = data.find(b"end_header")
-    if mark < 0:
+    end = _END.search(data)
+    if not end:
         raise damaged(name, "the header has no end")
-    start = mark + len(b"end_header")
-    while data[start : start + 1] in (b" ", b"\t"):
-        start += 1
-    start += 2 if data[start : start + 2] == b"\r\n" else 1
     order: str | None = ""
     elements: list[Element] = []
     try:
-        for line in data[:mark].decode("latin-1").replace("\r\n", "\n").replace("\r", "\n").split("\n"):
+        for line in (
+            data[: end.start()].decode("latin-1").replace("\r\n", "\n").replace("\r", "\n").split("\n")
+        ):
             match line.split():
                 case ["format", kind, *_]:
                     order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}[kind]
@@ -148,7 +147,11 @@ def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int]:
         raise damaged(name, f"the header line {line.strip()[:60]!r} makes no sense") from error
     if order == "":
         raise damaged(name, "the header names no format")
-    return order, elements, start
+    for each in elements:
+        names = [p.name for p in each.properties]
+        if len(set(names)) < len(names):
+            raise damaged(name, f"its header names a property of the element {each.name} twice")
+    return order, elements, end.end()
 
 
 def _check_kinds(name: str, element: Element) -> None:

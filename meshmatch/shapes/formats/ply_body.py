@@ -1,15 +1,16 @@
 """The tables behind a ply header: rows of numbers and lists, read all at once where rows are equally long."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Int, Ints
 from meshmatch.shapes.formats import damaged
 from meshmatch.shapes.formats.text import numbers
-
-_PROMISE = "fewer {0.name} rows than the {0.count} that its header promises"
 
 
 @dataclass
@@ -32,106 +33,62 @@ class Element:
     properties: list[Property] = field(default_factory=list)
 
 
-class TextBody:
-    """The body of a text file as one stream of numbers."""
+class Body:
+    """The bytes behind the header, read one element after the other.
 
-    def __init__(self, name: str, body: bytes) -> None:
-        self.name, self.values, self.at = name, numbers(name, body), 0
+    A text body (``order`` is None) becomes float64 numbers first, and is then read as a binary one of these.
+    """
 
-    def check(self, element: Element) -> None:
-        if element.count < 0 or self.at + element.count * len(element.properties) > len(self.values):
-            raise damaged(self.name, _PROMISE.format(element))
-
-    def element(self, element: Element) -> dict[str, Any]:
-        table = self._uniform(element)
-        return table if table is not None else self._walk(element)
-
-    def _uniform(self, element: Element) -> dict[str, Any] | None:
-        """All rows as long as the first one, at once."""
-        places, width = [], 0
-        for p in element.properties:
-            size = int(self._value(self.at + width)) if p.count_kind and element.count else 0
-            places.append((p, width, size))
-            width += 1 + max(size, 0)
-        if self.at + element.count * width > len(self.values):
-            return None
-        rows = self.values[self.at : self.at + element.count * width].reshape(element.count, width)
-        out: dict[str, Any] = {}
-        for p, k, size in places:
-            if not p.count_kind:
-                out[p.name] = Column(rows[:, k], p.kind)
-                continue
-            if size < 0 or (rows[:, k] != size).any():
-                return None
-            lists = _indices(self.name, rows[:, k + 1 : k + 1 + size]).ravel()
-            out[p.name] = lists, np.full(element.count, size, np.int64)
-        self.at += element.count * width
-        return out
-
-    def _walk(self, element: Element) -> dict[str, Any]:
-        positions: dict[str, list[int]] = {p.name: [] for p in element.properties}
-        at = self.at
-        for _ in range(element.count):
-            for p in element.properties:
-                positions[p.name].append(at)
-                at += 1 + (max(int(self._value(at)), 0) if p.count_kind else 0)
-            if at > len(self.values):
-                raise damaged(self.name, _PROMISE.format(element))
-        self.at = at
-        out: dict[str, Any] = {}
-        for p in element.properties:
-            starts = np.array(positions[p.name], np.int64)
-            if not p.count_kind:
-                out[p.name] = Column(self.values[starts], p.kind)
-                continue
-            sizes = np.maximum(_indices(self.name, self.values[starts]), 0)
-            out[p.name] = _indices(self.name, self.values[_ranges(starts + 1, sizes)]), sizes
-        return out
-
-    def _value(self, at: int) -> float:
-        """The number at a place; -1 behind the end or for one that is not finite."""
-        value = float(self.values[at]) if at < len(self.values) else -1.0
-        return value if abs(value) < 2**53 else -1.0
-
-
-class BinaryBody:
-    """The body of a binary file."""
-
-    def __init__(self, name: str, data: bytes, start: int, order: str) -> None:
-        self.name, self.data, self.at, self.order = name, data, start, order
-
-    def check(self, element: Element) -> None:
-        row = sum(np.dtype(p.count_kind or p.kind).itemsize for p in element.properties)
-        if element.count < 0 or self.at + element.count * row > len(self.data):
-            raise damaged(self.name, _PROMISE.format(element))
+    def __init__(self, name: str, data: bytes, start: int, order: str | None) -> None:
+        self.name, self.at, self.order, self.text = name, start, order or "=", order is None
+        self.data: Any = data
+        if self.text:
+            self.data, self.at = numbers(name, data[start:]).view(np.uint8).data, 0
 
     def element(self, element: Element) -> dict[str, Any]:
+        """By property: a `Column` of numbers, or, of lists, all their items and the size of each.
+
+        Raises
+        ------
+        InputError
+            Fewer rows than promised.
+        """
+        kinds = [self._dtype(p.count_kind or p.kind) for p in element.properties]
+        self._check(element, self.at + element.count * sum(kind.itemsize for kind in kinds))
         if element.count == 0:
             nothing = np.empty(0, np.int64)
             return {
                 p.name: (nothing, nothing) if p.count_kind else Column(nothing, p.kind)
                 for p in element.properties
             }
-        table = self._uniform(element)
+        table = self._equal_rows(element)
         return table if table is not None else self._walk(element)
 
-    def _uniform(self, element: Element) -> dict[str, Any] | None:
-        """All rows as long as the first one: a structured array over the bytes, nothing copied."""
+    def _check(self, element: Element, end: int) -> None:
+        if element.count < 0 or end > len(self.data):
+            raise damaged(
+                self.name, f"fewer {element.name} rows than the {element.count} that its header promises"
+            )
+
+    def _dtype(self, kind: str) -> np.dtype[Any]:
+        return np.dtype("f8" if self.text else self.order + kind)
+
+    def _equal_rows(self, element: Element) -> dict[str, Any] | None:
+        """All rows as long as the first one: a structured array over the bytes, nothing copied. None if they differ."""
         fields: list[Any] = []
         at = self.at
         for k, p in enumerate(element.properties):
+            size = 1
             if p.count_kind:
                 size = self._count(at, p.count_kind)
-                item = np.dtype(p.kind).itemsize
-                at += np.dtype(p.count_kind).itemsize + size * item
-                fields.append((f"n{k}", self.order + p.count_kind))
-                if at > len(self.data):
-                    return None
-                fields.append((f"v{k}", self.order + p.kind, (size,)))
-            else:
-                at += np.dtype(p.kind).itemsize
-                fields.append((f"v{k}", self.order + p.kind))
-        if self.at + (at - self.at) * element.count > len(self.data):
+                at += self._dtype(p.count_kind).itemsize
+                fields.append((f"n{k}", self._dtype(p.count_kind)))
+            at += size * self._dtype(p.kind).itemsize
+            if at > len(self.data):
+                return None
+            fields.append((f"v{k}", self._dtype(p.kind), (size,) if p.count_kind else ()))
+        end = self.at + (at - self.at) * element.count
+        if end > len(self.data):
             return None
         rows = np.frombuffer(self.data, np.dtype(fields), element.count, self.at)
         out: dict[str, Any] = {}
@@ -140,26 +97,25 @@ class BinaryBody:
                 out[p.name] = Column(rows[f"v{k}"], p.kind)
                 continue
             sizes = rows[f"n{k}"]
-            if (sizes != sizes[0]).any():
+            if (sizes != sizes[0]).any() or sizes[0] < 0:
                 return None
-            out[p.name] = _indices(self.name, rows[f"v{k}"]).ravel(), sizes.astype(np.int64)
-        self.at = at + (at - self.at) * (element.count - 1)
+            out[p.name] = self._indices(rows[f"v{k}"]).ravel(), self._indices(sizes)
+        self.at = end
         return out
 
     def _walk(self, element: Element) -> dict[str, Any]:
-        positions: dict[str, list[int]] = {p.name: [] for p in element.properties}
-        steps = [(p, positions[p.name], np.dtype(p.kind).itemsize) for p in element.properties]
+        places: list[list[int]] = [[] for _ in element.properties]
+        sizes = [self._dtype(p.kind).itemsize for p in element.properties]
+        steps = list(zip(element.properties, places, sizes, strict=True))
         at = self.at
         for _ in range(element.count):
             for p, where, item in steps:
                 where.append(at)
-                at += (
-                    np.dtype(p.count_kind).itemsize + self._count(at, p.count_kind) * item
-                    if p.count_kind
-                    else item
-                )
-            if at > len(self.data):
-                raise damaged(self.name, _PROMISE.format(element))
+                if p.count_kind:
+                    at += self._dtype(p.count_kind).itemsize + self._count(at, p.count_kind) * item
+                else:
+                    at += item
+            self._check(element, at)
         self.at = at
         out: dict[str, Any] = {}
         for p, where, item in steps:
@@ -167,34 +123,28 @@ class BinaryBody:
             if not p.count_kind:
                 out[p.name] = Column(self._gather(starts, p.kind), p.kind)
                 continue
-            sizes = _indices(self.name, self._gather(starts, p.count_kind))
-            first = starts + np.dtype(p.count_kind).itemsize
-            out[p.name] = _indices(self.name, self._gather(_ranges(first, sizes, item), p.kind)), sizes
+            counts = np.maximum(self._indices(self._gather(starts, p.count_kind)), 0)
+            first = np.repeat(starts + self._dtype(p.count_kind).itemsize, counts)
+            within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+            out[p.name] = self._indices(self._gather(first + within * item, p.kind)), counts
         return out
 
     def _count(self, at: int, kind: str) -> int:
-        if kind == "u1":  # by far the most frequent
-            return self.data[at] if at < len(self.data) else 0
-        size = np.dtype(kind).itemsize
-        value = int.from_bytes(
-            self.data[at : at + size], "little" if self.order == "<" else "big", signed=kind[0] == "i"
-        )
-        return max(value, 0)
+        """The size of the list at a place; 0 behind the end, and for one that is negative or not a number."""
+        if kind == "u1" and not self.text:  # by far the most frequent
+            return int(self.data[at]) if at < len(self.data) else 0
+        if at + self._dtype(kind).itemsize > len(self.data):
+            return 0
+        value = np.frombuffer(self.data, self._dtype(kind), 1, at)[0]
+        return int(value) if 0 < value < 2**53 else 0
 
-    def _gather(self, starts: NDArray[np.int64], kind: str) -> NDArray[Any]:
-        size = np.dtype(kind).itemsize
-        raw = np.frombuffer(self.data, np.uint8)[starts[:, None] + np.arange(size)]
-        return np.ascontiguousarray(raw).view(self.order + kind)[:, 0]
+    def _gather(self, starts: Int[Ints, " N"], kind: str) -> NDArray[Any]:
+        dtype = self._dtype(kind)
+        raw = np.frombuffer(self.data, np.uint8)[starts[:, None] + np.arange(dtype.itemsize)]
+        return np.ascontiguousarray(raw).view(dtype)[:, 0]
 
-
-def _ranges(starts: NDArray[np.int64], sizes: NDArray[np.int64], item: int = 1) -> NDArray[np.int64]:
-    """start, start + item, ... (size of them) for each row, one after the other."""
-    within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return np.repeat(starts, sizes) + within * item
-
-
-def _indices(name: str, values: NDArray[Any]) -> NDArray[np.int64]:
-    """Whole numbers, or an error: floats are what text files are read as."""
-    if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():
-        raise damaged(name, "a face names a vertex that is not a number")
-    return values.astype(np.int64)
+    def _indices(self, values: NDArray[Any]) -> NDArray[np.int64]:
+        """Whole numbers, or an error: floats are what text files are read as."""
+        if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():
+            raise damaged(self.name, "a face names a vertex that is not a number")
+        return values.astype(np.int64)

@@ -79,39 +79,15 @@ def lines_of(text: bytes, *words: bytes) -> list[tuple[bytes, NDArray[np.int64]]
     return out
 
 
-def without_slashes(text: bytes) -> bytes:
+def first_index(text: bytes) -> bytes:
     """Each word up to its first slash: 1/2/3 becomes 1."""
-    characters = np.frombuffer(b" " + text, np.uint8)
-    slash = characters == 47
-    marks = np.flatnonzero(slash | _SPACE[characters])
-    behind = np.repeat(slash[marks], np.diff(marks, append=len(characters)))
-    return characters[~behind].tobytes()
+    return re.sub(rb"/\S*", b"", text)
 
 
-def behind_slash(text: bytes) -> bytes:
-    """Of each word what stands between its first and its second slash, 0 where there is nothing: 1/2/3 becomes
-    2, and 1, 1//3 and 1/ become 0.
-    """
-    characters = np.frombuffer(b" " + text + b" ", np.uint8).copy()
-    space = _SPACE[characters]
-    slash = characters == 47
-    before = np.cumsum(slash)
-    starts = np.flatnonzero(~space & np.roll(space, 1))
-    ends = np.flatnonzero(~space & np.roll(space, -1))
-    inside = np.zeros(len(characters), np.int64)  # slashes of the same word up to here
-    lengths = ends - starts + 1
-    at = np.flatnonzero(~space)
-    inside[at] = before[at] - np.repeat(before[starts - 1], lengths)
-    kept = space | (inside == 1)
-    # The first slash turns into a zero in front of the number; of a word without one the last letter does.
-    first = slash & (inside == 1)
-    bare = ends[inside[ends] == 0]
-    characters[first] = 48
-    characters[bare] = 48
-    kept[bare] = True
-    negative = np.flatnonzero(first[:-1] & (characters[1:] == 45))
-    kept[negative] = False
-    return characters[kept].tobytes()
+def second_index(text: bytes) -> bytes:
+    """Of each word what stands between its first and its second slash: 1/2/3 becomes 2; 1, 1//3 and 1/ become 0."""
+    text = re.sub(rb"(?<!\S)(?:[^\s/]++|(?=/))(?:/(?:/\S*+)?+)?+(?=\s|\Z)", b"0", text)
+    return re.sub(rb"[^\s/]*+/([^\s/]*+)\S*+", rb"\1", text)
 
 
 def columns(
