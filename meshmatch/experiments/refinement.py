@@ -138,7 +138,7 @@ def choose_shapes(model: TrainedModel, name: str, count: int, seed: int, data: P
 
 def draw_bodies(model: TrainedModel, count: int, seed: int) -> list[Shape]:
     """Generated bodies that share the template's vertices."""
-    from meshmatch.training.run import unseen_bodies
+    from meshmatch.training.bodies import unseen_bodies
 
     bodies = unseen_bodies(model.template, count, model.card.seed, seed)
     return [Shape(verts, model.template.shape.faces, f"body {k}") for k, verts in enumerate(bodies)]

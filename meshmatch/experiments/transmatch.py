@@ -34,8 +34,8 @@ from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import Template, load_template, save_template
 from meshmatch.threads import set_threads
+from meshmatch.training.bodies import human_source
 from meshmatch.training.datasets import Source
-from meshmatch.training.run import human_source
 from meshmatch.training.scans import ScanConfig, bump, normalise, sample_scan, yaw_rotations
 
 CHECKPOINT = "checkpoint.safetensors"

@@ -6,34 +6,34 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Float, Int
 
-def nearest(queries: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Nearest of ``points`` (B, P, 3) to each of ``queries`` (B, Q, 3).
 
-    Returns
-    -------
-    index : int64 tensor (B, Q)
-    offset : tensor (B, Q, 3)
-        Nearest point minus query, in the unit of the input.
-    """
+def nearest_index(
+    queries: Float[torch.Tensor, "B Q D"], points: Float[torch.Tensor, "B P D"]
+) -> Int[torch.Tensor, "B Q"]:
+    """Index of the nearest of ``points``: trees on a CPU, where comparing all pairs is far slower."""
     if queries.is_cuda:
-        index = every_pair(queries, points)
-    else:
-        found = [
-            cKDTree(cloud, balanced_tree=False, compact_nodes=False).query(query)[1]
-            for query, cloud in zip(queries.detach().numpy(), points.detach().numpy(), strict=True)
-        ]
-        index = torch.from_numpy(np.stack(found))
+        return torch.cdist(queries, points).argmin(-1)
+    found = [
+        cKDTree(cloud, balanced_tree=False, compact_nodes=False).query(query)[1]
+        for query, cloud in zip(queries.detach().numpy(), points.detach().numpy(), strict=True)
+    ]
+    return torch.from_numpy(np.stack(found))
+
+
+def nearest(
+    queries: Float[torch.Tensor, "B Q 3"], points: Float[torch.Tensor, "B P 3"]
+) -> tuple[Int[torch.Tensor, "B Q"], Float[torch.Tensor, "B Q 3"]]:
+    """Index of the nearest of ``points``, and its offset from the query, in the unit of the input."""
+    index = nearest_index(queries, points)
     return index, torch.gather(points, 1, index[..., None].expand(-1, -1, 3)) - queries
 
 
-def every_pair(queries: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """Index (B, Q) of the nearest point by comparing all of them: what suits a GPU."""
-    return torch.cdist(queries, points).argmin(-1)
-
-
-def two_way_offsets(anchors: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """What a registration sees at its anchors (B, A, 7).
+def two_way_offsets(
+    anchors: Float[torch.Tensor, "B A 3"], points: Float[torch.Tensor, "B P 3"]
+) -> Float[torch.Tensor, "B A 7"]:
+    """What a registration sees at its anchors.
 
     Columns 0..2: offset to the nearest point; 3..5: mean offset of the points whose nearest anchor this is
     (0 if there is none); 6: log(1 + their share times A).

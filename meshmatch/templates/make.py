@@ -33,6 +33,11 @@ def low_resolution(shape: Shape, faces: int = LOW_FACES) -> tuple[np.ndarray, np
     return keep, corners[(a != b) & (b != c) & (c != a)]
 
 
+def low_mesh(shape: Shape, faces: int = LOW_FACES) -> tuple[np.ndarray, np.ndarray]:
+    """`low_resolution` of a mesh, or a triangulation of a cloud: kept indices (V,), faces (F, 3)."""
+    return triangulate_cloud(shape, faces) if shape.is_cloud else low_resolution(shape, faces)
+
+
 def make_template(
     shape: Shape,
     name: str,
@@ -66,9 +71,7 @@ def make_template(
     InputError
         If a cloud's points lie on no surface.
     """
-    if low is None:
-        low = triangulate_cloud(shape, LOW_FACES) if shape.is_cloud else low_resolution(shape)
-    keep, faces = low
+    keep, faces = low_mesh(shape) if low is None else low
     small = Shape(shape.verts[keep], faces, name)
     frame = sqrt_area_frame(small)
     small = Shape(frame.apply(small.verts), faces, name)

@@ -1,47 +1,70 @@
-"""`meshmatch prepare`: a folder of shapes made ready for training, with a template for them."""
+"""`meshmatch prepare` as a library: shapes made ready for training, with a template for them."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import save_file
 
-from meshmatch.errors import InputError, MeshmatchError
+from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.outputs import make_folder, replace_on_success
+from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.align import Align
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.triangulate import triangulate_cloud
-from meshmatch.templates.make import LOW_FACES, low_resolution, make_template
+from meshmatch.templates.landmarks import find_landmarks, read_landmarks
+from meshmatch.templates.make import LOW_FACES, low_mesh, make_template
 from meshmatch.templates.nodes import NodeConfig
-from meshmatch.templates.registered import registered_stack, same_faces, turned
+from meshmatch.templates.registered import registered_stack, rotation_range, same_faces
 from meshmatch.templates.template import Template, save_template
-from meshmatch.templates.unregistered import (
-    STRANGE,
-    Scale,
-    find_known,
-    gather,
-    most_typical,
-    prepared_words,
-    read_known,
-    save_gathered,
-)
+from meshmatch.templates.unregistered import MAX_RESIDUAL, Scale, collect_samples, medoid, save_samples
 
-MINIMUM_FACES = 50
-MINIMUM_POINTS = 100
+MIN_FACES = 50
+MIN_POINTS = 100
+
+
+@dataclass(frozen=True)
+class PrepareConfig:
+    """How shapes are prepared.
+
+    Parameters
+    ----------
+    nodes : NodeConfig
+    faces : int
+        Triangles of the low resolution.
+    template : name or path, optional
+        A shape of the folder, by its name, or any file. By default the first mesh where all are registered, else the
+        medoid: the shape that lies nearest to all others.
+    align : {"none", "near", "rigid"}, optional
+        How shapes are turned to the template; by default "rigid". Of registered ones correspondence says whether
+        they stand alike, which is "near"; of a hundred or more it is not asked, which is "none".
+    scale : {"area", "sphere"}
+        Which size of every shape is made that of the template.
+    landmarks : folder or suffix, optional
+        Where the landmarks of shapes are, see `meshmatch.templates.landmarks`.
+    labels : int array (V,), optional
+        The part of every vertex of a single shape's file, from 0; for the strategy "parts".
+    """
+
+    nodes: NodeConfig = field(default_factory=lambda: NodeConfig(strategy="geodesic"))
+    faces: int = LOW_FACES
+    template: str | Path | None = None
+    align: Align | None = None
+    scale: Scale = "area"
+    landmarks: str | Path | None = None
+    labels: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A folder made ready: the template, and the shapes that share its connectivity (or none).
+    """The template, and the shapes that share its connectivity (or none).
 
     shapes : float32 array (N, V, 3), template vertices on every shape, its own axes and unit, centred;
     empty if the folder's meshes are not registered. names : their files. notes : what was found and done.
@@ -56,230 +79,213 @@ class Prepared:
     landmarks: int = 0
 
 
-def prepare_folder(
-    folder: str | Path,
+def prepare(
+    shapes: str | Path,
     output: str | Path,
-    config: NodeConfig,
-    *,
-    template: str | Path | None = None,
-    faces: int = LOW_FACES,
-    align: Align | None = None,
-    scale: Scale = "area",
-    landmarks: str | Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    config: PrepareConfig | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Prepared:
-    """Check, normalise and decimate every shape of a folder and lay a template for them.
+    """Check, normalise and decimate every shape of a folder and make a template for them; or a template of one shape.
 
-    Writes ``template.safetensors``, ``shapes.safetensors`` (registered shapes), ``points.safetensors`` (samples of
-    all shapes in the template's frame), ``normalised/NAME.ply`` and, last, ``prepared.json``. Shapes are registered if
-    all have the vertex count and triangles of the template's file.
-
-    Parameters
-    ----------
-    template : name or path, optional
-        A shape of the folder, by its name, or any file. By default the first mesh where all are registered, else the
-        shape that lies nearest to all others.
-    align : {"none", "near", "rigid"}, optional
-        How shapes are turned to the template; by default "rigid". Of registered ones correspondence says whether
-        they stand alike, which is "near"; of `FEW` or more it is not asked, which is "none".
-    scale : {"area", "sphere"}
-        Which size of every shape is made that of the template.
-    landmarks : folder or suffix, optional
-        Where the known points of shapes are, see `meshmatch.templates.unregistered`.
+    Writes ``template.safetensors`` and, of a folder, ``shapes.safetensors`` (registered shapes), ``points.safetensors``
+    (samples of all shapes in the template's frame), ``normalised/NAME.ply`` and, last, ``prepared.json``. Shapes are
+    registered if all have the vertex count and triangles of the template's file.
 
     Raises
     ------
     InputError
-        No usable shape in the folder (files that cannot be read are named in the notes instead), or a template that
+        No usable shape (files of a folder that cannot be read are named in the notes instead), or a template that
         is nothing like the shapes.
     OptionError
-        No landmarks where they should be.
+        No landmarks where they should be, or choices that do not go together.
+    TemplateError
+        The nodes do not reach every vertex.
     OutputError
         The output folder cannot be written.
     """
-    folder, output = Path(folder), Path(output)
-    files = sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES)
-    known_files = find_known(landmarks, folder, files)
-    files = [path for path in files if path not in known_files]
-    known_files = find_known(landmarks, folder, files)
-    if not files:
-        raise InputError(f"no shapes in {folder}", f"files that end in {', '.join(SUFFIXES)} are read")
-    make_folder(output / "normalised")
-    tell = progress or (lambda done, total: None)
-    found: list[Repaired] = []
-    known: list[np.ndarray | None] = []
-    stems: list[str] = []
+    shapes, output, config = Path(shapes), Path(output), config or PrepareConfig()
+    if (config.nodes.strategy == "parts") != (config.labels is not None):
+        raise OptionError("strategy 'parts' and labels go together", "give both, or choose another strategy")
+    if shapes.is_dir():
+        if config.labels is not None:
+            raise OptionError("labels are of one shape, not of a folder", "name the shape itself")
+        if output.is_dir() and output.samefile(shapes):
+            raise OptionError(f"cannot prepare {shapes} into itself", "choose another folder with -o")
+        return _prepare_folder(shapes, output, config, Progress(progress, shapes.name).stage("checked"))
+    for name in ("template", "align", "landmarks"):
+        if getattr(config, name) is not None:
+            raise OptionError(f"{name} goes with a folder of shapes", "one shape is its own template")
+    make_folder(output)
+    clean = _template_file(shapes)
+    made = make_template(
+        clean.shape,
+        shapes.stem,
+        config.nodes,
+        labels=_repaired_labels(config.labels, clean),
+        source=shapes.name,
+        low=low_mesh(clean.shape, config.faces),
+    )
+    save_template(made, output / "template.safetensors")
+    none = np.zeros((0, made.shape.V, 3), np.float32)
+    return Prepared(made, none, (shapes.name,), tuple(clean.notes))
+
+
+def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress: Progress) -> Prepared:
     notes: list[str] = []
-    for number, path in enumerate(files):
-        try:
-            clean = _enough(repair(load_shape(path)))
-        except MeshmatchError as error:
-            notes.append(f"{path.name} left out: {error.message}")
-        else:
-            notes += [f"{path.name}: {note}" for note in clean.notes]
-            found.append(clean)
-            points_file = known_files[number]
-            known.append(None if points_file is None else read_known(points_file, clean))
-            stems.append(path.stem)
-        tell(number + 1, 2 * len(files))
-    if not found:
-        raise InputError(f"no shape in {folder} could be used", notes[0])
-    first, own = _template_shape(folder, template, found, scale, align, config.seed, notes)
-    low = _low(first, faces)
+    found, marks = _read_shapes(folder, output, config, notes, progress.between(0.0, 0.5))
+    first, own = _template_shape(folder, config, found, notes)
+    low = low_mesh(first.shape, config.faces)
     stack = registered_stack(first, found, first.kept_vertex[low[0]], notes)
     registered = len(stack) > 0
-    how: Align = align or (
-        turned(stack, first.original.verts[first.kept_vertex[low[0]]]) if registered else "rigid"
-    )
+    how: Align = "rigid"
+    if registered:
+        how = rotation_range(stack, first.original.verts[first.kept_vertex[low[0]]])
+    how = config.align or how
     name = folder.resolve().name
-    made = make_template(first.shape, name, config, source=f"{first.original.name} of {folder.name}", low=low)
-    gathered, frames, far = gather(
-        made,
-        found,
-        known,
-        _template_known(first, own, known, landmarks, made, low),
-        how,
-        scale,
-        config.seed,
-        lambda done: tell(len(files) + done * len(files) // len(found), 2 * len(files)),
-        strict=not registered,
+    source = f"{first.original.name} of {folder.name}"
+    made = make_template(first.shape, name, config.nodes, source=source, low=low)
+    template_marks = None
+    if config.landmarks is not None:
+        template_marks = _template_landmarks(first, None if own is None else marks[own], marks)
+        # the way from the template's file to its frame, read off two of its vertices' places
+        template_marks = sqrt_area_frame(Shape(first.shape.verts[low[0]], low[1], name)).apply(template_marks)
+    samples, frames, residuals = collect_samples(
+        *(made, found, marks, template_marks, how, config.scale, config.nodes.seed),
+        progress.between(0.5, 1.0),
     )
-    for clean, stem, frame, distance in zip(found, stems, frames, far, strict=True):
+    if not registered and np.median(residuals) > MAX_RESIDUAL:
+        raise InputError(
+            f"most shapes of the folder are nothing like the template {name}: aligned, they lie "
+            f"{100 * np.median(residuals):.0f} % of sqrt(area) apart",
+            "name one of the shapes with --template, or try another --align or --scale",
+        )
+    stems = [Path(clean.original.name).stem for clean in found]
+    for clean, stem, frame, residual in zip(found, stems, frames, residuals, strict=True):
         label = stem if stems.count(stem) == 1 else clean.original.name
-        small = clean.shape if clean.shape.F <= faces else decimate(clean.shape, faces)
+        small = clean.shape if clean.shape.F <= config.faces else decimate(clean.shape, config.faces)
         normal = Shape(frame.apply(small.verts), small.faces, small.name)
         save_shape(output / "normalised" / f"{label}.ply", normal)
-        if distance > STRANGE and not registered:
-            notes.append(f"{clean.original.name} is not much like the template: {100 * distance:.0f} % apart")
+        if residual > MAX_RESIDUAL and not registered:
+            notes.append(f"{clean.original.name} is not much like the template: {100 * residual:.0f} % apart")
     save_template(made, output / "template.safetensors")
-    save_gathered(gathered, output / "points.safetensors")
+    save_samples(samples, output / "points.safetensors")
     with replace_on_success(output / "shapes.safetensors") as temporary:
         save_file({"verts": stack}, temporary)
     names = tuple(clean.original.name for clean in found)
-    words = {
+    words: dict[str, Any] = {
         "names": names,
         "registered": registered,
         "notes": notes,
         "template": made.hash,
         "source": first.original.name,
         "align": how,
-        "scale": scale,
-        "landmarks": gathered.landmarks.shape[1],
+        "scale": config.scale,
+        "landmarks": samples.landmarks.shape[1],
         "frames": [
             {"scale": f.scale, "rotation": f.rotation.tolist(), "center": f.center.tolist()} for f in frames
         ],
-        "apart": [round(distance, 5) for distance in far],
-        "config": asdict(config),
+        "apart": [round(residual, 5) for residual in residuals],
+        "config": asdict(config.nodes),
     }
     with replace_on_success(output / "prepared.json") as temporary:
         Path(temporary).write_text(json.dumps(words, indent=1), encoding="utf-8")
-    return Prepared(made, stack, names, tuple(notes), how, gathered.landmarks.shape[1])
+    return Prepared(made, stack, names, tuple(notes), how, samples.landmarks.shape[1])
 
 
-def template_shape(path: str | Path) -> Repaired:
+def _read_shapes(
+    folder: Path, output: Path, config: PrepareConfig, notes: list[str], progress: Progress
+) -> tuple[list[Repaired], list[np.ndarray | None]]:
+    """The usable shapes of a folder, repaired, and the landmarks (L, 3) of each."""
+    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+    landmark_files = find_landmarks(config.landmarks, folder, files)
+    files = [path for path in files if path not in landmark_files]
+    landmark_files = find_landmarks(config.landmarks, folder, files)
+    if not files:
+        raise InputError(f"no shapes in {folder}", f"files that end in {', '.join(SUFFIXES)} are read")
+    make_folder(output / "normalised")
+    found: list[Repaired] = []
+    marks: list[np.ndarray | None] = []
+    for number, (path, file) in enumerate(zip(files, landmark_files, strict=True)):
+        try:
+            clean = _check_size(repair(load_shape(path)))
+        except MeshmatchError as error:
+            notes.append(f"{path.name} left out: {error.message}")
+        else:
+            notes += [f"{path.name}: {note}" for note in clean.notes]
+            found.append(clean)
+            marks.append(None if file is None else read_landmarks(file, clean))
+        progress((number + 1) / len(files))
+    if not found:
+        raise InputError(f"no shape in {folder} could be used", notes[0])
+    return found, marks
+
+
+def _template_file(path: Path) -> Repaired:
     """The shape of a file, repaired, if a template can be made of it; `InputError` otherwise."""
     try:
-        return _enough(repair(load_shape(path)))
+        return _check_size(repair(load_shape(path)))
     except InputError as error:
-        if Path(path).name in error.message:
+        if path.name in error.message:
             raise
-        raise InputError(f"{Path(path).name} cannot be a template: {error.message}", error.hint) from error
+        raise InputError(f"{path.name} cannot be a template: {error.message}", error.hint) from error
 
 
 def _template_shape(
-    folder: Path,
-    wanted: str | Path | None,
-    found: list[Repaired],
-    scale: Scale,
-    how: Align | None,
-    seed: int,
-    notes: list[str],
+    folder: Path, config: PrepareConfig, found: list[Repaired], notes: list[str]
 ) -> tuple[Repaired, int | None]:
     """The template's shape, and its number if it is one of those that were found."""
-    if wanted is not None:
-        for number, clean in enumerate(found):
-            if str(wanted) in (clean.original.name, Path(clean.original.name).stem):
-                return clean, number
-        path = Path(wanted)
+    if config.template is not None:
+        path = Path(config.template)
         same = path.is_file() and path.resolve().parent == folder.resolve()
-        for number, clean in enumerate(found if same else ()):
-            if clean.original.name == path.name:
+        wanted = {str(config.template)} | ({path.name} if same else set())
+        for number, clean in enumerate(found):
+            if wanted & {clean.original.name, Path(clean.original.name).stem}:
                 return clean, number
-        return template_shape(path), None
+        return _template_file(path), None
     number = next((k for k, clean in enumerate(found) if not clean.shape.is_cloud), 0)
     if len(found) > 1 and not same_faces(found[number], found):
-        number = most_typical(found, how or "rigid", scale, seed)
+        number = medoid(found, config.align or "rigid", config.scale, config.nodes.seed)
         notes.append(f"template: {found[number].original.name}, which lies nearest to all others on average")
     else:
         notes.append(f"template: {found[number].original.name}")
     return found[number], number
 
 
-def _low(first: Repaired, faces: int) -> tuple[np.ndarray, np.ndarray]:
-    return (
-        triangulate_cloud(first.shape, faces) if first.shape.is_cloud else low_resolution(first.shape, faces)
-    )
-
-
-def _template_known(first, own, known, landmarks, made, low) -> np.ndarray | None:
-    """Known points (L, 3) on the template, in its frame; None if there are none at all."""
-    if landmarks is None:
-        return None
-    sizes = {len(places) for places in known if places is not None}
+def _template_landmarks(
+    first: Repaired, own: np.ndarray | None, marks: list[np.ndarray | None]
+) -> np.ndarray:
+    """Landmarks (L, 3) of the template's shape, if all shapes have as many; `InputError` otherwise."""
+    sizes = {len(each) for each in marks if each is not None}
     if len(sizes) > 1:
         raise InputError(
             f"landmark files of {min(sizes)} and of {max(sizes)} points",
             "row k is the same point on every shape: write -1 where it is missing",
         )
-    places = known[own] if own is not None else None
-    if places is None or not np.isfinite(places).all():
+    if own is None or not np.isfinite(own).all():
         raise InputError(
             f"the template {first.original.name} has no landmarks, or not all of them",
             "choose with --template a shape of the folder on which every landmark is known",
         )
-    # the way from the template's file to its frame, read off two of its vertices' places
-    frame = sqrt_area_frame(Shape(first.shape.verts[low[0]], low[1], made.name))
-    return frame.apply(places)
+    return own
 
 
-def _enough(clean: Repaired) -> Repaired:
+def _repaired_labels(labels: np.ndarray | None, clean: Repaired) -> np.ndarray | None:
+    """Labels of the file's vertices (V_original,) as labels of the repaired ones (V,)."""
+    if labels is not None and len(labels) != clean.original.V:
+        raise InputError(
+            f"there are {len(labels)} labels, but {clean.original.name} has {clean.original.V} vertices",
+            "give one label for every vertex of the file",
+        )
+    return None if labels is None else labels[clean.kept_vertex]
+
+
+def _check_size(clean: Repaired) -> Repaired:
     """The same shape, if there is enough of it to learn from; `InputError` otherwise."""
     shape = clean.shape
-    if shape.is_cloud and shape.V < MINIMUM_POINTS:
+    if shape.is_cloud and shape.V < MIN_POINTS:
         places = "place" if shape.V == 1 else "places"
-        raise InputError(f"it has points in only {shape.V} {places}", f"at least {MINIMUM_POINTS} are needed")
-    if not shape.is_cloud and shape.F < MINIMUM_FACES:
-        raise InputError(f"it has only {shape.F} usable triangles", f"at least {MINIMUM_FACES} are needed")
-    sqrt_area_frame(shape)
+        raise InputError(f"it has points in only {shape.V} {places}", f"at least {MIN_POINTS} are needed")
+    if not shape.is_cloud and shape.F < MIN_FACES:
+        raise InputError(f"it has only {shape.F} usable triangles", f"at least {MIN_FACES} are needed")
+    sqrt_area_frame(shape)  # refuses a shape without area
     return clean
-
-
-def read_registered(folder: str | Path, template: Template) -> np.ndarray:
-    """Registered shapes (N, V, 3) of a prepared folder.
-
-    Raises
-    ------
-    InputError
-        Not a prepared folder, prepared for another template or scale, or its shapes are not registered.
-    """
-    folder = Path(folder)
-    try:
-        words = prepared_words(folder)
-        shapes = load_file(folder / "shapes.safetensors")["verts"]
-    except (OSError, ValueError, KeyError, SafetensorError) as error:
-        raise InputError(
-            f"{folder} is not a prepared folder", "run `meshmatch prepare FOLDER -o OUT` first"
-        ) from error
-    if words.get("template") != template.hash:
-        raise InputError(f"{folder} was prepared for another template", "prepare it again")
-    if words.get("scale", "area") != "area":
-        raise InputError(
-            f"{folder} was prepared with --scale {words['scale']}, but registered shapes are learned at equal areas",
-            "prepare it with --scale area, or learn without correspondence (--unsupervised)",
-        )
-    if not len(shapes):
-        raise InputError(
-            f"the shapes of {folder} do not share one connectivity",
-            "learn without correspondence (--unsupervised); registered means the same triangles in every file",
-        )
-    return shapes

@@ -15,6 +15,7 @@ from safetensors.numpy import save_file
 from meshmatch.errors import InputError, TemplateError
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
 
 SCHEMA = 1
 _ARRAYS = ("verts", "faces", "dense_verts", "dense_faces", "nodes", "labels", "core")
@@ -149,6 +150,21 @@ def load_template(path: str | Path) -> Template:
             f"{path.name} is damaged: its content does not match its hash", "make or fetch it again"
         )
     return template
+
+
+def read_template(name: str | Path) -> Template:
+    """A template by file, or one of the built-in ones by name (human-T, human-A, human-I).
+
+    Raises
+    ------
+    TemplateError
+        There is none, or the file is damaged.
+    """
+    path = Path(name)
+    if path.is_file():
+        return load_template(path)
+    inside = bundled_folder() / "human" / f"{name}.safetensors"
+    return load_template(inside if inside.is_file() else path)
 
 
 def _template(words: dict, arrays: dict[str, np.ndarray]) -> Template:

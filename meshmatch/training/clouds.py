@@ -7,75 +7,76 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from meshmatch.arrays import Float
 from meshmatch.fields.field import Field
 from meshmatch.fields.mls import build_field
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
-from meshmatch.templates.unregistered import Gathered
-from meshmatch.training.datasets import Source, registered_source
+from meshmatch.templates.unregistered import ShapeSamples
+from meshmatch.training.datasets import Source, registered_source, step_generator
 from meshmatch.training.scans import ScanConfig, small_rotations
 
-_SIDE = 4  # nodes of the lattice along each axis
+_SIDE = 4  # nodes of the lattice along each axis; this and the reach are set by hand
 _REACH = 1.9  # of a lattice node, in spacings
-_LARGEST = 400_000  # points on which a warp is kept ready; with more shapes there is no need of it
+_MAX_POINTS = 400_000  # for which a lattice is kept ready; with more shapes there is no need to deform them
 
 
 @dataclass(frozen=True)
-class CloudConfig:
-    """How much shapes are changed from one drawing to the next. Lengths in units of sqrt(surface area).
+class Augmentation:
+    """How much shapes are deformed from one drawing to the next; set by hand.
 
-    warp : standard deviation of the vectors of a coarse lattice of nodes, whose field deforms a shape smoothly; every
-    shape draws how much of it. plain : share of the shapes that are not warped.
+    deform : standard deviation, in units of sqrt(surface area), of the vectors of a coarse lattice of nodes, whose field
+    deforms a shape smoothly; every shape draws how much of it. plain : share of the shapes that are not deformed.
     """
 
-    warp: float = 0.08
+    deform: float = 0.08
     plain: float = 0.25
+
+    def vectors(self, B: int, L: int, generator: torch.Generator) -> Float[torch.Tensor, "B L 3"]:
+        """Vectors of the lattice's nodes for a batch of shapes."""
+        size = self.deform * torch.rand(B, 1, 1, generator=generator)
+        size = size * (torch.rand(B, 1, 1, generator=generator) >= self.plain)
+        return size * torch.randn(B, L, 3, generator=generator)
 
 
 @dataclass(frozen=True, eq=False)
-class Warp:
-    """A coarse field on every sample of N shapes: phi (N, P, L), gradient (N, P, 3, L); the same on landmarks."""
+class Lattice:
+    """A coarse field on every sample of N shapes, its gradient there, and the field on their landmarks."""
 
-    phi: torch.Tensor
-    gradient: torch.Tensor
-    landmark_phi: torch.Tensor
-
-    @property
-    def L(self) -> int:
-        return self.phi.shape[2]
+    phi: Float[torch.Tensor, "N P L"]
+    gradient: Float[torch.Tensor, "N P 3 L"]
+    landmark_phi: Float[torch.Tensor, "N M L"]
 
 
 @dataclass(frozen=True, eq=False)
 class CloudBatch:
     """One batch; lengths in units of sqrt(surface area), roughly the template's frame.
 
-    points, normals : (B, P, 3) a scan
-    landmarks : (B, L, 3) known points, not a number where missing
-    encode_features : what the encoder reads of ``points``
+    Landmarks that a shape lacks are NaN; ``encode_features`` are what the encoder reads of ``points``.
     """
 
-    points: torch.Tensor
-    normals: torch.Tensor
-    landmarks: torch.Tensor
+    points: Float[torch.Tensor, "B P 3"]
+    normals: Float[torch.Tensor, "B P 3"]
+    landmarks: Float[torch.Tensor, "B L 3"]
     encode_features: torch.Tensor
 
     def to(self, device: torch.device) -> CloudBatch:
         return replace(self, **{n: v.to(device) for n, v in vars(self).items()})
 
 
-def build_warp(gathered: Gathered) -> Warp | None:
+def build_lattice(samples: ShapeSamples) -> Lattice | None:
     """A lattice around all shapes and its field on their samples; None where there are so many that none is needed."""
-    N, P, _ = gathered.points.shape
-    if N * P > _LARGEST:
+    N, P, _ = samples.points.shape
+    if N * P > _MAX_POINTS:
         return None
-    known = np.nan_to_num(gathered.landmarks)
-    everything = np.concatenate([gathered.points.reshape(-1, 3), known.reshape(-1, 3)]).astype(np.float64)
+    known = np.nan_to_num(samples.landmarks)
+    everything = np.concatenate([samples.points.reshape(-1, 3), known.reshape(-1, 3)]).astype(np.float64)
     field = _lattice_field(everything)
     phi = field.phi.to_dense()
     gradient = field.gradient.to_dense()[: 3 * N * P].reshape(N, P, 3, -1)
-    return Warp(
+    return Lattice(
         phi[: N * P].reshape(N, P, -1),
         gradient,
-        phi[N * P :].reshape(N, gathered.landmarks.shape[1], field.K),
+        phi[N * P :].reshape(N, samples.landmarks.shape[1], field.K),
     )
 
 
@@ -88,14 +89,14 @@ def _lattice_field(points: np.ndarray) -> Field:
     return build_field(points, lattice, _REACH * float(ticks[1] - ticks[0]), "smooth")
 
 
-def warped_source(shapes: torch.Tensor, change: CloudConfig | None = None) -> Source:
+def deformed_source(shapes: torch.Tensor, augmentation: Augmentation | None = None) -> Source:
     """Registered shapes (N, V, 3), drawn with replacement and smoothly deformed; all stand alike, in any unit.
 
-    So many that no change is needed (see `build_warp`) are drawn as they are.
+    So many that no change is needed (see `build_lattice`) are drawn as they are.
     """
-    change = change or CloudConfig()
+    augmentation = augmentation or Augmentation()
     N, V, _ = shapes.shape
-    if N * V > _LARGEST or change.warp <= 0:
+    if N * V > _MAX_POINTS or augmentation.deform <= 0:
         return registered_source(shapes)
     shapes = shapes - shapes.mean(1, keepdim=True)
     shapes = 0.3 * shapes / shapes.flatten(1).std(1)[:, None, None]  # about area 1
@@ -103,10 +104,7 @@ def warped_source(shapes: torch.Tensor, change: CloudConfig | None = None) -> So
 
     def draw(count: int, generator: torch.Generator) -> torch.Tensor:
         which = torch.randint(N, (count,), generator=generator)
-        size = change.warp * torch.rand(count, 1, 1, generator=generator)
-        size = size * (torch.rand(count, 1, 1, generator=generator) >= change.plain)
-        vectors = size * torch.randn(count, phi.shape[2], 3, generator=generator)
-        return shapes[which] + phi[which] @ vectors
+        return shapes[which] + phi[which] @ augmentation.vectors(count, phi.shape[2], generator)
 
     return draw
 
@@ -115,13 +113,13 @@ def warped_source(shapes: torch.Tensor, change: CloudConfig | None = None) -> So
 class CloudDataset(torch.utils.data.Dataset):
     """Item s is the batch of training step s, a function of the seed and s alone."""
 
-    points: torch.Tensor
-    normals: torch.Tensor
-    landmarks: torch.Tensor
-    warp: Warp | None
+    points: Float[torch.Tensor, "N P 3"]
+    normals: Float[torch.Tensor, "N P 3"]
+    landmarks: Float[torch.Tensor, "N L 3"]
+    lattice: Lattice | None
     encoder: BasisEncoder | PointEncoder | None
     scan: ScanConfig
-    change: CloudConfig
+    augmentation: Augmentation
     shapes: int = 8
     seed: int = 0
     length: int = 1
@@ -131,7 +129,7 @@ class CloudDataset(torch.utils.data.Dataset):
 
     @torch.no_grad()
     def __getitem__(self, step: int) -> CloudBatch:
-        generator = torch.Generator().manual_seed((self.seed * 2_654_435_761 + step) % (2**63))
+        generator = step_generator(self.seed, step)
         N, total, _ = self.points.shape
         # Every shape once before one comes again, as far as a batch goes.
         order = [torch.randperm(N, generator=generator) for _ in range(-(-self.shapes // N))]
@@ -140,9 +138,13 @@ class CloudDataset(torch.utils.data.Dataset):
         pick = torch.stack([torch.randperm(total, generator=generator)[:P] for _ in which])
         rows = which[:, None]
         points, normals, known = self.points[rows, pick], self.normals[rows, pick], self.landmarks[which]
-        if self.warp is not None and self.change.warp > 0:
-            points, normals, known = self._warped(which, pick, points, normals, known, generator)
         B = len(which)
+        if self.lattice is not None and self.augmentation.deform > 0:
+            vectors = self.augmentation.vectors(B, self.lattice.phi.shape[2], generator)
+            points = points + self.lattice.phi[rows, pick] @ vectors
+            known = known + self.lattice.landmark_phi[which] @ vectors
+            slopes = self.lattice.gradient[rows, pick] @ vectors[:, None]  # B P k a: d u_a / d x_k
+            normals = deformed_normals(slopes.transpose(-1, -2) + torch.eye(3), normals)
         turn = small_rotations(B, generator)
         size = 1 + self.scan.scale * torch.randn(B, 1, 1, generator=generator).clamp(-2, 2)
         shift = 0.02 * torch.randn(B, 1, 3, generator=generator)
@@ -154,22 +156,11 @@ class CloudDataset(torch.utils.data.Dataset):
         features = torch.zeros(B, 0) if self.encoder is None else self.encoder.features(points)
         return CloudBatch(points, normals, known, features)
 
-    def _warped(self, which, pick, points, normals, known, generator):
-        assert self.warp is not None
-        B = len(which)
-        size = self.change.warp * torch.rand(B, 1, 1, generator=generator)
-        size = size * (torch.rand(B, 1, 1, generator=generator) >= self.change.plain)
-        vectors = size * torch.randn(B, self.warp.L, 3, generator=generator)
-        rows = which[:, None]
-        points = points + self.warp.phi[rows, pick] @ vectors
-        known = known + self.warp.landmark_phi[which] @ vectors
-        slopes = self.warp.gradient[rows, pick] @ vectors[:, None]  # B P k a: d u_a / d x_k
-        F = slopes.transpose(-1, -2) + torch.eye(3)
-        return points, turned_normals(F, normals), known
 
-
-def turned_normals(F: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
-    """Unit normals after a deformation with gradient F (..., 3, 3): its cofactors on the normals (..., 3)."""
+def deformed_normals(
+    F: Float[torch.Tensor, "*B 3 3"], normals: Float[torch.Tensor, "*B 3"]
+) -> Float[torch.Tensor, "*B 3"]:
+    """Unit normals after a deformation with gradient F: its cofactors on the normals."""
     a, b, c = F.unbind(-1)  # columns
     cofactors = torch.stack(
         [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -1

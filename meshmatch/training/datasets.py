@@ -8,9 +8,6 @@ from dataclasses import dataclass, replace
 import torch
 
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
-from meshmatch.training.bodies import sample_bodies
-from meshmatch.training.pose_files import GivenPoses
-from meshmatch.training.rig import Rig
 from meshmatch.training.scans import (
     ScanConfig,
     bump,
@@ -26,15 +23,15 @@ from meshmatch.training.scans import (
 Source = Callable[[int, torch.Generator], torch.Tensor]
 
 
-def body_source(rig: Rig, poses: GivenPoses | None = None) -> Source:
-    """Generated human bodies without end; some of them in given poses."""
-    return lambda count, generator: sample_bodies(rig, count, generator, poses)
-
-
 def registered_source(shapes: torch.Tensor) -> Source:
     """A fixed set of registered shapes (N, V, 3), drawn with replacement."""
     shapes = shapes - shapes.mean(1, keepdim=True)
     return lambda count, generator: shapes[torch.randint(len(shapes), (count,), generator=generator)]
+
+
+def step_generator(seed: int, step: int) -> torch.Generator:
+    """The random stream of one training step. A large odd multiplier keeps those of different seeds apart."""
+    return torch.Generator().manual_seed((seed * 2_654_435_761 + step) % (2**63))
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +41,7 @@ class Batch:
     points : (B, P, 3) scan in a roughly right core frame
     targets : (B, M, 3) where the template's loss points belong, same frame
     encode_features : what the encoder reads of ``points``
-    align_features, align_rotation, align_centre : the aligner's input (any turn) and answer
+    align_features, align_rotation, align_center : the aligner's input (any turn) and answer
     """
 
     points: torch.Tensor
@@ -52,7 +49,7 @@ class Batch:
     encode_features: torch.Tensor
     align_features: torch.Tensor | None = None
     align_rotation: torch.Tensor | None = None
-    align_centre: torch.Tensor | None = None
+    align_center: torch.Tensor | None = None
 
     def to(self, device: torch.device) -> Batch:
         return replace(self, **{n: v.to(device) for n, v in vars(self).items() if v is not None})
@@ -85,13 +82,9 @@ class BatchDataset(torch.utils.data.Dataset):
     def __len__(self) -> int:
         return self.length
 
-    def generator(self, step: int) -> torch.Generator:
-        # A large odd multiplier keeps the streams of different seeds apart.
-        return torch.Generator().manual_seed((self.seed * 2_654_435_761 + step) % (2**63))
-
     @torch.no_grad()
     def __getitem__(self, step: int) -> Batch:
-        generator = self.generator(step)
+        generator = step_generator(self.seed, step)
         verts = self.source(self.shapes, generator)
         scale = verts.flatten(1).std(1)[:, None, None]
         verts = bump(verts / scale * 0.3, self.scan.bumps, generator)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import make_template
@@ -74,12 +73,4 @@ def human_template(rig: Rig, pose: str, config: NodeConfig, low: tuple[np.ndarra
         source=SOURCE,
         licence=LICENCE,
         low=low,
-    )
-
-
-def restrict(rig: Rig, keep: np.ndarray, faces: np.ndarray) -> Rig:
-    """The same bodies on the low-resolution mesh."""
-    chosen = torch.from_numpy(keep)
-    return Rig(
-        rig.rest[:, chosen], rig.heads, rig.weights[chosen], rig.parents, rig.names, torch.from_numpy(faces)
     )

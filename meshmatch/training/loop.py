@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -17,10 +17,7 @@ from safetensors.torch import save_file
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.models.deformer import Deformer
 from meshmatch.outputs import replace_on_success
-from meshmatch.training.losses import LossConfig, LossPoints, losses
-
-# (model, batch, loss points, weights, generator) -> weighted terms by name, their sum under "total".
-Objective = Callable[..., dict[str, torch.Tensor]]
+from meshmatch.training.losses import CorrespondenceLoss, LossPoints, Objective
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class TrainConfig:
     threads: int = 1
     bf16: bool = False
     seed: int = 0
-    loss: LossConfig = field(default_factory=LossConfig)
+    loss: Objective = field(default_factory=CorrespondenceLoss)
 
     def __post_init__(self) -> None:
         for name in ("steps", "shapes", "scans_per_shape", "threads"):
@@ -63,8 +60,8 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """What a caller may show after a step: step counts, running means of the losses, speed."""
+class StepReport:
+    """What a caller may show after a step: step counts, rate, seconds of this run, means of the losses since the last."""
 
     step: int
     steps: int
@@ -72,6 +69,13 @@ class Progress:
     seconds: float
     terms: dict[str, float]
     validation: float | None = None
+
+    @property
+    def words(self) -> str:
+        """One line for people."""
+        words = ", ".join(f"{name} {value:.4g}" for name, value in self.terms.items())
+        known = "" if self.validation is None else f", validation {self.validation:.4f}"
+        return f"step {self.step:,} of {self.steps:,}: {words}{known}"
 
 
 def learning_rate(step: int, config: TrainConfig) -> float:
@@ -86,11 +90,8 @@ def learning_rate(step: int, config: TrainConfig) -> float:
 class Trainer:
     """State of a run: weights, their average, the optimiser and the next step. All of it is in a checkpoint."""
 
-    def __init__(
-        self, model: Deformer, points: LossPoints, config: TrainConfig, objective: Objective = losses
-    ) -> None:
+    def __init__(self, model: Deformer, points: LossPoints, config: TrainConfig) -> None:
         self.config = config
-        self.objective = objective
         self.rank = int(os.environ.get("RANK", 0))
         self.world = int(os.environ.get("WORLD_SIZE", 1))
         if torch.cuda.is_available():
@@ -165,7 +166,7 @@ class Trainer:
         self,
         data: torch.utils.data.Dataset,
         checkpoint: Path | None = None,
-        report: Callable[[Progress], None] | None = None,
+        report: Callable[[StepReport], None] | None = None,
         validate: Callable[[Deformer], float] | None = None,
         every: int = 50,
     ) -> None:
@@ -196,11 +197,8 @@ class Trainer:
             if report is not None and (self.step % every == 0 or self.step == config.steps):
                 score = validate(self.model) if validate and self.step % (10 * every) == 0 else None
                 means = {name: float(value) / summed for name, value in sums.items()}
-                report(
-                    Progress(
-                        self.step, config.steps, learning_rate(self.step, config), now - began, means, score
-                    )
-                )
+                rate = learning_rate(self.step, config)
+                report(StepReport(self.step, config.steps, rate, now - began, means, score))
                 sums, summed = {}, 0
             if checkpoint is not None and now - saved > 60 * config.checkpoint_minutes:
                 self.save(checkpoint)
@@ -221,7 +219,7 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.step, config)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=config.bf16):
-            terms = self.objective(self.model, batch.to(self.device), self.points, config.loss, generator)
+            terms = config.loss(self.model, batch.to(self.device), self.points, generator)
         self.optimiser.zero_grad(set_to_none=True)
         terms["total"].backward()
         self._share_gradients()
@@ -279,8 +277,3 @@ def _part(arrays: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tenso
 
 def _one_thread(_: int) -> None:
     torch.set_num_threads(1)
-
-
-def config_dict(config: TrainConfig) -> dict:
-    """Plain values for the model card."""
-    return asdict(config)

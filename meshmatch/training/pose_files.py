@@ -47,6 +47,8 @@ class GivenPoses:
         Rotation vectors in radians, none longer than a full turn.
     share : float
         Of the bodies, 0..1, how many stand in a pose of these.
+    name : str
+        Of the file.
 
     Raises
     ------
@@ -59,6 +61,7 @@ class GivenPoses:
     joints: tuple[str, ...]
     vectors: np.ndarray
     share: float = 0.5
+    name: str = ""
 
     def __post_init__(self) -> None:
         vectors = np.asarray(self.vectors)
@@ -161,7 +164,7 @@ def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
     except _DAMAGE as error:
         raise InputError(f"{path.name} is no file of poses: {error}", _HINT) from error
     try:
-        return GivenPoses(joints, vectors, share)
+        return GivenPoses(joints, vectors, share, path.name)
     except InputError as error:
         raise InputError(f"{path.name}: {error.message}", error.hint) from error
 

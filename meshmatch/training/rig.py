@@ -9,7 +9,7 @@ Frame: y up, facing +z, the left hand at +x; metres.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from safetensors.numpy import save_file
 
 from meshmatch.errors import OptionError
 from meshmatch.outputs import replace_on_success
+from meshmatch.progress import Progress
 
 RIG_VERSION = 1
 # anny is z up and faces -y.
@@ -61,6 +62,16 @@ class Rig:
     def joint(self, name: str) -> int:
         return self.names.index(name)
 
+    def restricted(self, keep: np.ndarray, faces: np.ndarray) -> Rig:
+        """The same bodies on some vertices (V',), joined by other triangles (F', 3) of these."""
+        chosen = torch.from_numpy(keep)
+        return replace(
+            self,
+            rest=self.rest[:, chosen],
+            weights=self.weights[chosen],
+            faces=torch.from_numpy(faces),
+        )
+
 
 def _sample_phenotypes(B: int, rng: np.random.Generator) -> dict[str, torch.Tensor]:
     """Adults mostly, about one child in ten; genders mostly clear, builds wide."""
@@ -92,19 +103,13 @@ def _sample_local_changes(labels: list[str], B: int, rng: np.random.Generator) -
     return changes
 
 
-def build_rig(
-    identities: int = 4096, seed: int = 0, vertices: np.ndarray | None = None, progress=None
-) -> Rig:
+def build_rig(identities: int = 4096, seed: int = 0, progress: Progress | None = None) -> Rig:
     """Sample identities from anny's phenotype space.
 
     Parameters
     ----------
     identities : int
         How many rest bodies to keep. Blends of two are valid bodies too (the model is linear).
-    vertices : int64 array (V,), optional
-        Which vertices of the ``notoes`` topology to keep; all 12,272 when None.
-    progress : callable, optional
-        Called with (done, total).
 
     Raises
     ------
@@ -125,7 +130,6 @@ def build_rig(
         warnings.simplefilter("ignore")
         model = anny.Anny(topology="notoes", phenotypes="all", local_changes="all", skinning_method="lbs")
     rng = np.random.default_rng(seed)
-    keep = np.arange(model.template_vertices.shape[0]) if vertices is None else np.asarray(vertices)
     rest, heads = [], []
     step = 64
     for start in range(0, identities, step):
@@ -136,11 +140,11 @@ def build_rig(
                 local_changes_kwargs=_sample_local_changes(model.local_change_labels, B, rng),
             )
         to_frame = torch.as_tensor(_TO_FRAME, dtype=out["rest_vertices"].dtype)
-        rest.append((out["rest_vertices"][:, keep] @ to_frame.T).half())
+        rest.append((out["rest_vertices"] @ to_frame.T).half())
         heads.append((out["rest_bone_heads"] @ to_frame.T).float())
         if progress is not None:
-            progress(start + B, identities)
-    weights = model.dense_vertex_bone_weights[keep].float()
+            progress((start + B) / identities)
+    weights = model.dense_vertex_bone_weights.float()
     return Rig(
         rest=torch.cat(rest),
         heads=torch.cat(heads),

@@ -28,6 +28,11 @@ class ScanConfig:
     scale: float = 0.04
     upright: bool = False
 
+    @staticmethod
+    def clean(points: int, upright: bool = False) -> ScanConfig:
+        """Points exactly on the surface and all over it."""
+        return ScanConfig(points, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, upright)
+
 
 def surface_area(verts: torch.Tensor, faces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Face areas (B, F) and their area-weighted centroid (B, 3)."""

@@ -1,8 +1,9 @@
-"""From a template and a source of shapes to an untrained network, its data and its loss points."""
+"""What a training begins with: an untrained network, its batches and its loss points."""
 
 from __future__ import annotations
 
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -14,7 +15,11 @@ from meshmatch.fields.mls import Kernel
 from meshmatch.models.deformer import Deformer, NetworkConfig
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.template import Template
+from meshmatch.templates.unregistered import ShapeSamples
+from meshmatch.training.chamfer import SurfacePoints
+from meshmatch.training.clouds import Augmentation, CloudDataset, build_lattice
 from meshmatch.training.datasets import BatchDataset, Source
+from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import LossPoints
 from meshmatch.training.scans import ScanConfig
 
@@ -46,7 +51,7 @@ def anchor_vertices(template: Template, A: int) -> np.ndarray:
     return farthest_points(template.shape.verts, A)
 
 
-def lay_anchors(
+def build_anchors(
     template: Template, network: NetworkConfig, kernel: Kernel
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
     """Anchors (A, 3) of the corrections and the shape functions there (A, K), None where the field has none."""
@@ -65,7 +70,7 @@ def build_deformer(
     """An untrained network for a template, its basis points laid where the source's shapes are."""
     torch.manual_seed(seed)
     nodes = torch.from_numpy(template.nodes).float()
-    anchors, anchor_phi = lay_anchors(template, network, kernel)
+    anchors, anchor_phi = build_anchors(template, network, kernel)
     empty = torch.zeros(1, 3)
     basis = align_basis = empty
     if network.encoder == "basis" or network.align_basis:
@@ -128,3 +133,54 @@ def build_loss_points(
     verts = template.shape.verts[loss_vertices(template, supervised)]
     field = model.field(verts, template.nodes, template.radius, kernel)
     return LossPoints(torch.from_numpy(verts).float(), field.for_training(strained))
+
+
+def build_cloud_dataset(
+    samples: ShapeSamples, config: TrainConfig, scan: ScanConfig, augmentation: Augmentation | None = None
+) -> CloudDataset:
+    """Batches of a folder's samples, as yet without an encoder."""
+    return CloudDataset(
+        points=torch.from_numpy(samples.points),
+        normals=torch.from_numpy(samples.normals),
+        landmarks=torch.from_numpy(samples.landmarks),
+        lattice=build_lattice(samples),
+        encoder=None,
+        scan=scan,
+        augmentation=augmentation or Augmentation(),
+        shapes=config.shapes,
+        seed=config.seed,
+        length=config.steps,
+    )
+
+
+def build_cloud_deformer(
+    template: Template, data: CloudDataset, network: NetworkConfig, kernel: Kernel, seed: int
+) -> Deformer:
+    """An untrained network, its basis points laid where the folder's shapes are."""
+    basis = torch.zeros(1, 3)
+    if network.encoder == "basis":
+        generator = torch.Generator().manual_seed(seed)
+        drawn = replace(data, shapes=64, seed=seed + 1)[0]
+        basis = fill_basis(drawn.points, network.basis, generator)
+    anchors, anchor_phi = build_anchors(template, network, kernel)
+    nodes = torch.from_numpy(template.nodes).float()
+    torch.manual_seed(seed)
+    return Deformer(network, nodes, anchors, anchor_phi, basis, torch.zeros(1, 3))
+
+
+def build_surface_points(
+    template: Template, kernel: Kernel, model: Deformer, landmarks: np.ndarray, count: int = 1200
+) -> SurfacePoints:
+    """Evenly spread template vertices, and the landmark vertices (L,), with what a Chamfer distance needs of them."""
+    chosen = loss_vertices(template, count)
+    at = np.concatenate([chosen, landmarks]).astype(np.int64)
+    verts = template.shape.verts[at]
+    field = model.field(verts, template.nodes, template.radius, kernel).for_training()
+    M = len(chosen)
+    return SurfacePoints(
+        torch.from_numpy(verts[:M]).float(),
+        field.part(0, M),
+        torch.from_numpy(template.shape.vertex_normals[chosen]).float(),
+        torch.from_numpy(verts[M:]).float(),
+        field.part(M, len(at)),
+    )

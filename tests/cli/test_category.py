@@ -11,7 +11,7 @@ from meshmatch.models.card import read_card, write_card
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
-from meshmatch.training.loop import Progress
+from meshmatch.training.loop import StepReport
 from tests.cli.conftest import Run
 from tests.conftest import icosphere
 
@@ -64,7 +64,7 @@ def test_from_a_folder_to_a_map(run: Run, eggs: Path, tmp_path: Path) -> None:
     assert run("prepare", eggs, "-o", tmp_path / "out", *FEW, "--align", "none").status == 0
     answer = run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", "--steps", "3")
     assert answer.status == 0, answer.err
-    assert "learning from 3 shapes without correspondence" in answer.err
+    assert "learned from 3 shapes of out, without correspondence" in answer.err
     card = read_card(tmp_path / "mine" / "card.json")
     assert card.frame == {"orientation": "none", "scale": "area"}
     assert (card.steps, card.category) == (3, "out")
@@ -118,14 +118,14 @@ def test_known_points_and_preset_reach_the_training(
 ) -> None:
     called = {}
 
-    def stub(template, gathered, output, **rest):
-        called.update(rest, known=gathered.landmarks.shape, output=output)
-        rest["progress"](Progress(1, 1, 1e-3, 1.0, {"total": 0.5}))
+    def stub(template, samples, output, recipe, facts, resume, report):
+        called.update(vars(facts), known=samples.landmarks.shape, output=output, recipe=recipe, resume=resume)
+        report(StepReport(1, 1, 1e-3, 1.0, {"total": 0.5}))
         card = read_card(bundled_folder() / "models" / "human" / "card.json")
-        write_card(replace(card, name=rest["name"]), Path(output) / "card.json")
+        write_card(replace(card, name=facts.name), Path(output) / "card.json")
         return output
 
-    monkeypatch.setattr("meshmatch.training.unsupervised.train_clouds", stub)
+    monkeypatch.setattr("meshmatch.training.train.train_model", stub)
     if registered:
         (eggs / "egg1.ply").unlink()
     prepared = ("--landmarks", ".tip.npy", "--template", "egg2")
@@ -146,8 +146,8 @@ def test_known_points_and_preset_reach_the_training(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["prepare", "eggs/egg0.ply", "-o", "out", "--align", "none"], "--align goes with a folder"),
-        (["prepare", "eggs/egg0.ply", "-o", "out", "--landmarks", ".x"], "--landmarks goes with a folder"),
+        (["prepare", "eggs/egg0.ply", "-o", "out", "--align", "none"], "align goes with a folder"),
+        (["prepare", "eggs/egg0.ply", "-o", "out", "--landmarks", ".x"], "landmarks goes with a folder"),
         (["prepare", "eggs", "-o", "out", "--landmarks", ".nothing"], "has landmarks"),
         (["prepare", "eggs", "-o", "out", "--template", "egg9"], "egg9"),
         (["prepare", "eggs", "-o", "out", "--template", "needle.ply", *FEW], "nothing like the template"),
@@ -164,7 +164,7 @@ def test_known_points_and_preset_reach_the_training(
             "same.npy cannot be a template: it has points in only 1 place",
         ),
         (["prepare", "bad/line.npy", "-o", "out"], "on no surface"),
-        (["train", "-o", "mine", "--unsupervised"], "--unsupervised learns from a folder"),
+        (["train", "-o", "mine", "--unsupervised"], "learning without correspondence needs a folder"),
         (["train", "-o", "mine", "--shapes", "alone"], "one shape is too few"),
     ],
 )

@@ -12,7 +12,7 @@ from meshmatch.render import picture
 from meshmatch.render.picture import Panel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.prepare import read_registered
+from meshmatch.templates.registered import read_registered
 from meshmatch.templates.template import load_template
 from tests.cli.conftest import Answer, Run
 
@@ -165,7 +165,6 @@ def test_options_of_the_nodes_reach_them(run: Run, two: tuple[Path, Path], tmp_p
         (["nothing.ply"], "nothing.ply"),
         (["a.ply", "--radius", "0.01"], "vert"),
         (["a.ply", "--template", "b.ply"], "folder"),
-        ([".", "--labels", "l.txt", "--strategy", "parts"], "one shape"),
         (["empty"], "no shapes"),
     ],
 )

@@ -25,7 +25,7 @@ from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
-from meshmatch.training import run as training
+from meshmatch.training import bodies as training
 from tests.experiments.small_bench import build
 from tests.fitting.eggs import egg_model
 from tests.training.small import bent_eggs

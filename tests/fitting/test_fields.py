@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +25,9 @@ from meshmatch.fitting.system import NodeSystem
 from meshmatch.models.deformer import NetworkConfig
 from meshmatch.models.trained import TrainedModel, load_model
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.training import run
+from meshmatch.training import recipes
 from meshmatch.training.loop import TrainConfig, Trainer
-from meshmatch.training.losses import LossConfig, losses
+from meshmatch.training.losses import CorrespondenceLoss, validation_error
 from tests.fitting.eggs import bent_egg, egg_model, gentle_vectors, scan_of
 from tests.training.small import NETWORK, SCAN, egg_template, small_data, small_network, small_points
 
@@ -65,13 +66,19 @@ def test_it_learns(field: str) -> None:
     model = small_network(egg, config_of(field))
     points = small_points(egg, model=model)
     config = TrainConfig(
-        steps=40, shapes=4, scans_per_shape=2, rate=3e-3, warm_up=3, workers=0, loss=LossConfig(robust=True)
+        steps=40,
+        shapes=4,
+        scans_per_shape=2,
+        rate=3e-3,
+        warm_up=3,
+        workers=0,
+        loss=CorrespondenceLoss(robust=True),
     )
     data = small_data(egg, model, length=40)
     held_out = small_data(egg, model, seed=7)[0]
-    before = run.validation_error(model, held_out, points)
+    before = validation_error(model, held_out, points)
     Trainer(model, points, config).run(data)
-    assert run.validation_error(model, held_out, points) < 0.97 * before
+    assert validation_error(model, held_out, points) < 0.97 * before
 
 
 @pytest.mark.parametrize("field", FIELDS)
@@ -79,7 +86,7 @@ def test_every_part_of_the_network_learns(field: str) -> None:
     egg = egg_template()
     model = small_network(egg, config_of(field))
     batch = small_data(egg, model)[0]
-    terms = losses(model, batch, small_points(egg, model=model), LossConfig(), torch.Generator())
+    terms = CorrespondenceLoss()(model, batch, small_points(egg, model=model), torch.Generator())
     assert {"volume", "arap", "blend", "correct", "align"} < set(terms)
     terms["total"].backward()
     assert [name for name, weight in model.named_parameters() if weight.grad is None] == []
@@ -88,8 +95,8 @@ def test_every_part_of_the_network_learns(field: str) -> None:
 def test_what_has_no_weight_is_not_computed(monkeypatch: pytest.MonkeyPatch, pointwise: TrainedModel) -> None:
     monkeypatch.setattr("meshmatch.fields.pointwise.jacobian", None)
     egg, model = pointwise.template, pointwise.network
-    bare = LossConfig(volume=0, arap=0, blend=0)
-    terms = losses(model, small_data(egg, model)[0], small_points(egg, model=model), bare, torch.Generator())
+    bare = CorrespondenceLoss(volume=0, arap=0, blend=0)
+    terms = bare(model, small_data(egg, model)[0], small_points(egg, model=model), torch.Generator())
     assert set(terms) == {
         *("total", "reconstruction", "correct", "align"),
         *("error_code", "error_corrected", "error_align"),
@@ -205,12 +212,12 @@ def test_train_save_load_and_register(
     nodes = ["--nodes", "36", "--radius", "0.5", "--strategy", "uniform"]
     assert main(["prepare", str(eggs), "-o", str(prepared), *nodes, "-q"]) == 0
 
-    def small(preset: str = "default") -> run.Recipe:
-        train = TrainConfig(shapes=2, scans_per_shape=1, warm_up=1, workers=0)
-        return run.Recipe(replace(NETWORK, align_basis=0), train, SCAN, "smooth")
+    def small(plain: recipes.Recipe) -> recipes.Recipe:
+        train = replace(plain.train, shapes=2, scans_per_shape=1, warm_up=1, workers=0)
+        return replace(plain, network=replace(NETWORK, align_basis=0), train=train, scan=SCAN)
 
-    monkeypatch.setattr(run, "recipe", small)
-    monkeypatch.setattr("meshmatch.training.unsupervised.cloud_recipe", small)
+    for name in ("small_data", "clouds"):
+        monkeypatch.setattr(recipes, name, partial(small, getattr(recipes, name)()))
     monkeypatch.setattr(FitConfig, "possible", _short(FitConfig.possible))
     words = ["--field", field, "--steps", "3", "--workers", "0", "--name", "eggs", "-q"]
     if way == "clouds":

@@ -7,17 +7,23 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from meshmatch.errors import InputError, OutputError
+from meshmatch.errors import InputError, OptionError, OutputError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates import registered
 from meshmatch.templates.nodes import NodeConfig
-from meshmatch.templates.prepare import prepare_folder, read_registered
+from meshmatch.templates.prepare import PrepareConfig, Prepared, prepare
+from meshmatch.templates.registered import frame_of, read_registered
 from meshmatch.templates.template import load_template
-from meshmatch.templates.unregistered import read_gathered
-from meshmatch.training.small_data import frame_of_few
+from meshmatch.templates.unregistered import read_samples
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.3)
+
+
+def prepared(folder: Path, output: Path, nodes: NodeConfig = FEW, progress=None, **choices) -> Prepared:
+    return prepare(folder, output, PrepareConfig(nodes, **choices), progress)
+
+
 FAR = np.array([1e6, -3e5, 2e4])  # a surveyor's coordinates
 
 
@@ -36,8 +42,10 @@ def folder(tmp_path: Path, sphere: Shape) -> Path:
 
 
 def test_registered_shapes_keep_their_correspondence(folder: Path, sphere: Shape, tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    made = prepare_folder(folder, tmp_path / "out", FEW, faces=600, progress=lambda *now: seen.append(now))
+    seen: list[float] = []
+    made = prepared(
+        folder, tmp_path / "out", FEW, faces=600, progress=lambda _stage, _name, share: seen.append(share)
+    )
     template = load_template(tmp_path / "out" / "template.safetensors")
     assert template.hash == made.template.hash
     assert template.name == "eggs"
@@ -51,7 +59,7 @@ def test_registered_shapes_keep_their_correspondence(folder: Path, sphere: Shape
     for n in range(3):
         wanted = egg(sphere, n)[vertex]
         assert np.allclose(stack[n], wanted - wanted.mean(0), atol=2e-5)  # not lost at a million metres
-    assert seen == [(n, 6) for n in range(1, 7)]  # read, then brought together
+    assert seen == pytest.approx([n / 6 for n in range(1, 7)])  # read, then brought together
     assert made.names == ("egg0.obj", "egg1.obj", "egg2.obj")
     words = json.loads((tmp_path / "out" / "prepared.json").read_text())
     assert words["registered"] is True
@@ -60,7 +68,7 @@ def test_registered_shapes_keep_their_correspondence(folder: Path, sphere: Shape
 
 
 def test_normalised_shapes_have_area_one_and_few_faces(folder: Path, tmp_path: Path) -> None:
-    prepare_folder(folder, tmp_path / "out", FEW, faces=600)
+    prepared(folder, tmp_path / "out", FEW, faces=600)
     files = sorted((tmp_path / "out" / "normalised").iterdir())
     assert [file.name for file in files] == ["egg0.ply", "egg1.ply", "egg2.ply"]
     for file in files:
@@ -72,7 +80,7 @@ def test_normalised_shapes_have_area_one_and_few_faces(folder: Path, tmp_path: P
 
 def test_files_of_one_stem_do_not_overwrite_each_other(folder: Path, torus: Shape, tmp_path: Path) -> None:
     save_shape(folder / "egg0.ply", torus)
-    prepare_folder(folder, tmp_path / "out", FEW)
+    prepared(folder, tmp_path / "out", FEW)
     files = sorted(file.name for file in (tmp_path / "out" / "normalised").iterdir())
     assert files == ["egg0.obj.ply", "egg0.ply.ply", "egg1.ply", "egg2.ply"]
 
@@ -81,7 +89,7 @@ def test_shapes_of_another_connectivity_are_not_registered(
     folder: Path, sphere: Shape, tmp_path: Path
 ) -> None:
     save_shape(folder / "odd.ply", Shape(egg(sphere, 1), sphere.faces[:, [1, 2, 0]]))
-    made = prepare_folder(folder, tmp_path / "out", FEW)
+    made = prepared(folder, tmp_path / "out", FEW)
     assert made.shapes.shape == (0, 642, 3)
     assert len(made.names) == 4
     with pytest.raises(InputError, match="do not share one connectivity") as caught:
@@ -95,7 +103,7 @@ def test_what_cannot_be_read_is_noted_and_left_out(folder: Path, tmp_path: Path,
     (folder / "notes.txt").write_text("not a shape")
     np.save(folder / "point.npy", np.zeros((300, 3)))  # has no area
     save_shape(folder / "dirty.obj", Shape(np.concatenate([sphere.verts, FAR[None]]), sphere.faces))
-    made = prepare_folder(folder, tmp_path / "out", FEW)
+    made = prepared(folder, tmp_path / "out", FEW)
     notes = "\n".join(made.notes)
     for name in ("broken.ply left out", "empty.off left out", "point.npy left out", "dirty.obj: 1 vertex"):
         assert name in notes
@@ -107,14 +115,14 @@ def test_a_template_is_made_after_repair(tmp_path: Path, sphere: Shape, torus: S
     shapes = tmp_path / "soup"
     shapes.mkdir()
     save_shape(shapes / "ball.stl", sphere)
-    made = prepare_folder(shapes, tmp_path / "out", FEW)
+    made = prepared(shapes, tmp_path / "out", FEW)
     assert made.template.shape.V == 642
     loose = tmp_path / "loose"
     loose.mkdir()
     for n in range(2):
         verts = np.concatenate([FAR[None], egg(sphere, n)])
         save_shape(loose / f"egg{n}.off", Shape(verts, sphere.faces + 1))
-    made = prepare_folder(loose, tmp_path / "out2", FEW)
+    made = prepared(loose, tmp_path / "out2", FEW)
     assert made.shapes.shape == (2, 642, 3)
     assert np.allclose(made.shapes[1], egg(sphere, 1) - egg(sphere, 1).mean(0), atol=1e-5)
 
@@ -123,22 +131,22 @@ def test_a_registered_shape_with_lost_positions_is_left_out(folder: Path, tmp_pa
     text = (folder / "egg2.obj").read_text().splitlines()
     text[[line.startswith("v ") for line in text].index(True)] = "v nan nan nan"
     (folder / "egg2.obj").write_text("\n".join(text))
-    made = prepare_folder(folder, tmp_path / "out", FEW)
+    made = prepared(folder, tmp_path / "out", FEW)
     assert len(made.shapes) == 2
     assert any("egg2.obj: not among the registered" in note for note in made.notes)
 
 
 def test_a_template_of_clouds_is_a_mesh_or_one_of_them(folder: Path, tmp_path: Path, sphere: Shape) -> None:
     np.save(folder / "a_cloud.npy", sphere.verts)
-    made = prepare_folder(folder, tmp_path / "out", FEW)
+    made = prepared(folder, tmp_path / "out", FEW)
     assert made.template.shape.F == 1280  # of the first mesh
     assert len(made.shapes) == 0
     clouds = tmp_path / "clouds"
     clouds.mkdir()
     np.save(clouds / "a.npy", sphere.verts)
-    made = prepare_folder(clouds, tmp_path / "out2", FEW)
+    made = prepared(clouds, tmp_path / "out2", FEW)
     assert made.template.shape.V > 600  # triangulated
-    made = prepare_folder(clouds, tmp_path / "out2", FEW, template=folder / "egg0.obj")
+    made = prepared(clouds, tmp_path / "out2", FEW, template=folder / "egg0.obj")
     assert made.template.shape.F == 1280
     assert made.names == ("a.npy",)
 
@@ -146,25 +154,33 @@ def test_a_template_of_clouds_is_a_mesh_or_one_of_them(folder: Path, tmp_path: P
 def test_no_usable_shape_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     with pytest.raises(InputError, match="no shapes in") as caught:
-        prepare_folder(tmp_path / "in", tmp_path / "out", FEW)
+        prepared(tmp_path / "in", tmp_path / "out", FEW)
     assert ".ply" in caught.value.hint
     (tmp_path / "in" / "x.ply").touch()
     with pytest.raises(InputError, match="could be used") as caught:
-        prepare_folder(tmp_path / "in", tmp_path / "out", FEW)
+        prepared(tmp_path / "in", tmp_path / "out", FEW)
     assert "x.ply left out" in caught.value.hint
-    with pytest.raises(InputError, match="no shapes in"):
-        prepare_folder(tmp_path / "nowhere", tmp_path / "out", FEW)
+    with pytest.raises(InputError, match="there is no file"):
+        prepared(tmp_path / "nowhere", tmp_path / "out", FEW)
 
 
 def test_an_output_that_cannot_be_made_is_told(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("a file")
     with pytest.raises(OutputError, match="cannot make the folder"):
-        prepare_folder(folder, tmp_path / "taken", FEW)
+        prepared(folder, tmp_path / "taken", FEW)
+
+
+def test_labels_are_of_one_shape_and_for_parts(folder: Path, tmp_path: Path) -> None:
+    parts = NodeConfig(strategy="parts", K=60, radius=0.3)
+    with pytest.raises(OptionError, match="labels are of one shape"):
+        prepared(folder, tmp_path / "out", parts, labels=np.zeros(5, int))
+    with pytest.raises(OptionError, match="labels go together"):
+        prepared(folder, tmp_path / "out", parts)
 
 
 def test_a_folder_of_another_template_or_none_is_refused(folder: Path, tmp_path: Path) -> None:
-    made = prepare_folder(folder, tmp_path / "out", FEW)
-    other = prepare_folder(folder, tmp_path / "other", NodeConfig(strategy="uniform", K=61, radius=0.3))
+    made = prepared(folder, tmp_path / "out", FEW)
+    other = prepared(folder, tmp_path / "other", NodeConfig(strategy="uniform", K=61, radius=0.3))
     with pytest.raises(InputError, match="prepared for another template"):
         read_registered(tmp_path / "out", other.template)
     with pytest.raises(InputError, match="not a prepared folder") as caught:
@@ -174,7 +190,7 @@ def test_a_folder_of_another_template_or_none_is_refused(folder: Path, tmp_path:
     with pytest.raises(InputError, match="not a prepared folder"):
         read_registered(tmp_path / "other", other.template)
     with pytest.raises(InputError, match="not a prepared folder"):
-        read_gathered(tmp_path / "other", other.template)
+        read_samples(tmp_path / "other", other.template)
     (tmp_path / "out" / "shapes.safetensors").write_bytes(b"?")
     with pytest.raises(InputError, match="not a prepared folder"):
         read_registered(tmp_path / "out", made.template)
@@ -184,24 +200,23 @@ def test_a_folder_of_another_template_or_none_is_refused(folder: Path, tmp_path:
 def test_correspondence_says_whether_registered_shapes_stand_alike(
     folder: Path, sphere: Shape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert prepare_folder(folder, tmp_path / "alike", FEW).align == "near"
+    assert prepared(folder, tmp_path / "alike", FEW).align == "near"
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     save_shape(folder / "egg3.obj", Shape(egg(sphere, 2) @ quarter.T, sphere.faces))
-    made = prepare_folder(folder, tmp_path / "turned", FEW)
+    made = prepared(folder, tmp_path / "turned", FEW)
     assert (len(made.shapes), made.align) == (4, "rigid")
-    assert frame_of_few(tmp_path / "turned") == {"orientation": "rigid", "scale": "area"}
-    assert prepare_folder(folder, tmp_path / "given", FEW, align="none").align == "none"
-    assert frame_of_few(tmp_path / "nowhere") is None
-    monkeypatch.setattr(registered, "FEW", 4)
-    assert prepare_folder(folder, tmp_path / "many", FEW).align == "none"
-    monkeypatch.setattr("meshmatch.training.small_data.FEW", 4)
-    assert frame_of_few(tmp_path / "many") is None
+    assert frame_of(tmp_path / "turned") == {"orientation": "rigid", "scale": "area"}
+    assert prepared(folder, tmp_path / "given", FEW, align="none").align == "none"
+    assert frame_of(tmp_path / "nowhere") is None
+    monkeypatch.setattr(registered, "SMALL_DATA", 4)
+    assert prepared(folder, tmp_path / "many", FEW).align == "none"
+    assert frame_of(tmp_path / "many") is None
 
 
 def test_registered_shapes_are_learned_at_equal_areas_alone(folder: Path, tmp_path: Path) -> None:
-    made = prepare_folder(folder, tmp_path / "out", FEW, scale="sphere")
+    made = prepared(folder, tmp_path / "out", FEW, scale="sphere")
     with pytest.raises(InputError, match="prepared with --scale sphere") as caught:
         read_registered(tmp_path / "out", made.template)
     assert "--unsupervised" in caught.value.hint
-    assert read_gathered(tmp_path / "out", made.template).scale == "sphere"
-    assert frame_of_few(tmp_path / "out") is None
+    assert read_samples(tmp_path / "out", made.template).scale == "sphere"
+    assert frame_of(tmp_path / "out") is None

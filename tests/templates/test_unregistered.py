@@ -12,15 +12,14 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.landmarks import find_landmarks, read_landmarks
 from meshmatch.templates.nodes import NodeConfig
-from meshmatch.templates.prepare import prepare_folder
+from meshmatch.templates.prepare import PrepareConfig, Prepared, prepare
+from meshmatch.templates.registered import is_registered
 from meshmatch.templates.template import load_template
 from meshmatch.templates.unregistered import (
-    find_known,
-    is_registered,
-    most_typical,
-    read_gathered,
-    read_known,
+    medoid,
+    read_samples,
     template_radius,
     unit_frame,
 )
@@ -28,6 +27,10 @@ from tests.conftest import icosphere
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.35)
 NONE = np.empty((0, 3), np.int64)
+
+
+def prepared(folder: Path, output: Path, nodes: NodeConfig = FEW, **choices) -> Prepared:
+    return prepare(folder, output, PrepareConfig(nodes, **choices))
 
 
 def pear(splits: int, stretch: float = 1.0) -> Shape:
@@ -51,21 +54,21 @@ def pears(tmp_path: Path) -> Path:
 
 
 def test_a_folder_without_correspondence(pears: Path, tmp_path: Path) -> None:
-    made = prepare_folder(pears, tmp_path / "out", FEW)
+    made = prepared(pears, tmp_path / "out", FEW)
     assert (len(made.shapes), made.align, made.landmarks) == (0, "rigid", 0)
     assert any(note.startswith("template: pear") for note in made.notes)
     assert not is_registered(tmp_path / "out")
     template = load_template(tmp_path / "out" / "template.safetensors")
-    gathered = read_gathered(tmp_path / "out", template)
-    assert gathered.points.shape == gathered.normals.shape == (4, 4096, 3)
-    assert (gathered.align, gathered.scale) == ("rigid", "area")
+    samples = read_samples(tmp_path / "out", template)
+    assert samples.points.shape == samples.normals.shape == (4, 4096, 3)
+    assert (samples.align, samples.scale) == ("rigid", "area")
     words = json.loads((tmp_path / "out" / "prepared.json").read_text())
     for number, (name, each) in enumerate(zip(words["names"], words["frames"], strict=True)):
         frame = Frame(each["scale"], np.array(each["rotation"]), np.array(each["center"]))
         original = load_shape(pears / name)
         there = Shape(frame.apply(original.verts), original.faces)
         assert there.area == pytest.approx(1, rel=1e-6)
-        gap = np.linalg.norm(there.verts[:, None] - gathered.points[number][None, :2000], axis=2).min(0)
+        gap = np.linalg.norm(there.verts[:, None] - samples.points[number][None, :2000], axis=2).min(0)
         assert gap.max() < 0.15  # samples lie on the shape, in the frame that was written down
     assert max(words["apart"]) < 0.06  # turned to the template
     assert len(list((tmp_path / "out" / "normalised").iterdir())) == 4
@@ -73,27 +76,27 @@ def test_a_folder_without_correspondence(pears: Path, tmp_path: Path) -> None:
 
 def test_the_typical_shape_is_the_middle_one() -> None:
     shapes = [repair(pear(2, stretch)) for stretch in (0.5, 0.8, 1.0, 1.25, 2.0)]
-    assert most_typical(shapes, "none", "area", 0) in (1, 2, 3)
+    assert medoid(shapes, "none", "area", 0) in (1, 2, 3)
     lonely = [repair(pear(2, stretch)) for stretch in (2.0, 1.0, 1.02, 0.98)]
-    assert most_typical(lonely, "none", "area", 0) != 0
+    assert medoid(lonely, "none", "area", 0) != 0
     clouds = [
         repair(Shape(pear(3).verts, NONE)),
         repair(pear(2, 0.7)),
         repair(Shape(pear(3, 1.1).verts, NONE)),
     ]
-    assert most_typical(clouds, "none", "area", 0) == 1  # a mesh, if there is one
+    assert medoid(clouds, "none", "area", 0) == 1  # a mesh, if there is one
 
 
 def test_the_template_by_name_by_file_and_of_a_cloud(pears: Path, tmp_path: Path) -> None:
     def hash_of(template: str | Path) -> str:
-        return prepare_folder(pears, tmp_path / "out", FEW, template=template).template.hash
+        return prepared(pears, tmp_path / "out", FEW, template=template).template.hash
 
     by_stem = hash_of("pear1")
     assert hash_of("pear1.ply") == hash_of(pears / "pear1.ply") == by_stem
     assert hash_of("pear0") != by_stem
     cloud = tmp_path / "cloud.npy"
     np.save(cloud, pear(3).verts)
-    made = prepare_folder(pears, tmp_path / "out", FEW, template=cloud).template
+    made = prepared(pears, tmp_path / "out", FEW, template=cloud).template
     assert made.shape.V > 600 and made.dense is made.shape
     with pytest.raises(InputError, match="pear9"):
         hash_of("pear9")
@@ -108,7 +111,7 @@ def test_nodes_of_a_cloud_scatter_around_it(tmp_path: Path) -> None:
             save_shape(tmp_path / f"in{n}" / f"{k}.ply", Shape(ball.verts * (1 + k), faces))
     radius = np.sqrt(1 / (4 * np.pi))
     below, around = (
-        np.linalg.norm(prepare_folder(tmp_path / f"in{n}", tmp_path / "out", FEW).template.nodes, axis=1)
+        np.linalg.norm(prepared(tmp_path / f"in{n}", tmp_path / "out", FEW).template.nodes, axis=1)
         for n in (0, 1)
     )
     assert below.max() < radius * 1.01
@@ -117,10 +120,10 @@ def test_nodes_of_a_cloud_scatter_around_it(tmp_path: Path) -> None:
 
 
 def test_the_sphere_scale_is_the_templates_radius(pears: Path, tmp_path: Path) -> None:
-    made = prepare_folder(pears, tmp_path / "out", FEW, scale="sphere", template="pear2")
-    gathered = read_gathered(tmp_path / "out", made.template)
-    assert gathered.scale == "sphere"
-    reach = np.linalg.norm(gathered.points, axis=2).max(1)
+    made = prepared(pears, tmp_path / "out", FEW, scale="sphere", template="pear2")
+    samples = read_samples(tmp_path / "out", made.template)
+    assert samples.scale == "sphere"
+    reach = np.linalg.norm(samples.points, axis=2).max(1)
     assert np.allclose(reach, template_radius(made.template), rtol=0.12)
     frame = unit_frame(pear(2), "sphere", 0.5)
     assert np.linalg.norm(frame.apply(pear(2).verts), axis=1).max() == pytest.approx(0.5)
@@ -138,13 +141,13 @@ def test_known_points_follow_their_shapes(pears: Path, tmp_path: Path) -> None:
             np.save(pears / "pear1.tips.npy", place)
         elif n != 3:
             np.save(pears / f"pear{n}.tips.npy", tips[n])
-    made = prepare_folder(pears, tmp_path / "out", FEW, landmarks=".tips.npy", template="pear2")
+    made = prepared(pears, tmp_path / "out", FEW, landmarks=".tips.npy", template="pear2")
     assert made.landmarks == 2
     assert made.names == tuple(f"pear{n}.ply" for n in range(4))  # the files of points are no shapes
-    gathered = read_gathered(tmp_path / "out", made.template)
-    known = gathered.landmarks
+    samples = read_samples(tmp_path / "out", made.template)
+    known = samples.landmarks
     assert np.isnan(known[1, 1]).all() and np.isnan(known[3]).all()
-    top, bottom = made.template.shape.verts[gathered.template_landmarks]
+    top, bottom = made.template.shape.verts[samples.template_landmarks]
     assert top[1] > 0.25 and bottom[1] < -0.25
     assert np.linalg.norm(known[0] - [top, bottom], axis=1).max() < 0.25
     assert np.linalg.norm(known[1, 0] - top) < 0.25
@@ -155,15 +158,15 @@ def test_known_points_in_a_folder_of_their_own_and_as_text(pears: Path, tmp_path
     points.mkdir()
     (points / "pear2.txt").write_text("0\n-1\n5\n")
     files = sorted(pears.glob("*.ply"))
-    found = find_known(points, pears, files)
+    found = find_landmarks(points, pears, files)
     assert found == [None, None, points / "pear2.txt", None]
     clean = repair(load_shape(pears / "pear2.ply"))
-    known = read_known(points / "pear2.txt", clean)
+    known = read_landmarks(points / "pear2.txt", clean)
     assert np.allclose(known[[0, 2]], clean.original.verts[[0, 5]]) and np.isnan(known[1]).all()
     with pytest.raises(InputError, match="has no landmarks, or not all"):
-        prepare_folder(pears, tmp_path / "out", FEW, landmarks=points, template="pear2")
+        prepared(pears, tmp_path / "out", FEW, landmarks=points, template="pear2")
     with pytest.raises(OptionError, match=r"no shape of .* has landmarks"):
-        find_known(".nothing", pears, files)
+        find_landmarks(".nothing", pears, files)
 
 
 @pytest.mark.parametrize(
@@ -179,22 +182,22 @@ def test_known_points_in_a_folder_of_their_own_and_as_text(pears: Path, tmp_path
 def test_wrong_known_points_are_told(pears: Path, tmp_path: Path, values: list, told: str) -> None:
     np.save(tmp_path / "x.npy", np.array(values))
     with pytest.raises(InputError) as caught:
-        read_known(tmp_path / "x.npy", repair(load_shape(pears / "pear0.ply")))
+        read_landmarks(tmp_path / "x.npy", repair(load_shape(pears / "pear0.ply")))
     assert told in caught.value.message + caught.value.hint
     for words in ("", "# only words\n"):
         (tmp_path / "x.txt").write_text(words)
         with pytest.raises(InputError, match="holds no landmarks"):
-            read_known(tmp_path / "x.txt", repair(load_shape(pears / "pear0.ply")))
+            read_landmarks(tmp_path / "x.txt", repair(load_shape(pears / "pear0.ply")))
     (tmp_path / "x.npy").write_bytes(b"no numbers")
     with pytest.raises(InputError, match="is no npy file"):
-        read_known(tmp_path / "x.npy", repair(load_shape(pears / "pear0.ply")))
+        read_landmarks(tmp_path / "x.npy", repair(load_shape(pears / "pear0.ply")))
 
 
 def test_files_of_different_length_do_not_belong_together(pears: Path, tmp_path: Path) -> None:
     np.save(pears / "pear0.tips.npy", np.arange(3))
     np.save(pears / "pear2.tips.npy", np.arange(2))
     with pytest.raises(InputError, match="of 2 and of 3 points"):
-        prepare_folder(pears, tmp_path / "out", FEW, landmarks=".tips.npy", template="pear2")
+        prepared(pears, tmp_path / "out", FEW, landmarks=".tips.npy", template="pear2")
 
 
 def test_a_template_of_another_kind_is_refused(pears: Path, tmp_path: Path) -> None:
@@ -202,7 +205,7 @@ def test_a_template_of_another_kind_is_refused(pears: Path, tmp_path: Path) -> N
     save_shape(tmp_path / "needle.ply", Shape(needle.verts * [0.05, 1, 0.05], needle.faces))
     wide = NodeConfig(strategy="uniform", K=60, radius=0.6)
     with pytest.raises(InputError, match="nothing like the template") as caught:
-        prepare_folder(pears, tmp_path / "out", wide, template=tmp_path / "needle.ply", scale="sphere")
+        prepared(pears, tmp_path / "out", wide, template=tmp_path / "needle.ply", scale="sphere")
     assert "--template" in caught.value.hint
     assert not (tmp_path / "out" / "prepared.json").exists()
 
@@ -213,7 +216,7 @@ def test_few_points_one_point_and_strays_are_left_out_or_told(pears: Path, tmp_p
     np.save(pears / "same.npy", np.ones((500, 3)))
     fog = np.concatenate([pear(3).verts[:64], rng.uniform(-9, 9, (576, 3))])  # 90 % of it are strays
     np.save(pears / "fog.npy", fog)
-    made = prepare_folder(pears, tmp_path / "out", FEW)
+    made = prepared(pears, tmp_path / "out", FEW)
     notes = "\n".join(made.notes)
     assert "three.npy left out: it has points in only 3 places" in notes
     assert "same.npy left out" in notes
@@ -221,14 +224,14 @@ def test_few_points_one_point_and_strays_are_left_out_or_told(pears: Path, tmp_p
 
 
 def test_a_damaged_or_foreign_folder_is_told(pears: Path, tmp_path: Path) -> None:
-    made = prepare_folder(pears, tmp_path / "out", FEW)
-    other = prepare_folder(pears, tmp_path / "other", FEW, template="pear0").template
+    made = prepared(pears, tmp_path / "out", FEW)
+    other = prepared(pears, tmp_path / "other", FEW, template="pear0").template
     if other.hash == made.template.hash:
-        other = prepare_folder(pears, tmp_path / "other", FEW, template="pear1").template
+        other = prepared(pears, tmp_path / "other", FEW, template="pear1").template
     with pytest.raises(InputError, match="another template"):
-        read_gathered(tmp_path / "out", other)
+        read_samples(tmp_path / "out", other)
     with pytest.raises(InputError, match="not a prepared folder"):
-        read_gathered(tmp_path, made.template)
+        read_samples(tmp_path, made.template)
     (tmp_path / "out" / "points.safetensors").write_bytes(b"?")
     with pytest.raises(InputError, match="not a prepared folder"):
-        read_gathered(tmp_path / "out", made.template)
+        read_samples(tmp_path / "out", made.template)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import OptionError
 from meshmatch.training.bodies import draw_identities, sample_bodies, skin
-from meshmatch.training.human_template import body_parts, human_template, restrict, standing_body
+from meshmatch.training.human_template import body_parts, human_template, standing_body
 from meshmatch.training.limbs import FOLDED, Draw, Still, draw_arms, draw_limbs, mirrored, with_legs
 from meshmatch.training.poses import sample_free_pose, sample_pose, still_pose
 from meshmatch.training.rig import Rig, build_rig, load_rig, save_rig
@@ -343,6 +343,6 @@ def test_a_template_of_the_rig(rig: Rig) -> None:
     hand = template.labels == template.label_names.index("left hand")
     assert template.shape.verts[hand, 0].min() > template.shape.verts[template.core, 0].max()  # left at +x
     assert standing_body(rig, "T").V == len(keep)
-    half = restrict(rig, keep[::2], np.zeros((0, 3), np.int64))
+    half = rig.restricted(keep[::2], np.zeros((0, 3), np.int64))
     assert torch.equal(half.rest, rig.rest[:, ::2])
     assert torch.equal(half.weights, rig.weights[::2])

@@ -10,14 +10,19 @@ from meshmatch.models.deformer import NetworkConfig
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
-from meshmatch.templates.unregistered import Gathered
-from meshmatch.training.chamfer import build_surface_points, chamfer, chamfer_losses, robust
-from meshmatch.training.clouds import CloudConfig, CloudDataset, build_warp, turned_normals, warped_source
+from meshmatch.templates.unregistered import ShapeSamples
+from meshmatch.training.chamfer import ChamferLoss, chamfer, robust, surface_error
+from meshmatch.training.clouds import (
+    Augmentation,
+    CloudDataset,
+    build_lattice,
+    deformed_normals,
+    deformed_source,
+)
 from meshmatch.training.loop import TrainConfig, Trainer
-from meshmatch.training.losses import LossConfig
-from meshmatch.training.run import Recipe
+from meshmatch.training.recipes import Recipe
 from meshmatch.training.scans import ScanConfig
-from meshmatch.training.unsupervised import build_cloud_dataset, build_cloud_deformer, surface_error
+from meshmatch.training.setup import build_cloud_dataset, build_cloud_deformer, build_surface_points
 from tests.training.small import egg_template
 
 SMALL = Recipe(
@@ -28,7 +33,7 @@ SMALL = Recipe(
         scans_per_shape=1,
         warm_up=5,
         workers=0,
-        loss=LossConfig(volume=1e-4, arap=1e-3, blend=1e-4),
+        loss=ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4),
     ),
     ScanConfig(points=128),
     "smooth",
@@ -42,7 +47,7 @@ def template() -> Template:
 
 
 @pytest.fixture(scope="module")
-def gathered(template: Template) -> Gathered:
+def eggs(template: Template) -> ShapeSamples:
     """Three eggs, of which one lacks its known point; the first two samples of each are vertices 0 and 1."""
     verts, faces = template.shape.verts, template.shape.faces
     points, normals, known = [], [], []
@@ -53,40 +58,40 @@ def gathered(template: Template) -> Gathered:
         normals.append(np.concatenate([shape.vertex_normals[:2], samples.normals]))
         known.append(shape.verts[[TOP]] if n else np.full((1, 3), np.nan))
     stack = [np.stack(each).astype(np.float32) for each in (points, normals, known)]
-    return Gathered(*stack, np.array([TOP]), "none", "area")
+    return ShapeSamples(*stack, np.array([TOP]), "none", "area")
 
 
 @pytest.fixture(scope="module")
-def data(gathered: Gathered, template: Template) -> CloudDataset:
-    data = build_cloud_dataset(gathered, SMALL)
-    return replace(data, encoder=build_cloud_deformer(template, data, SMALL, 0).encoder)
+def data(eggs: ShapeSamples, template: Template) -> CloudDataset:
+    data = build_cloud_dataset(eggs, SMALL.train, SMALL.scan)
+    return replace(data, encoder=build_cloud_deformer(template, data, SMALL.network, SMALL.kernel, 0).encoder)
 
 
-def test_a_lattice_reproduces_affine_maps_and_their_normals(gathered: Gathered) -> None:
-    warp = build_warp(gathered)
-    assert warp is not None
-    points = torch.from_numpy(gathered.points)
+def test_a_lattice_reproduces_affine_maps_and_their_normals(eggs: ShapeSamples) -> None:
+    lattice = build_lattice(eggs)
+    assert lattice is not None
+    points = torch.from_numpy(eggs.points)
     low, high = points.amin((0, 1)), points.amax((0, 1))
     half = 0.55 * float((high - low).max())
     ticks = torch.linspace(-half, half, 4)
-    lattice = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
-    lattice = lattice + 0.5 * (low + high)
+    nodes = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
+    nodes = nodes + 0.5 * (low + high)
     A = torch.eye(3) + torch.tensor([[0.1, 0.2, 0.0], [0.0, -0.1, 0.1], [0.05, 0.0, 0.2]])
-    vectors = lattice @ (A - torch.eye(3)).T
+    vectors = nodes @ (A - torch.eye(3)).T
     for n in range(3):
-        assert torch.allclose(points[n] + warp.phi[n] @ vectors, points[n] @ A.T, atol=1e-5)
-        F = (warp.gradient[n] @ vectors[None]).transpose(-1, -2) + torch.eye(3)
+        assert torch.allclose(points[n] + lattice.phi[n] @ vectors, points[n] @ A.T, atol=1e-5)
+        F = (lattice.gradient[n] @ vectors[None]).transpose(-1, -2) + torch.eye(3)
         assert torch.allclose(F, A.expand_as(F), atol=1e-4)
 
 
-def test_turned_normals_by_the_inverse_transpose() -> None:
+def test_deformed_normals_by_the_inverse_transpose() -> None:
     generator = torch.Generator().manual_seed(0)
     F = torch.eye(3) + 0.3 * torch.randn(7, 3, 3, generator=generator)
     F = F * torch.det(F).sign()[:, None, None]
     n = torch.nn.functional.normalize(torch.randn(7, 3, generator=generator), dim=-1)
     slow = torch.linalg.inv(F).transpose(1, 2) @ n[..., None]
     slow = torch.nn.functional.normalize(torch.det(F)[:, None] * slow[..., 0], dim=-1)
-    assert torch.allclose(turned_normals(F, n), slow, atol=1e-5)
+    assert torch.allclose(deformed_normals(F, n), slow, atol=1e-5)
 
 
 def test_batches_are_functions_of_seed_and_step(data: CloudDataset) -> None:
@@ -98,17 +103,17 @@ def test_batches_are_functions_of_seed_and_step(data: CloudDataset) -> None:
     assert torch.allclose(batch.normals.norm(dim=-1), torch.ones(4, 128), atol=1e-5)
 
 
-def test_every_shape_is_drawn_before_one_comes_again(gathered: Gathered, data: CloudDataset) -> None:
+def test_every_shape_is_drawn_before_one_comes_again(eggs: ShapeSamples, data: CloudDataset) -> None:
     still = replace(
-        data, change=CloudConfig(warp=0.0), scan=ScanConfig(points=202, noise=0, scale=0), shapes=3
+        data, augmentation=Augmentation(deform=0.0), scan=ScanConfig(points=202, noise=0, scale=0), shapes=3
     )
     heights = sorted(float(each[:, 1].max() - each[:, 1].min()) for each in still[0].points)
-    true = sorted(float(np.ptp(each[:, 1])) for each in gathered.points)
+    true = sorted(float(np.ptp(each[:, 1])) for each in eggs.points)
     assert np.allclose(heights, true, atol=0.15)
     assert len({round(height, 2) for height in heights}) == 3
 
 
-def test_known_points_move_with_their_shape(gathered: Gathered, data: CloudDataset) -> None:
+def test_known_points_move_with_their_shape(eggs: ShapeSamples, data: CloudDataset) -> None:
     """Vertex 0 is a sample of every shape as well as its known point: both must land on one place."""
     whole = replace(data, scan=ScanConfig(points=202, noise=0.0), shapes=6)
     seen = 0
@@ -122,11 +127,11 @@ def test_known_points_move_with_their_shape(gathered: Gathered, data: CloudDatas
     assert seen >= 6
 
 
-def test_a_warp_changes_shapes_and_many_shapes_have_none(gathered: Gathered, data: CloudDataset) -> None:
-    calm = replace(data, change=CloudConfig(warp=0.0))
+def test_a_warp_changes_shapes_and_many_shapes_have_none(eggs: ShapeSamples, data: CloudDataset) -> None:
+    calm = replace(data, augmentation=Augmentation(deform=0.0))
     assert (data[0].points - calm[0].points).abs().max() > 0.01
-    many = replace(gathered, points=np.zeros((400, 1024, 3), np.float32))
-    assert build_warp(many) is None
+    many = replace(eggs, points=np.zeros((400, 1024, 3), np.float32))
+    assert build_lattice(many) is None
 
 
 def test_chamfer_against_all_pairs() -> None:
@@ -155,13 +160,13 @@ def test_the_robust_function() -> None:
 
 
 def test_known_points_are_pulled_to_their_places(
-    gathered: Gathered, template: Template, data: CloudDataset
+    eggs: ShapeSamples, template: Template, data: CloudDataset
 ) -> None:
-    model = build_cloud_deformer(template, data, SMALL, 0).eval()
-    points = build_surface_points(template, "smooth", model, gathered.template_landmarks, 60)
+    model = build_cloud_deformer(template, data, SMALL.network, SMALL.kernel, 0).eval()
+    points = build_surface_points(template, "smooth", model, eggs.template_landmarks, 60)
     batch = data[0]
-    loss = LossConfig(blend=0.0, landmarks=2.0)
-    terms = chamfer_losses(model, batch, points, loss, torch.Generator())
+    loss = ChamferLoss(blend=0.0, landmarks=2.0)
+    terms = loss(model, batch, points, torch.Generator())
     with torch.no_grad():
         vectors = model.decoder(model.encoder(batch.encode_features))
     placed = points.landmarks + points.landmark_field.displacement(vectors)
@@ -169,7 +174,7 @@ def test_known_points_are_pulled_to_their_places(
     known = ~apart.isnan()
     assert 0 < int(known.sum()) < 4  # the egg without one pulls nothing
     assert terms["landmarks"].item() == pytest.approx(2.0 * float(apart[known].mean()), rel=1e-4)
-    without = chamfer_losses(model, batch, points, replace(loss, landmarks=0.0), torch.Generator())
+    without = replace(loss, landmarks=0.0)(model, batch, points, torch.Generator())
     assert "landmarks" not in without
     names = {"total", "reconstruction", "volume", "arap", "correct", "error"}
     assert set(without) == names
@@ -178,13 +183,13 @@ def test_known_points_are_pulled_to_their_places(
     )
 
 
-def test_it_learns(gathered: Gathered, template: Template, data: CloudDataset) -> None:
-    model = build_cloud_deformer(template, data, SMALL, 0)
-    points = build_surface_points(template, "smooth", model, gathered.template_landmarks, 150)
+def test_it_learns(eggs: ShapeSamples, template: Template, data: CloudDataset) -> None:
+    model = build_cloud_deformer(template, data, SMALL.network, SMALL.kernel, 0)
+    points = build_surface_points(template, "smooth", model, eggs.template_landmarks, 150)
     stretched = replace(data, encoder=model.encoder, length=150)
     held_out = replace(stretched, seed=99, shapes=6)[0]
     before = surface_error(model, held_out, points)
-    trainer = Trainer(model, points, replace(SMALL.train, steps=150, rate=3e-3), chamfer_losses)
+    trainer = Trainer(model, points, replace(SMALL.train, steps=150, rate=3e-3))
     trainer.run(stretched)
     assert surface_error(model, held_out, points) < 0.9 * before
 
@@ -193,7 +198,7 @@ def test_few_registered_shapes_are_deformed_at_every_drawing(template: Template)
     verts = torch.from_numpy(np.array(template.shape.verts)).float()
     shapes = torch.stack([verts, verts * torch.tensor([1.0, 1.2, 1.0])])
     generator = torch.Generator().manual_seed(0)
-    drawn = warped_source(100 + 20 * shapes, CloudConfig(warp=0.1, plain=0.5))(64, generator)
+    drawn = deformed_source(100 + 20 * shapes, Augmentation(deform=0.1, plain=0.5))(64, generator)
     centred = shapes - shapes.mean(1, keepdim=True)
     own = 0.3 * centred / centred.flatten(1).std(1)[:, None, None]
     apart = (drawn[:, None] - own[None]).norm(dim=-1).mean(-1).min(1).values
@@ -204,5 +209,5 @@ def test_few_registered_shapes_are_deformed_at_every_drawing(template: Template)
     moved = drawn[int(apart.argmax())] - own[0]
     step = (moved[ends[:, 0]] - moved[ends[:, 1]]).norm(dim=1).mean()
     assert float(step) < 0.5 * float(moved.norm(dim=1).mean())
-    plain = warped_source(shapes, CloudConfig(warp=0.0))(3, generator)
+    plain = deformed_source(shapes, Augmentation(deform=0.0))(3, generator)
     assert any(torch.allclose(plain[0], each) for each in centred)

@@ -11,7 +11,8 @@ from meshmatch.errors import TemplateError
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.encoder import BasisEncoder
 from meshmatch.templates.template import Template
-from meshmatch.training.datasets import Batch, BatchDataset, body_source, registered_source
+from meshmatch.training.bodies import body_source
+from meshmatch.training.datasets import Batch, BatchDataset, registered_source, step_generator
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.setup import anchor_vertices, build_dataset, fill_basis, loss_vertices
 from tests.training.small import UPRIGHT, egg_template, small_data, small_network
@@ -64,11 +65,7 @@ def test_a_batch_is_a_function_of_seed_and_step(egg: Template, network: Deformer
 
 
 def test_steps_and_seeds_do_not_share_streams(egg: Template, network: Deformer) -> None:
-    streams = {
-        small_data(egg, network, seed=seed).generator(step).initial_seed()
-        for seed in range(20)
-        for step in range(50)
-    }
+    streams = {step_generator(seed, step).initial_seed() for seed in range(20) for step in range(50)}
     assert len(streams) == 1000
 
 
@@ -81,7 +78,7 @@ def test_a_batch_has_the_sizes_it_says(egg: Template, network: Deformer) -> None
     assert all(tensor.isfinite().all() for tensor in tensors(batch))
     moved = batch.to(torch.device("cpu"))
     assert torch.equal(moved.points, batch.points)
-    bare = replace(batch, align_features=None, align_rotation=None, align_centre=None)
+    bare = replace(batch, align_features=None, align_rotation=None, align_center=None)
     assert bare.to(torch.device("cpu")).align_rotation is None
 
 
@@ -112,9 +109,9 @@ def test_the_aligner_is_told_where_the_core_is(egg: Template) -> None:
     """scan = R core + t: undone, the scan that the aligner sees lies on the resting template."""
     batch = still(egg, CLEAN)[0]
     assert batch.align_features is not None and batch.align_rotation is not None
-    assert batch.align_centre is not None
+    assert batch.align_center is not None
     assert torch.allclose(batch.align_features.mean(1), torch.zeros(6, 3), atol=1e-5)
-    for points, R, t in zip(batch.align_features, batch.align_rotation, batch.align_centre, strict=True):
+    for points, R, t in zip(batch.align_features, batch.align_rotation, batch.align_center, strict=True):
         in_core = (points - t) @ R
         assert cKDTree(egg.shape.verts).query(in_core.numpy())[0].max() < 0.12
     assert batch.align_rotation.diagonal(dim1=1, dim2=2).sum(1).min() < 0.5  # turned anywhere

@@ -10,7 +10,7 @@ from meshmatch.fields.mls import build_field
 from meshmatch.models.deformer import Deformer
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import Batch
-from meshmatch.training.losses import LossConfig, LossPoints, distance, losses
+from meshmatch.training.losses import CorrespondenceLoss, LossPoints, distance
 from meshmatch.training.setup import loss_vertices
 from tests.training.small import POINTS, UPRIGHT, egg_template, small_data, small_network, small_points
 
@@ -46,14 +46,14 @@ def answering(egg: Template, vectors: torch.Tensor) -> tuple[Deformer, Batch]:
 
 
 def terms(
-    model: Deformer, batch: Batch, points: LossPoints, config: LossConfig, seed: int = 0
+    model: Deformer, batch: Batch, points: LossPoints, config: CorrespondenceLoss, seed: int = 0
 ) -> dict[str, float]:
-    found = losses(model, batch, points, config, torch.Generator().manual_seed(seed))
+    found = config(model, batch, points, torch.Generator().manual_seed(seed))
     return {name: float(value.detach()) for name, value in found.items()}
 
 
 def test_the_truth_costs_nothing(egg: Template, points: LossPoints) -> None:
-    found = terms(*answering(egg, torch.zeros(1, egg.K, 3)), points, LossConfig())
+    found = terms(*answering(egg, torch.zeros(1, egg.K, 3)), points, CorrespondenceLoss())
     assert found["reconstruction"] == 0
     assert found["volume"] < 1e-9
     assert found["arap"] < 1e-5 * 1.01
@@ -64,7 +64,7 @@ def test_terms_by_hand(egg: Template, points: LossPoints) -> None:
     """Twice as large, with the field exact for affine motions: det F = 8, F^T F - I = 3 I."""
     nodes = torch.from_numpy(egg.nodes).float()[None]
     model, batch = answering(egg, nodes)
-    config = LossConfig(reconstruction=2.0, volume=0.5, arap=0.25, blend=0.1)
+    config = CorrespondenceLoss(reconstruction=2.0, volume=0.5, arap=0.25, blend=0.1)
     found = terms(model, batch, points, config)
     rest = batch.targets[0]
     assert found["reconstruction"] == pytest.approx(2 * float(rest.square().sum(1).mean()), rel=1e-3)
@@ -105,13 +105,13 @@ def test_the_kernel_reaches_the_loss(egg: Template, points: LossPoints) -> None:
 def test_every_part_of_the_network_learns(egg: Template, points: LossPoints) -> None:
     model = small_network(egg)
     batch = small_data(egg, model)[0]
-    found = losses(model, batch, points, LossConfig(), torch.Generator().manual_seed(0))
+    found = CorrespondenceLoss()(model, batch, points, torch.Generator().manual_seed(0))
     assert {"align", "correct", "blend", "error_align", "error_corrected"} <= found.keys()
     found["total"].backward()
     still = {n for n, p in model.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0}
     # the last layer of a fresh residual block is zero: what stands before it learns from the second step on
     assert {name for name in still if ".widen." not in name and ".norm." not in name} == set()
-    off = losses(model, batch, points, LossConfig(align=0.0), torch.Generator().manual_seed(0))
+    off = CorrespondenceLoss(align=0.0)(model, batch, points, torch.Generator().manual_seed(0))
     assert float(off["align"].detach()) == 0
 
 
@@ -119,7 +119,9 @@ def test_blends_come_from_the_generator(egg: Template, points: LossPoints) -> No
     model = small_network(egg)
     torch.nn.init.normal_(model.decoder.network[-1].weight, std=0.3)  # a fresh one hardly moves anything
     batch = small_data(egg, model)[0]
-    a, b, c = (terms(model, batch, points, LossConfig(blend=1.0), seed)["blend"] for seed in (0, 0, 1))
+    a, b, c = (
+        terms(model, batch, points, CorrespondenceLoss(blend=1.0), seed)["blend"] for seed in (0, 0, 1)
+    )
     assert a == b != c
 
 
@@ -142,7 +144,7 @@ def test_blends_are_of_different_shapes(egg: Template, points: LossPoints) -> No
             return torch.zeros(len(code), egg.K, 3)
 
     model.encoder, model.decoder = Names(), Listener()  # type: ignore[assignment]
-    terms(model, batch, points, LossConfig(blend=1.0))
+    terms(model, batch, points, CorrespondenceLoss(blend=1.0))
     blended = seen[1]
     assert torch.allclose(blended.sum(1), torch.ones(6)) and ((blended > 0).sum(1) == 2).all()
 
@@ -150,15 +152,15 @@ def test_blends_are_of_different_shapes(egg: Template, points: LossPoints) -> No
 def test_the_aligner_errs_by_nothing_when_it_is_right(egg: Template, points: LossPoints) -> None:
     model = small_network(egg)
     batch = small_data(egg, model)[0]
-    assert batch.align_rotation is not None and batch.align_centre is not None
-    right = torch.cat([batch.align_rotation.transpose(1, 2).flatten(1)[:, :6], batch.align_centre], 1)
+    assert batch.align_rotation is not None and batch.align_center is not None
+    right = torch.cat([batch.align_rotation.transpose(1, 2).flatten(1)[:, :6], batch.align_center], 1)
 
     class Oracle(torch.nn.Module):
         def forward(self, features: torch.Tensor) -> torch.Tensor:
             return right
 
     model.aligner = Oracle()  # type: ignore[assignment]
-    found = terms(model, batch, points, LossConfig())
+    found = terms(model, batch, points, CorrespondenceLoss())
     assert found["error_align"] < 1e-3
     assert found["align"] < 1e-3
     assert np.isfinite(found["total"])

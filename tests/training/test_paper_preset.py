@@ -15,7 +15,7 @@ from meshmatch.fitting.fit_shape import fit_shape
 from meshmatch.models.trained import TrainedModel, load_model
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.training import run
+from meshmatch.training import recipes
 from tests.training.small import POINTS, egg_template
 
 QUICK = FitConfig(samples=1000, coarse_samples=300)
@@ -45,10 +45,10 @@ def model(eggs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("paper")
     nodes = ["--nodes", "36", "--radius", "0.45", "--strategy", "uniform"]
     assert main(["prepare", str(eggs), "-o", str(root / "prepared"), *nodes, "-q"]) == 0
-    plain = run.recipe
+    plain = recipes.paper
 
-    def narrow(preset: run.Preset) -> run.Recipe:
-        chosen = plain(preset)
+    def narrow() -> recipes.Recipe:
+        chosen = plain()
         same = (
             chosen.network.encoder,
             chosen.network.decoder,
@@ -60,7 +60,7 @@ def model(eggs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         return replace(chosen, network=POINTS, scan=replace(chosen.scan, points=96), train=train)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "recipe", narrow)
+        patch.setattr(recipes, "paper", narrow)
         words = ["--preset", "paper", "--steps", "60", "--workers", "0", "--name", "eggs", "-q"]
         prepared = str(root / "prepared")
         assert main(["train", "--shapes", prepared, "-o", str(root / "model"), *words]) == 0

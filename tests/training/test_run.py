@@ -13,12 +13,16 @@ from meshmatch.models.trained import TrainedModel, load_model
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.nodes import NodeConfig
-from meshmatch.templates.prepare import prepare_folder
-from meshmatch.templates.template import Template, save_template
-from meshmatch.training import run
-from meshmatch.training.loop import Progress, TrainConfig
-from meshmatch.training.run import Recipe, folder_source, read_template, recipe, train_model
+from meshmatch.templates.prepare import PrepareConfig, prepare
+from meshmatch.templates.registered import read_registered
+from meshmatch.templates.template import Template, read_template, save_template
+from meshmatch.training import bodies
+from meshmatch.training.datasets import Source, registered_source
+from meshmatch.training.loop import StepReport, TrainConfig
+from meshmatch.training.losses import CorrespondenceLoss
+from meshmatch.training.recipes import Recipe, default, paper, recipe_for
 from meshmatch.training.scans import ScanConfig
+from meshmatch.training.train import CardFacts, train, train_model
 from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template, small_data, small_network
 from tests.training.stick import stick_figure
 
@@ -37,25 +41,18 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for n in range(5):
         verts = egg.verts @ (np.eye(3) + 0.1 * rng.normal(size=(3, 3)))
         save_shape(root / "in" / f"egg{n}.ply", Shape(verts, egg.faces))
-    prepare_folder(root / "in", root / "out", NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05))
+    nodes = NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)
+    prepare(root / "in", root / "out", PrepareConfig(nodes))
     return root / "out"
 
 
+def egg_source(prepared: Path, template: Template) -> Source:
+    return registered_source(torch.from_numpy(read_registered(prepared, template)))
+
+
 def trained(prepared: Path, output: Path, chosen: Recipe = SMALL, **more) -> Path:
-    template = read_template(prepared / "template.safetensors")
-    source, count = folder_source(prepared, template)
-    assert count == 5
-    return train_model(
-        template,
-        source,
-        output,
-        recipe=chosen,
-        name="eggs",
-        category="eggs",
-        data="5 eggs",
-        licence="CC0-1.0",
-        **more,
-    )
+    facts = CardFacts("eggs", "eggs", "5 eggs", "CC0-1.0", start=more.pop("start", None))
+    return train(output, shapes=prepared, recipe=chosen, facts=facts, **more)
 
 
 @pytest.mark.parametrize(
@@ -64,8 +61,8 @@ def trained(prepared: Path, output: Path, chosen: Recipe = SMALL, **more) -> Pat
     ids=["default", "paper"],
 )
 def test_a_folder_becomes_a_model(prepared: Path, tmp_path: Path, chosen: Recipe) -> None:
-    seen: list[Progress] = []
-    folder = trained(prepared, tmp_path / "model", chosen, progress=seen.append)
+    seen: list[StepReport] = []
+    folder = trained(prepared, tmp_path / "model", chosen, report=seen.append)
     card = verify_model(folder)
     assert (card.name, card.category, card.data, card.licence) == ("eggs", "eggs", "5 eggs", "CC0-1.0")
     assert card.steps == 4
@@ -112,7 +109,7 @@ def test_training_goes_on_from_the_checkpoint_unless_told_not_to(prepared: Path,
 
     half = replace(SMALL, train=replace(SMALL.train, checkpoint_minutes=0.0))
     template = read_template(prepared / "template.safetensors")
-    source, _ = folder_source(prepared, template)
+    source = egg_source(prepared, template)
     calls = iter(range(100))
 
     def interrupted(count: int, generator: torch.Generator) -> torch.Tensor:
@@ -121,7 +118,7 @@ def test_training_goes_on_from_the_checkpoint_unless_told_not_to(prepared: Path,
         return source(count, generator)
 
     with pytest.raises(KeyboardInterrupt):
-        train_model(template, interrupted, stopped, recipe=half, name="eggs")
+        train_model(template, interrupted, stopped, half, CardFacts("eggs"))
     assert (stopped / "checkpoint" / "last.safetensors").is_file()
     assert not (stopped / "card.json").exists()  # no model yet
     assert verify_model(trained(prepared, stopped)).weights_sha256 == whole.weights_sha256
@@ -159,22 +156,28 @@ def test_an_output_that_cannot_be_made_is_told(prepared: Path, tmp_path: Path) -
         trained(prepared, tmp_path / "taken")
 
 
+def test_bodies_do_not_go_with_a_folder(prepared: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="poses and bodies do not go with a folder"):
+        train(tmp_path / "mine", shapes=prepared, bodies=bodies.Bodies())
+
+
 def test_the_presets_are_what_they_say() -> None:
-    paper, default = recipe("paper"), recipe("default")
-    assert recipe() == default
-    assert (paper.network.encoder, paper.network.decoder, paper.kernel) == ("point", "node", "cubic")
-    assert paper.network.align_basis == paper.network.corrections == 0
-    loss = paper.train.loss
+    papers, usual = recipe_for(preset="paper"), recipe_for()
+    assert (papers, usual) == (paper(), default())
+    assert (papers.network.encoder, papers.network.decoder, papers.kernel) == ("point", "node", "cubic")
+    assert papers.network.align_basis == papers.network.corrections == 0
+    loss = papers.train.loss
+    assert isinstance(loss, CorrespondenceLoss)
     assert (loss.reconstruction, loss.volume, loss.arap, loss.blend) == (1.0, 5e-3, 1e-2, 5e-3)
     assert not loss.robust
-    assert (paper.train.shapes, paper.train.scans_per_shape, paper.train.rate) == (16, 1, 1e-3)
+    assert (papers.train.shapes, papers.train.scans_per_shape, papers.train.rate) == (16, 1, 1e-3)
     # 1,200 epochs of 1,000 shapes in batches of 16
-    assert paper.train.steps == 1_200_000 // 16
-    assert paper.scan == ScanConfig(3000, 0, 0, 0, 0, 0, 0, 0, upright=True)
-    assert default.network.encoder == "basis"
-    assert default.scan.noise > 0
-    with pytest.raises(OptionError, match="no preset 'best'") as caught:
-        recipe("best")  # type: ignore[arg-type]
+    assert papers.train.steps == 1_200_000 // 16
+    assert papers.scan == ScanConfig(3000, 0, 0, 0, 0, 0, 0, 0, upright=True)
+    assert usual.network.encoder == "basis"
+    assert usual.scan.noise > 0
+    with pytest.raises(OptionError, match="unknown preset 'best'") as caught:
+        recipe_for(preset="best")  # type: ignore[arg-type]
     assert "paper" in caught.value.hint
 
 
@@ -184,23 +187,23 @@ def test_templates_are_found_by_file_and_by_name(prepared: Path) -> None:
     with pytest.raises(TemplateError, match="human-Z"):
         read_template("human-Z")
     with pytest.raises(InputError, match="another template"):
-        folder_source(prepared, egg_template())
+        read_registered(prepared, egg_template())
 
 
 def test_bodies_need_a_template_of_the_body_model(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = stick_figure()
-    monkeypatch.setattr(run, "cached_rig", lambda *_: rig)
+    monkeypatch.setattr(bodies, "cached_rig", lambda *_: rig)
     with pytest.raises(OptionError, match="not made from the body model") as caught:
-        run.human_source(egg_template())
+        bodies.human_source(egg_template())
     assert "--shapes" in caught.value.hint
     dense = Shape(rig.rest[0].double().numpy(), rig.faces.numpy(), "stick")
     keep = np.arange(0, dense.V, 2)
     faces = np.stack([np.arange(len(keep) - 2) + k for k in range(3)], 1)
     small = Shape(dense.verts[keep], faces)
     half = Template("half", small, dense, np.eye(3), 1.0, np.zeros(len(keep), int), ("all",), np.arange(9))
-    drawn = run.human_source(half)(3, torch.Generator().manual_seed(0))
+    drawn = bodies.human_source(half)(3, torch.Generator().manual_seed(0))
     assert drawn.shape == (3, len(keep), 3)
-    wanted = run.body_source(rig)(3, torch.Generator().manual_seed(0))[:, keep]
+    wanted = bodies.body_source(rig)(3, torch.Generator().manual_seed(0))[:, keep]
     assert torch.equal(drawn, wanted)
 
 
@@ -211,9 +214,11 @@ def test_unseen_bodies_are_of_people_that_the_training_never_drew(monkeypatch: p
         asked.append((identities, seed))
         return lambda count, generator: torch.rand(count, 5, 3, generator=generator)
 
-    monkeypatch.setattr(run, "human_source", source)
+    monkeypatch.setattr(bodies, "human_source", source)
     egg = egg_template()
-    drawn = [run.unseen_bodies(egg, 2, trained, seed) for trained, seed in ((0, 0), (0, 1), (7, 0), (0, 0))]
+    drawn = [
+        bodies.unseen_bodies(egg, 2, trained, seed) for trained, seed in ((0, 0), (0, 1), (7, 0), (0, 0))
+    ]
     assert [seed for _, seed in asked] == [1, 2, 8, 1]
     assert all(identities < 4096 for identities, _ in asked)
     assert drawn[0].shape == (2, 5, 3)
@@ -229,14 +234,14 @@ def test_the_rig_is_built_once_and_kept(monkeypatch: pytest.MonkeyPatch, tmp_pat
         built.append(identities)
         return stick_figure(identities)
 
-    monkeypatch.setattr(run, "build_rig", build)
-    monkeypatch.setattr(run.platformdirs, "user_cache_dir", lambda name: str(tmp_path / "cache"))
-    first = run.cached_rig(3, 0)
-    second = run.cached_rig(3, 0)
+    monkeypatch.setattr(bodies, "build_rig", build)
+    monkeypatch.setattr(bodies.platformdirs, "user_cache_dir", lambda name: str(tmp_path / "cache"))
+    first = bodies.cached_rig(3, 0)
+    second = bodies.cached_rig(3, 0)
     assert built == [3]
     assert torch.equal(first.heads, second.heads)
-    run.cached_rig(4, 0)
-    run.cached_rig(3, 1)
+    bodies.cached_rig(4, 0)
+    bodies.cached_rig(3, 1)
     assert built == [3, 4, 3]
 
 

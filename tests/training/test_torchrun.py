@@ -15,7 +15,7 @@ from meshmatch.models.registry import verify_model
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.nodes import NodeConfig
-from meshmatch.templates.prepare import prepare_folder
+from meshmatch.templates.prepare import PrepareConfig, prepare
 from tests.training.small import egg_template
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,13 +27,13 @@ from dataclasses import replace
 from pathlib import Path
 from safetensors.torch import save_file
 from meshmatch.cli import main
-from meshmatch.training import run
+from meshmatch.training import loop, recipes
 from tests.training.small import NETWORK, SCAN
 
-plain, finish = run.recipe, run.Trainer.close
+plain, finish = recipes.recipe_for, loop.Trainer.close
 
-def small(preset):
-    chosen = plain(preset)
+def small(*words):
+    chosen = plain(*words)
     train = replace(chosen.train, shapes=4, scans_per_shape=1, workers=0, warm_up=1)
     return replace(chosen, network=NETWORK, scan=SCAN, train=train)
 
@@ -42,7 +42,7 @@ def close(trainer):
     save_file({n: t.clone() for n, t in kept.items()}, Path(os.environ["KEPT"]) / f"rank{trainer.rank}.safetensors")
     finish(trainer)
 
-run.recipe, run.Trainer.close = small, close
+recipes.recipe_for, loop.Trainer.close = small, close
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -56,7 +56,8 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for n in range(3):
         verts = egg.verts @ (np.eye(3) + 0.1 * rng.normal(size=(3, 3)))
         save_shape(root / "in" / f"egg{n}.ply", Shape(verts, egg.faces))
-    prepare_folder(root / "in", root / "out", NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05))
+    nodes = NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)
+    prepare(root / "in", root / "out", PrepareConfig(nodes))
     return root / "out"
 
 

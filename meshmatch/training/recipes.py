@@ -1,0 +1,131 @@
+"""Recipes: everything that a training is a function of, besides its shapes; and which one a folder is learned by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from meshmatch.errors import OptionError
+from meshmatch.fields.mls import Kernel
+from meshmatch.models.checkpoint import Storage
+from meshmatch.models.deformer import PAPER, NetworkConfig
+from meshmatch.templates.registered import frame_of, is_registered
+from meshmatch.training.chamfer import ChamferLoss
+from meshmatch.training.loop import TrainConfig
+from meshmatch.training.losses import CorrespondenceLoss
+from meshmatch.training.scans import ScanConfig
+
+Preset = Literal["default", "paper"]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Network, training (with its loss), simulated scans and kernel.
+
+    ``deform``: registered shapes are smoothly deformed whenever they are drawn, and the card says how a fit finds the
+    orientation, as the network does not. ``storage``: how compactly the weights are written.
+    """
+
+    network: NetworkConfig
+    train: TrainConfig
+    scan: ScanConfig
+    kernel: Kernel
+    deform: bool = False
+    storage: Storage = "int8"
+
+    @property
+    def needs_correspondence(self) -> bool:
+        return isinstance(self.train.loss, CorrespondenceLoss)
+
+    def changed(self, **settings: Any) -> Recipe:
+        """Another recipe: fields of `TrainConfig`, ``field`` of the network or ``blend`` of the loss; None changes nothing.
+
+        Raises
+        ------
+        OptionError
+            A setting that is unknown or out of range.
+        """
+        wanted = {name: value for name, value in settings.items() if value is not None}
+        network, loss = self.network, self.train.loss
+        if "field" in wanted:
+            network = replace(network, field=wanted.pop("field"))
+        if "blend" in wanted:
+            loss = replace(loss, blend=wanted.pop("blend"))
+        known = {each.name for each in fields(TrainConfig)}
+        if unknown := sorted(wanted.keys() - known):
+            raise OptionError(
+                f"unknown training setting {unknown[0]!r}", f"choose from {', '.join(sorted(known))}"
+            )
+        return replace(self, network=network, train=replace(self.train, **({"loss": loss} | wanted)))
+
+
+def default() -> Recipe:
+    """For many registered shapes; chosen on generated bodies (docs/results.md, ablations)."""
+    loss = CorrespondenceLoss(volume=2e-3, arap=2e-3, blend=1e-3, robust=True)
+    return Recipe(NetworkConfig(), TrainConfig(steps=13_000, decay=0.65, loss=loss), ScanConfig(), "smooth")
+
+
+def paper() -> Recipe:
+    """The NeurIPS 2022 paper's: point encoder, node decoder, squared loss with its weights, its kernel, batch and rate.
+
+    Scans are 3,000 clean points turned about the vertical axis; 75,000 steps are its 1,200 epochs of 1,000 shapes.
+    """
+    train = TrainConfig(
+        steps=75_000, shapes=16, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=CorrespondenceLoss()
+    )
+    return Recipe(PAPER, train, ScanConfig.clean(3000, upright=True), "cubic")
+
+
+def small_data() -> Recipe:
+    """For fewer than a hundred registered shapes: a small network that finds no orientation; measured on
+    hearts and animals (docs/categories.md)."""
+    network = NetworkConfig(
+        code=128, width=256, depth=1, basis=384, align_basis=0, corrections=2, correct_width=256
+    )
+    loss = CorrespondenceLoss(volume=1e-3, arap=1e-3, blend=1e-3, robust=True)
+    train = TrainConfig(
+        steps=3000, shapes=8, scans_per_shape=1, decay=0.5, warm_up=100, average=0.99, loss=loss, workers=0
+    )
+    return Recipe(network, train, ScanConfig(points=1024), "smooth", deform=True)
+
+
+def clouds() -> Recipe:
+    """For shapes without correspondence: the network for small data, the paper's weights for segmentation transfer."""
+    small = small_data()
+    loss = ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4)
+    return replace(small, train=replace(small.train, loss=loss), storage="float16")
+
+
+def paper_clouds() -> Recipe:
+    """The paper's network and weights for shapes without correspondence."""
+    loss = ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4)
+    train = TrainConfig(
+        steps=4000, shapes=8, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=loss, workers=0
+    )
+    scan = ScanConfig(points=1024, noise=0.0, scale=0.0)
+    return Recipe(PAPER, train, scan, "cubic", storage="float16")
+
+
+def recipe_for(
+    shapes: str | Path | None = None, preset: Preset = "default", unsupervised: bool = False
+) -> Recipe:
+    """How a folder that `meshmatch prepare` made is learned, or generated bodies where there is none.
+
+    With correspondence where all shapes are registered, unless ``unsupervised``; by the recipe for small data where
+    they are few and stand at equal areas. The paper's preset knows no small data.
+
+    Raises
+    ------
+    OptionError
+        An unknown preset, or ``unsupervised`` without a folder.
+    """
+    if preset not in ("default", "paper"):
+        raise OptionError(f"unknown preset {preset!r}", "choose default or paper")
+    if shapes is None and unsupervised:
+        raise OptionError("learning without correspondence needs a folder of shapes", "name it with --shapes")
+    if shapes is not None and (unsupervised or not is_registered(shapes)):
+        return paper_clouds() if preset == "paper" else clouds()
+    if preset == "paper":
+        return paper()
+    return small_data() if shapes is not None and frame_of(shapes) else default()

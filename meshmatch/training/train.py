@@ -1,0 +1,281 @@
+"""`meshmatch train` as a library: a folder of shapes, or generated bodies, becomes a model folder.
+
+How a folder is learned is decided by `meshmatch.training.recipes.recipe_for`.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.models.card import ModelCard, check_name, write_card
+from meshmatch.models.checkpoint import save_weights
+from meshmatch.models.deformer import Deformer
+from meshmatch.models.registry import CARD, TEMPLATE, WEIGHTS
+from meshmatch.models.trained import TrainedModel, load_model
+from meshmatch.outputs import make_folder
+from meshmatch.progress import Progress, ProgressCallback
+from meshmatch.templates.registered import frame_of, read_registered
+from meshmatch.templates.template import Template, read_template, save_template
+from meshmatch.templates.unregistered import ShapeSamples, read_samples
+from meshmatch.training.bodies import Bodies, human_source
+from meshmatch.training.chamfer import surface_error
+from meshmatch.training.clouds import deformed_source
+from meshmatch.training.datasets import Source, registered_source
+from meshmatch.training.loop import StepReport, Trainer
+from meshmatch.training.losses import validation_error
+from meshmatch.training.recipes import Recipe, recipe_for
+from meshmatch.training.setup import (
+    build_cloud_dataset,
+    build_cloud_deformer,
+    build_dataset,
+    build_deformer,
+    build_loss_points,
+    build_surface_points,
+)
+
+VALIDATION_SEED = 999_983
+"""Of the batch that no training sees and every training is measured on."""
+
+
+@dataclass(frozen=True)
+class CardFacts:
+    """What a training is told about its model; goes onto the card.
+
+    Parameters
+    ----------
+    name, category, data : str
+        Where empty: the name of the output folder, that of the folder of shapes ("human" for bodies), and a sentence
+        about the shapes.
+    licence : str
+        Under which terms the weights may be used.
+    stiffness : float
+        How firmly two fits hold a common stretch of the template: 1 suits bodies; 0.05 what differs more from shape to
+        shape, such as organs.
+    start : model, optional
+        Whose weights the training begins with: a loaded model, its name or its folder. It must have the same template,
+        network and kernel.
+    frame : dict, optional
+        How a fit finds orientation and scale, see `ModelCard`; by default as the training's shapes and network say.
+    """
+
+    name: str = ""
+    category: str = ""
+    data: str = ""
+    licence: str = "unstated"
+    stiffness: float = 1.0
+    start: TrainedModel | str | Path | None = None
+    frame: dict[str, str] | None = None
+
+
+def train(
+    output: str | Path,
+    *,
+    shapes: str | Path | None = None,
+    bodies: Bodies | None = None,
+    recipe: Recipe | None = None,
+    facts: CardFacts | None = None,
+    resume: bool = True,
+    progress: ProgressCallback | None = None,
+    report: Callable[[StepReport], None] | None = None,
+) -> Path:
+    """Train a model, or go on training it from the checkpoint in its folder, exactly.
+
+    Parameters
+    ----------
+    output : path
+        The model folder. It receives ``checkpoint/last.safetensors`` on the way and, at every stop,
+        ``template.safetensors``, ``weights.safetensors`` and last ``card.json``.
+    shapes : path, optional
+        A folder that `prepare` made, which also has the template; generated human ``bodies`` where not given.
+    recipe : Recipe, optional
+        By default `recipe_for` of the shapes; ``recipe_for(shapes, ...).changed(steps=..., minutes=...)`` is another.
+    resume : bool
+        Go on from the folder's checkpoint, if there is one.
+    progress, report : callable, optional
+        Called with (stage, name, share); and with losses and validation every 50 steps.
+
+    Returns
+    -------
+    Path
+        The model folder.
+
+    Raises
+    ------
+    InputError
+        No prepared folder, or too few shapes.
+    OptionError
+        Choices that do not go together, or the extra ``bodies`` is not installed.
+    ModelError
+        A name that cannot be one, or a checkpoint of another training.
+    OutputError
+        The folder cannot be written.
+    """
+    output = Path(output)
+    facts = facts or CardFacts()
+    facts = replace(facts, name=check_name(facts.name or output.resolve().name))
+    if isinstance(facts.start, str | Path):
+        facts = replace(facts, start=load_model(facts.start))
+    recipe = recipe or recipe_for(shapes)
+    source: Source | ShapeSamples
+    if shapes is None:
+        bodies = bodies or Bodies()
+        template = read_template(bodies.template)
+        making = Progress(progress, "bodies").stage("making bodies (once)")
+        source = human_source(template, bodies.identities, recipe.train.seed, making, bodies.poses)
+        category, data = "human", bodies.words
+    elif bodies is not None:
+        raise OptionError("poses and bodies do not go with a folder of shapes", "leave out one of the two")
+    else:
+        template = read_template(Path(shapes) / TEMPLATE)
+        category = Path(shapes).resolve().name
+        source, data = _source(Path(shapes), template, recipe)
+        if recipe.deform and facts.frame is None:
+            facts = replace(facts, frame=frame_of(shapes))
+    facts = replace(facts, category=facts.category or category, data=facts.data or data)
+
+    def both(now: StepReport) -> None:
+        if progress is not None:
+            progress(now.words, "training", now.step / now.steps)
+        if report is not None:
+            report(now)
+
+    return train_model(template, source, output, recipe, facts, resume, both)
+
+
+def _source(shapes: Path, template: Template, recipe: Recipe) -> tuple[Source | ShapeSamples, str]:
+    """The shapes of a prepared folder as a recipe needs them, and a few words about them."""
+    name = shapes.resolve().name
+    if recipe.needs_correspondence:
+        verts = torch.from_numpy(read_registered(shapes, template))
+        source = (deformed_source if recipe.deform else registered_source)(verts)
+        return source, f"{len(verts)} registered shapes of {name}"
+    samples = read_samples(shapes, template)
+    known = len(samples.template_landmarks)
+    words = f"{len(samples.points)} shapes of {name}, without correspondence"
+    return samples, words + (f" and {known} known points" if known else "")
+
+
+def train_model(
+    template: Template,
+    source: Source | ShapeSamples,
+    output: str | Path,
+    recipe: Recipe,
+    facts: CardFacts,
+    resume: bool = True,
+    report: Callable[[StepReport], None] | None = None,
+) -> Path:
+    """`train` on shapes with the template's vertices, or on samples without correspondence; returns the folder.
+
+    Raises
+    ------
+    InputError
+        There is only one shape.
+    OptionError
+        The model to start from has another template, network or kernel.
+    """
+    output = Path(output)
+    checkpoint = checkpoint_in(output)
+    make_folder(checkpoint.parent)
+    config, kernel = recipe.train, recipe.kernel
+    measure: Any
+    points: Any
+    data: Any
+    held_out: Any
+    if isinstance(source, ShapeSamples):
+        if len(source.points) < 2:
+            raise InputError(
+                "one shape is too few to learn from", "prepare a folder of several; ten or more are better"
+            )
+        data = build_cloud_dataset(source, config, recipe.scan)
+        model = build_cloud_deformer(template, data, recipe.network, kernel, config.seed)
+        _begin(model, template, recipe, facts)
+        data = replace(data, encoder=deepcopy(model.encoder).cpu())
+        points = build_surface_points(template, kernel, model, source.template_landmarks)
+        held_out = replace(data, seed=VALIDATION_SEED, shapes=min(32, 2 * len(source.points)))[0]
+        facts = replace(facts, frame=facts.frame or {"orientation": source.align, "scale": source.scale})
+        measure = surface_error
+    else:
+        model = build_deformer(template, source, recipe.network, recipe.scan, kernel, config.seed)
+        _begin(model, template, recipe, facts)
+        points = build_loss_points(template, kernel, model)
+        size = config.shapes, config.scans_per_shape
+        data = build_dataset(template, source, model, recipe.scan, *size, config.seed, config.steps)
+        held_out = replace(data, seed=VALIDATION_SEED, shapes=32, scans_per_shape=1)[0]
+        measure = validation_error
+    trainer = Trainer(model, points, config)
+    if resume and checkpoint.is_file():
+        trainer.load(checkpoint)
+        for name in ("encoder", "aligner"):  # what reads the batches are copies (see `build_dataset`)
+            if (reader := getattr(data, name, None)) is not None:
+                reader.load_state_dict(getattr(trainer.model, name).state_dict())
+    trainer.run(data, checkpoint, report, lambda model: measure(model, held_out, trainer.points))
+    trainer.close()
+    if trainer.rank == 0:
+        trainer.model.load_state_dict(trainer.averaged_state())
+        export(trainer, template, output, recipe, facts, measure(trainer.model, held_out, trainer.points))
+    return output
+
+
+def checkpoint_in(output: str | Path) -> Path:
+    """Where the checkpoint of a training into a folder lies."""
+    return Path(output) / "checkpoint" / "last.safetensors"
+
+
+def _begin(model: Deformer, template: Template, recipe: Recipe, facts: CardFacts) -> None:
+    """Take the weights of the model that a training starts from, if it does."""
+    start = facts.start
+    if not isinstance(start, TrainedModel):
+        return
+    same = start.template.hash == template.hash and start.network.config == recipe.network
+    if not (same and start.card.field["kernel"] == recipe.kernel):
+        raise OptionError(
+            f"model {start.card.name} has another template, network or kernel",
+            "start from a model of the same template and preset, or from nothing",
+        )
+    model.load_state_dict(start.network.state_dict())
+
+
+def export(
+    trainer: Trainer, template: Template, output: Path, recipe: Recipe, facts: CardFacts, score: float
+) -> None:
+    """Write the averaged weights as a model folder, with the validation error ``score``; the card comes last."""
+    (output / CARD).unlink(missing_ok=True)
+    save_template(template, output / TEMPLATE)
+    digest = save_weights(trainer.averaged_state(), output / WEIGHTS, storage=recipe.storage)
+    settings: dict[str, Any] = {"train": asdict(recipe.train), "scan": asdict(recipe.scan)}
+    if isinstance(facts.start, TrainedModel):
+        begun = facts.start.card
+        settings["start"] = {
+            "model": begun.name,
+            "weights_sha256": begun.weights_sha256,
+            "steps": begun.steps,
+        }
+    frame: dict[str, Any] = {} if facts.frame is None else {"frame": facts.frame}
+    card = ModelCard(
+        name=facts.name,
+        category=facts.category,
+        template=template.name,
+        template_hash=template.hash,
+        network=recipe.network.to_dict(),
+        field={"kernel": recipe.kernel, "radius": template.radius, "nodes": template.K},
+        data=facts.data,
+        licence=facts.licence,
+        recipe=settings,
+        seed=recipe.train.seed,
+        steps=trainer.step,
+        training_minutes=round(trainer.seconds / 60, 1),
+        metrics={"validation": {"distance": round(score, 5)}},
+        weights_sha256=digest,
+        created=datetime.date.today().isoformat(),
+        stiffness=facts.stiffness,
+        **frame,
+    )
+    write_card(card, output / CARD)
