@@ -49,7 +49,8 @@ def _reader(file: Path) -> Callable[[Path], Record]:
 def _is_list(file: Path) -> bool:
     """A .npy of one axis is a map, one of two is a cloud."""
     from meshmatch.errors import InputError
-    from meshmatch.shapes.array_files import existing, read_npy
+    from meshmatch.shapes.array_files import read_npy
+    from meshmatch.shapes.paths import existing
 
     try:
         return read_npy(existing(file, "")).ndim == 1

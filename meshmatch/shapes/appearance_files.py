@@ -7,9 +7,9 @@ from pathlib import Path
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError
 from meshmatch.shapes.appearance import Appearance, no_coordinates, vertex_colors_alone
-from meshmatch.shapes.files import read_bytes
 from meshmatch.shapes.formats import gltf_look, obj_look
 from meshmatch.shapes.images import ImageReader, Pixels
+from meshmatch.shapes.paths import read_bytes
 from meshmatch.shapes.shape import Shape
 
 

@@ -96,16 +96,3 @@ def _not_arrays(path: Path, error: Exception) -> InputError:
     return InputError(
         f"{path.name} does not hold arrays that can be read: {error}", "is it damaged, or of another format?"
     )
-
-
-def existing(path: Path, what: str) -> Path:
-    """The path, if a file that is not empty is there and may be read; `InputError` otherwise."""
-    if not path.is_file():
-        raise InputError(f"there is no file {path}" if not path.exists() else f"{path} is not a file", what)
-    if path.stat().st_size == 0:
-        raise InputError(f"{path.name} is empty", what)
-    try:
-        path.open("rb").close()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}", what) from error
-    return path

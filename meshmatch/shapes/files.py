@@ -13,6 +13,7 @@ import numpy as np
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import plain_text, replace_on_success
 from meshmatch.shapes.formats import Raw, gltf, gltf_out, obj, off, ply, points, stl
+from meshmatch.shapes.paths import existing, read_bytes
 from meshmatch.shapes.shape import Shape
 
 _READERS: dict[str, Callable[[Path, bytes], Raw]] = {
@@ -51,9 +52,9 @@ def load_shape(path: str | Path) -> Shape:
     InputError
         The file is missing, empty, cut short, of an unknown kind, or holds no usable vertex.
     """
-    path = Path(path)
+    path = existing(Path(path), suffixes=SUFFIXES)
     suffix = path.suffix.lower()
-    if path.exists() and not path.is_dir() and suffix not in _READERS:
+    if suffix not in _READERS:
         raise InputError(
             f"{path.name}: unknown kind of file {suffix or '(no suffix)'}",
             f"meshmatch reads {', '.join(SUFFIXES)}",
@@ -62,33 +63,6 @@ def load_shape(path: str | Path) -> Shape:
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
         raw = _READERS[suffix](path, data)
     return Shape.with_invalid(raw.verts, raw.faces, plain_text(path.name), raw.colors)
-
-
-def read_bytes(path: Path) -> bytes:
-    """All of a file.
-
-    Raises
-    ------
-    InputError
-        It is missing, a folder, empty, or may not be read.
-    """
-    if path.is_dir():
-        raise InputError(f"{path} is a folder, not a file", "name one mesh or point cloud")
-    if not path.exists():
-        if path.is_symlink():
-            raise InputError(
-                f"{path} is a link to a file that is not there", "mend the link, or name the file"
-            )
-        raise InputError(f"there is no file {path}", _similar(path))
-    if not path.is_file():
-        raise InputError(f"{path} is no ordinary file", "save what comes out of it, and name that file")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    if not data:
-        raise InputError(f"{path.name} is empty (0 bytes)", "was the download or the export cut short?")
-    return data
 
 
 def save_shape(path: str | Path, shape: Shape) -> None:
@@ -117,13 +91,3 @@ def save_shape(path: str | Path, shape: Shape) -> None:
         raise OptionError(f"a {suffix} file cannot hold faces", "choose .ply, .obj, .off, .stl or .glb")
     with replace_on_success(path) as temporary:
         _WRITERS[suffix](temporary, shape)
-
-
-def _similar(path: Path) -> str:
-    from difflib import get_close_matches
-
-    if not path.parent.is_dir():
-        return f"there is no folder {path.parent} either"
-    names = [entry.name for entry in path.parent.iterdir() if entry.suffix.lower() in _READERS]
-    close = get_close_matches(path.name, names, n=1)
-    return f"did you mean {path.parent / close[0]}?" if close else "check the name and the folder"

@@ -24,8 +24,9 @@ import numpy as np
 from meshmatch.arrays import Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.array_files import existing, read_npy
+from meshmatch.shapes.array_files import read_npy
 from meshmatch.shapes.palette import label_colors
+from meshmatch.shapes.paths import existing
 from meshmatch.shapes.shape import Shape
 
 On = Literal["vertices", "faces"]

@@ -25,7 +25,7 @@ import numpy as np
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.pairs import load_points
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.array_files import existing
+from meshmatch.shapes.paths import existing
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.landmarks import Landmarks, at_faces, at_points, at_vertices, joined
 

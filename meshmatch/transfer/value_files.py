@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Floats
 from meshmatch.errors import InputError, OptionError
-from meshmatch.shapes.array_files import existing, read_npy
+from meshmatch.shapes.array_files import read_npy
+from meshmatch.shapes.paths import existing
 from meshmatch.shapes.shape import Shape
 
 _HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy or .csv"

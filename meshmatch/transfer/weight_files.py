@@ -23,7 +23,8 @@ from scipy.sparse import csr_array
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.array_files import existing, read_npz
+from meshmatch.shapes.array_files import read_npz
+from meshmatch.shapes.paths import existing
 from meshmatch.shapes.shape import Shape
 
 _FORMAT = "meshmatch skin weights 1"

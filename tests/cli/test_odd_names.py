@@ -94,7 +94,7 @@ def test_a_file_that_is_write_protected_stays(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.parametrize(
-    ("name", "told"), [("loop.ply", "a link to a file"), ("pipe.ply", "no ordinary file")]
+    ("name", "told"), [("loop.ply", "a link to a file"), ("pipe.ply", "not a regular file")]
 )
 def test_inputs_that_are_no_files(run: Run, tmp_path: Path, name: str, told: str) -> None:
     (tmp_path / "loop.ply").symlink_to("loop.ply")

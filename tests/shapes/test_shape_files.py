@@ -410,7 +410,7 @@ def test_gltf_that_cannot_be_used(tmp_path: Path, document: dict, words: str) ->
     ("uri", "words"),
     [
         ("gone.bin", "needs the file gone.bin"),
-        ("../../secret.bin", "outside its folder"),
+        ("../../secret.bin", "not in its folder"),
         ("data:application/octet-stream;base64,!!!", "not base64"),
         ("data:application/octet-stream;base64,AAAA", "needs 36 bytes of data, but holds 3"),
     ],

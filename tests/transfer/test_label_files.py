@@ -158,7 +158,7 @@ def test_as_many_vertices_as_faces_are_asked_about(tmp_path: Path) -> None:
 
 BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "not there": ("a.npy", lambda path: None, "there is no file"),
-    "a folder": ("a.npy", lambda path: path.mkdir(), "is not a file"),
+    "a folder": ("a.npy", lambda path: path.mkdir(), "is a folder"),
     "empty": ("a.txt", lambda path: path.touch(), "is empty"),
     "wrong length": (
         "a.npy",

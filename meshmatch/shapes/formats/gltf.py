@@ -18,15 +18,16 @@ from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged
+from meshmatch.shapes.paths import beside, read_bytes
 from meshmatch.shapes.srgb import to_srgb
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
-MOST_CORNERS = 200_000_000
-"""Vertices of a scene, and corners of its faces. One mesh may stand in it a thousand times, so that a small file can
-promise any number.
+MOST_CORNERS = 30_000_000
+"""Vertices of a scene, and corners of its faces: about 2 GB while it is read. One mesh may stand in a scene a thousand
+times, so that a small file can promise any number.
 """
 NONSENSE = (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError, OverflowError)
 """What a description that is not as it should be can cause."""
@@ -260,14 +261,13 @@ class Document:
                 return base64.b64decode(uri.split(",", 1)[1], validate=True)
             except (binascii.Error, IndexError) as error:
                 raise damaged(self.name, "its embedded data is not base64") from error
-        file = (self.path.parent / unquote(uri)).resolve()
-        if not file.is_relative_to(self.path.parent.resolve()):
-            raise InputError(f"{self.name} wants data outside its folder: {uri}", "copy the data beside it")
-        if not file.is_file():
+        file = beside(self.path.parent, unquote(uri))
+        if file is None:
             raise InputError(
-                f"{self.name} needs the file {uri}, which is not there", "copy it beside the gltf"
+                f"{self.name} needs the file {uri[:200]}, which is not in its folder",
+                "copy it beside the gltf",
             )
-        return file.read_bytes()
+        return read_bytes(file)
 
 
 def _local(node: dict[str, Any]) -> NDArray[np.float64]:

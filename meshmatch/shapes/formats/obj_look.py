@@ -18,6 +18,7 @@ from meshmatch.shapes.formats import damaged, fan
 from meshmatch.shapes.formats.obj import joined_lines, with_old
 from meshmatch.shapes.formats.text import columns, lines_of, numbers, second_index, words_per_line
 from meshmatch.shapes.images import ImageReader, Pixels
+from meshmatch.shapes.paths import beside, read_bytes
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import to_linear
 
@@ -152,14 +153,7 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
 def _beside(folder: Path, name: str) -> Path | None:
     """A file that is named relative to a folder, within it; else one of the same name in it; else None."""
     windows = PureWindowsPath(name.strip().strip('"'))  # takes both kinds of slash
-    inside = folder.resolve()
-    for wanted in (windows.as_posix(), windows.name):
-        if not wanted or "\0" in wanted:
-            return None
-        file = (folder / wanted).resolve()
-        if file.is_relative_to(inside) and file.is_file():
-            return file
-    return None
+    return beside(folder, windows.as_posix()) or beside(folder, windows.name)
 
 
 def _parse(file: Path) -> dict[str, _Entry]:
@@ -268,4 +262,4 @@ class _Material:
                 "which is not there",
                 f"copy it to {self.entry.folder}, or name another with --image",
             )
-        return self.reader.decode(file.read_bytes(), file.name)
+        return self.reader.decode(read_bytes(file), file.name)
