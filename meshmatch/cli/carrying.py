@@ -14,7 +14,7 @@ from meshmatch.cli.console import Console
 if TYPE_CHECKING:
     from meshmatch.maps.vertex_map import VertexMap
     from meshmatch.pipeline import MatchResult
-    from meshmatch.render.carried import Scene
+    from meshmatch.render.compose import Composition
     from meshmatch.shapes.shape import Shape
     from meshmatch.transfer.low_confidence import LowConfidence
 
@@ -107,10 +107,11 @@ def output_file(request: Request, output: Path, inputs: list[Path | None]) -> It
 
 
 def check_picture(request: Request, picture: Path | None, others: list[Path | None]) -> None:
-    """Refuse a picture that is no PNG, cannot be written, or would replace a file of this command: before the work."""
-    from meshmatch.cli.output_paths import check_apart, check_writable
+    """Refuse a picture that is not a PNG, cannot be written, or would replace a file of this command: before the work."""
+    from meshmatch.cli.output_paths import check_apart, check_png, check_writable
 
     check_apart([picture], [request.source, request.target, request.map, *others])
+    check_png(picture)
     check_writable(picture)
 
 
@@ -120,11 +121,11 @@ def draw(
     picture: Path | None,
     shapes: "tuple[Shape, Shape]",
     maps: Maps,
-    scene: "Scene",
+    shown: "Composition",
 ) -> None:
     """Draw what was carried along `maps` between the two shapes."""
     from meshmatch.outputs import replace_on_success
-    from meshmatch.render.carried import render_carried
+    from meshmatch.render.facing import same_side
 
     if picture is None:
         return
@@ -133,7 +134,7 @@ def draw(
         (None, None) if found is None else (found.source_fit.frame.rotation, found.target_fit.frame.rotation)
     )
     with replace_on_success(picture) as temporary:
-        render_carried(scene, maps.forward, shapes, temporary, rotations=turns, labels=request.names)
+        shown.rotated(same_side(*shapes, maps.forward, turns)).named(request.names).render(temporary)
     voice.say(f"drew {picture}: what was carried, on both shapes")
 
 

@@ -8,7 +8,7 @@ import typer
 from meshmatch.cli import options
 from meshmatch.cli import truth as truths
 from meshmatch.cli.console import Console, print_json, print_rows
-from meshmatch.cli.output_paths import check_apart, check_png, claimed
+from meshmatch.cli.output_paths import check_apart, check_chart, check_png, claimed
 
 if TYPE_CHECKING:
     from meshmatch.maps.evaluate import Evaluation
@@ -51,7 +51,7 @@ def evaluate(
     from meshmatch.errors import OptionError
     from meshmatch.maps.evaluate import evaluate_map
     from meshmatch.maps.files import load_map
-    from meshmatch.render.charts import check_chart, draw_curves
+    from meshmatch.render.charts import draw_curves
     from meshmatch.shapes.files import load_shape
 
     told = truths.check_truth(truth, points)
@@ -59,8 +59,7 @@ def evaluate(
         raise OptionError("a curve of errors needs the truth", "give it with --truth or --points")
     if picture is not None and not told:
         raise OptionError("a picture of errors needs the truth", "give it with --truth or --points")
-    if curve is not None:
-        check_chart(curve)
+    check_chart(curve)
     check_png(picture)
     inputs = [map_file, source, target, truth, *(points or ())]
     check_apart([curve, picture], inputs)
@@ -74,9 +73,9 @@ def evaluate(
             limit = 20.0 if unit == "cm" else 25.0
             draw_curves({found.source or source.stem: result.errors}, plot, limit, unit=unit)
         if drawing is not None and result.errors is not None and known[0] is not None:
-            from meshmatch.render.matched import render_errors
+            from meshmatch.render.compose import compose_errors
 
-            render_errors(*shapes, found, known, result.errors, drawing, unit=unit)
+            compose_errors(*shapes, found, known, result.errors, unit).render(drawing)
     for reason in found.reasons:
         Console().say(f"note: {reason}")
     if json:

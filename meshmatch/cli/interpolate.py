@@ -7,7 +7,7 @@ import typer
 
 from meshmatch.cli import options
 from meshmatch.cli.console import Console, print_json
-from meshmatch.cli.output_paths import check_apart, claimed
+from meshmatch.cli.output_paths import check_apart, check_chart, claimed
 
 if TYPE_CHECKING:
     from meshmatch.api.interpolation import Interpolation
@@ -93,10 +93,7 @@ def interpolate(
     way = [] if through is None else through
     options.check_axes(up, front)
     kind = _kind(output)
-    if plot is not None:
-        from meshmatch.render.charts import check_chart
-
-        check_chart(plot)
+    check_chart(plot)
     files = [source, *way, target]
     check_apart([output, plot], files)
     voice = Console(quiet)

@@ -95,10 +95,10 @@ def match(
                 raise PoorFit(f"poor fit, nothing was written: {_why(found.reasons)}", _HINT)
             save_map(temporary, found)
         if drawing is not None:
-            from meshmatch.render.matched import render_match
+            from meshmatch.render.compose import compose_match
 
             rotations = result.source_fit.frame.rotation, result.target_fit.frame.rotation
-            render_match(*shapes, found, drawing, rotations=rotations, labels=names)
+            compose_match(*shapes, found, rotations).named(names).render(drawing)
     _tell_match(voice, result, names, output)
     if picture is not None:
         voice.say(f"drew {picture}: matched places have one colour")
@@ -186,9 +186,9 @@ def register(
                 fitted = dense_shape(pipeline.read_model(model), fit)
             save_shape(temporary, fitted)
         if drawing is not None:
-            from meshmatch.render.fitted import render_fit
+            from meshmatch.render.compose import compose_fit
 
-            render_fit(loaded, fitted, drawing, rotation=fit.frame.rotation)
+            compose_fit(loaded, fitted, fit.frame.rotation).render(drawing)
     notes = [f"{loaded.name}: {note}" for note in pipeline.usable(loaded).notes]
     notes += pipeline.refine_notes(pipeline.read_model(model), refine)
     for note in notes:

@@ -37,6 +37,14 @@ def check_png(path: Path | None) -> None:
         raise OptionError(f"{path.name}: a picture is a PNG", "end the name in .png")
 
 
+def check_chart(path: Path | None) -> None:
+    """Refuse a chart that is not .png, .svg or .pdf, or that cannot be drawn (`OptionError`)."""
+    if path is not None:
+        from meshmatch.render import charts
+
+        charts.check_chart(path)
+
+
 def check_writable(path: Path | None) -> None:
     """Refuse a file that cannot be written (`OutputError`), long before it is."""
     if path is not None:

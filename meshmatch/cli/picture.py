@@ -118,12 +118,12 @@ def picture(
     from meshmatch.errors import OptionError
     from meshmatch.outputs import replace_on_success
     from meshmatch.render.framing import VIEWS
-    from meshmatch.render.picture import Look, render_shapes
+    from meshmatch.render.picture import Look
 
     options.check_axes(up, front)
     check_png(output)
     told = truths.check_truth(truth, points)
-    asked = picture_options.Asked(
+    asked = picture_options.PictureOptions(
         map, confidence, (truth, points) if told else None, unit, values or [], title, range, labels or [], on,
         fit, image, plain, seed,
     )  # fmt: skip
@@ -138,35 +138,43 @@ def picture(
     voice = Console(quiet)
     with replace_on_success(output) as temporary:
         subjects = [picture_options.load_subject(path, asked) for path in shapes]
-        labelled = name or _apart(shapes, subjects)
-        drawn = picture_options.compose(asked, subjects, labelled, look, voice)
-        width, height = render_shapes(
-            drawn.panels, temporary, drawn.look, labels=None if names else [""] * len(drawn.panels)
-        )
-    voice.say(f"drew {output}: {drawn.what} ({width} x {height} pixels)")
+        shown = picture_options.compose(asked, subjects, look, voice)
+        below = _labels(shapes, subjects, name, [panel.label for panel in shown.panels])
+        shown = shown.named(below if names else [""] * len(below))
+        width, height = shown.render(temporary, look)
+    voice.say(f"drew {output}: {shown.caption} ({width} x {height} pixels)")
     if json:
-        record = {"output": str(output), "shapes": [str(path) for path in shapes], "shows": drawn.what}
-        print_json(record | {"width": width, "height": height} | drawn.record)
+        record = {"output": str(output), "shapes": [str(path) for path in shapes], "shows": shown.caption}
+        print_json(record | {"width": width, "height": height} | shown.record)
 
 
 def _size(text: str | None) -> tuple[int, int] | None:
-    """Width and height of words such as 1200x800 (`OptionError` if they are none)."""
+    """Width and height of words such as 1200x800 (`OptionError` if invalid)."""
     from meshmatch.errors import OptionError
 
     if text is None:
         return None
     width, _, height = text.lower().partition("x")
     if not (width.isascii() and width.isdigit() and height.isascii() and height.isdigit()):
-        raise OptionError(f"'{text}' is no size", "give width and height in pixels, such as 1200x800")
+        raise OptionError(f"invalid size '{text}'", "give width and height in pixels, such as 1200x800")
     if max(len(width), len(height)) > 9:
         raise OptionError(f"a picture of {text} pixels is too large", "give a size such as 1200x800")
     return int(width), int(height)
 
 
-def _apart(paths: list[Path], subjects: "list[Subject]") -> list[str]:
-    """Names to show: those of the files, with their folders where they are the same."""
-    of: dict[str, set[str]] = {}
+def _labels(
+    paths: list[Path], subjects: "list[Subject]", names: list[str] | None, labels: list[str]
+) -> list[str]:
+    """The words below the panels with the names that the user gave; files of one name get their folders."""
+    files: dict[str, set[str]] = {}
     for path, subject in zip(paths, subjects, strict=True):
-        of.setdefault(subject.name, set()).add(os.path.realpath(path))
-    pairs = zip(paths, subjects, strict=True)
-    return [subject.name if len(of[subject.name]) == 1 else str(path) for path, subject in pairs]
+        files.setdefault(subject.name, set()).add(os.path.realpath(path))
+    for k, (path, subject) in enumerate(zip(paths, subjects, strict=True)):
+        if names:
+            given = names[k]
+        elif len(files[subject.name]) > 1:
+            given = str(path)
+        else:
+            continue
+        labels[k] = labels[k].replace(subject.name, given) if len(labels) > len(paths) else given
+    return labels

@@ -29,8 +29,7 @@ def prepare(
     folder, shapes.safetensors, points.safetensors, normalised/ and prepared.json.
     """
     from meshmatch.maps.pairs import load_points
-    from meshmatch.render.fitted import nodes_panel
-    from meshmatch.render.picture import render_shapes
+    from meshmatch.render.compose import compose_shapes
     from meshmatch.templates.nodes import NodeConfig
     from meshmatch.templates.prepare import PrepareConfig
     from meshmatch.templates.prepare import prepare as prepare_shapes
@@ -46,7 +45,7 @@ def prepare(
     if shapes.is_dir():
         found = {"align": made.align, "scale": scale, "landmarks": made.landmarks}
     registered, picture = len(made.shapes), output / "nodes.png"
-    render_shapes([nodes_panel(made.template)], picture)
+    compose_shapes([(made.template, None)]).render(picture)
     for note in made.notes:
         console.say(note)
     console.say(

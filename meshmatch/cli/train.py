@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from meshmatch.cli import options
 from meshmatch.cli import training_options as given
 from meshmatch.cli.console import Console, print_json
-from meshmatch.cli.output_paths import check_writable
+from meshmatch.cli.output_paths import check_chart, check_writable
 from meshmatch.outputs import make_folder
 
 if TYPE_CHECKING:
@@ -56,10 +56,7 @@ def train(
     from meshmatch.training.recipes import recipe_for
 
     set_threads(threads)
-    if picture is not None:
-        from meshmatch.render.charts import check_chart
-
-        check_chart(picture)
+    check_chart(picture)
     make_folder(output)
     check_writable(picture)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks

@@ -97,14 +97,15 @@ def transfer_color(
     what = "colours" if values is None else f"{columns} number{'s' if columns > 1 else ''} each"
     voice.say(f"wrote {output}: {what} for the {b.V} vertices of {request.names[1]}")
     if picture is not None:
-        from meshmatch.render.carried import light_on_both, values_on_both
+        from meshmatch.render.compose import compose_light, compose_values
 
         if values is None:
-            shown = light_on_both(a, b, given.numbers, carried)
+            shown = compose_light((a, b), (given.numbers, carried))
         else:
             title = given.names[0] if given.names else values.stem
             title += "" if columns == 1 else f" (the first of {columns} numbers)"
-            shown = values_on_both(a, b, given.numbers, carried, title)
+            tables = [table if table.ndim == 1 else table[:, 0] for table in (given.numbers, carried)]
+            shown = compose_values((a, b), tables, title)
         carrying.draw(request, voice, picture, (a, b), result, shown)
     if json:
         drawn = None if picture is None else str(picture)

@@ -97,12 +97,12 @@ def transfer_labels(
     used = len(np.unique(carried.codes))
     voice.say(f"wrote {output}: {used} different labels on the {len(found)} {kind} of {request.names[1]}")
     if picture is not None:
-        from meshmatch.render.carried import labels_on_both
+        from meshmatch.render.compose import compose_labels
 
         words = [str(name) for name in given.names]
         theirs = np.where(carried.codes < len(words), carried.codes, -1)  # a blank comes after the names
         faces = given.on == "faces", kind == "faces"
-        shown = labels_on_both(a, b, given.codes, theirs, words, faces)
+        shown = compose_labels((a, b), (given.codes, theirs), words, faces)
         carrying.draw(request, voice, picture, (a, b), result, shown)
     if json:
         drawn = None if picture is None else str(picture)

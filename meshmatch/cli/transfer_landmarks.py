@@ -73,9 +73,9 @@ def transfer_landmarks(
         voice.warn(f"and so are {len(low) - 10} more")
     voice.say(f"wrote {output}: {len(found.names)} landmarks on {request.names[1]}")
     if picture is not None:
-        from meshmatch.render.carried import points_on_both
+        from meshmatch.render.compose import compose_points
 
-        shown = points_on_both(a, b, given.points, found.points)
+        shown = compose_points((a, b), (given.points, found.points))
         carrying.draw(request, voice, picture, (a, b), result, shown)
     if json:
         drawn = None if picture is None else str(picture)

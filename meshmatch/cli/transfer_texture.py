@@ -136,11 +136,11 @@ def transfer_texture(
     what = "with vertex colours" if painted else f"with a texture of {size} x {size}"
     voice.say(f"wrote {' '.join(str(file) for file in files)}: {request.names[1]} {what}")
     if picture is not None:
-        from meshmatch.render.carried import looks_on_both
+        from meshmatch.render.compose import compose_shapes
         from meshmatch.shapes.appearance_files import find_appearance
 
         worn = load_shape(output)
-        shown = looks_on_both(a, worn, look, find_appearance(output, worn))
+        shown = compose_shapes([(a, look), (worn, find_appearance(output, worn))])
         carrying.draw(request, voice, picture, (a, b), result, shown)
     if json:
         drawn = None if picture is None else str(picture)

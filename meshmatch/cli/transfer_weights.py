@@ -74,10 +74,11 @@ def transfer_weights(
     joints = len(np.unique(carried.indices))
     voice.say(f"wrote {output}: weights of {joints} joints for the {b.V} vertices of {request.names[1]}")
     if picture is not None:
-        from meshmatch.render.carried import labels_on_both
+        from meshmatch.render.compose import compose_labels
         from meshmatch.transfer.attributes import most_votes
 
-        shown = labels_on_both(a, b, most_votes(given.matrix), most_votes(carried), given.names)
+        heaviest = most_votes(given.matrix), most_votes(carried)
+        shown = compose_labels((a, b), heaviest, given.names)
         carrying.draw(request, voice, picture, (a, b), result, shown)
     if json:
         drawn = None if picture is None else str(picture)

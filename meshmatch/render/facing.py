@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import OptionError
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
 FloatArray = NDArray[np.float64]
+Rotations = tuple[FloatArray | None, FloatArray | None]
 
 _AXES = {
     sign + name: (-1.0 if sign else 1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in ("", "-")
@@ -64,6 +66,30 @@ def upright(rotation: FloatArray) -> FloatArray:
     if rotation[1] @ upward < _NEAR_AXIS or length < 0.5:
         return rotation
     return np.stack([np.cross(upward, ahead / length), upward, ahead / length])
+
+
+def same_side(
+    source: Shape,
+    target: Shape,
+    vertex_map: VertexMap,
+    rotations: Rotations = (None, None),
+    up: str | None = None,
+    front: str | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Rotations of source and target into y up, z to the viewer that show both from the same side.
+
+    ``rotations`` are those of fits (`Frame.rotation`), if known; otherwise the named axes count, and without these the
+    source is oriented by its own shape and the target by the map.
+    """
+    first, second = (None if rotation is None else upright(rotation) for rotation in rotations)
+    if first is None:
+        first = facing(source, up, front)
+    if second is None and (up is not None or front is not None):
+        second = facing(target, up, front)
+    elif second is None:
+        known = slice(None) if source.invalid is None else ~source.invalid
+        second = facing_alike(target, vertex_map.points(target)[known], source.verts[known] @ first.T)
+    return first, second
 
 
 def facing_alike(shape: Shape, points: FloatArray, seen: FloatArray) -> FloatArray:

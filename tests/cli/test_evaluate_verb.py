@@ -164,15 +164,15 @@ def test_a_curve_that_cannot_be_is_told_before_the_work(
 def test_the_errors_as_heat_on_both_shapes(
     run: Run, files: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unit: str
 ) -> None:
-    from meshmatch.render import matched
+    from meshmatch.render import compose
 
-    real, legends = matched.render_shapes, []
+    real, legends = compose.render_shapes, []
 
-    def watched(panels: object, path: Path, look: matched.Look) -> None:
+    def watched(panels: object, path: Path, look: compose.Look) -> None:
         legends.append(look.legend)
         real(panels, path, look)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(matched, "render_shapes", watched)
+    monkeypatch.setattr(compose, "render_shapes", watched)
     picture = tmp_path / "errors.png"
     words = ("evaluate", *files, *write_truth(tmp_path, "column"), "--picture", picture, "--unit", unit)
     answer = run(*words)

@@ -286,7 +286,7 @@ def test_a_picture_that_fails_costs_no_map(
     def failing(*_: object, **__: object) -> None:
         raise OutputError("the disk is full")
 
-    monkeypatch.setattr("meshmatch.render.matched.render_match", failing)
+    monkeypatch.setattr("meshmatch.render.compose.compose_match", failing)
     output = two[0].with_name("map.npy")
     assert run("match", *two, "-o", output, "--picture", two[0].with_name("both.png")).status == 1
     assert sorted(path.name for path in two[0].parent.iterdir()) == ["a.ply", "b.ply", "map.npy"]
@@ -384,7 +384,7 @@ def test_register_draws_the_template_over_the_shape(
     def failing(*_: object, **__: object) -> None:
         raise OutputError("the disk is full")
 
-    monkeypatch.setattr("meshmatch.render.fitted.render_fit", failing)
+    monkeypatch.setattr("meshmatch.render.compose.compose_fit", failing)
     words = ("register", two[0], "-o", two[0].with_name("second.ply"), "--picture", picture)
     assert run(*words).status == 1
     assert two[0].with_name("second.ply").exists()

@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 
 from meshmatch import pipeline
-from meshmatch.cli.picture_options import Asked
+from meshmatch.cli.picture_options import PictureOptions
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.render import picture as drawing
+from meshmatch.render import compose as drawing
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look
 from meshmatch.render.scales import UNKNOWN, Scale, Swatches
@@ -35,16 +35,15 @@ class Drawn:
     def __init__(self) -> None:
         self.panels: list[Panel] = []
         self.look = Look()
-        self.labels: list[str] | None = None
 
-    def __call__(self, panels: Any, path: Path, look: Look, *, labels: Any = None) -> tuple[int, int]:
-        self.panels, self.look, self.labels = list(panels), look, labels
+    def __call__(self, panels: Any, path: Path, look: Look) -> tuple[int, int]:
+        self.panels, self.look = list(panels), look
         path.write_bytes(b"a picture")
         return look.size or (7, 5)
 
     @property
     def names(self) -> list[str]:
-        return [panel.label for panel in self.panels] if self.labels is None else self.labels
+        return [panel.label for panel in self.panels]
 
 
 @pytest.fixture
@@ -348,11 +347,11 @@ BAD: list[tuple[str, str]] = [
     ("gone.ply -o o.png", "there is no file"),
     ("gone -o o.png", "there is no file"),
     ("v.npy -o o.png", "v.npy"),
-    ("a.ply -o o.png --size 12", "is no size"),
-    ("a.ply -o o.png --size 12x", "is no size"),
-    ("a.ply -o o.png --size ax9", "is no size"),
-    ("a.ply -o o.png --size -5x9", "is no size"),
-    ("a.ply -o o.png --size 1e9x2", "is no size"),
+    ("a.ply -o o.png --size 12", "invalid size"),
+    ("a.ply -o o.png --size 12x", "invalid size"),
+    ("a.ply -o o.png --size ax9", "invalid size"),
+    ("a.ply -o o.png --size -5x9", "invalid size"),
+    ("a.ply -o o.png --size 1e9x2", "invalid size"),
     ("a.ply -o o.png --size 99999x99999", "too large"),
     ("a.ply -o o.png --size 8000x8000", "too large"),
     ("a.ply -o o.png --size 99999999999999999999x9", "too large"),
@@ -365,9 +364,9 @@ BAD: list[tuple[str, str]] = [
     ("c.ply a.ply -o o.png --map map.npz", "wrong way"),
     ("a.ply b.ply -o o.png --map map.npz", "another target"),
     ("a.ply c.ply -o o.png --map gone.npz", "no file"),
-    ("a.ply c.ply -o o.png --confidence", "is that of a map"),
-    ("a.ply c.ply -o o.png --truth truth.npy", "are about a map"),
-    ("a.ply c.ply -o o.png --map map.npz --confidence --truth truth.npy", "two heats"),
+    ("a.ply c.ply -o o.png --confidence", "needs a map"),
+    ("a.ply c.ply -o o.png --truth truth.npy", "need a map"),
+    ("a.ply c.ply -o o.png --map map.npz --confidence --truth truth.npy", "both color"),
     ("a.ply c.ply -o o.png --map map.npz --truth truth.npy --points truth.npy truth.npy", "both give the truth"),
     ("a.ply c.ply -o o.png --map map.npz --truth seven.npy", "seven.npy"),
     ("a.ply c.ply -o o.png --map map.npz --values v.npy", "do not go together"),
@@ -375,16 +374,16 @@ BAD: list[tuple[str, str]] = [
     ("a.ply -o o.png --values v.npy --labels v.npy", "do not go together"),
     ("a.ply -o o.png --plain --image x.png", "do not go together"),
     ("a.ply -o o.png --values seven.npy", "has 7 rows"),
-    ("a.ply -o o.png --values wide.npy", "2 numbers a vertex"),
-    ("a.ply -o o.png --values loud.npy", "3 numbers a vertex"),
-    ("a.ply -o o.png --values fine.npy --title x", "colours have no scale"),
+    ("a.ply -o o.png --values wide.npy", "2 numbers per vertex"),
+    ("a.ply -o o.png --values loud.npy", "3 numbers per vertex"),
+    ("a.ply -o o.png --values fine.npy --title x", "colors have no scale"),
     ("a.ply -o o.png --values gone.npy", "no file"),
     ("a.ply b.ply -o o.png --values v.npy", "need --values 2 times"),
     ("a.ply -o o.png --values v.npy --range 2 1", "cannot run from 2 to 1"),
     ("a.ply -o o.png --values v.npy --range nan 1", "cannot run"),
-    ("a.ply -o o.png --range 0 1", "that of a heat"),
-    ("a.ply -o o.png --title x", "what numbers are"),
-    ("a.ply -o o.png --on faces", "what labels belong to"),
+    ("a.ply -o o.png --range 0 1", "needs a color scale"),
+    ("a.ply -o o.png --title x", "--title needs"),
+    ("a.ply -o o.png --on faces", "--on needs"),
     ("a.ply -o o.png --labels seven.npy", "7 labels"),
     ("a.ply -o o.png --labels empty.txt", "empty.txt"),
     ("a.ply b.ply -o o.png --labels v.npy", "need --labels 2 times"),
@@ -438,7 +437,7 @@ def test_a_picture_that_fails_leaves_what_was_there(
 
 
 def test_all_files_that_are_read_are_guarded() -> None:
-    asked = Asked(
+    asked = PictureOptions(
         Path("m"), False, (Path("t"), (Path("p"), Path("q"))), "cm", [Path("v")], None, None, [Path("l")],
         None, "f", Path("i"), False, 0,
     )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from meshmatch.render import picture
+from meshmatch.render import compose
 from meshmatch.render.picture import Panel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
@@ -24,7 +24,7 @@ FEW = ("--nodes", "60", "--radius", "0.3")
 def pictures(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Sequence[Panel], Path]]:
     """What was to be drawn; one test alone waits for a real picture."""
     asked: list[tuple[Sequence[Panel], Path]] = []
-    monkeypatch.setattr(picture, "render_shapes", lambda panels, path: asked.append((panels, path)))
+    monkeypatch.setattr(compose, "render_shapes", lambda panels, path, look: asked.append((panels, path)))
     return asked
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from meshmatch import pipeline
 from meshmatch.maps.files import load_map, save_map
-from meshmatch.render import carried
+from meshmatch.render import compose
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look
 from meshmatch.render.scales import UNKNOWN, Scale, Swatches, label_colors
@@ -35,7 +35,7 @@ class Drawn:
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> Drawn:
     recorder = Drawn()
-    monkeypatch.setattr(carried, "render_shapes", recorder)
+    monkeypatch.setattr(compose, "render_shapes", recorder)
     return recorder
 
 
@@ -172,7 +172,7 @@ def test_a_picture_that_fails_costs_no_output(
     def failing(*_: object, **__: object) -> None:
         raise OutputError("the disk is full")
 
-    monkeypatch.setattr(carried, "render_shapes", failing)
+    monkeypatch.setattr(compose, "render_shapes", failing)
     before = {path.name for path in pair.iterdir()}
     assert run(*call(verb, "--picture", "p.png")).status == 1
     new = {path.name for path in pair.iterdir()} - before

@@ -22,7 +22,7 @@ from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import replace_on_success
 from meshmatch.render.colors import position_colors
-from meshmatch.render.matched import brought
+from meshmatch.render.compose import matched_colors
 from meshmatch.render.scales import Scale
 from meshmatch.render.viewer.drawn import MOST, Drawn, draw
 from meshmatch.render.viewer.looks import Looks, dress
@@ -93,7 +93,7 @@ def write_page(
     turns = upright(source, target, there, rotations)
     cubes = boxes(shapes, parts, there, turns)
     position = position_colors(source, turns[0])
-    tints = position, brought(position, there, back, source)
+    tints = position, matched_colors(position, there, back, source)
     shown = names or (source.name or "source", target.name or "target")
     arrays: dict[str, NDArray[Any]] = {}
     words: dict[str, Any] = {}
