@@ -126,3 +126,16 @@ def test_python_on_a_page_compiles_and_names_what_exists(page: Path) -> None:
             elif isinstance(node, ast.ImportFrom) and str(node.module).startswith("meshmatch"):
                 module = importlib.import_module(str(node.module))
                 assert {alias.name for alias in node.names} <= set(dir(module))
+
+
+def test_the_python_of_the_readme_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, remembered_fits: None
+) -> None:
+    (tmp_path / "templates").symlink_to(ROOT / "templates")
+    monkeypatch.chdir(tmp_path)
+    sources = blocks((ROOT / "README.md").read_text(encoding="utf-8"), "python")
+    assert sources
+    for source in sources:
+        found: dict[str, Any] = {}
+        exec(compile(source, "README.md", "exec"), found)
+        assert len(found["result"].map.index) == len(found["points"])
