@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
@@ -23,6 +23,7 @@ __all__ = [
     "Int",
     "Ints",
     "Ints32",
+    "UInt8",
     "UInts8",
     "frozen",
     "read_only",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 
 # Neighbours are discontinuous if their images are further apart than this (sqrt(area)) plus so many times their own
 # distance. Set by hand.
@@ -15,7 +15,7 @@ _GAP, _STRETCH = 0.06, 3.0
 _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 
 
-def same_rows(rows: NDArray[np.float64] | Ints) -> Ints:
+def same_rows(rows: Float[Floats, "N D"] | Int[Ints, "N D"]) -> Int[Ints, " N"]:
     """(N,) for each row the first row that is equal to it: itself where it is the first. 0.0 equals -0.0."""
     own = np.arange(len(rows))
     if len(rows) < 2:
@@ -37,7 +37,7 @@ def same_rows(rows: NDArray[np.float64] | Ints) -> Ints:
     return np.asarray(index[inverse.ravel()], np.int64)
 
 
-def face_parts(faces: Ints, V: int) -> Ints:
+def face_parts(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " F"]:
     """(F,) number of the connected part that each face is in; faces that share a vertex are connected."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
@@ -68,13 +68,13 @@ class Edges:
         The number of the edge between vertices i < j is i * stride + j.
     """
 
-    ordered: Ints
-    begins: Ints
-    sizes: Ints
+    ordered: Int[Ints, " F_times_3"]
+    begins: Int[Ints, " E"]
+    sizes: Int[Ints, " E"]
     stride: int
 
     @property
-    def vertices(self) -> Ints:
+    def vertices(self) -> Int[Ints, "E 2"]:
         """(E, 2) the two vertices of each edge, the smaller first; sorted."""
         return np.stack(np.divmod(self.ordered[self.begins] >> 1, self.stride), axis=1)
 
@@ -84,13 +84,13 @@ class Edges:
         return int((self.sizes == 1).sum()), int((self.sizes > 2).sum())
 
     @property
-    def disagreeing(self) -> NDArray[np.bool_]:
+    def disagreeing(self) -> Bool[Bools, " pairs"]:
         """For each edge of exactly two faces: do both run along it the same way?"""
         two = self.begins[self.sizes == 2]
         return np.asarray(self.ordered[two] == self.ordered[two + 1])
 
 
-def edges_of(faces: Ints) -> Edges:
+def edges_of(faces: Int[Ints, "F 3"]) -> Edges:
     """Sort the edges of `faces`."""
     ordered = np.sort(directed_edges(faces))
     group = ordered >> 1
@@ -98,13 +98,13 @@ def edges_of(faces: Ints) -> Edges:
     return Edges(ordered, begins, np.diff(np.append(begins, len(group))), _stride(faces))
 
 
-def directed_edges(faces: Ints) -> Ints:
+def directed_edges(faces: Int[Ints, "F 3"]) -> Int[Ints, " F_times_3"]:
     """(3 F,) the numbers that `Edges.ordered` sorts: F of the edges 0-1, then of 1-2, then of 2-0."""
     columns = np.ascontiguousarray(faces.T)
     return 2 * edge_keys(faces, _stride(faces)) + (columns < columns[[1, 2, 0]]).ravel()
 
 
-def open_edges(faces: Ints) -> Ints:
+def open_edges(faces: Int[Ints, "F 3"]) -> Int[Ints, "N 2"]:
     """(N, 2) vertices of the edges that have one face."""
     V = _stride(faces)
     keys = np.sort(edge_keys(faces, V))
@@ -114,7 +114,7 @@ def open_edges(faces: Ints) -> Ints:
     return np.stack([keys[alone] // V, keys[alone] % V], axis=1)
 
 
-def edge_keys(faces: Ints, V: int) -> Ints:
+def edge_keys(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " F_times_3"]:
     """(3 F,) a number for each edge of each face, the same both ways: F of the edges 0-1, then 1-2, 2-0."""
     columns = np.ascontiguousarray(faces.T)
     start, end = columns.ravel(), columns[[1, 2, 0]].ravel()
@@ -125,12 +125,12 @@ def _stride(faces: Ints) -> int:
     return int(faces.max()) + 1 if len(faces) else 1
 
 
-def is_watertight(faces: Ints) -> bool:
+def is_watertight(faces: Int[Ints, "F 3"]) -> bool:
     """True if every edge has exactly two faces."""
     return len(faces) > 0 and edges_of(faces).counts == (0, 0)
 
 
-def _hash(rows: NDArray[np.float64] | Ints) -> NDArray[np.uint64]:
+def _hash(rows: Floats | Ints) -> NDArray[np.uint64]:
     bits = np.ascontiguousarray(rows + 0 if rows.dtype.kind == "i" else rows + 0.0).view(np.uint64)
     total = np.zeros(len(rows), np.uint64)
     for k in range(rows.shape[1]):

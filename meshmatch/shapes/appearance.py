@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.images import Pixels
 from meshmatch.shapes.shape import Shape
@@ -76,9 +76,9 @@ class Appearance:
     """
 
     materials: tuple[Material, ...]
-    material: NDArray[np.int64]
-    uv: NDArray[np.float64]
-    colors: NDArray[np.float64] | None = None
+    material: Int[Ints, " F"]
+    uv: Float[Floats, "F 3 2"]
+    colors: Float[Floats, "V 4"] | None = None
 
     def __post_init__(self) -> None:
         pictured = np.array([m.image is not None for m in self.materials])[self.material]

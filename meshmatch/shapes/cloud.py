@@ -3,16 +3,19 @@
 A cloud of more than `LARGEST` points is judged by a random part of it, so that a million points cost seconds.
 """
 
-import numpy as np
-from numpy.typing import NDArray
+from __future__ import annotations
 
-from meshmatch.arrays import Floats, Ints
+import numpy as np
+
+from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.shapes.orientation import agreeing_flips
 
 LARGEST = 20_000
 
 
-def local_areas(points: Floats, invalid: NDArray[np.bool_] | None = None) -> Floats:
+def local_areas(
+    points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None = None
+) -> Float[Floats, " V"]:
     """(V,) area that each point stands for, squared units; 0 for an invalid one.
 
     Among points scattered with density n over a surface, the disc that just holds a point's k nearest others
@@ -46,7 +49,9 @@ def local_areas(points: Floats, invalid: NDArray[np.bool_] | None = None) -> Flo
     return areas
 
 
-def estimate_normals(points: Floats, invalid: NDArray[np.bool_] | None = None) -> Floats:
+def estimate_normals(
+    points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None = None
+) -> Float[Floats, "V 3"]:
     """(V, 3) unit normals: where the neighbourhood is thinnest; zeros for an invalid point.
 
     Signs are made to agree between neighbours (Hoppe et al. 1992, section 3.3), then each connected part is
@@ -75,7 +80,7 @@ def estimate_normals(points: Floats, invalid: NDArray[np.bool_] | None = None) -
     return normals
 
 
-def roughness(points: Floats, invalid: NDArray[np.bool_] | None = None) -> float:
+def roughness(points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None = None) -> float:
     """How noisy a cloud is beside its spacing, 0..1: about 0 for a clean one, 1 for noise of 1 % of the diagonal."""
     valid = points if invalid is None else points[~invalid]
     if len(valid) < 20:
@@ -84,7 +89,7 @@ def roughness(points: Floats, invalid: NDArray[np.bool_] | None = None) -> float
     return _size(part, index)[1]
 
 
-def outlier_points(points: Floats, far: float = 3.0) -> NDArray[np.bool_]:
+def outlier_points(points: Float[Floats, "V 3"], far: float = 3.0) -> Bool[Bools, " V"]:
     """(V,) True for a point that lies ``far`` times further from its neighbours than these from theirs, and than usual."""
     from scipy.spatial import cKDTree
 
@@ -103,7 +108,7 @@ def outlier_points(points: Floats, far: float = 3.0) -> NDArray[np.bool_]:
     return np.asarray((reach > far * usual) & (reach > far * np.median(own_reach)))
 
 
-def on_a_line(points: Floats) -> bool:
+def on_a_line(points: Float[Floats, "V 3"]) -> bool:
     """Whether no point (V, 3) leaves one line by more than a billionth of its length."""
     away = points - points.mean(axis=0)
     _, length, _ = np.linalg.svd(away / max(np.abs(away).max(), 1e-300), full_matrices=False)

@@ -1,14 +1,15 @@
 """What occurs twice in a mesh, or is nothing: vertices of seams, faces, slivers."""
 
-import numpy as np
-from numpy.typing import NDArray
+from __future__ import annotations
 
-from meshmatch.arrays import Floats, Ints
+import numpy as np
+
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.topology import edge_keys, open_edges, same_rows
 from meshmatch.geometry.triangles import squared_lengths
 
 
-def seams(verts: Floats, faces: Ints) -> Ints:
+def seams(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, " V"]:
     """(V,) the vertex to use instead of each: the first at the same position, if both lie on an open edge."""
     twin = same_rows(verts)
     own = np.arange(len(verts))
@@ -26,7 +27,9 @@ def seams(verts: Floats, faces: Ints) -> Ints:
     return own
 
 
-def flat_faces(verts: Floats, faces: Ints, cross: Floats, diagonal: float) -> NDArray[np.bool_]:
+def flat_faces(
+    verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], cross: Float[Floats, "F 3"], diagonal: float
+) -> Bool[Bools, " F"]:
     """True for a face that names a vertex twice, or whose height is rounding beside its longest edge."""
     double_areas = squared_lengths(cross)
     flat = double_areas <= (1e-12 * diagonal**2) ** 2  # no edge is longer than the diagonal
@@ -37,7 +40,7 @@ def flat_faces(verts: Floats, faces: Ints, cross: Floats, diagonal: float) -> ND
     return np.asarray(flat)
 
 
-def duplicate_faces(faces: Ints) -> NDArray[np.bool_]:
+def duplicate_faces(faces: Int[Ints, "F 3"]) -> Bool[Bools, " F"]:
     """True for faces to drop: all but the first of the same three corners, and both of a flap.
 
     Two that face opposite ways cancel. On a surface that goes on around them they are a fold of no volume,
@@ -64,7 +67,7 @@ def duplicate_faces(faces: Ints) -> NDArray[np.bool_]:
     return double
 
 
-def _handed(faces: Ints) -> NDArray[np.bool_]:
+def _handed(faces: Ints) -> Bools:
     """Which of its two ways round each face goes: the same for a b c, b c a and c a b."""
     turned = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     return np.asarray(turned[:, 1] < turned[:, 2])

@@ -8,12 +8,12 @@ import zlib
 from io import BytesIO
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from meshmatch.arrays import UInts8
 from meshmatch.errors import InputError
 
-Pixels = NDArray[np.uint8]
+Pixels = UInts8
 
 MAX_PIXELS = 8192 * 8192
 """Of one image. Pillow's own alarm stands a little higher."""

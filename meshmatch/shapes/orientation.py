@@ -1,15 +1,16 @@
 """Making neighbours agree which side is out: one tool for faces of a mesh and for normals of a cloud."""
 
-import numpy as np
-from numpy.typing import NDArray
+from __future__ import annotations
 
-from meshmatch.arrays import Floats, Ints
+import numpy as np
+
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.topology import Edges, directed_edges
 
 
 def agreeing_flips(
-    count: int, pairs: Ints, differ: NDArray[np.bool_], cost: Floats
-) -> tuple[NDArray[np.bool_], Ints]:
+    count: int, pairs: Int[Ints, "N 2"], differ: Bool[Bools, " N"], cost: Float[Floats, " N"]
+) -> tuple[Bool[Bools, " count"], Int[Ints, " count"]]:
     """Which of `count` things to flip so that neighbours agree along a minimum spanning forest.
 
     Parameters
@@ -64,7 +65,9 @@ def agreeing_flips(
         parent = parent[parent]
 
 
-def turn_faces(verts: Floats, faces: Ints, cross: Floats, edges: Edges) -> tuple[Ints, int]:
+def turn_faces(
+    verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], cross: Float[Floats, "F 3"], edges: Edges
+) -> tuple[Int[Ints, "F 3"], int]:
     """Faces turned so that neighbours agree and the shape is not inside out, and how many were turned.
 
     A part whose faces disagreed is turned outwards by the sign of its volume; if they agreed everywhere, the
@@ -106,7 +109,7 @@ def turn_faces(verts: Floats, faces: Ints, cross: Floats, edges: Edges) -> tuple
     return turned, int(flip.sum())
 
 
-def _flips(faces: Ints, edges: Edges) -> tuple[NDArray[np.bool_], Ints, NDArray[np.bool_]]:
+def _flips(faces: Ints, edges: Edges) -> tuple[Bools, Ints, Bools]:
     """(F,) faces to flip so that all agree, (F,) their part, and for each part whether any disagreed."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

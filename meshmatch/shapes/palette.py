@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.shapes.srgb import to_srgb
 
 UNKNOWN = (0.62, 0.64, 0.67)
 """What has no value."""
 
 
-def oklab_to_linear(lab: NDArray[np.float64]) -> NDArray[np.float64]:
+def oklab_to_linear(lab: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
     """Light (N, 3) of colours (N, 3) in Oklab, where equal steps look equal (Ottosson 2020)."""
     roots = lab @ np.array(
         [
@@ -32,7 +33,7 @@ def oklab_to_linear(lab: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def label_colors(labels: ArrayLike) -> NDArray[np.float64]:
+def label_colors(labels: ArrayLike) -> Float[Floats, "N 3"]:
     """Written colours (N, 3) of labels (N,): the same for the same label always, and neighbours far apart."""
     number = np.asarray(labels, dtype=np.int64)
     # Hue by the golden angle; three rings of lightness, so that many labels stay apart.

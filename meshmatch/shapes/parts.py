@@ -1,11 +1,12 @@
 """Which connected parts of a mesh belong to the object, and which are dirt or another object."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.topology import face_parts
 from meshmatch.geometry.triangles import squared_lengths
 
@@ -31,14 +32,14 @@ class Parts:
         Their share of the surface, in 0..1.
     """
 
-    stray: NDArray[np.bool_]
+    stray: Bool[Bools, " F"]
     stray_parts: int
     kept: int
     far: int
     far_share: float
 
 
-def find_parts(verts: Floats, faces: Ints, cross: Floats) -> Parts:
+def find_parts(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], cross: Float[Floats, "F 3"]) -> Parts:
     """Judge the connected parts of a mesh; `cross` (F, 3) is the normal of each face, twice its area long."""
     part = face_parts(faces, len(verts))
     if part.max() == 0:

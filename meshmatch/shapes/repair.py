@@ -3,12 +3,13 @@
 Only what is safe is done: nothing is moved, no hole is closed, no face is invented.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.topology import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
@@ -43,14 +44,16 @@ class Repaired:
     """
 
     shape: Shape
-    original_to_repaired: Ints
-    kept_vertex: Ints
+    original_to_repaired: Int[Ints, " V_original"]
+    kept_vertex: Int[Ints, " V"]
     notes: tuple[str, ...]
     original: Shape
-    kept_face: Ints
+    kept_face: Int[Ints, " F"]
     far_parts: int = 0
 
-    def original_face(self, face: Ints, weights: Floats) -> tuple[Ints, Floats]:
+    def original_face(
+        self, face: Int[Ints, " N"], weights: Float[Floats, "N 3"]
+    ) -> tuple[Int[Ints, " N"], Float[Floats, "N 3"]]:
         """Repaired faces (N,) and weights (N, 3) of their corners, numbered and ordered as originally."""
         theirs = self.kept_face[face]
         corners = self.original_to_repaired[self.original.faces[theirs]]  # N 3
@@ -146,7 +149,7 @@ def _repair_mesh(shape: Shape) -> Repaired:
 
 
 def _result(
-    shape: Shape, kept: NDArray[np.bool_], twin: Ints, faces: Ints, which: Ints, valid: NDArray[np.bool_],
+    shape: Shape, kept: Bools, twin: Ints, faces: Ints, which: Ints, valid: Bools,
     notes: list[str], far_parts: int = 0,
 ) -> Repaired:  # fmt: skip
     chosen = np.flatnonzero(kept)
@@ -175,7 +178,7 @@ def _result(
     return Repaired(repaired, answer, chosen, tuple(notes), shape, which, far_parts)
 
 
-def _valid_neighbour(shape: Shape, valid: NDArray[np.bool_]) -> Ints:
+def _valid_neighbour(shape: Shape, valid: Bools) -> Ints:
     """(V,) itself if valid; else a valid corner of one of its faces, or the nearest in file order."""
     places = np.flatnonzero(valid)
     every = np.arange(shape.V)
@@ -191,7 +194,7 @@ def _valid_neighbour(shape: Shape, valid: NDArray[np.bool_]) -> Ints:
     return stands
 
 
-def _valid(shape: Shape, notes: list[str]) -> NDArray[np.bool_]:
+def _valid(shape: Shape, notes: list[str]) -> Bools:
     if shape.invalid is None:
         return np.ones(shape.V, bool)
     count = int(shape.invalid.sum())

@@ -1,11 +1,14 @@
 """Points spread evenly over a shape."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
+from meshmatch.geometry.triangles import interpolate
 from meshmatch.shapes.shape import Shape
 
 
@@ -26,11 +29,11 @@ class Samples:
         The face's corner of the largest weight; for a cloud the very point that was drawn.
     """
 
-    points: Floats
-    normals: Floats
-    face: Ints
-    barycentric: Floats
-    vertex: Ints
+    points: Float[Floats, "P 3"]
+    normals: Float[Floats, "P 3"]
+    face: Int[Ints, " P"]
+    barycentric: Float[Floats, "P 3"]
+    vertex: Int[Ints, " P"]
 
 
 def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
@@ -65,12 +68,12 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
     other = rng.random(P)
     weights = np.stack([1.0 - root, root * (1.0 - other), root * other], axis=1)  # P 3
     corners = shape.faces[face]  # P 3
-    points = np.einsum("pk,pki->pi", weights, shape.verts[corners])
+    points = interpolate(shape.verts, corners, weights)
     vertex = corners[np.arange(P), weights.argmax(axis=1)]
     return Samples(points, shape.face_normals[face], face, weights, vertex)
 
 
-def farthest_points(points: Floats, K: int, start: int = 0) -> Ints:
+def farthest_points(points: Float[Floats, "N 3"], K: int, start: int = 0) -> Int[Ints, " K"]:
     """Indices (K,) of points that are each as far as possible from all before them, beginning with `start`.
 
     Takes K passes over the points. With fewer distinct points than `K` the last ones repeat positions, never

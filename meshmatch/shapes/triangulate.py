@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
@@ -19,7 +19,7 @@ _NEIGHBOURS = 16
 _LONGEST = 3.0  # of an edge, against the usual reach of a point's sixth neighbour
 
 
-def triangulate_cloud(cloud: Shape, most: int) -> tuple[Ints, Ints]:
+def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
     """A mesh over some points of a cloud.
 
     Parameters

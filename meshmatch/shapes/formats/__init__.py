@@ -11,11 +11,13 @@ promises. STL goes through trimesh. The other readers are our own, because of wh
   Written vertex colours have 8 bits of linear light, too few for dark colours.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 
 
@@ -23,9 +25,9 @@ from meshmatch.errors import InputError
 class Raw:
     """What a file says, unchecked: positions (V, 3), maybe NaN; faces (F, 3), sRGB colours (V, 4) in 0..1."""
 
-    verts: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    colors: NDArray[np.float64] | None = None
+    verts: Float[Floats, "V 3"]
+    faces: Int[Ints, "F 3"]
+    colors: Float[Floats, "V 4"] | None = None
 
 
 NO_FACES = np.empty((0, 3), np.int64)
@@ -36,7 +38,7 @@ def damaged(name: str, what: str) -> InputError:
     return InputError(f"{name}: {what}", "the file is damaged or was cut short; export or download it again")
 
 
-def fan(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+def fan(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
     """Triangles (F, 3) of polygons: `corners` one polygon after the other, `sizes` how many each has.
 
     A polygon a b c d ... becomes a b c, a c d, ...; one of fewer than 3 corners becomes nothing.

@@ -5,6 +5,8 @@ Specification: Khronos glTF 2.0. A skinned mesh stands as its joints stand in th
 are read by `meshmatch.shapes.formats.gltf_look`, files written by `meshmatch.shapes.formats.gltf_out`.
 """
 
+from __future__ import annotations
+
 import base64
 import binascii
 import json
@@ -16,6 +18,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged
 from meshmatch.shapes.paths import beside, read_bytes
@@ -68,7 +71,7 @@ class Document:
                 )
         self.nodes = self.json.get("nodes", [])
         self.buffers: dict[int, bytes] = {}
-        self.world: dict[int, NDArray[np.float64]] = {}
+        self.world: dict[int, Floats] = {}
 
     def _chunks(self, data: bytes) -> bytes:
         """The JSON chunk; the binary one is kept in `body`."""
@@ -85,9 +88,9 @@ class Document:
         return data[20 : 20 + size]
 
     def scene(self) -> Raw:
-        verts: list[NDArray[np.float64]] = []
-        faces: list[NDArray[np.int64]] = []
-        colors: list[NDArray[np.float64] | None] = []
+        verts: list[Floats] = []
+        faces: list[Ints] = []
+        colors: list[Floats | None] = []
         total = 0
         for node, primitive in self.primitives():
             total += self.count(primitive["attributes"]["POSITION"])
@@ -142,7 +145,7 @@ class Document:
             stack += [(child, self.world[node]) for child in reversed(self.nodes[node].get("children", []))]
         return order
 
-    def _placed(self, node: dict[str, Any], number: int, primitive: dict[str, Any]) -> NDArray[np.float64]:
+    def _placed(self, node: dict[str, Any], number: int, primitive: dict[str, Any]) -> Floats:
         """(V, 3) positions in the scene."""
         attributes = primitive["attributes"]
         own = np.hstack(
@@ -169,7 +172,7 @@ class Document:
             np.where(total > 0, moved / np.where(total > 0, total, 1.0), own @ self.world[number].T)
         )[:, :3]
 
-    def triangles(self, primitive: dict[str, Any], V: int) -> NDArray[np.int64]:
+    def triangles(self, primitive: dict[str, Any], V: int) -> Int[Ints, "F 3"]:
         mode = primitive.get("mode", _TRIANGLES)
         if mode == _POINTS:
             return NO_FACES
@@ -187,7 +190,7 @@ class Document:
         odd = np.arange(len(a)) % 2 == 1
         return np.stack([np.where(odd, b, a), np.where(odd, a, b), c], axis=1)
 
-    def colors(self, primitive: dict[str, Any]) -> NDArray[np.float64] | None:
+    def colors(self, primitive: dict[str, Any]) -> Float[Floats, "V 4"] | None:
         """(V, 4) light and alpha of a primitive's vertices: `COLOR_0` is linear (section 3.9.2)."""
         if "COLOR_0" not in primitive["attributes"]:
             return None
@@ -200,7 +203,7 @@ class Document:
         """How many values an accessor has."""
         return int(self.json["accessors"][number]["count"])
 
-    def accessor(self, number: int, whole: bool = False) -> NDArray[np.float64]:
+    def accessor(self, number: int, whole: bool = False) -> Float[Floats, "count width"]:
         """(count, width) values; whole numbers that stand for 0..1 or -1..1 are divided unless `whole`."""
         accessor = self.json["accessors"][number]
         count, width = int(accessor["count"]), _WIDTHS[accessor["type"]]
@@ -270,7 +273,7 @@ class Document:
         return read_bytes(file)
 
 
-def _local(node: dict[str, Any]) -> NDArray[np.float64]:
+def _local(node: dict[str, Any]) -> Floats:
     """(4, 4) matrix of a node: given by columns, or translation, rotation (x y z w) and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.appearance import Alpha, Appearance, Material, Wrap, no_coordinates
 from meshmatch.shapes.formats import damaged
@@ -34,7 +34,7 @@ def read_look(path: Path, data: bytes, reader: ImageReader, picture: Pixels | No
         raise damaged(path.name, f"its materials make no sense ({type(error).__name__}: {error})") from error
 
 
-def read_coordinates(path: Path, data: bytes) -> NDArray[np.float64] | None:
+def read_coordinates(path: Path, data: bytes) -> Float[Floats, "F 3 2"] | None:
     """(F, 3, 2) first texture coordinates of all faces; None where a part has none."""
     try:
         document = Document(path, data)
@@ -59,9 +59,9 @@ class _Look:
         self.numbers: dict[tuple[int, bool], int] = {}
 
     def scene(self) -> Appearance:
-        uvs: list[NDArray[np.float64]] = []
-        kinds: list[NDArray[np.int64]] = []
-        colors: list[NDArray[np.float64] | None] = []
+        uvs: list[Floats] = []
+        kinds: list[Ints] = []
+        colors: list[Floats | None] = []
         counts: list[int] = []
         for _, primitive in self.document.primitives():
             counts.append(self.document.count(primitive["attributes"]["POSITION"]))
@@ -143,7 +143,7 @@ class _Look:
             self.images[number] = self.reader.decode(data, label)
         return self.images[number]
 
-    def _coordinates(self, primitive: dict[str, Any]) -> NDArray[np.float64] | None:
+    def _coordinates(self, primitive: dict[str, Any]) -> Floats | None:
         """(V, 2) coordinates of a primitive's vertices, or None where it has none, or nothing to lay on."""
         _, texture, _ = self._base(primitive.get("material", -1))
         if texture is None and self.picture is None:

@@ -3,12 +3,14 @@
 Vertices are those of `meshmatch.shapes.formats.gltf.read`, in the same order.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.formats import damaged
@@ -31,9 +33,9 @@ class Skin:
     """
 
     V: int
-    vertex: NDArray[np.int64]
-    joint: NDArray[np.int64]
-    weight: NDArray[np.float64]
+    vertex: Int[Ints, " N"]
+    joint: Int[Ints, " N"]
+    weight: Float[Floats, " N"]
     names: tuple[str, ...]
 
 

@@ -2,12 +2,14 @@
 the faces is read by `meshmatch.shapes.formats.obj_look`.
 """
 
+from __future__ import annotations
+
 import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged, fan
 from meshmatch.shapes.formats.text import columns, first_index, lines_of, numbers, words_per_line
@@ -47,7 +49,7 @@ def joined_lines(data: bytes) -> bytes:
     return re.sub(rb"\\\r?\n", b" ", data) if b"\\" in data else data
 
 
-def with_old(found: list[tuple[bytes, NDArray[np.int64]]]) -> tuple[bytes, NDArray[np.int64]]:
+def with_old(found: list[tuple[bytes, Ints]]) -> tuple[bytes, Ints]:
     """Lines of faces, those of the old spelling ``fo`` last."""
     (text, lines), (old, old_lines) = found
     return (text + b"\n" + old, np.concatenate([lines, old_lines])) if len(old_lines) else (text, lines)
@@ -67,9 +69,7 @@ def write(path: Path, shape: Shape) -> None:
     path.write_text("\n".join(["# meshmatch", *lines, ""]))
 
 
-def _faces(
-    name: str, text: bytes, lines: NDArray[np.int64], vertex_lines: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _faces(name: str, text: bytes, lines: Ints, vertex_lines: Ints) -> Ints:
     if b"/" in text:
         text = first_index(text)  # position/texture/normal: the first alone
     sizes = words_per_line(text)
@@ -92,6 +92,6 @@ def _faces(
     return fan(corners - 1, sizes)
 
 
-def _channels(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _channels(values: Floats) -> Floats:
     values = np.nan_to_num(values)
     return np.clip(values / (255.0 if (values > 1).any() else 1.0), 0.0, 1.0)

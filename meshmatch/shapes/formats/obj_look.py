@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Bools, Float, Floats, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.appearance import Alpha, Appearance, Material, Wrap, no_coordinates, vertex_colors_alone
 from meshmatch.shapes.formats import damaged, fan
@@ -83,19 +83,19 @@ def read_look(
     return Appearance(tuple(materials), kind.reshape(-1).astype(np.int64), corners)
 
 
-def _words(text: bytes, lines: NDArray[np.int64]) -> list[tuple[str, int]]:
+def _words(text: bytes, lines: Ints) -> list[tuple[str, int]]:
     names = [re.split(r"\s#", row.decode("utf-8", "surrogateescape"))[0].strip() for row in text.split(b"\n")]
     return list(zip(names, lines.tolist(), strict=False))
 
 
-def read_coordinates(path: Path, data: bytes) -> NDArray[np.float64] | None:
+def read_coordinates(path: Path, data: bytes) -> Float[Floats, "F 3 2"] | None:
     """(F, 3, 2) texture coordinates of all faces, v down; None where a face has none."""
     uv, laid, _ = _coordinates(path.name, joined_lines(data))
     uv[:, :, 1] = 1.0 - uv[:, :, 1]
     return uv if laid.all() else None
 
 
-def _coordinates(name: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64]]:
+def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
     """(F, 3, 2) coordinates with v up, (F,) whether all three corners have them, and (F,) the line of each face."""
     if b"#" in data:
         data = re.sub(rb"#[^\n]*", b"", data)

@@ -1,5 +1,7 @@
 """Stanford PLY, text and binary of either byte order."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged, fan
 from meshmatch.shapes.formats.ply_body import Body, Element, Property
@@ -164,7 +167,7 @@ def _check_kinds(name: str, element: Element) -> None:
             raise damaged(name, f"its header makes {what} of {p.name} of the element {element.name}")
 
 
-def _strips(lists: NDArray[np.int64]) -> NDArray[np.int64]:
+def _strips(lists: Ints) -> Ints:
     """Triangles of strips, -1 between two strips; every second triangle of a strip is turned round."""
     a, b, c = lists[:-2], lists[1:-1], lists[2:]
     place = np.arange(len(lists))
@@ -174,7 +177,7 @@ def _strips(lists: NDArray[np.int64]) -> NDArray[np.int64]:
     return faces[(a >= 0) & (b >= 0) & (c >= 0)]
 
 
-def _colors(table: dict[str, Any]) -> NDArray[np.float64] | None:
+def _colors(table: dict[str, Any]) -> Floats | None:
     names = next((n for n in (("red", "green", "blue"), ("r", "g", "b")) if set(n) <= set(table)), None)
     if names is None:
         return None

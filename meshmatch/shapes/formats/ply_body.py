@@ -143,7 +143,7 @@ class Body:
         raw = np.frombuffer(self.data, np.uint8)[starts[:, None] + np.arange(dtype.itemsize)]
         return np.ascontiguousarray(raw).view(dtype)[:, 0]
 
-    def _indices(self, values: NDArray[Any]) -> NDArray[np.int64]:
+    def _indices(self, values: NDArray[Any]) -> Ints:
         """Whole numbers, or an error: floats are what text files are read as."""
         if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():
             raise damaged(self.name, "a face names a vertex that is not a number")

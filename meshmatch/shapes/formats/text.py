@@ -1,18 +1,20 @@
 """Numbers out of text, fast: whole files at a time, no loop over lines."""
 
+from __future__ import annotations
+
 import re
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.shapes.formats import damaged
 
 _SPACE = np.zeros(256, bool)
 _SPACE[[9, 10, 11, 12, 13, 32]] = True
 
 
-def numbers(name: str, text: bytes) -> NDArray[np.float64]:
+def numbers(name: str, text: bytes) -> Float[Floats, " N"]:
     """All the whitespace-separated numbers of `text`, nan and inf included.
 
     Raises
@@ -41,7 +43,7 @@ def numbers(name: str, text: bytes) -> NDArray[np.float64]:
     return np.array(values)
 
 
-def words_per_line(text: bytes) -> NDArray[np.int64]:
+def words_per_line(text: bytes) -> Int[Ints, " lines"]:
     """How many words each non-blank line of `text` has."""
     if not text:
         return np.empty(0, np.int64)
@@ -54,7 +56,7 @@ def words_per_line(text: bytes) -> NDArray[np.int64]:
     return counts[counts > 0].astype(np.int64)
 
 
-def lines_of(text: bytes, *words: bytes) -> list[tuple[bytes, NDArray[np.int64]]]:
+def lines_of(text: bytes, *words: bytes) -> list[tuple[bytes, Ints]]:
     """For each of the given first words: its lines without that word, and which lines of the text they are.
 
     Spaces in front of the word are allowed.
@@ -91,8 +93,8 @@ def second_index(text: bytes) -> bytes:
 
 
 def columns(
-    values: NDArray[np.float64], counts: NDArray[np.int64], first: int, last: int
-) -> NDArray[np.float64]:
+    values: Float[Floats, " words"], counts: Int[Ints, " lines"], first: int, last: int
+) -> Float[Floats, "lines width"]:
     """Columns `first` to `last` (excluded) of lines of unequal length: flat values, and words per line."""
     if len(counts) and (counts == counts[0]).all():
         return values.reshape(len(counts), -1)[:, first:last]
