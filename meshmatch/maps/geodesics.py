@@ -1,6 +1,6 @@
 """Distances along a surface: Dijkstra on the edges and on the straight diagonals across each edge.
 
-A path along edges before_agreement is about 3 % too long. Two triangles that share an edge can be unfolded into one
+A path along edges alone is about 3 % too long. Two triangles that share an edge can be unfolded into one
 plane without stretching; where the straight line between their far corners crosses the shared edge, that line
 lies on the surface and its length is exact. Adding these diagonals to the graph brings the error to between
 1 and 2.5 %, always upwards: every path of the graph lies on the surface, so no distance is underestimated.

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import blend, closest_on_triangles, interpolate, squared_lengths
-from meshmatch.maps.vertex_map import corners_of
+from meshmatch.maps.map_checks import corners_of
 
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area): enough to tell
 # the sides of a thin wall. More would drag points along the surface to where it bends the same way. Set by hand.

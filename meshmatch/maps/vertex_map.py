@@ -6,17 +6,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, frozen
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
+from meshmatch.maps.map_checks import UNKNOWN, check_faces, check_range, checked_arrays, corners_of, misfit
 from meshmatch.shapes.shape import Shape
 
 DIRECTION = "index[i] is the vertex of the target matched to vertex i of the source"
 VERDICTS = ("good", "fair", "poor", "unknown")
-UNKNOWN = -1
 _OTHER_MESH = (
     "match these two again; a map needs one entry for each vertex of the source, in the order of its file, and one "
     "kept as .npy or .csv goes by the count of vertices alone"
@@ -79,50 +79,17 @@ class VertexMap:
 
     def __post_init__(self) -> None:
         label = f"the map {self.source or 'source'} -> {self.target or 'target'}"
-        index = _integers(self.index, f"{label}: index")
-        size = len(index)
-        if index.ndim != 1 or size == 0:
-            raise InputError(
-                f"{label}: index must be a list of (V_src,) vertices, not an array of {index.shape}"
-            )
+        size, arrays = checked_arrays(
+            label, self.index, self.face, self.barycentric, self.confidence, self.target_vertices
+        )
         if self.source_vertices not in (UNKNOWN, size):
             raise InputError(f"{label} has {size} entries for {self.source_vertices} vertices of the source")
-        if self.target_vertices != UNKNOWN and self.target_vertices < 1:
-            raise InputError(f"{label}: a target needs vertices, not {self.target_vertices}")
-        _in_range(index, self.target_vertices, label)
-
-        face = np.full(size, -1) if self.face is None else _integers(self.face, f"{label}: face")
-        if self.barycentric is None:
-            weights = np.zeros((size, 3))
-            weights[:, 0] = 1.0
-        else:
-            weights = np.array(self.barycentric, dtype=np.float64)
-        confidence = np.ones(size) if self.confidence is None else np.asarray(self.confidence)
-        confidence = np.array(confidence, dtype=np.float32)
-        for name, array, shape in (
-            ("face", face, (size,)),
-            ("barycentric", weights, (size, 3)),
-            ("confidence", confidence, (size,)),
-        ):
-            if array.shape != shape:
-                raise InputError(f"{label}: {name} must be an array of {shape}, not {array.shape}")
-        if face.min() < -1:
-            raise InputError(f"{label}: face {int(face.min())} does not exist")
-        if not (weights >= -1e-9).all() or not np.allclose(weights.sum(axis=1), 1.0, atol=1e-6):
-            raise InputError(f"{label}: barycentric weights must be 0 or more and sum to 1")
-        if not ((confidence >= 0) & (confidence <= 1)).all():
-            raise InputError(f"{label}: confidence must lie in 0..1")
         if self.verdict not in VERDICTS:
             raise InputError(f"{label}: a verdict is one of {', '.join(VERDICTS)}, not '{self.verdict}'")
-
-        for name, array in (
-            ("index", index),
-            ("face", face),
-            ("barycentric", weights),
-            ("confidence", confidence),
-        ):
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        for name, array in arrays.items():
+            object.__setattr__(self, name, frozen(array))
+        if self.target_faces is not None:
+            check_faces(self.face, len(self.target_faces), label)
         object.__setattr__(self, "reasons", tuple(str(reason) for reason in self.reasons))
         object.__setattr__(self, "source_vertices", size)
 
@@ -136,7 +103,7 @@ class VertexMap:
         InputError
             As `VertexMap`, or a face that the target does not have.
         """
-        made = cls(
+        return cls(
             source=source.name,
             target=target.name,
             index=np.asarray(index),
@@ -147,8 +114,6 @@ class VertexMap:
             target_faces=target.faces,
             **rest,
         )
-        made._check_faces(target)
-        return made
 
     @classmethod
     def identity(cls, shape: Shape) -> VertexMap:
@@ -167,8 +132,10 @@ class VertexMap:
             The map was made for another mesh, runs from target to source, or names a vertex or a face that the
             target does not have. The message calls it `label`.
         """
-        sides = [("source", source), ("target", target)]
-        misfits = [self._misfit(side, shape) for side, shape in sides if shape is not None]
+        sides = [
+            (side, shape) for side, shape in (("source", source), ("target", target)) if shape is not None
+        ]
+        misfits = [self._misfit(side, shape) for side, shape in sides]
         if source is not None and target is not None and any(misfits):
             reversed_fits = not self._misfit("source", target) and not self._misfit("target", source)
             if reversed_fits and self.index.max() < source.V:
@@ -177,39 +144,20 @@ class VertexMap:
                     f"{label} runs the wrong way: from {b} to {a}, where one from {a} to {b} is needed",
                     f"swap the two shapes, or match {a} to {b} ({DIRECTION})",
                 )
-        for misfit in misfits:
-            if misfit:
-                raise InputError(f"{label} was made for another {misfit}", _OTHER_MESH)
-        fill: dict[str, Any] = {}
+        for found in filter(None, misfits):
+            raise InputError(f"{label} was made for another {found}", _OTHER_MESH)
+        fill: dict[str, Any] = {} if target is None else {"target_faces": target.faces}
         for side, shape in sides:
-            if shape is not None:
-                name = getattr(self, side) or shape.name
-                fill |= {side: name, f"{side}_vertices": shape.V, f"{side}_hash": shape.hash}
+            name = getattr(self, side) or shape.name
+            fill |= {side: name, f"{side}_vertices": shape.V, f"{side}_hash": shape.hash}
         try:
-            if target is not None:
-                fill["target_faces"] = target.faces
-                self._check_faces(target)
             return replace(self, **fill)
         except InputError as error:
             raise InputError(f"{label}: {error.message}", error.hint) from error
 
     def _misfit(self, side: str, shape: Shape) -> str:
-        """In what `shape` differs from the source or target that the map was made for; empty if in nothing."""
-        made_for, vertices = getattr(self, side), getattr(self, f"{side}_vertices")
-        digest, name = getattr(self, f"{side}_hash"), shape.name or f"the {side}"
-        if vertices not in (UNKNOWN, shape.V):
-            return f"{side}: {made_for or 'a mesh'} of {vertices} vertices, but {name} has {shape.V}"
-        if digest not in ("", shape.hash):
-            return f"{side}: {made_for or 'a mesh'} ({digest}), but {name} is {shape.hash}: vertices or faces differ"
-        return ""
-
-    def _check_faces(self, target: Shape) -> None:
-        highest = int(self.face.max())
-        if highest >= target.F:
-            raise InputError(
-                f"the map {_way(self)} names face {highest}, but {target.name or 'the target'} "
-                f"has only {target.F} faces"
-            )
+        vertices, digest = getattr(self, f"{side}_vertices"), getattr(self, f"{side}_hash")
+        return misfit(side, getattr(self, side), vertices, digest, shape)
 
     @property
     def on_vertex(self) -> Bool[Bools, " V_source"]:
@@ -219,10 +167,7 @@ class VertexMap:
     def corners(self) -> Int[Ints, "V_source 3"]:
         """The three target vertices that ``barycentric`` weights; three times ``index`` where the face is -1.
 
-        Raises
-        ------
-        InputError
-            Points lie in faces, and the faces are not known: the map was read without its target.
+        `InputError` if points lie in faces that are not known: the map was read without its target.
         """
         if self.target_faces is None and self.face.max() >= 0:
             raise InputError(
@@ -244,17 +189,14 @@ class VertexMap:
                 f"the map leads to {self.target} with {self.target_vertices} vertices, "
                 f"but {target.name or 'the target'} has {target.V}"
             )
-        _in_range(self.index, target.V, f"the map {_way(self)}")
-        self._check_faces(target)
+        check_range(self.index, target.V, f"the map {_way(self)}")
+        check_faces(self.face, target.F, f"the map {_way(self)}")
         return interpolate(target.verts, corners_of(target.faces, self.face, self.index), self.barycentric)
 
     def sparse(self) -> csr_array:
         """(V_source, V_target) float64 matrix P of the map: ``P @ values`` is `apply`. Rows sum to 1.
 
-        Raises
-        ------
-        InputError
-            The map was read without its target, whose vertices or faces are unknown.
+        `InputError` if the map was read without its target, whose vertices or faces are unknown.
         """
         if self.target_vertices == UNKNOWN:
             raise InputError(
@@ -275,13 +217,7 @@ class VertexMap:
         """Values of the *target's* vertices, pulled back to the source: at each source vertex the value at its
         matched point, interpolated between the corners of the target's face.
 
-        Parameters
-        ----------
-        values : (V_target,) or (V_target, D)
-
-        Returns
-        -------
-        (V_source,) or (V_source, D) float64
+        (V_target,) becomes (V_source,), and (V_target, D) becomes (V_source, D), float64.
 
         Raises
         ------
@@ -349,7 +285,7 @@ class VertexMap:
                 if backwards
                 else "the first must end where the second starts",
             )
-        _in_range(self.index, other.source_vertices, _way(self))
+        check_range(self.index, other.source_vertices, _way(self))
         worse = max(self.verdict, other.verdict, key=("good", "fair", "unknown", "poor").index)
         return VertexMap(
             source=self.source,
@@ -372,17 +308,6 @@ class VertexMap:
         return f"VertexMap({_way(self)}, {self.source_vertices} -> {target} vertices, {self.verdict})"
 
 
-def corners_of(
-    faces: Int[Ints, "F 3"] | None, face: Int[Ints, " N"], vertex: Int[Ints, " N"]
-) -> Int[Ints, "N 3"]:
-    """Corners of faces (N,); where the face is -1, three times the vertex itself."""
-    corners = np.repeat(vertex[:, None], 3, axis=1)
-    inside = face >= 0
-    if faces is not None:
-        corners[inside] = faces[face[inside]]
-    return corners
-
-
 def _way(m: VertexMap) -> str:
     return f"{m.source or '?'} -> {m.target or '?'}"
 
@@ -390,28 +315,3 @@ def _way(m: VertexMap) -> str:
 def _named(name: str, vertices: int, digest: str) -> str:
     count = "vertices unknown" if vertices == UNKNOWN else f"{vertices} vertices"
     return f"{name or '?'} ({count}{', ' + digest if digest else ''})"
-
-
-def _in_range(index: NDArray[np.int64], target_vertices: int, label: str) -> None:
-    if index.min() < 0:
-        raise InputError(
-            f"{label}: vertex {int(np.argmin(index))} is matched to {int(index.min())}; indices start at 0"
-        )
-    if target_vertices != UNKNOWN and index.max() >= target_vertices:
-        one_based = index.min() >= 1 and index.max() == target_vertices
-        raise InputError(
-            f"{label}: vertex {int(np.argmax(index))} is matched to vertex {int(index.max())}, "
-            f"but the target has only {target_vertices} vertices",
-            "it looks 1-based: subtract 1"
-            if one_based
-            else "is it a map to another shape, or the other way round?",
-        )
-
-
-def _integers(values: ArrayLike, label: str) -> NDArray[np.int64]:
-    array = np.asarray(values)
-    if array.dtype.kind == "f" and np.isfinite(array).all() and (array == np.round(array)).all():
-        return array.astype(np.int64)  # MATLAB's numbers are doubles
-    if array.dtype.kind not in "iu":
-        raise InputError(f"{label} must be whole numbers, not {array.dtype}")
-    return np.array(array, dtype=np.int64)

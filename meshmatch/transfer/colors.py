@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.arrays import Floats
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError
+from meshmatch.maps import table_files
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import to_linear, to_srgb
@@ -40,11 +41,7 @@ def light(colors: Floats) -> Floats:
 
 def check_suffix(path: Path) -> None:
     """Refuse a suffix that cannot hold vertex colours (`OptionError`)."""
-    if path.suffix.lower() not in (*_SHAPES, *_TABLES):
-        raise OptionError(
-            f"{path.name}: vertex colours cannot be kept as '{path.suffix or 'a file without a suffix'}'",
-            f"end the name in one of {' '.join((*_SHAPES, *_TABLES))}",
-        )
+    table_files.check_suffix(path, (*_SHAPES, *_TABLES), "vertex colours")
 
 
 def save(path: Path, shape: Shape, amounts: Floats) -> None:

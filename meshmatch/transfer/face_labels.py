@@ -7,7 +7,8 @@ from scipy.sparse import csr_array
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import triangle_areas
-from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.maps.map_checks import corners_of
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import faces_at_vertices, most_votes, one_hot, vertex_votes
 from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals

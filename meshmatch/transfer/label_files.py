@@ -13,20 +13,30 @@ JSON may also be a bare list, or name the parts: ``{"left hand": [17, 18, ...], 
 
 from __future__ import annotations
 
-import csv
-import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.arrays import Ints
+from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError, OptionError
+from meshmatch.maps.table_files import (
+    check_numbered,
+    check_suffix,
+    read_by_suffix,
+    read_json,
+    read_rows,
+    read_text,
+    write_json,
+    write_npy,
+    write_rows,
+)
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.array_files import read_npy
 from meshmatch.shapes.palette import label_colors
-from meshmatch.shapes.paths import existing
 from meshmatch.shapes.shape import Shape
 
 On = Literal["vertices", "faces"]
@@ -49,9 +59,15 @@ class Labels:
     on : {"vertices", "faces"}
     """
 
-    codes: Ints
+    codes: Int[Ints, " N"]
     names: tuple[Label, ...]
     on: On
+
+    @property
+    def values(self) -> NDArray[np.generic]:
+        """(N,) the label itself of each vertex or face; -1 or an empty word for none."""
+        table = np.array([*self.names, "" if self.are_words else -1])
+        return table[self.codes]
 
     @property
     def are_words(self) -> bool:
@@ -96,30 +112,25 @@ def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
     OptionError
         The count fits both, and neither the file nor `on` says which.
     """
-    path = existing(Path(path), _HINT)
-    suffix = path.suffix.lower()
-    values: Any
-    said: str | None = None
-    if suffix == ".npy":
-        values = read_npy(path)
-        if values.dtype.kind not in "iufbU" or values.ndim != 1:
-            raise InputError(
-                f"{path.name} holds an array of {values.shape} {values.dtype}, not labels", _HINT
-            )
-        values = values.tolist()
-    elif suffix == ".txt":
-        values = _lines(path)
-    elif suffix == ".csv":
-        values, said = _read_csv(path, shape)
-    elif suffix == ".json":
-        values, said = _read_json(path, shape, on)
-    else:
-        raise InputError(
-            f"{path.name}: labels are not read from '{suffix}' files", "choose .npy, .csv, .txt or .json"
-        )
-    if on is not None and said is not None and on != said:
-        raise OptionError(f"{path.name} says that it holds labels of {said}, not of {on}", "leave out --on")
-    return _labels(path.name, values, _belongs(path.name, len(values), shape, on or said))
+    readers = {
+        ".npy": lambda path: (_read_npy(path), None),
+        ".csv": lambda path: _read_csv(path, (shape.V, shape.F)),
+        ".txt": lambda path: ([line.strip() for line in read_text(path).rstrip().splitlines()], None),
+        ".json": lambda path: _read_json(path, shape, on),
+    }
+    values, written = read_by_suffix(path, readers, "labels", _HINT)
+    name = Path(path).name
+    if on is not None and written is not None and on != written:
+        raise OptionError(f"{name} says that it holds labels of {written}, not of {on}", "leave out --on")
+    return _labels(name, values, _belongs(name, len(values), shape, on or written))
+
+
+def labels_of(values: ArrayLike, shape: Shape, on: On | None = None) -> Labels:
+    """Labels of the vertices or faces of `shape` from an array of whole numbers or words; see `load_labels`."""
+    array = np.asarray(values)
+    if array.ndim != 1 or array.dtype.kind not in "iufbUO":
+        raise InputError(f"labels must be a list of (N,), not an array of {array.shape} {array.dtype}", _HINT)
+    return _labels("the array", array.tolist(), _belongs("the array", len(array), shape, on))
 
 
 def _belongs(name: str, count: int, shape: Shape, on: str | None) -> On:
@@ -140,19 +151,17 @@ def _belongs(name: str, count: int, shape: Shape, on: str | None) -> On:
     return "faces" if (on or fits[0]) == "faces" else "vertices"
 
 
-def _labels(name: str, values: list[Any], on: On) -> Labels:
+def _labels(name: str, values: Sequence[Any], on: On) -> Labels:
     whole = [_whole(value) for value in values]
     cells: list[Label | None] = []
     if all(value is not None or _missing(raw) for value, raw in zip(whole, values, strict=True)):
         cells = list(whole)
     else:
         for raw in values:
-            if not isinstance(raw, str | int | float | None):
-                raise InputError(f"{name}: a label is a whole number or a word, not {str(raw)[:40]!r}", _HINT)
             if isinstance(raw, float):
-                raise InputError(
-                    f"{name}: {raw} is no label", "numbers between labels go with transfer-color"
-                )
+                raise InputError(f"{name}: {raw} is no label", "transfer-color interpolates numbers")
+            if not isinstance(raw, str | int | None):
+                raise InputError(f"{name}: a label is a whole number or a word, not {str(raw)[:40]!r}", _HINT)
             word = plain_text(" ".join(str(raw).split()))  # one line each
             cells.append(None if raw is None or raw == "" else word)
     names = tuple(sorted({cell for cell in cells if cell is not None}))
@@ -166,7 +175,7 @@ def _labels(name: str, values: list[Any], on: On) -> Labels:
 def _whole(value: Any) -> int | None:
     """A whole number, also one written as text or with a decimal point."""
     try:
-        if isinstance(value, str):
+        if isinstance(value, str | int):
             return int(value)
         return int(value) if float(value) == int(value) else None
     except (ValueError, TypeError, OverflowError):
@@ -177,57 +186,46 @@ def _missing(value: Any) -> bool:
     return value is None or value == "" or value != value
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path.name} is not text: {error}", _HINT) from error
+def _read_npy(path: Path) -> list[Any]:
+    values = read_npy(path)
+    if values.dtype.kind not in "iufbU" or values.ndim != 1:
+        raise InputError(f"it holds an array of {values.shape} {values.dtype}, not labels")
+    labels: list[Any] = values.tolist()
+    return labels
 
 
-def _lines(path: Path) -> list[str]:
-    return [line.strip() for line in _text(path).rstrip().splitlines()]
-
-
-def _read_csv(path: Path, shape: Shape) -> tuple[list[str], str | None]:
-    try:
-        rows = [[cell.strip() for cell in row] for row in csv.reader(_text(path).splitlines()) if row]
-    except csv.Error as error:
-        raise InputError(f"{path.name} is not a csv file: {error}", _HINT) from error
+def _read_csv(path: Path, counts: tuple[int, int]) -> tuple[list[str], str | None]:
+    rows = read_rows(path)
     if not rows or len({len(row) for row in rows}) != 1:
-        raise InputError(f"{path.name}: its rows are not equally long", "one row each: vertex,label")
+        raise InputError("its rows are not equally long", "one row each: vertex,label")
     head = [cell.lower() for cell in rows[0]]
-    said = {"vertex": "vertices", "face": "faces"}.get(head[0])
-    named = said is not None or "label" in head
-    counts = (shape.V, shape.F)
-    if named or (len(rows) - 1 in counts and len(rows) not in counts):
+    written = {"vertex": "vertices", "face": "faces"}.get(head[0])
+    has_names = written is not None or "label" in head
+    if has_names or (len(rows) - 1 in counts and len(rows) not in counts):
         rows = rows[1:]
-    column = head.index("label") if named and "label" in head else len(head) - 1
-    if len(head) > 2 and not (named and "label" in head):
-        raise InputError(f"{path.name} has {len(head)} columns and none is called label", "use vertex,label")
-    numbered = said is not None or (len(head) == 2 and column == 1)
-    if numbered and [row[0] for row in rows] != [str(k) for k in range(len(rows))]:
-        raise InputError(f"{path.name}: its rows are not 0, 1, 2, ... in order", "sort it, one row for each")
-    return [row[column] for row in rows], said
+    column = head.index("label") if "label" in head else len(head) - 1
+    if len(head) > 2 and "label" not in head:
+        raise InputError(f"it has {len(head)} columns and none is called label", "use vertex,label")
+    if written is not None or (len(head) == 2 and column == 1):
+        check_numbered([row[0] for row in rows])
+    return [row[column] for row in rows], written
 
 
 def _read_json(path: Path, shape: Shape, on: On | None) -> tuple[list[Any], str | None]:
-    try:
-        record = json.loads(_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path.name} is not JSON: {error}", _HINT) from error
+    record = read_json(path)
     if isinstance(record, list):
         return record, None
     if not isinstance(record, dict):
-        raise InputError(f"{path.name} holds no list of labels", _HINT)
+        raise InputError("it holds no list of labels")
     if isinstance(record.get("labels"), list) and set(record) - {"labels"} <= {"format", "on", "shape"}:
-        said = record.get("on")
-        if said not in (None, "vertices", "faces"):
-            raise InputError(f"{path.name}: labels are on vertices or on faces, not on {said!r}")
-        return record["labels"], said
-    return _parts(path.name, record, shape, on), on or "vertices"
+        written = record.get("on")
+        if written not in (None, "vertices", "faces"):
+            raise InputError(f"labels are on vertices or on faces, not on {written!r}")
+        return record["labels"], written
+    return _parts(record, shape, on), on or "vertices"
 
 
-def _parts(name: str, record: dict[str, Any], shape: Shape, on: On | None) -> list[Any]:
+def _parts(record: dict[str, Any], shape: Shape, on: On | None) -> list[Any]:
     """Labels from lists of the members of each part. Where two parts share a member the first keeps it."""
     size = shape.F if on == "faces" else shape.V
     labels: list[Any] = [None] * size
@@ -235,7 +233,7 @@ def _parts(name: str, record: dict[str, Any], shape: Shape, on: On | None) -> li
         whole = isinstance(members, list) and all(type(member) is int for member in members)
         if not whole or (members and not 0 <= min(members) <= max(members) < size):
             raise InputError(
-                f"{name}: '{part[:40]}' is no list of {on or 'vertices'} of {shape.name or 'the source'}",
+                f"'{part[:40]}' is no list of {on or 'vertices'} of {shape.name or 'the source'}",
                 f"its {on or 'vertices'} are 0 to {size - 1}",
             )
         for member in members:
@@ -243,13 +241,9 @@ def _parts(name: str, record: dict[str, Any], shape: Shape, on: On | None) -> li
     return labels
 
 
-def check_labels_suffix(path: Path) -> None:
-    """Refuse a suffix that cannot hold labels (`OptionError`)."""
-    if path.suffix.lower() not in LABEL_SUFFIXES:
-        raise OptionError(
-            f"{path.name}: labels cannot be kept as '{path.suffix or 'a file without a suffix'}'",
-            f"end the name in one of {' '.join(LABEL_SUFFIXES)}",
-        )
+def check_labels_suffix(path: Path) -> str:
+    """The suffix, if it is one of `LABEL_SUFFIXES`; `OptionError` otherwise."""
+    return check_suffix(path, LABEL_SUFFIXES, "labels")
 
 
 def save_labels(path: Path, labels: Labels, shape: Shape) -> None:
@@ -258,38 +252,38 @@ def save_labels(path: Path, labels: Labels, shape: Shape) -> None:
     Raises
     ------
     OptionError
-        The suffix is none of `LABEL_SUFFIXES`.
+        The suffix is not one of `LABEL_SUFFIXES`, or a label is too large a number for the format.
     """
-    check_labels_suffix(path)
-    suffix = path.suffix.lower()
+    suffix = check_labels_suffix(path)
     cells = [labels.names[code] for code in labels.codes.tolist()]
     if suffix == ".npy":
-        kind = np.str_ if labels.are_words else np.int64
-        with path.open("wb") as file:
-            np.save(file, np.array(cells, kind), allow_pickle=False)
+        if not labels.are_words:
+            _check_range(path, labels, 64)
+        write_npy(path, np.array(cells, np.str_ if labels.are_words else np.int64))
     elif suffix == ".txt":
         path.write_text("".join(f"{cell}\n" for cell in cells), encoding="utf-8")
     elif suffix == ".csv":
-        with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["vertex" if labels.on == "vertices" else "face", "label"])
-            writer.writerows(enumerate(cells))
+        write_rows(path, ["vertex" if labels.on == "vertices" else "face", "label"], enumerate(cells))
     elif suffix == ".json":
-        record = {"format": _FORMAT, "on": labels.on, "shape": shape.name, "labels": cells}
-        path.write_text(json.dumps(record, ensure_ascii=False) + "\n", encoding="utf-8")
+        write_json(path, {"format": _FORMAT, "on": labels.on, "shape": shape.name, "labels": cells})
     else:
         _write_ply(path, labels, shape)
+
+
+def _check_range(path: Path, labels: Labels, bits: int) -> None:
+    if any(not -(2 ** (bits - 1)) <= int(name) < 2 ** (bits - 1) for name in labels.names):
+        raise OptionError(
+            f"{path.name}: this format holds labels of at most {bits} bits", "choose .csv or .json"
+        )
 
 
 def _write_ply(path: Path, labels: Labels, shape: Shape) -> None:
     """Whole numbers as they are; words by their number, which comments in the header explain."""
     from meshmatch.shapes.formats import ply
 
-    numbers = list(range(len(labels.names))) if labels.are_words else [int(name) for name in labels.names]
-    if max(numbers) >= 2**31 or min(numbers) < -(2**31):
-        raise OptionError(
-            f"{path.name}: a ply file holds labels of 32 bits alone", "choose .npy, .csv or .json"
-        )
+    if not labels.are_words:
+        _check_range(path, labels, 32)
+    numbers = range(len(labels.names)) if labels.are_words else [int(name) for name in labels.names]
     used = np.array(numbers, np.int32)
     comments = [f"label {k} {name}" for k, name in enumerate(labels.names)] if labels.are_words else []
     known = [k if name not in ("", -1) else -1 for k, name in enumerate(labels.names)]
@@ -297,7 +291,5 @@ def _write_ply(path: Path, labels: Labels, shape: Shape) -> None:
     columns: dict[str, Any] = {"label": used[labels.codes]}
     columns |= {channel: colors[:, k] for k, channel in enumerate(("red", "green", "blue"))}
     plain = Shape(shape.verts, shape.faces, shape.name, None, shape.invalid)
-    if labels.on == "vertices":
-        ply.write(path, plain, vertex=columns, comments=comments)
-    else:
-        ply.write(path, plain, face=columns, comments=comments)
+    where: Any = {"vertex" if labels.on == "vertices" else "face": columns}
+    ply.write(path, plain, comments=comments, **where)

@@ -12,9 +12,7 @@ the nearest point of the surface. Also a plain list of vertices, .txt or .npy.
 
 from __future__ import annotations
 
-import csv
-import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,10 +20,18 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError
 from meshmatch.maps.pairs import load_points
+from meshmatch.maps.table_files import (
+    check_suffix,
+    read_by_suffix,
+    read_json,
+    read_rows,
+    short_floats,
+    write_json,
+    write_rows,
+)
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.paths import existing
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.landmarks import Landmarks, at_faces, at_points, at_vertices, joined
 
@@ -60,62 +66,43 @@ def load_landmarks(path: str | Path, shape: Shape) -> tuple[Landmarks, float]:
     InputError
         The file is missing or damaged, holds no landmark, or one that is not on `shape`.
     """
-    path = existing(Path(path), _HINT)
-    suffix = path.suffix.lower()
-    if suffix in (".txt", ".npy"):
-        return at_vertices(shape, load_points(path)), 0.0
-    if suffix not in LANDMARK_SUFFIXES:
-        raise InputError(
-            f"{path.name}: landmarks are not read from '{suffix}' files", "choose .csv, .json, .pp or .txt"
-        )
-    try:
-        entries = {".csv": _read_csv, ".json": _read_json, ".pp": _read_pp}[suffix](path)
-    except InputError as error:
-        raise InputError(f"{path.name}: {error.message}", error.hint or _HINT) from error
-    except (ValueError, TypeError, KeyError, RecursionError, csv.Error, OverflowError) as error:
-        raise InputError(f"{path.name} does not hold landmarks that can be read: {error}", _HINT) from error
+    readers: dict[str, Callable[[Path], tuple[Landmarks, float]]] = {
+        ".csv": lambda path: _on_shape(_read_csv(path), shape),
+        ".json": lambda path: _on_shape(_read_json(path), shape),
+        ".pp": lambda path: _on_shape(_read_pp(path), shape),
+        ".txt": lambda path: (at_vertices(shape, load_points(path)), 0.0),
+        ".npy": lambda path: (at_vertices(shape, load_points(path)), 0.0),
+    }
+    return read_by_suffix(path, readers, "landmarks", _HINT)
+
+
+def _on_shape(entries: Sequence[_Entry], shape: Shape) -> tuple[Landmarks, float]:
+    """Landmarks in the order of the entries; and the largest distance of a position from the surface."""
     if not entries:
-        raise InputError(f"{path.name} holds no landmark", _HINT)
-    return _placed(entries, shape)
-
-
-def _placed(entries: Sequence[_Entry], shape: Shape) -> tuple[Landmarks, float]:
-    """On the shape, in the order of the entries; and the largest distance of a position."""
+        raise InputError("it holds no landmark")
+    kinds = np.array([0 if e.vertex is not None else 1 if e.face is not None else 2 for e in entries])
     parts: list[Landmarks] = []
-    order: list[int] = []
-    furthest = 0.0
-
-    def some(chosen: list[int]) -> tuple[list[_Entry], tuple[str, ...]]:
-        order.extend(chosen)
-        own = [entries[k] for k in chosen]
-        return own, tuple(entry.name for entry in own)
-
-    numbers = range(len(entries))
-    if vertices := [k for k in numbers if entries[k].vertex is not None]:
-        own, names = some(vertices)
-        parts.append(at_vertices(shape, np.array([entry.vertex for entry in own]), names))
-    if faces := [k for k in numbers if entries[k].vertex is None and entries[k].face is not None]:
-        own, names = some(faces)
-        weights = np.array([entry.weights for entry in own])
-        parts.append(at_faces(shape, np.array([entry.face for entry in own]), weights, names))
-    if positions := [k for k in numbers if entries[k].vertex is None and entries[k].face is None]:
-        own, names = some(positions)
-        found, distance = at_points(shape, np.array([entry.position for entry in own]), names)
-        parts.append(found)
-        furthest = float(distance.max())
-    together, back = joined(parts), np.argsort(order)
-    arrays = [
-        getattr(together, name)[back] for name in ("points", "vertex", "face", "barycentric", "confidence")
-    ]
-    return Landmarks(tuple(together.names[k] for k in back), *arrays), furthest
+    largest = 0.0
+    for kind in (0, 1, 2):
+        own = [entry for entry, its in zip(entries, kinds, strict=True) if its == kind]
+        if not own:
+            continue
+        names = tuple(entry.name for entry in own)
+        if kind == 0:
+            parts.append(at_vertices(shape, np.array([entry.vertex for entry in own]), names))
+        elif kind == 1:
+            weights = np.array([entry.weights for entry in own])
+            parts.append(at_faces(shape, np.array([entry.face for entry in own]), weights, names))
+        else:
+            found, distance = at_points(shape, np.array([entry.position for entry in own]), names)
+            parts.append(found)
+            largest = float(distance.max())
+    # They were joined kind by kind: back to the order of the file.
+    return joined(parts).rows(np.argsort(np.argsort(kinds, kind="stable"))), largest
 
 
 def _read_csv(path: Path) -> list[_Entry]:
-    rows = [
-        [cell.strip() for cell in row]
-        for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
-        if row and not row[0].startswith("#")
-    ]
+    rows = [row for row in read_rows(path) if not row[0].startswith("#")]
     if not rows:
         return []
     head = [cell.lower() for cell in rows[0]]
@@ -124,7 +111,7 @@ def _read_csv(path: Path) -> list[_Entry]:
     else:
         width = len(head)
         if width not in (1, 2, 3, 4) or (width == 2 and _is_whole(head[0])):
-            raise InputError("its first row names no columns", _HINT)
+            raise InputError("its first row names no columns")
         head = {1: ["vertex"], 2: ["name", "vertex"], 3: ["x", "y", "z"], 4: ["name", "x", "y", "z"]}[width]
     entries = []
     for number, row in enumerate(rows):
@@ -149,7 +136,7 @@ def _is_whole(text: str) -> bool:
 
 
 def _read_json(path: Path) -> list[_Entry]:
-    record = json.loads(path.read_text(encoding="utf-8-sig"))
+    record = read_json(path)
     if isinstance(record, dict) and isinstance(record.get("landmarks"), list | dict):
         record = record["landmarks"]
     if isinstance(record, dict):
@@ -179,7 +166,7 @@ def _entry(record: dict[str, Any], number: int) -> _Entry:
         return _Entry(name, vertex=_whole(record["vertex"], name))
     if record.get("position") is not None:
         return _Entry(name, position=_three(record["position"], name))
-    raise InputError(f"landmark {name} has no place", _HINT)
+    raise InputError(f"landmark {name} has no place")
 
 
 def _whole(value: Any, name: str) -> int:
@@ -216,13 +203,9 @@ def _read_pp(path: Path) -> list[_Entry]:
     return entries
 
 
-def check_landmarks_suffix(path: Path) -> None:
-    """Refuse a suffix that cannot hold landmarks (`OptionError`)."""
-    if path.suffix.lower() not in LANDMARK_SUFFIXES:
-        raise OptionError(
-            f"{path.name}: landmarks cannot be kept as '{path.suffix or 'a file without a suffix'}'",
-            f"end the name in one of {' '.join(LANDMARK_SUFFIXES)}",
-        )
+def check_landmarks_suffix(path: Path) -> str:
+    """The suffix, if it is one of `LANDMARK_SUFFIXES`; `OptionError` otherwise."""
+    return check_suffix(path, LANDMARK_SUFFIXES, "landmarks")
 
 
 def save_landmarks(path: Path, landmarks: Landmarks) -> None:
@@ -231,35 +214,28 @@ def save_landmarks(path: Path, landmarks: Landmarks) -> None:
     Raises
     ------
     OptionError
-        The suffix is none of `LANDMARK_SUFFIXES`.
+        The suffix is not one of `LANDMARK_SUFFIXES`.
     """
-    check_landmarks_suffix(path)
-    suffix = path.suffix.lower()
+    suffix = check_landmarks_suffix(path)
+    columns = (landmarks.vertex, landmarks.points, landmarks.face, landmarks.barycentric)
     rows = list(
         zip(
             landmarks.names,
-            landmarks.vertex.tolist(),
-            landmarks.points.tolist(),
-            landmarks.face.tolist(),
-            landmarks.barycentric.tolist(),
-            landmarks.confidence.astype(np.float32).astype(np.str_).tolist(),
+            *(column.tolist() for column in columns),
+            short_floats(landmarks.confidence),
             strict=True,
         )
     )
     if suffix == ".csv":
-        with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(COLUMNS)
-            writer.writerows(
-                [name, vertex, *point, face, *weights, sure]
-                for name, vertex, point, face, weights, sure in rows
-            )
+        cells = (
+            [name, vertex, *xyz, face, *weights, sure] for name, vertex, xyz, face, weights, sure in rows
+        )
+        write_rows(path, COLUMNS, cells)
         return
     if suffix == ".json":
         keys = ("name", "vertex", "position", "face", "barycentric", "confidence")
-        records = [dict(zip(keys, (*row[:5], float(row[5])), strict=True)) for row in rows]
-        text = json.dumps({"format": _FORMAT, "landmarks": records}, ensure_ascii=False, indent=1)
-        path.write_text(text + "\n", encoding="utf-8")
+        records = [dict(zip(keys, row, strict=True)) for row in rows]
+        write_json(path, {"format": _FORMAT, "landmarks": records}, indent=1)
         return
     root = ElementTree.Element("PickedPoints")
     for name, _, (x, y, z), *_ in rows:

@@ -44,6 +44,12 @@ class Landmarks:
     barycentric: Floats
     confidence: Floats
 
+    def rows(self, rows: Ints) -> Landmarks:
+        """Some of them, in this order."""
+        names = tuple(self.names[k] for k in rows.tolist())
+        face, weights, confidence = self.face[rows], self.barycentric[rows], self.confidence[rows]
+        return Landmarks(names, self.points[rows], self.vertex[rows], face, weights, confidence)
+
 
 def at_vertices(shape: Shape, vertex: Ints, names: tuple[str, ...] = ()) -> Landmarks:
     """Landmarks that are vertices (N,) of `shape`.

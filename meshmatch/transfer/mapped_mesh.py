@@ -19,8 +19,9 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.geometry.topology import edges_of
 from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths, unit
+from meshmatch.maps.map_checks import corners_of
 from meshmatch.maps.surface import Footpoints
-from meshmatch.maps.vertex_map import VertexMap, corners_of
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
 # All set by hand; lengths in units of sqrt(area).

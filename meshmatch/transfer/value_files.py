@@ -11,20 +11,28 @@ Colours go into shape files: .ply, .obj, .off, .glb.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from meshmatch.arrays import Floats
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
+from meshmatch.maps.table_files import (
+    check_numbered,
+    check_suffix,
+    read_by_suffix,
+    read_rows,
+    write_npy,
+    write_rows,
+)
 from meshmatch.shapes.array_files import read_npy
-from meshmatch.shapes.paths import existing
 from meshmatch.shapes.shape import Shape
 
+VALUE_SUFFIXES = (".npy", ".csv", ".ply")
 _HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy or .csv"
+# Properties that a ply has already.
+_RESERVED = {"x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,49 +51,39 @@ def load_values(path: str | Path, shape: Shape) -> Values:
     InputError
         The file is missing or damaged, holds no numbers, or not one row for each vertex.
     """
-    path = existing(Path(path), _HINT)
-    suffix = path.suffix.lower()
-    if suffix == ".npy":
-        array = read_npy(path)
-        if array.dtype.kind not in "fiub" or array.ndim not in (1, 2):
-            raise InputError(f"{path.name} holds an array of {array.shape} {array.dtype}, not numbers", _HINT)
-        found = Values(array.astype(np.float64))
-    elif suffix in (".csv", ".txt"):
-        found = _read_csv(path)
-    else:
-        raise InputError(f"{path.name}: values are not read from '{suffix}' files", _HINT)
-    rows = len(found.numbers)
+    readers = {".npy": _read_npy, ".csv": _read_csv, ".txt": _read_csv}
+    found = read_by_suffix(path, readers, "values", _HINT)
+    name, rows = Path(path).name, len(found.numbers)
     if rows != shape.V:
         raise InputError(
-            f"{path.name} has {rows} rows, but {shape.name or 'the source'} has {shape.V} vertices", _HINT
+            f"{name} has {rows} rows, but {shape.name or 'the source'} has {shape.V} vertices", _HINT
         )
     if found.numbers.size == 0:
-        raise InputError(f"{path.name} has no columns", _HINT)
+        raise InputError(f"{name} has no columns", _HINT)
     return found
 
 
+def _read_npy(path: Path) -> Values:
+    array = read_npy(path)
+    if array.dtype.kind not in "fiub" or array.ndim not in (1, 2):
+        raise InputError(f"it holds an array of {array.shape} {array.dtype}, not numbers")
+    return Values(array.astype(np.float64))
+
+
 def _read_csv(path: Path) -> Values:
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if row]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path.name} is not a csv file: {error}", _HINT) from error
+    rows = read_rows(path)
     if not rows:
-        raise InputError(f"{path.name} is empty", _HINT)
+        raise InputError(f"{path.name} is empty")
     names: tuple[str, ...] = ()
     if not all(_is_number(cell) for cell in rows[0]):
-        names, rows = tuple(cell.strip() for cell in rows[0]), rows[1:]
+        names, rows = tuple(rows[0]), rows[1:]
     widths = {len(row) for row in rows} | ({len(names)} if names else set())
     if len(widths) > 1:
-        raise InputError(f"{path.name} has rows of {min(widths)} and of {max(widths)} cells", _HINT)
-    try:
-        table = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
-    except ValueError as error:
-        raise InputError(f"{path.name}: {error}", _HINT) from error
+        raise InputError(f"it has rows of {min(widths)} and of {max(widths)} cells")
+    table = np.array([[float(cell or "nan") for cell in row] for row in rows])
     table = table.reshape(len(rows), widths.pop() if widths else 0)
     if names and names[0].lower() == "vertex":
-        if not np.array_equal(table[:, 0], np.arange(len(table))):
-            raise InputError(f"{path.name}: its rows are not the vertices 0, 1, 2, ... in order", "sort it")
+        check_numbered(table[:, 0])
         names, table = names[1:], table[:, 1:]
     return Values(table[:, 0] if table.shape[1] == 1 else table, names)
 
@@ -104,67 +102,56 @@ def save_values(path: Path, values: Values, shape: Shape) -> None:
     Raises
     ------
     OptionError
-        The suffix is none of .npy, .csv and .ply.
+        The suffix is not one of `VALUE_SUFFIXES`.
     """
-    check_values_suffix(path)
-    suffix, numbers = path.suffix.lower(), values.numbers
+    suffix, numbers = check_values_suffix(path), values.numbers
     if suffix == ".npy":
-        with path.open("wb") as file:
-            np.save(file, numbers, allow_pickle=False)
+        write_npy(path, numbers)
         return
     table = numbers if numbers.ndim == 2 else numbers[:, None]
-    names = values.names or _names(table.shape[1])
+    columns = table.shape[1]
+    names = values.names or (("value",) if columns == 1 else tuple(f"value_{k}" for k in range(columns)))
     if suffix == ".csv":
-        with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["vertex", *names])
-            writer.writerows([k, *row] for k, row in enumerate(table.tolist()))
+        write_rows(path, ["vertex", *names], ([k, *row] for k, row in enumerate(table.tolist())))
         return
     from meshmatch.shapes.formats import ply
 
-    ply.write(path, shape, vertex=dict(zip(_words(names), table.T, strict=True)))
+    ply.write(path, shape, vertex=dict(zip(_ply_names(names), table.T, strict=True)))
 
 
-def check_values_suffix(path: Path) -> None:
-    """Refuse a suffix that cannot hold numbers (`OptionError`)."""
-    if path.suffix.lower() not in (".npy", ".csv", ".ply"):
-        raise OptionError(
-            f"{path.name}: values cannot be kept as '{path.suffix or 'a file without a suffix'}'",
-            "end the name in .npy, .csv or .ply",
-        )
+def check_values_suffix(path: Path) -> str:
+    """The suffix, if it is one of `VALUE_SUFFIXES`; `OptionError` otherwise."""
+    return check_suffix(path, VALUE_SUFFIXES, "values")
 
 
-def _names(count: int) -> tuple[str, ...]:
-    return ("value",) if count == 1 else tuple(f"value_{k}" for k in range(count))
-
-
-def _words(names: tuple[str, ...]) -> list[str]:
-    """Names as a ply header can hold them: no spaces, none twice, none that means something else."""
+def _ply_names(names: tuple[str, ...]) -> list[str]:
+    """Names as a ply header can hold them: no spaces, no duplicates, none that a ply uses already."""
     taken: list[str] = []
     for name in names:
         word = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name) or "value"
-        while word in taken or word in ("x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a"):
+        while word in taken or word in _RESERVED:
             word += "_"
         taken.append(word)
     return taken
 
 
-def parse_blank(text: str, columns: int) -> NDArray[np.float64]:
-    """What stands where nothing is known, from the words of the user: a number, numbers, or #rrggbb.
+def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:
+    """The values to write where nothing is known, from the user's text: a number, numbers, or #rrggbb.
 
     Raises
     ------
     OptionError
-        It is neither, or not as many numbers as there are columns.
+        Any other text, or not as many numbers as there are columns.
     """
-    if text.startswith("#"):
-        numbers = [int(text[k : k + 2], 16) / 255 for k in (1, 3, 5)] if _is_hex(text) else []
-        numbers += [1.0] if columns == 4 and numbers else []
-    else:
-        try:
+    try:
+        if text.startswith("#"):
+            # int() also reads "+f" and "0x", which are no colours
+            digits = text[1:] if len(text) == 7 and text[1:].isalnum() else ""
+            numbers = [int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4)]
+        else:
             numbers = [float(word) for word in text.replace(",", " ").split()]
-        except ValueError:
-            numbers = []
+    except ValueError:
+        numbers = []
     if len(numbers) == 3 and columns == 4:
         numbers.append(1.0)
     if len(numbers) == 1:
@@ -175,7 +162,3 @@ def parse_blank(text: str, columns: int) -> NDArray[np.float64]:
             "such as nan, 0, 0.5,0.5,0.5 or #808080",
         )
     return np.array(numbers)
-
-
-def _is_hex(text: str) -> bool:
-    return len(text) == 7 and all(c in "0123456789abcdefABCDEF" for c in text[1:])

@@ -12,25 +12,33 @@ N is the most that any vertex has. Also read: `weights` (V, J) without `joints`,
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, issparse
 
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError
+from meshmatch.maps.table_files import (
+    check_suffix,
+    read_by_suffix,
+    read_json,
+    short_floats,
+    write_json,
+    write_npz,
+)
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.array_files import read_npz
-from meshmatch.shapes.paths import existing
 from meshmatch.shapes.shape import Shape
 
+WEIGHT_SUFFIXES = (".npz", ".json")
 _FORMAT = "meshmatch skin weights 1"
 _KEYS = ("format", "names", "joints", "weights")
 _HINT = "arrays 'joints' (V, N) and 'weights' (V, N), or 'weights' (V, J) alone; 'names' (J,)"
-_SLACK = 1e-3
+_MAX_JOINTS = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,66 +64,65 @@ def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
     InputError
         The file is missing or damaged, holds no weights, or not those of `shape`.
     """
-    path = existing(Path(path), _HINT)
-    suffix = path.suffix.lower()
-    if suffix in (".glb", ".gltf"):
-        from meshmatch.shapes.formats.gltf_skin import read_skin
-
-        skin = read_skin(path, path.read_bytes())
-        matrix = csr_array((skin.weight, (skin.vertex, skin.joint)), shape=(skin.V, len(skin.names)))
-        return _checked(path.name, matrix, skin.names, shape)
-    if suffix == ".npz":
-        record: dict[str, Any] = dict(read_npz(path, _KEYS))
-    elif suffix == ".json":
-        record = _read_json(path)
-    else:
-        raise InputError(
-            f"{path.name}: skin weights are not read from '{suffix}' files", "choose .npz, .json or .glb"
-        )
-    if "weights" not in record:
-        raise InputError(f"{path.name}: there is no 'weights' in it", _HINT)
-    return _from_record(path.name, record, shape)
+    readers = {
+        ".npz": lambda path: _from_record(read_npz(path, _KEYS)),
+        ".json": lambda path: _from_record(read_json(path)),
+        ".glb": _read_gltf,
+        ".gltf": _read_gltf,
+    }
+    found = read_by_suffix(path, readers, "skin weights", _HINT)
+    return _normalized(Path(path).name, found, shape)
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path.name} is not JSON: {error}", _HINT) from error
-    if not isinstance(record, dict):
-        raise InputError(f"{path.name} holds no object with 'weights'", _HINT)
-    return {key: record[key] for key in _KEYS if key in record}
+def weights_of(matrix: csr_array | ArrayLike, shape: Shape) -> SkinWeights:
+    """Skin weights of the vertices of `shape` from a table (V, J), dense or sparse; joints are named by number.
+
+    Raises
+    ------
+    InputError
+        Not numbers, not a row for each vertex, or negative.
+    """
+    sparse = csr_array(
+        matrix if issparse(matrix) else _table("weights", matrix, np.float64), dtype=np.float64
+    )
+    names = tuple(str(joint) for joint in range(sparse.shape[1]))
+    return _normalized("the array", SkinWeights(sparse, names), shape)
 
 
-def _from_record(name: str, record: dict[str, Any], shape: Shape) -> SkinWeights:
-    weights = _table(name, "weights", record["weights"], np.float64)
+def _read_gltf(path: Path) -> SkinWeights:
+    from meshmatch.shapes.formats.gltf_skin import read_skin
+
+    skin = read_skin(path, path.read_bytes())
+    return SkinWeights(
+        csr_array((skin.weight, (skin.vertex, skin.joint)), (skin.V, len(skin.names))), skin.names
+    )
+
+
+def _from_record(record: Any) -> SkinWeights:
+    if not isinstance(record, Mapping) or "weights" not in record:
+        raise InputError("there is no 'weights' in it")
+    weights = _table("weights", record["weights"], np.float64)
+    joints = _table("joints", record["joints"], np.int64) if "joints" in record else None
     if "names" in record:
         names = tuple(plain_text(str(word)) for word in np.ravel(np.asarray(record["names"], np.str_)))
     else:
-        count = weights.shape[1] if "joints" not in record else int(np.max(record["joints"], initial=-1)) + 1
-        names = tuple(f"joint {k}" for k in range(max(min(count, 1 << 20), 1)))
-    if "joints" in record:
-        joints = _table(name, "joints", record["joints"], np.int64)
-        if joints.shape != weights.shape:
-            raise InputError(
-                f"{name}: 'joints' is an array of {joints.shape}, but 'weights' of {weights.shape}", _HINT
-            )
-        used = weights != 0
-        if used.any() and not 0 <= joints[used].min() <= joints[used].max() < len(names):
-            raise InputError(
-                f"{name} names joint {joints[used].max()}, but there are {len(names)}", "they count from 0"
-            )
-        row, column = np.nonzero(used)
-        entries = weights[row, column], (row, joints[row, column])
-        matrix = csr_array(entries, shape=(len(weights), len(names)))
-    else:
+        count = weights.shape[1] if joints is None else int(joints.max(initial=-1)) + 1
+        names = tuple(f"joint {k}" for k in range(max(min(count, _MAX_JOINTS), 1)))
+    if joints is None:
         if weights.shape[1] != len(names):
-            raise InputError(f"{name} has {weights.shape[1]} columns for {len(names)} names", _HINT)
-        matrix = csr_array(weights)
-    return _checked(name, matrix, names, shape)
+            raise InputError(f"there are {weights.shape[1]} columns for {len(names)} names")
+        return SkinWeights(csr_array(weights), names)
+    if joints.shape != weights.shape:
+        raise InputError(f"'joints' is an array of {joints.shape}, but 'weights' of {weights.shape}")
+    row, column = np.nonzero(weights)
+    used = joints[row, column]
+    if len(used) and not 0 <= used.min() <= used.max() < len(names):
+        raise InputError(f"it names joint {used.max()}, but there are {len(names)}", "they count from 0")
+    return SkinWeights(csr_array((weights[row, column], (row, used)), (len(weights), len(names))), names)
 
 
-def _table(name: str, key: str, values: ArrayLike, kind: type) -> np.ndarray:
+def _table(key: str, values: ArrayLike, kind: type) -> np.ndarray:
+    """An array (V, N) of finite numbers, whole ones where `kind` is an integer."""
     try:
         array = np.asarray(values)
         if array.ndim != 2 or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
@@ -123,11 +130,13 @@ def _table(name: str, key: str, values: ArrayLike, kind: type) -> np.ndarray:
         if kind is np.int64 and (array != np.round(array)).any():
             raise ValueError("its numbers are not whole")
     except ValueError as error:
-        raise InputError(f"{name}: '{key}' is no table of numbers: {error}", _HINT) from error
+        raise InputError(f"'{key}' is no table of numbers: {error}", _HINT) from error
     return array.astype(kind)
 
 
-def _checked(name: str, matrix: csr_array, names: tuple[str, ...], shape: Shape) -> SkinWeights:
+def _normalized(name: str, weights: SkinWeights, shape: Shape) -> SkinWeights:
+    """Checked to be of `shape`, and with rows that sum to 1."""
+    matrix = weights.matrix
     if matrix.shape[0] != shape.V:
         raise InputError(
             f"{name} has weights of {matrix.shape[0]} vertices, but {shape.name or 'the source'} has {shape.V}",
@@ -144,16 +153,12 @@ def _checked(name: str, matrix: csr_array, names: tuple[str, ...], shape: Shape)
     scale = np.where(total > 0, 1.0 / np.where(total > 0, total, 1.0), 0.0)
     matrix = csr_array(matrix * scale[:, None])
     matrix.eliminate_zeros()
-    return SkinWeights(matrix, names)
+    return SkinWeights(matrix, weights.names)
 
 
-def check_weights_suffix(path: Path) -> None:
-    """Refuse a suffix that cannot hold skin weights (`OptionError`)."""
-    if path.suffix.lower() not in (".npz", ".json"):
-        raise OptionError(
-            f"{path.name}: skin weights cannot be kept as '{path.suffix or 'a file without a suffix'}'",
-            "end the name in .npz or .json",
-        )
+def check_weights_suffix(path: Path) -> str:
+    """The suffix, if it is one of `WEIGHT_SUFFIXES`; `OptionError` otherwise."""
+    return check_suffix(path, WEIGHT_SUFFIXES, "skin weights")
 
 
 def save_weights(path: Path, weights: SkinWeights) -> None:
@@ -162,9 +167,9 @@ def save_weights(path: Path, weights: SkinWeights) -> None:
     Raises
     ------
     OptionError
-        The suffix is neither .npz nor .json.
+        The suffix is not one of `WEIGHT_SUFFIXES`.
     """
-    check_weights_suffix(path)
+    suffix = check_weights_suffix(path)
     matrix = csr_array(weights.matrix)
     V = matrix.shape[0]
     rows = np.repeat(np.arange(V), np.diff(matrix.indptr))
@@ -174,20 +179,9 @@ def save_weights(path: Path, weights: SkinWeights) -> None:
     joints, shares = np.zeros((V, N), np.int32), np.zeros((V, N), np.float32)
     joints[rows[order], place] = matrix.indices[order]
     shares[rows[order], place] = matrix.data[order]
-    if path.suffix.lower() == ".npz":
-        record = {
-            "format": np.array(_FORMAT),
-            "names": np.array(weights.names, np.str_),
-            "joints": joints,
-            "weights": shares,
-        }
-        with path.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **record)
-        return
-    words = {
-        "format": _FORMAT,
-        "names": list(weights.names),
-        "joints": joints.tolist(),
-        "weights": shares.astype(np.str_).astype(np.float64).tolist(),  # the shortest text of each
-    }
-    path.write_text(json.dumps(words, ensure_ascii=False) + "\n", encoding="utf-8")
+    if suffix == ".npz":
+        names = np.array(weights.names, np.str_)
+        write_npz(path, {"format": _FORMAT, "names": names, "joints": joints, "weights": shares})
+    else:
+        record = {"format": _FORMAT, "names": weights.names, "joints": joints.tolist()}
+        write_json(path, record | {"weights": short_floats(shares)})

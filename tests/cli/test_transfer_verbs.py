@@ -385,7 +385,7 @@ def unfit_map(pair: Path) -> dict[str, str]:
         "high.npy": "high.npy: the map a.ply -> b.ply: vertex 161",
         "broken.npz": "broken.npz: does not hold arrays",
         "gone.npz": "there is no file gone.npz",
-        "map.xyz": "a map cannot be kept as '.xyz'",
+        "map.xyz": "'.xyz' is not a format for maps",
     }
 
 
@@ -441,11 +441,15 @@ def nothing(folder: Path) -> None:
 
 WRONG: dict[str, tuple[list[str | Path], Callable[[Path], object], str]] = {
     "no colours": (call("transfer-color"), plain, "a.ply has no vertex colours"),
-    "colours as stl": (call("transfer-color", out="c.stl"), nothing, "cannot be kept as '.stl'"),
+    "colours as stl": (
+        call("transfer-color", out="c.stl"),
+        nothing,
+        "'.stl' is not a format for vertex colours",
+    ),
     "values as glb": (
         call("transfer-color", "--values", "values.npy", out="c.glb"),
         nothing,
-        "values cannot be kept as '.glb'",
+        "'.glb' is not a format for values",
     ),
     "short values": (
         call("transfer-color", "--values", "values.npy", out="v.npy"),
@@ -460,18 +464,18 @@ WRONG: dict[str, tuple[list[str | Path], Callable[[Path], object], str]] = {
         short("labels.npy"),
         "9 labels, but a.ply has 162 vertices and 320 faces",
     ),
-    "labels as obj": (call("transfer-labels", out="l.obj"), nothing, "labels cannot be kept as '.obj'"),
+    "labels as obj": (call("transfer-labels", out="l.obj"), nothing, "'.obj' is not a format for labels"),
     "blank labels": (call("transfer-labels", "--blank", "none"), nothing, "labels are whole numbers here"),
     "labels of what": (call("transfer-labels", "--on", "faces"), nothing, "cannot be of its faces"),
     "no labels": (call("transfer-labels", "--labels", "gone.npy"), nothing, "there is no file gone.npy"),
     "both labels": (call("transfer-labels", "--blank", "0", "--fill"), nothing, "contradict each other"),
-    "weights as fbx": (call("transfer-weights", out="w.fbx"), nothing, "skin weights cannot be kept"),
+    "weights as fbx": (call("transfer-weights", out="w.fbx"), nothing, "not a format for skin weights"),
     "other weights": (
         call("transfer-weights", "--weights", "values.npy"),
         nothing,
         "not read from '.npy' files",
     ),
-    "landmarks as txt": (call("transfer-landmarks", out="l.txt"), nothing, "landmarks cannot be kept"),
+    "landmarks as txt": (call("transfer-landmarks", out="l.txt"), nothing, "not a format for landmarks"),
     "landmarks of another": (
         call("transfer-landmarks"),
         lambda folder: (folder / "marks.csv").write_text("name,vertex\nnose,900\n"),
@@ -481,7 +485,7 @@ WRONG: dict[str, tuple[list[str | Path], Callable[[Path], object], str]] = {
     "over the map": (
         call("transfer-color", "--values", "values.npy", out="ab.npz"),
         nothing,
-        "cannot be kept",
+        "not a format for values",
     ),
     "over the source": (call("transfer-color", out="a.ply"), nothing, "is an input of this command"),
     "over the weights": (call("transfer-weights", out="weights.npz"), nothing, "is an input of this command"),

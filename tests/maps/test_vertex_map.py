@@ -92,7 +92,7 @@ def test_refusals(change: dict, message: str, hint: str) -> None:
 
 
 def test_a_face_that_the_target_lacks_is_refused() -> None:
-    with pytest.raises(InputError, match=r"face 18, but b has only 18"):
+    with pytest.raises(InputError, match=r"face 18, but its target has only 18"):
         VertexMap.between(A, B, np.zeros(A.V, int), face=np.full(A.V, B.F))
 
 

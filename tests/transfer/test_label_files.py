@@ -16,6 +16,7 @@ from meshmatch.transfer.label_files import (
     Label,
     Labels,
     On,
+    labels_of,
     load_labels,
     named,
     save_labels,
@@ -174,7 +175,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     ),
     "broken numbers": ("a.npy", lambda path: np.save(path, np.linspace(0, 1, 42)), "is no label"),
     "no label at all": ("a.json", lambda path: path.write_text(json.dumps([None] * 42)), "no label at all"),
-    "no json": ("a.json", lambda path: path.write_text("[1,"), "is not JSON"),
+    "no json": ("a.json", lambda path: path.write_text("[1,"), "can be read"),
     "a number": ("a.json", lambda path: path.write_text("7"), "no list of labels"),
     "lists": ("a.json", lambda path: path.write_text(json.dumps([[1]] * 42)), "whole number or a word"),
     "on what": (
@@ -191,7 +192,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
         "in order",
     ),
     "nameless csv": ("a.csv", lambda path: path.write_text("1,2,3\n" * 42), "none is called label"),
-    "not text": ("a.txt", lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not text"),
+    "not text": ("a.txt", lambda path: path.write_bytes(b"\xff\xfe\x00"), "can be read"),
     "a suffix": ("a.xlsx", lambda path: path.write_text("x"), "not read from '.xlsx'"),
 }
 
@@ -223,10 +224,37 @@ def test_blank_has_the_kind_of_the_labels() -> None:
 
 
 def test_a_suffix_that_cannot_hold_labels_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match=r"l\.obj: labels cannot be kept"):
+    with pytest.raises(OptionError, match=r"l\.obj: '\.obj' is not a format for labels"):
         save_labels(tmp_path / "l.obj", some("vertices", True), SHAPE)
     wide = Labels(np.zeros(42, int), (2**40,), "vertices")
     with pytest.raises(OptionError, match="32 bits"):
         save_labels(tmp_path / "l.ply", wide, SHAPE)
     save_labels(tmp_path / "l.npy", wide, SHAPE)
     assert load_labels(tmp_path / "l.npy", SHAPE).names == (2**40,)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "fine"), [(".npy", False), (".ply", False), (".csv", True), (".json", True)]
+)
+def test_labels_of_more_than_64_bits(tmp_path: Path, suffix: str, fine: bool) -> None:
+    huge = 99999999999999999999999
+    (tmp_path / "a.txt").write_text(f"{huge}\n" * SHAPE.V)
+    given = load_labels(tmp_path / "a.txt", SHAPE)
+    assert given.names == (huge,)
+    if fine:
+        save_labels(tmp_path / f"l{suffix}", given, SHAPE)
+        assert load_labels(tmp_path / f"l{suffix}", SHAPE).names == (huge,)
+    else:
+        with pytest.raises(OptionError, match="bits"):
+            save_labels(tmp_path / f"l{suffix}", given, SHAPE)
+
+
+def test_labels_from_an_array() -> None:
+    assert labels_of(np.arange(SHAPE.V) % 3, SHAPE).names == (0, 1, 2)
+    words = labels_of(["arm", "leg"] * (SHAPE.F // 2), SHAPE)
+    assert (words.names, words.on) == (("arm", "leg"), "faces")
+    assert words.values[:2].tolist() == ["arm", "leg"]
+    with pytest.raises(InputError, match=r"not an array of \(2, 2\)"):
+        labels_of(np.eye(2), SHAPE)
+    with pytest.raises(InputError, match="the array has 3 labels"):
+        labels_of([1, 2, 3], SHAPE)

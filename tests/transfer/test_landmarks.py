@@ -224,7 +224,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "half a vertex": ("a.json", write('[{"vertex": 1.5}]'), "no number of a vertex"),
     "true": ("a.json", write('[{"vertex": true}]'), "no number of a vertex"),
     "huge": ("a.json", write('[{"vertex": 1e300}]'), "no number of a vertex"),
-    "no json": ("a.json", write("{"), "cannot be read|can be read"),
+    "no json": ("a.json", write("{"), "can be read"),
     "a word": ("a.json", write('"nose"'), "no list of landmarks"),
     "no xml": ("a.pp", write("PickedPoints"), "is not XML"),
     "other xml": ("a.pp", write("<svg/>"), "its root is 'svg'"),
@@ -252,5 +252,5 @@ def test_names_cannot_break_a_file(tmp_path: Path) -> None:
 
 
 def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match=r"l\.txt: landmarks cannot be kept"):
+    with pytest.raises(OptionError, match=r"l\.txt: '\.txt' is not a format for landmarks"):
         save_landmarks(tmp_path / "l.txt", some())

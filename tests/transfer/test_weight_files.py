@@ -9,10 +9,11 @@ import pytest
 from scipy.sparse import csr_array
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.maps.table_files import write_json
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import sparse_rows
-from meshmatch.transfer.weight_files import SkinWeights, load_weights, save_weights
+from meshmatch.transfer.weight_files import SkinWeights, load_weights, save_weights, weights_of
 from tests.conftest import icosphere
 from tests.transfer.skinned import write_skinned_glb
 
@@ -114,6 +115,10 @@ def table(**arrays: np.ndarray) -> Callable[[Path], None]:
     return lambda path: np.savez(path, **arrays)
 
 
+def json_of(**values: object) -> Callable[[Path], None]:
+    return lambda path: write_json(path, {"weights": [[1]] * SHAPE.V, **values})
+
+
 BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "not there": ("a.npz", lambda path: None, "there is no file"),
     "empty": ("a.npz", lambda path: path.touch(), "is empty"),
@@ -146,9 +151,13 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
         table(weights=np.ones((SHAPE.V, 3)), names=np.array(["a", "b"])),
         "3 columns for 2 names",
     ),
-    "no json": ("a.json", lambda path: path.write_text("{"), "is not JSON"),
-    "a list": ("a.json", lambda path: path.write_text("[1]"), "no object with 'weights'"),
+    "no json": ("a.json", lambda path: path.write_text("{"), "can be read"),
+    "a list": ("a.json", lambda path: path.write_text("[1]"), "there is no 'weights'"),
     "ragged": ("a.json", lambda path: path.write_text('{"weights": [[1], [1, 2]]}'), "no table of numbers"),
+    "joints of a word": ("a.json", json_of(joints="x"), "'joints' is no table"),
+    "joints of words": ("a.json", json_of(joints=[["a"]] * SHAPE.V), "'joints' is no table"),
+    "no joints": ("a.json", json_of(joints=None), "'joints' is no table"),
+    "ragged names": ("a.json", json_of(names=[["a"], ["b", "c"]]), "can be read"),
     "a suffix": ("a.fbx", lambda path: path.write_text("x"), "not read from '.fbx'"),
     "no skin": ("a.glb", glb_without_skin, "has no skin"),
 }
@@ -177,6 +186,18 @@ def test_joints_of_one_name_are_told_apart(tmp_path: Path) -> None:
     assert load_weights(tmp_path / "s.glb", load_shape(tmp_path / "s.glb")).names == ("knee", "knee 2")
 
 
+def test_weights_from_a_table() -> None:
+    table = some_weights().matrix
+    for given in (table * 2, table.toarray()):
+        found = weights_of(given, SHAPE)
+        assert np.allclose(found.matrix.toarray(), table.toarray())
+        assert found.names == tuple("0123456")
+    with pytest.raises(InputError, match="no table of numbers"):
+        weights_of(np.ones(SHAPE.V), SHAPE)
+    with pytest.raises(InputError, match="the array has weights of 3 vertices"):
+        weights_of(np.ones((3, 2)), SHAPE)
+
+
 def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match=r"w\.txt: skin weights cannot be kept"):
+    with pytest.raises(OptionError, match=r"w\.txt: '\.txt' is not a format for skin weights"):
         save_weights(tmp_path / "w.txt", some_weights())

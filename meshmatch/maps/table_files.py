@@ -1,0 +1,123 @@
+"""What the files of maps and of values on shapes share: the choice by suffix, tables of text, errors in one line."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.outputs import plain_text
+from meshmatch.shapes.paths import existing
+
+T = TypeVar("T")
+# What a damaged file raises in the readers of the standard library and NumPy.
+_DAMAGE = (
+    ValueError,
+    TypeError,
+    LookupError,
+    ArithmeticError,
+    RecursionError,
+    EOFError,
+    StopIteration,
+    csv.Error,
+)
+
+
+def check_suffix(path: str | Path, suffixes: Iterable[str], what: str) -> str:
+    """The suffix in small letters, if it is one of `suffixes`; `OptionError` otherwise. Ask before long work."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in suffixes:
+        given = f"'{suffix}'" if suffix else "a name without a suffix"
+        raise OptionError(
+            f"{Path(path).name}: {given} is not a format for {what}",
+            f"end the name in one of {' '.join(suffixes)}",
+        )
+    return suffix
+
+
+def read_by_suffix(path: str | Path, readers: Mapping[str, Callable[[Path], T]], what: str, hint: str) -> T:
+    """What the reader for the file's suffix makes of it.
+
+    Raises
+    ------
+    InputError
+        The file is missing, empty or damaged, or there is no reader for its suffix; the file's name comes first. A
+        reader's own errors keep their words, and get `hint` where they have none.
+    OptionError
+        The reader's own.
+    """
+    path = existing(Path(path), hint)
+    suffix = path.suffix.lower()
+    if suffix not in readers:
+        raise InputError(
+            f"{path.name}: {what} are not read from '{suffix}' files", f"choose {', '.join(readers)}"
+        )
+    try:
+        return readers[suffix](path)
+    except MeshmatchError as error:
+        words = error.message if error.message.startswith(path.name) else f"{path.name}: {error.message}"
+        raise type(error)(words, error.hint or hint) from error
+    except _DAMAGE as error:
+        raise InputError(f"{path.name} does not hold {what} that can be read: {error}", hint) from error
+
+
+def read_text(path: Path) -> str:
+    """A file's text, in UTF-8."""
+    return path.read_text(encoding="utf-8-sig")
+
+
+def read_rows(path: Path) -> list[list[str]]:
+    """The rows of a csv file that are not empty, without spaces around the cells."""
+    return [[cell.strip() for cell in row] for row in csv.reader(read_text(path).splitlines()) if row]
+
+
+def check_numbered(numbers: ArrayLike) -> None:
+    """`InputError` if the rows are not numbered 0, 1, 2, ..."""
+    rows = np.asarray(numbers, np.float64)
+    if not np.array_equal(rows, np.arange(len(rows))):
+        raise InputError("its rows are not 0, 1, 2, ... in order", "sort it, one row for each")
+
+
+def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """A csv file; floats are written with the fewest digits that read back as the same number."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
+
+
+def read_json(path: Path) -> Any:
+    """The value of a JSON file."""
+    return json.loads(read_text(path))
+
+
+def write_json(path: Path, record: Mapping[str, Any], indent: int | None = None) -> None:
+    """A JSON file, in letters where every file can hold them."""
+    text = json.dumps(record, ensure_ascii=False, allow_nan=False, indent=indent)
+    path.write_text(plain_text(text) + "\n", encoding="utf-8")
+
+
+def write_npy(path: Path, array: np.ndarray) -> None:
+    """An npy file. Through an open file: given a path such as a.NPY, NumPy writes a.NPY.npy."""
+    with path.open("wb") as file:
+        np.save(file, array, allow_pickle=False)
+
+
+def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
+    """A compressed npz file; see `write_npy`."""
+    with path.open("wb") as file:
+        np.savez_compressed(
+            file, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()}
+        )
+
+
+def short_floats(values: np.ndarray) -> list[Any]:
+    """float32 numbers as the floats with the fewest digits that read back as the same float32."""
+    short: list[Any] = values.astype(np.float32).astype(np.str_).astype(np.float64).tolist()
+    return short
