@@ -3,7 +3,6 @@
 const SIDES = ['source', 'target'];
 const OTHER = { source: 'target', target: 'source' };
 const VIEW = { turn: 20, tilt: 8, field: 28 }; // degrees
-const $ = (id) => document.getElementById(id);
 
 const words = readWords();
 const state = { mode: 'matches', wireframe: false, linked: true, hover: null, pin: null, frames: 0 };
@@ -94,7 +93,9 @@ function fittingDistance() {
     const [top, bottom] = covered(side),
       height = Math.max(box.clientHeight, 1);
     const room = Math.max(height - top - bottom - 16, 40) / height;
-    distance = Math.max(distance, h / 2 / half / room + d / 2, (width / 2 / half / aspect) * 1.1 + d / 2);
+    // Turned, any corner may come to the front: nearer, and so larger.
+    const front = Math.hypot(w, d) / 2;
+    distance = Math.max(distance, h / 2 / half / room + front, (width / 2 / half / aspect) * 1.1 + d / 2);
   }
   return distance;
 }

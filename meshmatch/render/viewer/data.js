@@ -24,3 +24,28 @@ function fromBase64(text) {
   for (let i = 0; i < bytes.length; i++) bytes[i] = binary.charCodeAt(i);
   return bytes;
 }
+
+const $ = (id) => document.getElementById(id);
+
+// Open the page by its parts: write the words, prepare the drawing, begin when all is in place.
+async function openPage(words, { write, prepare, resize, reset, begin }) {
+  try {
+    write();
+    if (typeof DecompressionStream === 'undefined')
+      throw new Error('this browser is too old to unpack the page');
+    const arrays = await readArrays(words.arrays);
+    try {
+      prepare(arrays);
+    } catch (error) {
+      throw new Error(`this browser does not draw in 3D (WebGL 2): ${error.message}`);
+    }
+    new ResizeObserver(resize).observe($('stage'));
+    resize();
+    reset();
+    $('message').textContent = '';
+    await begin();
+  } catch (error) {
+    $('message').textContent = `This page cannot be shown: ${error.message}.`;
+    console.error(error);
+  }
+}

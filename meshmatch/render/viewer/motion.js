@@ -1,6 +1,5 @@
 // A shape that moves: between two of its frames every vertex goes straight from one to the next.
 
-const $ = (id) => document.getElementById(id);
 const VIEW = { turn: 20, tilt: 8, field: 28 }; // degrees
 const SECONDS = 4; // from the first frame to the last
 const words = readWords();
@@ -194,19 +193,7 @@ function write() {
   }
 }
 
-async function open() {
-  write();
-  if (typeof DecompressionStream === 'undefined')
-    throw new Error('this browser is too old to unpack the page');
-  const arrays = await readArrays(words.arrays);
-  try {
-    prepare(arrays);
-  } catch (error) {
-    throw new Error(`this browser does not draw in 3D (WebGL 2): ${error.message}`);
-  }
-  new ResizeObserver(resize).observe($('stage'));
-  resize();
-  reset();
+async function begin() {
   show(words.times[0]);
   $('time').addEventListener('input', () => {
     play(false);
@@ -215,7 +202,6 @@ async function open() {
   $('play').addEventListener('click', () => play(!state.playing));
   $('reset').addEventListener('click', reset);
   document.addEventListener('keydown', keys);
-  $('message').textContent = '';
 }
 
 // For tests, and for the curious at the console.
@@ -224,7 +210,4 @@ window.meshmatch = {
   show,
 };
 
-open().catch((error) => {
-  $('message').textContent = `This page cannot be shown: ${error.message}.`;
-  console.error(error);
-});
+openPage(words, { write, prepare, resize, reset, begin });

@@ -112,7 +112,9 @@ def write_page(
     words |= {
         "verdict": there.verdict,
         "reasons": [plain_text(reason) for reason in there.reasons],
-        "confidence": [round(float(found.confidence.mean()), 4) for found in maps],
+        "confidence": [round(float(found.confidence.mean()), 4) for found in maps]
+        if _is_known(there)
+        else None,
         "ramp": Scale(0.0, 1.0, reverse=True).colors(np.linspace(0, 1, 9)).round(4).tolist(),
         "version": __version__,
         "arrays": table,
@@ -122,6 +124,11 @@ def write_page(
         temporary.write_text(text, encoding="utf-8", newline="\n")
     notes = tuple(f"{name}: {part.note}" for name, part in zip(shown, parts, strict=True) if part.note)
     return PageReport((len(parts[0].vertex), len(parts[1].vertex)), notes, len(text.encode()))
+
+
+def _is_known(found: VertexMap) -> bool:
+    """Whether the map says how confident it is: files of indices alone are read as confident everywhere."""
+    return found.verdict != "unknown" or bool((found.confidence < 1).any())
 
 
 def check_page(path: str | Path) -> None:
@@ -169,7 +176,7 @@ def assemble(name: str, scripts: Sequence[str], words: dict[str, Any], packed: s
 
     Every part is put in once, in one pass: a name cannot pose as a part.
     """
-    style = _asset(f"{name}.css")
+    style = _asset("page.css") + _asset(f"{name}.css")
     library = _asset("three.min.js")
     program = "(() => {\n'use strict';\n" + "\n".join(_asset(f"{part}.js") for part in scripts) + "})();\n"
     # Scripts and styles are allowed by their hashes alone, and nothing may be fetched from anywhere.
@@ -187,12 +194,13 @@ def assemble(name: str, scripts: Sequence[str], words: dict[str, Any], packed: s
         "policy": policy,
         "title": html.escape(plain_text(title)),
         "style": style,
+        "body": _asset(f"{name}.html"),
         "library": library,
         "program": program,
         "words": _json(words),
         "packed": packed,
     }
-    return re.sub(r"<!--(\w+)-->", lambda found: parts[found[1]], _asset(f"{name}.html"))
+    return re.sub(r"<!--(\w+)-->", lambda found: parts[found[1]], _asset("page.html"))
 
 
 def _asset(name: str) -> str:

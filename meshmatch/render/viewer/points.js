@@ -78,7 +78,7 @@ function tell(announce) {
   const status = $('status');
   if (found) {
     const [from, to] = [words[found.side].name, words[OTHER[found.side]].name];
-    const sure = found.confidence.toFixed(2);
+    const sure = words.confidence ? found.confidence.toFixed(2) : 'unknown';
     status.replaceChildren(
       'Confidence ',
       bold(sure),

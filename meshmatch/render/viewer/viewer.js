@@ -24,19 +24,7 @@ async function dress() {
   setMode(state.mode);
 }
 
-async function open() {
-  write();
-  if (typeof DecompressionStream === 'undefined')
-    throw new Error('this browser is too old to unpack the page');
-  const arrays = await readArrays(words.arrays);
-  try {
-    prepare(arrays);
-  } catch (error) {
-    throw new Error(`this browser does not draw in 3D (WebGL 2): ${error.message}`);
-  }
-  new ResizeObserver(resize).observe($('stage'));
-  resize();
-  reset();
+async function begin() {
   setMode('matches');
   tell();
   $('wireframe').addEventListener('click', () => setWireframe(!state.wireframe));
@@ -47,7 +35,6 @@ async function open() {
   document.addEventListener('pointerdown', (event) => {
     if (!$('verdict').contains(event.target)) $('verdict').open = false;
   });
-  $('message').textContent = '';
   await dress();
 }
 
@@ -69,7 +56,4 @@ window.meshmatch = {
   },
 };
 
-open().catch((error) => {
-  $('message').textContent = `This page cannot be shown: ${error.message}.`;
-  console.error(error);
-});
+openPage(words, { write, prepare, resize, reset, begin });

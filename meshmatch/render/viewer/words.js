@@ -29,7 +29,8 @@ function modes() {
   const found = [['matches', 'Matches']];
   if (words.look) found.push(['look', words.look.kind === 'texture' ? 'Texture' : 'Colours']);
   if (words.own) found.push(['own', 'Original']);
-  return [...found, ['confidence', 'Confidence'], ['plain', 'Plain']];
+  if (words.confidence) found.push(['confidence', 'Confidence']);
+  return [...found, ['plain', 'Plain']];
 }
 
 function setMode(mode) {
