@@ -14,10 +14,11 @@ import numpy as np
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.agree import agreed_fits
+from meshmatch.fitting.choices import Partial, Refine
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_config import FitConfig, Partial, Refine, check_landmarks
-from meshmatch.fitting.fit_shape import fit_shape as lay_template
-from meshmatch.fitting.landmarks import honour_pairs
+from meshmatch.fitting.fit_config import FitConfig, check_landmarks
+from meshmatch.fitting.fitter import Fitter
+from meshmatch.fitting.landmarks import fits_with_landmarks
 from meshmatch.maps.build import build_map
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
@@ -108,13 +109,13 @@ def match(
     names = _apart(shapes[0].name, shapes[1].name)
 
     def one(number: int) -> Fit:
-        def tell(what: str, share: float) -> None:
+        def tell(what: str, name: str, share: float) -> None:
             if stop.is_set():
                 raise CancelledError
             if progress is not None:
                 progress(what, names[number], share)
 
-        return lay_template(loaded, clean[number].shape, config, None, tell)
+        return Fitter(loaded, config, tell).fit(clean[number].shape)
 
     with ThreadPoolExecutor(max(1, min(2, workers))) as pool:
         try:
@@ -124,7 +125,7 @@ def match(
             raise
     known = None
     if landmarks is not None:
-        fits, known = honour_pairs(loaded, clean, fits, landmarks, config)
+        fits, known = fits_with_landmarks(loaded, clean, fits, landmarks, [config, config])
     alone = (fits[0], fits[1])
     fits = agreed_fits(loaded, [part.shape for part in clean], fits, config, known)
     found = build_map(clean[0], fits[0], clean[1], fits[1], workers=workers, before_agreement=alone)
@@ -137,7 +138,7 @@ def match(
 
 def refine_notes(model: TrainedModel, refine: Refine) -> tuple[str, ...]:
     """Words where another refinement is done than was asked for."""
-    if FitConfig(refine=refine).possible(model).refine == refine:
+    if FitConfig(refine=refine).for_model(model).refine == refine:
         return ()
     return (f"model {model.card.name} is pointwise and has no nodes: its code was refined instead",)
 
@@ -155,13 +156,8 @@ def register(
 ) -> Fit:
     """Lay the model's template on one shape; see `match` for the parameters."""
     shape = as_shape(shape)
-
-    def tell(what: str, share: float) -> None:
-        if progress is not None:
-            progress(what, shape.name, share)
-
     config = FitConfig(refine=refine, seed=seed, up=up, front=front, partial=partial)
-    return lay_template(read_model(model), usable(shape).shape, config, None, tell)
+    return Fitter(read_model(model), config, progress).fit(usable(shape).shape)
 
 
 def fit_shape(shape: Shape, *, model: str | Path = "human", refine: Refine = "nodes", seed: int = 0) -> Fit:

@@ -32,20 +32,21 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @contextmanager
 def remembering(folder: Path) -> Iterator[None]:
     """Fit no shape with the same model and choices twice: `folder` keeps the fits, for other tests and processes."""
-    from meshmatch.api import matching
+    from meshmatch.fitting.fitter import Fitter
 
-    fit_shape = matching.fit_shape
+    fit = Fitter.fit
 
-    def remembered(model, shape, config, landmarks=None, progress=None):
-        key = (model.card.weights_sha256, model.template.hash, config, landmarks, shape.name)
+    def remembered(fitter, shape, landmarks=None):
+        model = fitter.model
+        key = (model.card.weights_sha256, model.template.hash, fitter.config, landmarks, shape.name)
         file = folder / sha256(pickle.dumps((key, shape.verts, shape.faces))).hexdigest()
         with FileLock(f"{file}.lock"):
             if not file.exists():
-                file.write_bytes(pickle.dumps(fit_shape(model, shape, config, landmarks, progress)))
+                file.write_bytes(pickle.dumps(fit(fitter, shape, landmarks)))
             return pickle.loads(file.read_bytes())
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(matching, "fit_shape", remembered)
+        patch.setattr(Fitter, "fit", remembered)
         yield
 
 

@@ -18,8 +18,8 @@ from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig, check_landmarks
-from meshmatch.fitting.fit_shape import fit_shape
-from meshmatch.fitting.landmarks import honour_pairs
+from meshmatch.fitting.fitter import Fitter
+from meshmatch.fitting.landmarks import fits_with_landmarks
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
@@ -141,7 +141,7 @@ class Matcher:
             known = None
             if landmarks is not None:
                 pairs = np.asarray(landmarks[0]), np.asarray(landmarks[1])
-                honoured, known = honour_pairs(self.model, clean, fits, pairs, configs[0])
+                honoured, known = fits_with_landmarks(self.model, clean, fits, pairs, configs)
                 fits = [self._finished(*each) for each in zip(honoured, clean, configs, strict=True)]
             before = fits[0], fits[1]
             agreed = self._agreed(before, configs[0], known)
@@ -164,14 +164,14 @@ class Matcher:
         ]
 
         def one(number: int) -> Fit:
-            def report(stage: str, share: float) -> None:
+            def report(stage: str, name: str, share: float) -> None:
                 if stop.is_set():
                     raise CancelledError
                 if self.progress is not None:
                     self.progress(stage, labels[number], share)
 
             try:
-                found = fit_shape(self.model, clean[number].shape, configs[number], None, report)
+                found = Fitter(self.model, configs[number], report).fit(clean[number].shape)
             except BaseException:
                 stop.set()
                 raise
@@ -194,7 +194,7 @@ class Matcher:
     def _finished(self, fit: Fit, clean: Repaired, config: FitConfig) -> Fit:
         """The fit with its shape, and with what its user should know."""
         notes = [f"{clean.shape.name}: {note}" for note in clean.notes]
-        if config.refine == "nodes" and not self.model.has_nodes:
+        if config.for_model(self.model) != config:
             notes.append(
                 f"model {self.model.card.name} is pointwise and has no nodes: its code was refined instead"
             )
@@ -289,7 +289,7 @@ def checked_threads(threads: int | None) -> int:
 
 def _check_landmarks(model: TrainedModel, configs: Sequence[FitConfig]) -> None:
     for config in configs:
-        if config.refine != "nodes":
+        if not config.refinement.moves_nodes:
             raise OptionError(
                 f"landmarks need refine='nodes', not {config.refine!r}",
                 "leave out the landmarks, or choose nodes",

@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 import typer
 
 from meshmatch.errors import OptionError
+from meshmatch.fitting.choices import Partial, Refine
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
-Refine = Literal["none", "latent", "nodes"]
 
 Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="The shape whose every vertex is matched.")]
 Target = Annotated[Path, typer.Argument(metavar="TARGET", help="The shape that it is matched to.")]
@@ -40,7 +40,7 @@ Threads = Annotated[int, typer.Option(min=1, help="How many threads to use.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary; warnings stay.")]
 
 
-def partial_choice(partial: bool | None) -> Literal["auto", "yes", "no"]:
+def partial_choice(partial: bool | None) -> Partial:
     """The pipeline's word for the flag."""
     if partial is None:
         return "auto"

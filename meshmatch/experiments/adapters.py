@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import fit_shape as lay_template
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
@@ -201,7 +201,7 @@ class CodedMatcher:
         """Orient, predict, search the code."""
         latent = replace(LatentRefineConfig(steps=self.steps), volume=0.0, arap=0.0)
         config = FitConfig(refine="latent", seed=self.seed, partial="no", latent=latent)
-        return lay_template(read_model(self.model), usable(shape).shape, config)
+        return Fitter(read_model(self.model), config).fit(usable(shape).shape)
 
     def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:
         """Through the template."""

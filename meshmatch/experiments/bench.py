@@ -17,7 +17,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from meshmatch.experiments.distances import default_folder
 from meshmatch.experiments.protocols import CLOUD_SET, SET_NAMES, BenchSet, Pair, load_set
 from meshmatch.experiments.report import circumstances, print_table, status_of
 from meshmatch.experiments.scores import SetScores, evaluate_set
+from meshmatch.fitting.choices import Refine
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.maps.vertex_map import VertexMap
@@ -54,7 +55,7 @@ class PipelineMatcher:
     """This project's own pipeline with its options."""
 
     model: str = "human"
-    refine: Literal["none", "latent", "nodes"] = "nodes"
+    refine: Refine = "nodes"
     seed: int = 0
 
     def fit(self, shape: Shape) -> Any:

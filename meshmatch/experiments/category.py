@@ -20,7 +20,7 @@ from meshmatch.errors import InputError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import fit_shape as lay_template
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.build import build_map
 from meshmatch.maps.vertex_map import VertexMap
@@ -157,7 +157,7 @@ def fit_all(model: Path, shapes: Mapping[str, Shape], config: FitConfig, tell: T
     fits = {}
     for name, shape in shapes.items():
         tell(f"fitting {name}")
-        fits[name] = lay_template(loaded, usable(shape).shape, config)
+        fits[name] = Fitter(loaded, config).fit(usable(shape).shape)
     return fits
 
 

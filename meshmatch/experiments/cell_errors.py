@@ -21,13 +21,13 @@ from meshmatch.experiments.cells import Cell
 from meshmatch.experiments.distances import TruthDistances
 from meshmatch.experiments.protocols import BenchSet
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import fit_shape as lay_template
-from meshmatch.fitting.fit_shape import node_system
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig, refine_code
-from meshmatch.fitting.network_fit import Candidate, lay_on
+from meshmatch.fitting.network_fit import Candidate, Predictor
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
-from meshmatch.fitting.scan import Scan
-from meshmatch.geometry.frames import Frame, kabsch
+from meshmatch.fitting.system import node_system
+from meshmatch.geometry.frames import Frame, RigidPose, kabsch
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.evaluate import CM_PER_UNIT, LOST_CM
 from meshmatch.models.trained import TrainedModel
 from meshmatch.pipeline import read_model, usable
@@ -73,7 +73,7 @@ class Subject:
 
     name: str
     frame: Frame
-    scan: Scan
+    scan: OrientedPoints
     marks: np.ndarray
     tree: cKDTree
     distances: np.ndarray
@@ -82,7 +82,7 @@ class Subject:
 def oriented(shape: Shape, model: str, measure: Measure) -> Frame:
     """From the file to the core frame that a model finds."""
     config = FitConfig(seed=measure.seed, partial="no")
-    return lay_template(read_model(model), usable(shape).shape, config).frame
+    return Fitter(read_model(model), config).fit(usable(shape).shape).frame
 
 
 def chosen_names(bench: BenchSet, measure: Measure) -> list[str]:
@@ -97,7 +97,7 @@ def subject(bench: BenchSet, name: str, frame: Frame, measure: Measure, cache: P
     """A shape whose core frame is known, sampled, with its landmarks and the distances from them."""
     shape, landmarks = bench.seen(name), bench.landmarks(name)
     samples = sample_surface(usable(shape).shape, measure.samples, np.random.default_rng(measure.seed))
-    scan = Scan(frame.apply(samples.points), samples.normals @ frame.rotation.T)
+    scan = OrientedPoints(frame.apply(samples.points), samples.normals @ frame.rotation.T)
     count = min(measure.landmarks, len(landmarks))
     chosen = np.linspace(0, len(landmarks) - 1, count).round().astype(int)
     distances = TruthDistances(bench.shape(name), landmarks, cache).of(chosen)
@@ -129,7 +129,7 @@ class Start:
     """The network's own answer on a subject: the way into the cell's core frame, samples there, rows of the field."""
 
     frame: Frame
-    scan: Scan
+    scan: OrientedPoints
     candidate: Candidate
 
 
@@ -139,11 +139,11 @@ def begin(model: TrainedModel, one: Subject, reference: str, measure: Measure) -
     turn = Frame(1.0, np.eye(3), np.zeros(3))
     if theirs.shape.V == ours.shape.V and np.array_equal(theirs.core, ours.core):
         turn = kabsch(ours.shape.verts[ours.core], theirs.shape.verts[theirs.core]).frame
-    scan = Scan(turn.apply(one.scan.points), one.scan.normals @ turn.rotation.T)
+    scan = OrientedPoints(turn.apply(one.scan.points), one.scan.normals @ turn.rotation.T)
     rng = np.random.default_rng(measure.seed)
-    found = lay_on(model.network, node_system(model), ours.core, scan, np.eye(3), np.zeros(3), rng)
-    frame = one.frame.compose(turn).compose(Frame(1.0, found.rotation.T, found.center))
-    return Start(frame, scan.turned(found.rotation, found.center), found)
+    found = Predictor.of(model, rng).fit(scan, RigidPose.identity())
+    frame = one.frame.compose(turn).compose(found.pose.frame)
+    return Start(frame, scan.to_local(found.pose), found)
 
 
 def refined(

@@ -17,12 +17,12 @@ import torch
 from meshmatch.experiments.ablation_cells import CODED
 from meshmatch.experiments.cell_errors import Measure, Start, refined, refinement_of
 from meshmatch.experiments.cells import BASE, Cell, Setting
-from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.latent import LatentRefineConfig
-from meshmatch.fitting.network_fit import lay_on
+from meshmatch.fitting.network_fit import Predictor
 from meshmatch.fitting.nodes import NodeRefineConfig
-from meshmatch.fitting.scan import Scan
+from meshmatch.fitting.system import node_system
 from meshmatch.geometry.frames import kabsch
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -90,14 +90,12 @@ def _start(model: TrainedModel, verts: np.ndarray, measure: Measure) -> tuple[St
     frame = sqrt_area_frame(shape)
     places = frame.apply(verts)
     samples = sample_surface(shape, measure.samples, np.random.default_rng(measure.seed))
-    scan = Scan(frame.apply(samples.points), samples.normals @ frame.rotation.T)
+    scan = OrientedPoints(frame.apply(samples.points), samples.normals @ frame.rotation.T)
     pose = kabsch(template.shape.verts[template.core], places[template.core])
     rng = np.random.default_rng(measure.seed)
-    found = lay_on(
-        model.network, node_system(model), template.core, scan, pose.rotation, pose.center, rng, rounds=1
-    )
-    local = scan.turned(found.rotation, found.center)
-    return Start(frame, local, found), (places - found.center) @ found.rotation
+    found = Predictor.of(model, rng).fit(scan, pose, rounds=1)
+    local = scan.to_local(found.pose)
+    return Start(frame, local, found), found.pose.to_local(places)
 
 
 def _error(model: TrainedModel, rows: np.ndarray, true: np.ndarray) -> float:

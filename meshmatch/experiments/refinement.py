@@ -1,6 +1,6 @@
 """Gauss-Newton on the nodes against the paper's refinement: ``python -m meshmatch.experiments.refinement``.
 
-Both start from the same node vectors, the network's own answer in the orientation that `fit_shape` finds, and see
+Both start from the same node vectors, the network's own answer in the orientation that `Fitter` finds, and see
 the same samples of the same shapes, in one process with one thread, taking turns at going first.
 
 - *code*: 2,000 Adam steps on the shape code, Chamfer distance (3,000 points each way) plus volume and rigidity with
@@ -40,11 +40,11 @@ from meshmatch.experiments.report import circumstances, status_of, wide_console
 from meshmatch.experiments.scores import evaluate_set
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import fit_shape as lay_template
-from meshmatch.fitting.fit_shape import node_system
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy, refine_code
 from meshmatch.fitting.nodes import NodeRefineConfig, refine_nodes
-from meshmatch.fitting.scan import Scan
+from meshmatch.fitting.system import node_system
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.trained import TrainedModel
 from meshmatch.pipeline import map_between, read_model, usable
@@ -87,10 +87,10 @@ def refined(
         fit, scan = _start(model, shape, seed)
         energy = PaperEnergy(model, scan, code, np.random.default_rng(seed))
 
-        def by_nodes(config: NodeRefineConfig, scan: Scan = scan, fit: Fit = fit) -> np.ndarray:
+        def by_nodes(config: NodeRefineConfig, scan: OrientedPoints = scan, fit: Fit = fit) -> np.ndarray:
             return refine_nodes(system, scan, fit.vectors, config)
 
-        def by_code(config: LatentRefineConfig, scan: Scan = scan, fit: Fit = fit) -> np.ndarray:
+        def by_code(config: LatentRefineConfig, scan: OrientedPoints = scan, fit: Fit = fit) -> np.ndarray:
             rng = np.random.default_rng(seed)
             return refine_code(model, scan, config, rng, start=fit.vectors)
 
@@ -109,13 +109,13 @@ def refined(
     return subjects
 
 
-def _start(model: TrainedModel, shape: Shape, seed: int) -> tuple[Fit, Scan]:
+def _start(model: TrainedModel, shape: Shape, seed: int) -> tuple[Fit, OrientedPoints]:
     """The network's own fit, and samples of the shape in its core frame."""
     clean = usable(shape).shape
     config = FitConfig(refine="none", seed=seed)
-    fit = lay_template(model, clean, config)
+    fit = Fitter(model, config).fit(clean)
     samples = sample_surface(clean, config.samples, np.random.default_rng(seed))
-    return fit, Scan(fit.frame.apply(samples.points), samples.normals @ fit.frame.rotation.T)
+    return fit, OrientedPoints(fit.frame.apply(samples.points), samples.normals @ fit.frame.rotation.T)
 
 
 def choose_shapes(model: TrainedModel, name: str, count: int, seed: int, data: Path) -> list[Shape]:

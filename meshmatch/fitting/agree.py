@@ -2,40 +2,51 @@
 
 A fit sees its own surface alone, so it is free to slide along it. Shapes of one kind, or one shape in two poses,
 stretch the template alike: a few more Gauss-Newton steps on each fit pull its stretch at every strain point to the
-mean of all. The mean is taken of logarithms, so that doubling and halving cancel. Pairs of points hold tighter
-across the surface than along it, where the stretch has its say.
+mean of all. The mean is taken of logarithms, so that doubling and halving cancel (the log-Euclidean mean of Arsigny,
+Fillard, Pennec and Ayache, 2006). Pairs of points hold tighter across the surface than along it, where the stretch
+decides.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from meshmatch.fitting.fit import Fit
+from meshmatch.arrays import Float, Floats
+from meshmatch.fitting.fit import Fit, vertex_distance
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import node_system, take_samples
-from meshmatch.fitting.nodes import NodeRefineConfig, add_landmarks, between, nearest_rotations, pair_terms
-from meshmatch.fitting.scan import Scan
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.nodes import (
+    NodeRefineConfig,
+    add_landmarks,
+    geometric_between,
+    nearest_rotations,
+    pair_terms,
+)
+from meshmatch.fitting.samples import Landmarks, take_samples
+from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
 
-if TYPE_CHECKING:
-    from meshmatch.models.trained import TrainedModel
-
-# Template vertices (N,) and where they belong (N, 3).
-Landmarks = tuple[np.ndarray, np.ndarray]
-
-_SMALLEST = 1e-3  # a stretch below it is taken for it: a logarithm must stay finite
+_MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
 
 
 @dataclass(frozen=True)
 class AgreeConfig:
-    """Steps, weight of the common stretch, robust scale (units of sqrt(area)), share of the pull along the surface, how
-    many points of the scan are paired with the template, and how much these are shared (see `NodeRefineConfig`)."""
+    """How fits are refined together. Tuned on bodies.
+
+    Attributes
+    ----------
+    steps : int
+    strain : float
+        Weight of the common stretch.
+    scale : float
+        Of the robust weight (units of sqrt(area)).
+    point_share, back_points, shared
+        As in `NodeRefineConfig`.
+    """
 
     steps: int = 8
     strain: float = 0.0004
@@ -44,15 +55,19 @@ class AgreeConfig:
     back_points: int = 8000
     shared: float = 0.0
 
-    def suited(self, roughness: float) -> AgreeConfig:
-        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all points, shared, a stiffer template."""
+    def for_noise(self, roughness: float) -> AgreeConfig:
+        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all samples, shared, a stiffer template."""
         return replace(
             self,
-            strain=between(self.strain, 20 * self.strain, roughness),
-            point_share=between(self.point_share, max(self.point_share, 3.0), roughness),
+            strain=geometric_between(self.strain, 20 * self.strain, roughness),
+            point_share=geometric_between(self.point_share, max(self.point_share, 3.0), roughness),
             back_points=round(self.back_points * (1 + roughness)),
             shared=max(self.shared, roughness),
         )
+
+    def pairing(self, nodes: NodeRefineConfig) -> NodeRefineConfig:
+        """How pairs are found: as in the refinement of nodes, with this pull along the surface."""
+        return replace(nodes, point_share=self.point_share, back_points=self.back_points, shared=self.shared)
 
 
 def agreed_fits(
@@ -77,99 +92,91 @@ def agreed_fits(
         As given if one of them is poor, for it has nothing to say about the others, or if nodes are not refined
         (a pointwise model has none).
     """
-    if any(fit.verdict == "poor" for fit in fits):
-        return list(fits)
-    config = (config or FitConfig()).possible(model)
-    if config.refine != "nodes":
+    config = (config or FitConfig()).for_model(model)
+    if any(fit.verdict == "poor" for fit in fits) or not config.refinement.moves_nodes:
         return list(fits)
     system = node_system(model)
-    scans = [_samples(shape, fit, config) for shape, fit in zip(shapes, fits, strict=True)]
-    local = None
-    if landmarks is not None:
-        local = [(at, fit.frame.apply(place)) for (at, place), fit in zip(landmarks, fits, strict=True)]
-    parts = [fit.partial for fit in fits]
-    plain = AgreeConfig()
-    how = how or replace(plain, strain=plain.strain * model.card.stiffness)
-    refined = agree(
-        system,
-        scans,
-        [fit.vectors for fit in fits],
-        [how.suited(shape.roughness) for shape in shapes],
-        config.nodes,
-        local,
-        parts,
-    )
+    if how is None:
+        how = AgreeConfig()
+        how = replace(how, strain=how.strain * model.card.stiffness)
+    members = []
+    for number, (shape, fit) in enumerate(zip(shapes, fits, strict=True)):
+        local = None
+        if landmarks is not None:
+            local = landmarks[number][0], fit.frame.apply(landmarks[number][1])
+        samples = _samples(shape, fit, config)
+        members.append(Member(samples, fit.vectors, how.for_noise(shape.roughness), local, fit.partial))
     agreed = []
-    for shape, fit, vectors in zip(shapes, fits, refined, strict=True):
+    for shape, fit, vectors in zip(shapes, fits, agree(system, members, config.nodes), strict=True):
         points = system.moved(vectors)
-        distance = cKDTree(points).query(fit.frame.apply(shape.verts))[0]
+        distance = vertex_distance(points, fit.frame.apply(shape.verts))
         agreed.append(replace(fit, vectors=vectors, points=points, vertex_distance=distance))
     return agreed
 
 
-def _samples(shape: Shape, fit: Fit, config: FitConfig) -> Scan:
-    """The samples that the fit has seen, in its core frame."""
-    config = config.suited(shape.roughness)
-    frame, scan = take_samples(shape, config.samples, np.random.default_rng(config.seed))
-    return Scan(
-        fit.frame.apply(frame.undo(scan.points)), scan.normals @ frame.rotation @ fit.frame.rotation.T
-    )
+def _samples(shape: Shape, fit: Fit, config: FitConfig) -> OrientedPoints:
+    """Samples of a shape in the core frame of its fit, whose template has told the signs of their normals."""
+    config = config.for_noise(shape.roughness)
+    frame, samples = take_samples(shape, config.samples, np.random.default_rng(config.seed))
+    points = fit.frame.apply(frame.undo(samples.points))
+    return OrientedPoints(points, samples.normals @ frame.rotation @ fit.frame.rotation.T)
+
+
+@dataclass(frozen=True, eq=False)
+class Member:
+    """One of several fits that agree.
+
+    Attributes
+    ----------
+    samples : OrientedPoints
+        Of the shape, in the fit's core frame.
+    vectors : (K, 3)
+        Node vectors of the fit.
+    config : AgreeConfig
+        All members take as many steps as the first.
+    landmarks : (template vertices (N,), positions (N, 3) in the core frame), optional
+    partial : bool
+        The shape shows a part only.
+    """
+
+    samples: OrientedPoints
+    vectors: Float[Floats, "K 3"]
+    config: AgreeConfig
+    landmarks: Landmarks | None = None
+    partial: bool = False
 
 
 def agree(
-    system: NodeSystem,
-    scans: Sequence[Scan],
-    vectors: Sequence[np.ndarray],
-    configs: Sequence[AgreeConfig],
-    nodes: NodeRefineConfig,
-    landmarks: Sequence[Landmarks] | None = None,
-    partial: Sequence[bool] | None = None,
-) -> list[np.ndarray]:
-    """Refine the fits of several shapes together.
+    system: NodeSystem, members: Sequence[Member], nodes: NodeRefineConfig
+) -> list[Float[Floats, "K 3"]]:
+    """Refine the fits of several shapes together: better node vectors for each.
 
     Parameters
     ----------
-    scans : samples of each shape in its core frame
-    vectors : (K, 3) node vectors of each fit
-    configs : one for each fit; they take as many steps as the first
-    nodes : how pairs of points are found and weighed
-    landmarks : optional, for each shape template vertices (N,) and positions (N, 3) in its core frame
-    partial : optional, for each shape whether it shows a part only
-
-    Returns
-    -------
-    list of (K, 3)
-        Better node vectors, one for each shape.
+    nodes : how pairs of points are found and weighed, where a member's own configuration does not say
     """
-    refined = list(vectors)
-    for _ in range(configs[0].steps):
-        gradients = [system.deformation_gradient(each) for each in refined]
+    refined = [member.vectors for member in members]
+    for _ in range(members[0].config.steps):
+        gradients = [system.deformation_gradient(vectors) for vectors in refined]
         common = mean_stretch(gradients)
-        for number, (scan, F) in enumerate(zip(scans, gradients, strict=True)):
-            one_sided = partial is not None and partial[number]
-            config = configs[number]
-            pairing = replace(
-                nodes,
-                point_share=config.point_share,
-                back_points=config.back_points,
-                shared=config.shared,
-            )
-            weights, pulls = pair_terms(system, scan, refined[number], config.scale, pairing, one_sided)
-            if landmarks is not None:
-                add_landmarks(weights, pulls, landmarks[number], nodes.landmark_weight)
+        for number, (member, F) in enumerate(zip(members, gradients, strict=True)):
+            config, vectors = member.config, refined[number]
+            pairing = config.pairing(nodes)
+            terms = pair_terms(system, member.samples, vectors, config.scale, pairing, member.partial)
+            if member.landmarks is not None:
+                add_landmarks(terms, member.landmarks, nodes.landmark_weight)
             targets = nearest_rotations(F, common) @ common
-            refined[number] = system.solve(
-                weights, pulls, config.strain / len(F), targets, nodes.damping / system.K, refined[number]
-            )
+            damping = nodes.damping / system.K
+            refined[number] = system.solve(*terms, config.strain / len(F), targets, damping, vectors)
     return refined
 
 
-def mean_stretch(gradients: Sequence[np.ndarray]) -> np.ndarray:
-    """exp of the mean of the logarithms of the right stretches sqrt(F^T F); (G, 3, 3) of several (G, 3, 3)."""
+def mean_stretch(gradients: Sequence[Float[Floats, "G 3 3"]]) -> Float[Floats, "G 3 3"]:
+    """Log-Euclidean mean of the right stretches sqrt(F^T F): exp of the mean of their logarithms."""
     total = np.zeros_like(gradients[0])
     for F in gradients:
         squares, axes = np.linalg.eigh(F.transpose(0, 2, 1) @ F)
-        logs = 0.5 * np.log(np.maximum(squares, _SMALLEST**2))
+        logs = 0.5 * np.log(np.maximum(squares, _MIN_STRETCH**2))
         total += (axes * logs[:, None, :]) @ axes.transpose(0, 2, 1)
     logs, axes = np.linalg.eigh(total / len(gradients))
     return (axes * np.exp(logs)[:, None, :]) @ axes.transpose(0, 2, 1)

@@ -1,30 +1,28 @@
-"""What lies between several fits of one template, and beyond them: a curve through them, and how true it is."""
+"""A curve through several fits of one template and beyond them, and how far its poses are from what they should be."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.fields.field import PointField
+from meshmatch.fitting.choices import WAYS, Way
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_shape import node_system, take_samples
+from meshmatch.fitting.samples import take_samples
+from meshmatch.fitting.system import node_system
 from meshmatch.fitting.turning import FieldPath, Path, RotationBlend, StretchBlend, polar
 from meshmatch.geometry.frames import Frame
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
 
-if TYPE_CHECKING:
-    from meshmatch.models.trained import TrainedModel
-
-Way = Literal["field", "codes"]
-WAYS: tuple[Way, ...] = get_args(Way)
-_SAMPLES = 2048
+_SAMPLES = 2048  # of which a shape's code is read
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,8 @@ class Blend:
     Raises
     ------
     OptionError
-        Fewer than two fits, fits of another template, times that do not increase, or an unknown way.
+        Fewer than two fits, fits of another template, times that do not increase, an unknown way, or the way
+        "field" for a model without nodes.
     """
 
     def __init__(
@@ -77,13 +76,9 @@ class Blend:
         way: Way = "field",
     ) -> None:
         if len(fits) < 2:
-            raise OptionError("there is nothing between fewer than two shapes")
+            raise OptionError("at least two shapes are needed to blend between them")
         for fit in fits:
-            if fit.template_hash != model.template.hash:
-                raise OptionError(
-                    f"the fit is of another template ({fit.template_hash}, not {model.template.hash})",
-                    "use the model that made the fit",
-                )
+            fit.check_template(model.template.hash)
         self.times = np.linspace(0, 1, len(fits)) if times is None else np.asarray(times, float)
         if self.times.shape != (len(fits),) or not (np.diff(self.times) > 0).all():
             raise OptionError(f"{len(fits)} shapes need as many times, each later than the one before")
@@ -103,10 +98,10 @@ class Blend:
             self._path: Path = FieldPath(self._system, list(self._keys), model.template.core)
         elif way == "codes":
             if shapes is None or len(shapes) != len(fits):
-                raise OptionError("codes are those of shapes: give a shape for each fit")
+                raise OptionError("blending codes needs the shape of each fit")
             self._path = _code_path(model, shapes, fits)
         else:
-            raise OptionError(f"no way {way!r} to blend", f"choose one of {', '.join(WAYS)}")
+            raise OptionError(f"unknown way to blend {way!r}", f"choose one of {', '.join(WAYS)}")
         met = [self._path(row) for row in np.eye(len(fits))]
         self._left = self._keys - np.stack(met)
         self._near: PointField | None = None
@@ -118,8 +113,8 @@ class Blend:
         self._scales = np.array([fit.frame.scale for fit in fits])
         self._centers = np.stack([fit.frame.center for fit in fits])
 
-    def weights(self, time: float) -> np.ndarray:
-        """Weights (n,) of the fits at a time; they sum to one."""
+    def weights(self, time: float) -> Float[Floats, " n"]:
+        """Weights of the n fits at a time; they sum to one."""
         inside = float(np.clip(time, self.times[0], self.times[-1]))
         near = self._curve(inside)
         if time == inside:
@@ -127,8 +122,8 @@ class Blend:
             return np.eye(len(self.times))[met[0]] if len(met) else near
         return near + (time - inside) * self._curve(inside, 1)
 
-    def vectors(self, time: float) -> np.ndarray:
-        """Node vectors (K, 3) at a time, core frame."""
+    def vectors(self, time: float) -> Float[Floats, "K 3"]:
+        """Node vectors at a time, core frame."""
         weights = self.weights(time)
         if weights.max() == 1.0:  # a fit itself
             return self._keys[weights.argmax()]
@@ -137,12 +132,12 @@ class Blend:
             left if self._near is None else np.einsum("kij,kj->ki", _turns(self._near, there), left)
         )
 
-    def points(self, vectors: np.ndarray) -> np.ndarray:
-        """Template vertices (V, 3) of a pose (K, 3), core frame."""
+    def points(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
+        """Template vertices of a pose, core frame."""
         return self._system.moved(vectors)
 
-    def turns(self, vectors: np.ndarray) -> np.ndarray:
-        """How the field of a pose (K, 3) turns each template vertex: rotations (V, 3, 3)."""
+    def turns(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3 3"]:
+        """Rotations by which the field of a pose turns each template vertex."""
         return _turns(self._field, vectors)
 
     def frame(self, time: float) -> Frame:
@@ -151,27 +146,28 @@ class Blend:
         scale = float(np.exp(weights @ np.log(self._scales)))
         return Frame(scale, self._turns.at(weights)[0], weights @ self._centers)
 
-    def deviation(self, time: float, vectors: np.ndarray) -> Deviation:
-        """How far a pose (K, 3) is from what it should be at a time."""
+    def deviation(self, time: float, vectors: Float[Floats, "K 3"]) -> Deviation:
+        """How far a pose is from what it should be at a time."""
         F = self._system.deformation_gradient(vectors)
         S = self._stretches.at(self.weights(time))
-        return Deviation(*_apart(F, S), *_apart(F, np.eye(3)[None]))
+        return Deviation(*_energies(F, S), *_energies(F, np.eye(3)[None]))
 
 
-def _turns(field: PointField, vectors: np.ndarray) -> np.ndarray:
-    """How a pose (K, 3) turns the points of a field: rotations (P, 3, 3)."""
+def _turns(field: PointField, vectors: Float[Floats, "K 3"]) -> Float[Floats, "P 3 3"]:
+    """Rotations by which a pose turns the points of a field."""
     with torch.no_grad():
         F = field.deformation_gradient(torch.from_numpy(np.array(vectors)).float()[None])[0]
     return polar(F.double().numpy())[0]
 
 
-def _beside_nodes(model: TrainedModel) -> np.ndarray:
-    """The template vertex beside each node (K, 3): there the field is sure to have nodes enough around it."""
+def _beside_nodes(model: TrainedModel) -> Float[Floats, "K 3"]:
+    """The template vertex beside each node: there the field is sure to have nodes enough around it."""
     verts = model.template.shape.verts
     return verts[cKDTree(verts).query(model.template.nodes)[1]]
 
 
-def _apart(F: np.ndarray, S: np.ndarray) -> tuple[float, float]:
+def _energies(F: Float[Floats, "G 3 3"], S: Float[Floats, "... 3 3"]) -> tuple[float, float]:
+    """Means of |det F - det S| and of |F^T F - S^T S|."""
     volume = np.abs(np.linalg.det(F) - np.linalg.det(S)).mean()
     squares = F.transpose(0, 2, 1) @ F - S.transpose(0, 2, 1) @ S
     return float(volume), float(np.linalg.norm(squares, axis=(1, 2)).mean())
@@ -182,14 +178,14 @@ def _code_path(model: TrainedModel, shapes: Sequence[Shape], fits: Sequence[Fit]
     network = model.network
     found = []
     for shape, fit in zip(shapes, fits, strict=True):
-        frame, scan = take_samples(shape, _SAMPLES, np.random.default_rng(fit.seed))
-        points = torch.from_numpy(fit.frame.apply(frame.undo(scan.points))).float()[None]
+        frame, samples = take_samples(shape, _SAMPLES, np.random.default_rng(fit.seed))
+        points = torch.from_numpy(fit.frame.apply(frame.undo(samples.points))).float()[None]
         with torch.inference_mode():
             found.append(network.encoder(network.encoder.features(points)))
     codes = torch.cat(found)
 
     @torch.inference_mode()
-    def path(weights: np.ndarray) -> np.ndarray:
+    def path(weights: Floats) -> Floats:
         blended = torch.from_numpy(weights).float()[None] @ codes
         return network.decoder(blended)[0].double().numpy()
 

@@ -1,8 +1,8 @@
-"""Scans of a part, completed by what a fit takes the rest to be.
+"""Samples of a part, completed by what a fit takes the rest to be.
 
-The network was mostly shown wholes. Where a scan shows a part, the template's fitted surface stands in for what is
-missing, and the network is asked again about both together. The refinement then holds what was not seen where the
-network wants it, and nothing beyond a cut is pulled onto its edge.
+The network was mostly shown complete shapes. Where samples show a part, the template's fitted surface stands in for
+what is missing, and the network is asked again about both together. The refinement then holds what is not visible where
+the network wants it, and nothing beyond a cut is pulled onto its edge.
 """
 
 from __future__ import annotations
@@ -10,59 +10,64 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from meshmatch.fitting.scan import Scan, with_normals
+from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
-# A template vertex is seen if the scan is this near, and if the scan's nearest point belongs this near to the vertex
-# on the resting template (units of sqrt(area)).
+# A template vertex is visible if a sample is this near, and if the nearest sample belongs this near to the vertex on the
+# resting template (units of sqrt(area)). Set by hand.
 _NEAR, _HOME = 0.06, 0.06
-_MOST = 3  # stand-in points for each point of the scan, at most
+_MAX_ADDED = 3  # points that are added for each sample, at most
 
 
-def seen(system: NodeSystem, scan: Scan, vectors: np.ndarray) -> np.ndarray:
-    """(V,) whether the scan (core frame) shows each vertex of the template as fitted.
+def visible_vertices(
+    system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"]
+) -> Bool[Bools, " V"]:
+    """Whether samples (core frame) show each vertex of the template as fitted.
 
-    Vertices beyond a cut have the edge of the scan near by, but the edge belongs elsewhere on the template.
+    Vertices beyond a cut have the edge of the samples near by, but the edge belongs elsewhere on the template.
     """
-    moved = system.moved(vectors)
-    normals = system.normals(moved)
-    scan = scan.facing(moved, normals)
-    features = with_normals(moved, normals)
-    distance, point = scan.tree.query(features)
-    home = cKDTree(features).query(with_normals(scan.points, scan.normals))[1]
-    away = np.linalg.norm(system.verts[home[point]] - system.verts, axis=1)
+    surface = system.surface(vectors)
+    local = local.facing(surface.points, surface.normals)
+    distance, nearest = local.tree.query(surface.features)
+    home = surface.tree.query(local.features)[1]
+    away = np.linalg.norm(system.verts[home[nearest]] - system.verts, axis=1)
     return np.asarray((distance < _NEAR) & (away < _HOME))
 
 
 def completed(
-    system: NodeSystem, scan: Scan, vectors: np.ndarray, share: float, rng: np.random.Generator
-) -> Scan:
-    """A scan (core frame) of a ``share`` of the surface, with points of the fitted template where it shows nothing."""
-    moved = system.moved(vectors)
-    there = seen(system, scan, vectors)
-    faces = system.faces[~there[system.faces].any(axis=1)]
+    system: NodeSystem,
+    local: OrientedPoints,
+    vectors: Float[Floats, "K 3"],
+    share: float,
+    rng: np.random.Generator,
+) -> OrientedPoints:
+    """Samples (core frame) of a ``share`` of the surface, with points of the fitted template where they show nothing."""
+    surface = system.surface(vectors)
+    visible = visible_vertices(system, local, vectors)
+    faces = system.faces[~visible[system.faces].any(axis=1)]
     if not len(faces):
-        return scan
-    missing = Shape(moved, faces)
+        return local
+    missing = Shape(surface.points, faces)
     if not missing.area > 0:
-        return scan
-    P = len(scan.points)
-    count = min(round(P * missing.area / share), _MOST * P)
-    found = sample_surface(missing, count, rng)
-    scan = scan.facing(moved, system.normals(moved))
+        return local
+    P = len(local.points)
+    count = min(round(P * missing.area / share), _MAX_ADDED * P)
+    added = sample_surface(missing, count, rng)
+    local = local.facing(surface.points, surface.normals)
     order = rng.permutation(P + count)
     return replace(
-        scan,
-        points=np.concatenate([scan.points, found.points])[order],
-        normals=np.concatenate([scan.normals, found.normals])[order],
+        local,
+        points=np.concatenate([local.points, added.points])[order],
+        normals=np.concatenate([local.normals, added.normals])[order],
+        weights=None if local.weights is None else np.append(local.weights, np.ones(count))[order],
     )
 
 
-def seen_area(system: NodeSystem, there: np.ndarray) -> float:
-    """Share (0..1) of the resting template's area around vertices (V,) that are seen."""
+def area_share(system: NodeSystem, vertices: Bool[Bools, " V"]) -> float:
+    """Share (0..1) of the resting template's area around some vertices."""
     area = Shape(system.verts, system.faces).vertex_areas
-    return float(area[there].sum() / area.sum())
+    return float(area[vertices].sum() / area.sum())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
@@ -21,11 +20,7 @@ def dense_shape(model: TrainedModel, fit: Fit) -> Shape:
         A vertex of the dense mesh has too few nodes in reach.
     """
     template = model.template
-    if fit.template_hash != template.hash:
-        raise OptionError(
-            f"the fit is of another template ({fit.template_hash}, not {template.hash})",
-            "use the model that made the fit",
-        )
+    fit.check_template(template.hash)
     verts = np.asarray(template.dense.verts)
     moved = verts + model.field(verts).displaced(fit.vectors)
     return Shape(fit.frame.undo(moved), template.dense.faces, template.name)

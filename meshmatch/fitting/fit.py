@@ -1,17 +1,36 @@
-"""The noun of this room: a template laid on one shape."""
+"""The result of this room: a template fitted to one shape."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.errors import OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.repair import Repaired
 
-# Mean two-way residual (units of sqrt(area)) up to which a fit is called good, and fair.
-GOOD_RESIDUAL = 0.0285
-FAIR_RESIDUAL = 0.031
+Verdict = Literal["good", "fair", "poor"]
+ReasonCode = Literal["residual", "unreached", "part", "empty"]
+"""Template and shape stay apart; some of the shape is not reached; it was taken for a part; template lies where the
+shape has no surface."""
+
+
+class Reason(str):
+    """Why a verdict is not good: a sentence to print, with a ``code`` to branch on."""
+
+    code: ReasonCode
+
+    def __new__(cls, code: ReasonCode, sentence: str) -> Reason:
+        reason = super().__new__(cls, sentence)
+        reason.code = code
+        return reason
+
+    def __reduce__(self) -> tuple[type[Reason], tuple[str, str]]:
+        return Reason, (self.code, str(self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,21 +43,21 @@ class Fit:
         Which template: fits of two templates cannot be joined.
     frame : Frame
         From the shape's file to the core frame (template's orientation, area about 1).
-    points : float64 array (V, 3)
+    points : (V, 3)
         Template vertices (low resolution) on the shape, core frame.
-    vectors : float64 array (K, 3)
+    vectors : (K, 3)
         Node vectors, core frame.
-    resting : float64 array (V, 3)
+    resting : (V, 3)
         The same vertices on the resting template, template frame.
-    faces : int64 array (F, 3)
+    faces : (F, 3)
         The template's triangles.
     residual : float
-        Mean normal-compatible distance between template and shape, both ways, in units of sqrt(area).
-    vertex_distance : float64 array (V_shape,)
-        Distance of every vertex of the shape to the template's surface, same unit.
-    verdict : "good", "fair" or "poor"
-    reasons : tuple of str
-        What the verdict rests on where it is not good.
+        Mean distance, normals included, between template and shape, both ways, in units of sqrt(area).
+    vertex_distance : (N,)
+        Distance of every vertex of the shape to the nearest template vertex, same unit.
+    verdict : {"good", "fair", "poor"}
+    reasons : tuple of Reason
+        Why the verdict is not good.
     up, front : str
         The axes of the file that the fit took for up and front, such as "+y" and "-z".
     seconds : float
@@ -53,12 +72,12 @@ class Fit:
 
     template_hash: str
     frame: Frame
-    points: np.ndarray
-    vectors: np.ndarray
-    resting: np.ndarray
-    faces: np.ndarray
+    points: Float[Floats, "V 3"]
+    vectors: Float[Floats, "K 3"]
+    resting: Float[Floats, "V 3"]
+    faces: Int[Ints, "F 3"]
     residual: float
-    vertex_distance: np.ndarray
+    vertex_distance: Float[Floats, " N"]
     verdict: str
     reasons: tuple[str, ...]
     up: str
@@ -70,12 +89,25 @@ class Fit:
     notes: tuple[str, ...] = ()
 
     @property
-    def points_in_file(self) -> np.ndarray:
-        """Template vertices (V, 3) in the frame and unit of the shape's file."""
+    def points_in_file(self) -> Float[Floats, "V 3"]:
+        """Template vertices in the frame and unit of the shape's file."""
         return self.frame.undo(self.points)
 
+    def check_template(self, expected: str) -> None:
+        """Refuse a fit of another template than the one with this hash (`OptionError`)."""
+        if self.template_hash != expected:
+            raise OptionError(
+                f"the fit is of another template ({self.template_hash}, not {expected})",
+                "use the model that made the fit",
+            )
 
-def axis_name(direction: np.ndarray) -> str:
-    """The signed axis nearest to a direction (3,), such as "+y"."""
+
+def vertex_distance(points: Float[Floats, "V 3"], verts: Float[Floats, "N 3"]) -> Float[Floats, " N"]:
+    """Distance of each vertex of a shape to the nearest template vertex, both in the core frame."""
+    return np.asarray(cKDTree(points).query(verts)[0])
+
+
+def axis_name(direction: Float[Floats, 3]) -> str:
+    """The signed axis nearest to a direction, such as "+y"."""
     axis = int(np.abs(direction).argmax())
     return ("+" if direction[axis] > 0 else "-") + "xyz"[axis]

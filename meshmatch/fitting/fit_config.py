@@ -3,30 +3,50 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from meshmatch.errors import OptionError
+from meshmatch.fitting.choices import PARTIALS, REFINE_NAMES, Partial, Refine
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.nodes import NodeRefineConfig
+from meshmatch.fitting.refinement import REFINEMENTS, Refinement
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
-
-Refine = Literal["none", "latent", "nodes"]
-Partial = Literal["auto", "yes", "no"]
-REFINEMENTS: tuple[Refine, ...] = ("none", "latent", "nodes")
 
 
 @dataclass(frozen=True)
 class FitConfig:
     """How hard to look and how to refine.
 
-    samples : points drawn on the surface, of which coarse_samples see every orientation; hypotheses : voted
-    orientations, each tried with its flips; laid : of which this many are laid on with care; variants : readings
-    of the best from frames tilted by ``tilt`` degrees; finalists : readings that get ``screening`` node steps
-    before the best one gets them all; copies : turned copies that vote on the orientation; partial : whether the
-    shape may be a part of a whole, tried where a fit of the whole leaves template without surface ("auto"), always
-    or never.
+    Attributes
+    ----------
+    refine : {"none", "latent", "nodes"}
+        The network alone, the paper's search over codes, or Gauss-Newton on the nodes.
+    seed : int
+    up, front : str, optional
+        Axes of the file, such as "y" or "-z"; searched where not given.
+    partial : {"auto", "yes", "no"}
+        Whether the shape may be a part: tried where a fit of the whole leaves template without surface, always, never.
+    samples, coarse_samples : int
+        Points drawn on the surface, and how many of them are used to screen orientations.
+    copies : int
+        Turned copies of the samples that vote on the orientation.
+    hypotheses : int
+        Voted orientations that are tried, each with its flips.
+    careful : int
+        The best so many of these are fitted again with all samples.
+    variants, tilt : int, float
+        Further interpretations of the best of these: predictions from frames tilted at random, by about so many degrees.
+    finalists, screening : int
+        So many interpretations get so many node steps before the best one gets them all.
+    nodes : NodeRefineConfig
+    latent : LatentRefineConfig
+
+    Raises
+    ------
+    OptionError
+        An unknown refinement, or an unknown word for ``partial``.
     """
 
     refine: Refine = "nodes"
@@ -38,7 +58,7 @@ class FitConfig:
     coarse_samples: int = 2048
     copies: int = 48
     hypotheses: int = 2
-    laid: int = 3
+    careful: int = 3
     variants: int = 12
     tilt: float = 15.0
     finalists: int = 4
@@ -48,27 +68,32 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         if self.refine not in REFINEMENTS:
-            raise OptionError(f"no refinement {self.refine!r}", f"choose one of {', '.join(REFINEMENTS)}")
-        if self.partial not in ("auto", "yes", "no"):
-            raise OptionError(f"partial cannot be {self.partial!r}", "choose auto, yes or no")
+            raise OptionError(
+                f"unknown refinement {self.refine!r}", f"choose one of {', '.join(REFINE_NAMES)}"
+            )
+        if self.partial not in PARTIALS:
+            raise OptionError(f"partial cannot be {self.partial!r}", f"choose one of {', '.join(PARTIALS)}")
 
-    def possible(self, model: TrainedModel) -> FitConfig:
+    @property
+    def refinement(self) -> Refinement:
+        """What ``refine`` names."""
+        return REFINEMENTS[self.refine]
+
+    def for_model(self, model: TrainedModel) -> FitConfig:
         """The same for a model: where there are no nodes to refine (pointwise), the code is refined instead."""
-        if self.refine == "nodes" and not model.has_nodes:
-            return replace(self, refine="latent")
-        return self
+        return replace(self, refine="latent") if self.refinement.moves_nodes and not model.has_nodes else self
 
-    def suited(self, roughness: float) -> FitConfig:
-        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): more points, refined more stiffly."""
+    def for_noise(self, roughness: float) -> FitConfig:
+        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): more samples, refined more stiffly."""
         if roughness <= 0:
             return self
         return replace(
-            self, samples=round(self.samples * (1 + roughness)), nodes=self.nodes.suited(roughness)
+            self, samples=round(self.samples * (1 + roughness)), nodes=self.nodes.for_noise(roughness)
         )
 
 
 def check_landmarks(model: TrainedModel) -> None:
-    """Refuse known pairs for a model that has no nodes to hold them (`OptionError`)."""
+    """Refuse landmarks for a model without nodes, which could not hold them (`OptionError`)."""
     if not model.has_nodes:
         raise OptionError(
             f"model {model.card.name} is pointwise: it has no nodes that landmarks could hold",

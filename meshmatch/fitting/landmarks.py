@@ -1,25 +1,29 @@
-"""Known pairs of points: where on the template they belong, and fits that honour them."""
+"""Known pairs of points: where on the template they belong, and fits that hold them."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import fit_shape
+from meshmatch.fitting.fitter import Fitter
+from meshmatch.fitting.samples import Landmarks
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.repair import Repaired
 from meshmatch.templates.template import Template
 
-if TYPE_CHECKING:
-    from meshmatch.models.trained import TrainedModel
+_HINT = "one pair of vertices a line"
 
 
-def template_vertices(template: Template, fits: list[Fit], places: list[np.ndarray]) -> np.ndarray:
-    """Template vertices (N,) for N points given on several fitted shapes (file frames).
+def template_vertices(
+    template: Template, fits: Sequence[Fit], places: Sequence[Float[Floats, "N 3"]]
+) -> Int[Ints, " N"]:
+    """Template vertices for N points given on several fitted shapes (file frames).
 
     Each fit answers with the template vertex nearest to the point; the vertex nearest to the mean of the
     answers on the resting template is taken, so no shape's fit decides alone.
@@ -32,14 +36,14 @@ def template_vertices(template: Template, fits: list[Fit], places: list[np.ndarr
     return cKDTree(verts).query(np.mean(answers, axis=0))[1].astype(np.int64)
 
 
-def honour_pairs(
+def fits_with_landmarks(
     model: TrainedModel,
-    clean: list[Repaired],
-    fits: list[Fit],
-    landmarks: tuple[np.ndarray, np.ndarray],
-    config: FitConfig,
-) -> tuple[list[Fit], list[tuple[np.ndarray, np.ndarray]]]:
-    """Fit again with known pairs.
+    clean: Sequence[Repaired],
+    fits: Sequence[Fit],
+    landmarks: tuple[Ints, Ints],
+    configs: Sequence[FitConfig],
+) -> tuple[list[Fit], list[Landmarks]]:
+    """Fit two shapes again with known pairs.
 
     A pair is carried to the template through the first fits; the template point between the two answers is
     then pulled to the landmark on both shapes.
@@ -48,6 +52,7 @@ def honour_pairs(
     ----------
     clean : the two repaired shapes
     landmarks : vertices (N,) of the source's file, vertices (N,) of the target's
+    configs : one for each shape
 
     Returns
     -------
@@ -59,22 +64,26 @@ def honour_pairs(
     OptionError
         Not pairs of vertices, or a vertex that a shape does not have.
     """
-    places = []
-    for part, chosen in zip(clean, landmarks, strict=True):
-        chosen = np.asarray(chosen, np.int64)
-        if chosen.ndim != 1 or len(chosen) == 0 or chosen.min() < 0:
-            raise OptionError("landmarks must be lists of vertex numbers", "one pair of vertices a line")
-        if chosen.max() >= len(part.original_to_repaired):
-            raise OptionError(
-                f"landmark vertex {chosen.max()} is not on {part.shape.name}, which has "
-                f"{len(part.original_to_repaired)} vertices",
-                "numbers start at 0; the source comes first",
-            )
-        places.append(part.shape.verts[part.original_to_repaired[chosen]])
+    places = [_places(part, np.asarray(chosen)) for part, chosen in zip(clean, landmarks, strict=True)]
     if len(places[0]) != len(places[1]):
-        raise OptionError("landmarks must come in pairs", "one pair of vertices a line")
+        raise OptionError("landmarks must come in pairs", _HINT)
     at = template_vertices(model.template, fits, places)
     known = [(at, place) for place in places]
-    return [
-        fit_shape(model, part.shape, config, pairs) for part, pairs in zip(clean, known, strict=True)
-    ], known
+    found = [
+        Fitter(model, config).fit(part.shape, held)
+        for config, part, held in zip(configs, clean, known, strict=True)
+    ]
+    return found, known
+
+
+def _places(part: Repaired, chosen: Int[Ints, " N"]) -> Float[Floats, "N 3"]:
+    """Where vertices of a shape's file lie."""
+    if chosen.ndim != 1 or len(chosen) == 0 or chosen.dtype.kind not in "iu" or chosen.min() < 0:
+        raise OptionError("landmarks must be lists of vertex numbers", _HINT)
+    if chosen.max() >= len(part.original_to_repaired):
+        raise OptionError(
+            f"landmark vertex {chosen.max()} is not on {part.shape.name}, which has "
+            f"{len(part.original_to_repaired)} vertices",
+            "numbers start at 0; the source comes first",
+        )
+    return part.shape.verts[part.original_to_repaired[chosen]]

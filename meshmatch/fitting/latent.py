@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.fields.energies import arap_energy, volume_energy
 from meshmatch.fields.field import PointField
-from meshmatch.fitting.scan import Scan
-from meshmatch.models.trained import TrainedModel
+from meshmatch.fitting.samples import draw
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.models.trained import TrainedModel, once_per_model
+from meshmatch.progress import Progress
 from meshmatch.shapes.sampling import farthest_points
 
 
@@ -30,21 +31,25 @@ class LatentRefineConfig:
 
 
 class PaperEnergy:
-    """The paper's energy of what a decoder answers: Chamfer distance to points drawn from a scan, volume, rigidity.
+    """The paper's energy of what a decoder answers: Chamfer distance to points drawn from samples, volume, rigidity.
 
     Parameters
     ----------
-    scan : Scan
-        In the core frame; ``config.points`` of its points are drawn.
+    samples : OrientedPoints
+        In the core frame; ``config.points`` of them are drawn.
     """
 
     def __init__(
-        self, model: TrainedModel, scan: Scan, config: LatentRefineConfig, rng: np.random.Generator
+        self,
+        model: TrainedModel,
+        samples: OrientedPoints,
+        config: LatentRefineConfig,
+        rng: np.random.Generator,
     ) -> None:
         self.config = config
-        chosen = rng.choice(len(scan.points), min(config.points, len(scan.points)), replace=False)
-        self.points = torch.from_numpy(scan.points[chosen]).float()
-        self._tree = cKDTree(scan.points[chosen])
+        drawn = samples.points[draw(samples, config.points, rng)]
+        self.points = torch.from_numpy(drawn).float()
+        self._tree = cKDTree(drawn)
         self._template = _on_template(model, min(config.points, model.template.shape.V))
 
     def __call__(self, vectors: torch.Tensor) -> torch.Tensor:
@@ -59,23 +64,23 @@ class PaperEnergy:
             chamfer + self.config.volume * volume_energy(F).mean() + self.config.arap * arap_energy(F).mean()
         )
 
-    def value(self, vectors: np.ndarray) -> float:
-        """The same of an array (K, 3)."""
+    def value(self, vectors: Float[Floats, "K 3"]) -> float:
+        """The same of an array."""
         with torch.no_grad():
             return float(self(torch.from_numpy(vectors).float()[None]))
 
 
 def refine_code(
     model: TrainedModel,
-    scan: Scan,
+    samples: OrientedPoints,
     config: LatentRefineConfig,
     rng: np.random.Generator,
-    progress: Callable[[int, int], None] | None = None,
-    start: np.ndarray | None = None,
-) -> np.ndarray:
-    """Node vectors (K, 3) of the code that fits a scan (core frame) best.
+    progress: Progress | None = None,
+    start: Float[Floats, "K 3"] | None = None,
+) -> Float[Floats, "K 3"]:
+    """Node vectors of the code that fits samples (core frame) best, found by Adam.
 
-    The best code seen is returned, so the energy never ends higher than it began.
+    The best of all codes is returned, so the energy never ends higher than it began.
 
     Parameters
     ----------
@@ -83,7 +88,7 @@ def refine_code(
         Node vectors to start from, by default the network's own answer. What the encoder's code does not say
         of them (the learned corrections, where the model has them) stays as a constant offset.
     """
-    energy_of = PaperEnergy(model, scan, config, rng)
+    energy_of = PaperEnergy(model, samples, config, rng)
     network = model.network
     with torch.no_grad():
         code = network.encoder(network.encoder.features(energy_of.points[None]))
@@ -101,12 +106,12 @@ def refine_code(
         (code.grad,) = torch.autograd.grad(energy, code)
         optimiser.step()
         if progress is not None and (step % 20 == 0 or step == config.steps - 1):
-            progress(step + 1, config.steps)
+            progress((step + 1) / config.steps)
     assert best_vectors is not None
     return best_vectors.double().numpy()
 
 
-@lru_cache(maxsize=4)
+@once_per_model
 def _on_template(model: TrainedModel, P: int) -> tuple[torch.Tensor, PointField]:
     """Template points (P, 3) and the field there."""
     verts = model.template.shape.verts

@@ -1,142 +1,194 @@
-"""The network's own fit: core frame, code, learned corrections, for every hypothesis of the orientation."""
+"""The network's own fits: core frame, code and learned corrections, for a pose to start from; and their residual."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fitting.mirror import Mirror
-from meshmatch.fitting.scan import Scan, with_normals
-from meshmatch.fitting.system import NodeSystem
-from meshmatch.geometry.frames import kabsch
+from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.fitting.mirror import Mirror, mirror_of
+from meshmatch.fitting.samples import draw
+from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.geometry.frames import RigidPose, kabsch
+from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.models.deformer import Deformer
 
+if TYPE_CHECKING:
+    from meshmatch.models.trained import TrainedModel
+
+# How many points the network sees of tilted copies, in turn: thin samples tip it either way where it is in doubt.
 _VARIANT_POINTS = (700, 1400)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One way to lay the template on a scan.
+    """One way to fit the template to samples.
 
-    rotation, center : the core frame, scan = R core + center
-    vectors : (K, 3) node vectors in the core frame
-    residual : mean normal-compatible distance, both ways, in units of sqrt(area)
+    Attributes
+    ----------
+    pose : RigidPose
+        The core frame (local) in the frame of the samples.
+    vectors : (K, 3)
+        Node vectors, core frame.
+    residual : float
+        Mean distance, normals included, of template and samples (units of sqrt(area)).
     """
 
-    rotation: np.ndarray
-    center: np.ndarray
-    vectors: np.ndarray
+    pose: RigidPose
+    vectors: Float[Floats, "K 3"]
     residual: float
 
 
-def two_way_residual(
-    system: NodeSystem, scan: Scan, vectors: np.ndarray, stride: int = 2, cap: float = 0.1
-) -> float:
-    """Mean of the capped 6-D nearest-neighbour distances, template to scan and back.
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """The network, and what its answers move; draws its points with ``rng``.
 
-    Every ``stride``-th point of both is asked for its neighbour.
+    Attributes
+    ----------
+    network : Deformer
+    system : NodeSystem
+    core : (C,) int
+        Vertices of the template by which the core frame is read off a fit.
+    mirror : Mirror, optional
+        Of a symmetric template: interpretations are then sought in the mirror too.
+    rng : numpy.random.Generator
     """
-    moved = system.moved(vectors)
-    normals = system.normals(moved)
-    forward = _apart(scan.tree, moved[::stride], normals[::stride], scan.signed, cap)
-    tree = cKDTree(with_normals(moved, normals))
-    back = _apart(tree, scan.points[::stride], scan.normals[::stride], scan.signed, cap)
-    return float(0.5 * forward.mean() + 0.5 * back.mean())
+
+    network: Deformer
+    system: NodeSystem
+    core: Ints
+    mirror: Mirror | None
+    rng: np.random.Generator
+
+    @classmethod
+    def of(cls, model: TrainedModel, rng: np.random.Generator) -> Predictor:
+        """The predictor of a trained model."""
+        return cls(model.network, node_system(model), model.template.core, mirror_of(model), rng)
+
+    @torch.inference_mode()
+    def predict(self, samples: OrientedPoints, draws: int, points: int = 2048) -> Float[Floats, "K 3"]:
+        """Mean prediction of node vectors over several draws of samples, which lie in their core frame."""
+        chosen = np.stack([draw(samples, points, self.rng) for _ in range(draws)])
+        clouds = torch.from_numpy(samples.points[chosen]).float()
+        return self.network(clouds).mean(0).double().numpy()
+
+    def fit(
+        self, samples: OrientedPoints, pose: RigidPose, rounds: int = 2, draws: int = 2, stride: int = 2
+    ) -> Candidate:
+        """Predict, move the core frame to where the prediction puts the core, predict again.
+
+        Parameters
+        ----------
+        pose : RigidPose
+            Where the core frame is looked for first.
+        rounds, draws : int
+            Predictions, and how many draws of samples each is the mean of.
+        stride : int
+            The residual is that of every so many samples and vertices.
+        """
+        for turn in range(rounds):
+            local = samples.to_local(pose)
+            vectors = self.predict(local, draws)
+            if turn < rounds - 1:
+                moved = self.system.moved(vectors)
+                pose = pose @ kabsch(self.system.verts[self.core], moved[self.core])
+        return Candidate(pose, vectors, two_way_residual(self.system, local, vectors, stride))
+
+    @torch.inference_mode()
+    def variants(
+        self, local: OrientedPoints, coarse: OrientedPoints, pose: RigidPose, count: int, degrees: float
+    ) -> list[Candidate]:
+        """Other interpretations of a hard pose: predictions from randomly tilted core frames, turned back.
+
+        Where a limb could be one or the other, tilts and thinner samples tip the network either way, and the residual
+        tells which interpretation is right. With a mirror, as many again are of the mirrored samples.
+
+        Parameters
+        ----------
+        local, coarse : OrientedPoints
+            Samples in the core frame: those to predict from, and those that give the residual.
+        pose : RigidPose
+            The core frame.
+        count, degrees : int, float
+            How many tilts, and how large they are (standard deviation about each axis).
+        """
+        tilts = Rotation.from_rotvec(np.radians(degrees) * self.rng.standard_normal((count, 3))).as_matrix()
+        found = self._tilted(local, tilts)
+        if self.mirror is not None:
+            mirrored = replace(local, points=self.mirror.points(local.points))
+            found += [self.mirror.vectors(vectors) for vectors in self._tilted(mirrored, tilts)]
+        return [
+            Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors, 1)) for vectors in found
+        ]
+
+    def _tilted(self, samples: OrientedPoints, tilts: Float[Floats, "N 3 3"]) -> list[Floats]:
+        """Node vectors (K, 3) predicted from tilted samples, turned back."""
+        back = []
+        for number, tilt in enumerate(tilts):
+            size = _VARIANT_POINTS[number % len(_VARIANT_POINTS)]
+            cloud = samples.points[draw(samples, size, self.rng)] @ tilt.T
+            vectors = self.network(torch.from_numpy(cloud).float()[None])[0].double().numpy()
+            back.append(self.network.turned(vectors, tilt))
+        return back
+
+
+def two_way_residual(
+    system: NodeSystem,
+    samples: OrientedPoints,
+    vectors: Float[Floats, "K 3"],
+    stride: int = 2,
+    cap: float = 0.1,
+) -> float:
+    """Mean of the capped 6-D nearest-neighbour distances, template to samples and back (units of sqrt(area)).
+
+    Every ``stride``-th point of both is asked for its neighbour. Distances to and from samples count by their weights.
+    """
+    surface = system.surface(vectors)
+    moved, normals = surface.points[::stride], surface.normals[::stride]
+    distance, nearest = _capped_distances(samples.tree, moved, normals, samples.signed, cap)
+    weights = None if samples.weights is None else np.append(samples.weights, 1.0)[nearest]
+    forward = weighted_mean(distance, weights)
+    return float(0.5 * forward + 0.5 * _back_residual(surface, samples, stride, cap))
 
 
 def one_way_residual(
-    system: NodeSystem, scan: Scan, vectors: np.ndarray, stride: int = 2, cap: float = 0.1
+    system: NodeSystem,
+    samples: OrientedPoints,
+    vectors: Float[Floats, "K 3"],
+    stride: int = 2,
+    cap: float = 0.1,
 ) -> float:
-    """Mean of the capped 6-D distances from every ``stride``-th scan point to the template."""
-    moved = system.moved(vectors)
-    tree = cKDTree(with_normals(moved, system.normals(moved)))
-    back = _apart(tree, scan.points[::stride], scan.normals[::stride], scan.signed, cap)
-    return float(back.mean())
+    """Mean of the capped 6-D distances from every ``stride``-th sample to the template, by the samples' weights."""
+    return float(_back_residual(system.surface(vectors), samples, stride, cap))
 
 
-def _apart(tree: cKDTree, points: np.ndarray, normals: np.ndarray, signed: bool, cap: float) -> np.ndarray:
-    """(N,) capped 6-D distances to the nearest; to the nearer of both sides where normals have no sure sign."""
-    apart = np.full(len(points), cap)
+def _back_residual(surface: OrientedPoints, samples: OrientedPoints, stride: int, cap: float) -> np.floating:
+    points, normals = samples.points[::stride], samples.normals[::stride]
+    distance, _ = _capped_distances(surface.tree, points, normals, samples.signed, cap)
+    return weighted_mean(distance, None if samples.weights is None else samples.weights[::stride])
+
+
+def _capped_distances(
+    tree: cKDTree, points: Float[Floats, "N 3"], normals: Float[Floats, "N 3"], signed: bool, cap: float
+) -> tuple[Floats, Ints]:
+    """Capped 6-D distances (N,) to the nearest, and which that is (N,), ``tree.n`` beyond the cap.
+
+    Normals without a sure sign are turned to the nearer side.
+    """
+    distance, index = np.full(len(points), cap), np.full(len(points), tree.n)
     for side in (1,) if signed else (1, -1):
         # A search without a bound visits every point of a tree that is far away.
-        found = tree.query(with_normals(points, side * normals), distance_upper_bound=cap)[0]
-        apart = np.minimum(apart, found)
-    return apart
+        found, at = tree.query(with_normals(points, side * normals), distance_upper_bound=cap)
+        index = np.where(found < distance, at, index)
+        distance = np.minimum(distance, found)
+    return distance, index
 
 
-@torch.inference_mode()
-def predict(
-    model: Deformer, scan: Scan, draws: int, rng: np.random.Generator, points: int = 2048
-) -> np.ndarray:
-    """Mean prediction over several draws of points: node vectors (K, 3) for a scan in its core frame."""
-    count = min(points, len(scan.points))
-    chosen = np.stack([rng.choice(len(scan.points), count, replace=False) for _ in range(draws)])
-    clouds = torch.from_numpy(scan.points[chosen]).float()
-    return model(clouds).mean(0).double().numpy()
-
-
-def lay_on(
-    model: Deformer,
-    system: NodeSystem,
-    core: np.ndarray,
-    scan: Scan,
-    rotation: np.ndarray,
-    center: np.ndarray,
-    rng: np.random.Generator,
-    rounds: int = 2,
-    draws: int = 2,
-    stride: int = 2,
-) -> Candidate:
-    """Predict, move the core frame to where the prediction puts the core, predict again.
-
-    ``draws`` point samples are averaged each time; ``stride`` coarsens the residual.
-    """
-    for turn in range(rounds):
-        local = scan.turned(rotation, center)
-        vectors = predict(model, local, draws, rng)
-        if turn < rounds - 1:
-            step = kabsch(system.verts[core], system.moved(vectors)[core])
-            rotation, center = rotation @ step.rotation, rotation @ step.center + center
-    return Candidate(rotation, center, vectors, two_way_residual(system, local, vectors, stride))
-
-
-@torch.inference_mode()
-def variants(
-    model: Deformer,
-    system: NodeSystem,
-    scan: Scan,
-    coarse: Scan,
-    candidate: Candidate,
-    rng: np.random.Generator,
-    count: int,
-    degrees: float,
-    mirror: Mirror | None = None,
-) -> list[Candidate]:
-    """Other readings of a hard pose: predictions from randomly tilted core frames, turned back.
-
-    Where a limb could be one or the other, tilts and thinner samples tip the network either way, and the residual on the
-    ``coarse`` scan (core frame, like ``scan``) tells which reading is right. With a ``mirror``, as many again are of the
-    mirrored scan.
-    """
-    tilts = Rotation.from_rotvec(np.radians(degrees) * rng.standard_normal((count, 3))).as_matrix()
-
-    def read(points: np.ndarray) -> list[np.ndarray]:
-        back = []
-        for number, tilt in enumerate(tilts):
-            size = min(_VARIANT_POINTS[number % len(_VARIANT_POINTS)], len(points))
-            cloud = points[rng.choice(len(points), size, replace=False)] @ tilt.T
-            vectors = model(torch.from_numpy(cloud).float()[None])[0].double().numpy()
-            back.append(model.turned(vectors, tilt))
-        return back
-
-    back = read(scan.points)
-    if mirror is not None:
-        back += [mirror.vectors(vectors) for vectors in read(mirror.points(scan.points))]
-    return [
-        Candidate(candidate.rotation, candidate.center, u, two_way_residual(system, coarse, u, 1))
-        for u in back
-    ]
+def weighted_mean(values: np.ndarray, weights: Float[Floats, " N"] | None) -> np.floating:
+    """Mean of N values by weights that are not negative; without them, all count the same."""
+    return values.mean() if weights is None else weights @ values / max(weights.sum(), 1e-300)

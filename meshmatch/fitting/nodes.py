@@ -1,9 +1,10 @@
 """Gauss-Newton on the node vectors: from the network's fit to the surface.
 
-Each step pairs template and scan both ways by normal-compatible neighbours, weighs the pairs robustly,
-and solves one linear system. The prior keeps the deformation gradient at every strain point near a rotated
-copy of the network's own, R_g F_g(network) with R_g the best local rotation: the surface may bend to meet
-the scan but not stretch along it, which Chamfer and normals cannot see.
+Each step pairs template and samples both ways by normal-compatible neighbours, weighs the pairs robustly (iteratively
+reweighted least squares with Geman and McClure's function), and solves one linear system. The prior keeps the
+deformation gradient at every strain point near a rotated copy of the network's own, R_g F_g(network) with R_g the best
+local rotation: the surface may bend to meet the samples but not stretch along itself, which Chamfer distance and normals
+cannot see.
 """
 
 from __future__ import annotations
@@ -13,19 +14,42 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.fitting.scan import PAIR_WEIGHT, Scan, with_normals
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.fitting.samples import Landmarks
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.geometry.oriented import PAIR_WEIGHT, OrientedPoints, with_normals
 from meshmatch.geometry.triangles import vertex_areas
 
 _SHARERS = 16  # vertices of the template that share a point, at most
 
+# Upper triangles H_p (V, 6) and right-hand sides H_p s_p (V, 3) of data terms, see `NodeSystem.solve`.
+Terms = tuple[Float[Floats, "V 6"], Float[Floats, "V 3"]]
+
 
 @dataclass(frozen=True)
 class NodeRefineConfig:
-    """Schedule and weights of the node refinement; lengths in units of sqrt(area).
+    """Schedule and weights of the node refinement; lengths in units of sqrt(area). Tuned on generated bodies.
 
-    From the first step to the last the strain weight and the robust scale fall geometrically. ``shared`` (0..1) is how
-    much points of the scan pull at all of the template within about ``spread`` instead of at the nearest of it.
+    Attributes
+    ----------
+    steps : int
+    strain_first, strain_last : float
+        Weight of the prior in the first step and in the last; it falls geometrically between them.
+    scale_first, scale_last : float
+        The same of the scale of the robust weight.
+    point_share : float
+        How much a pair pulls along the surface, against 1 across it.
+    normal_cosine : float
+        Pairs whose normals differ more do not count.
+    back_points : int
+        About how many samples look for their template vertex.
+    damping : float
+        Weight of the present node vectors, for those that nothing else holds.
+    landmark_weight : float
+        Of each landmark; all other pairs together have about 1.
+    shared : float
+        How much (0..1) samples pull at all of the template within about ``spread`` instead of at the nearest of it.
+    spread : float
     """
 
     steps: int = 10
@@ -41,60 +65,59 @@ class NodeRefineConfig:
     shared: float = 0.0
     spread: float = 0.016
 
-    def suited(self, roughness: float) -> NodeRefineConfig:
+    def for_noise(self, roughness: float) -> NodeRefineConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`).
 
         Noise does not tell across from along, and asks for the mean of many points rather than for the nearest: a wider
-        robust scale, a stiffer template, more points, shared pairs. Measured on bodies with noise of 1 % of the diagonal.
+        robust scale, a stiffer template, more points, shared pairs. Tuned on bodies with noise of 1 % of the diagonal.
         """
         return replace(
             self,
-            strain_last=between(self.strain_last, 10 * self.strain_last, roughness),
-            scale_last=between(self.scale_last, 2 * self.scale_last, roughness),
-            point_share=between(self.point_share, max(self.point_share, 1.0), roughness),
-            back_points=round(between(self.back_points, 5 * self.back_points, roughness)),
+            strain_last=geometric_between(self.strain_last, 10 * self.strain_last, roughness),
+            scale_last=geometric_between(self.scale_last, 2 * self.scale_last, roughness),
+            point_share=geometric_between(self.point_share, max(self.point_share, 1.0), roughness),
+            back_points=round(geometric_between(self.back_points, 5 * self.back_points, roughness)),
             shared=max(self.shared, roughness),
         )
 
 
-def between(low: float, high: float, share: float) -> float:
-    """The number that lies at a ``share`` (0..1) of the way from one to another, by ratio."""
+def geometric_between(low: float, high: float, share: float) -> float:
+    """The number at a ``share`` (0..1) of the way from one to another, by ratio."""
     return low if low <= 0 else low * (high / low) ** share
 
 
 def refine_nodes(
     system: NodeSystem,
-    scan: Scan,
-    vectors: np.ndarray,
+    samples: OrientedPoints,
+    vectors: Float[Floats, "K 3"],
     config: NodeRefineConfig,
-    landmarks: tuple[np.ndarray, np.ndarray] | None = None,
-    one_sided: bool = False,
-) -> np.ndarray:
-    """Fit node vectors (K, 3) to a scan in the core frame; returns better node vectors.
+    landmarks: Landmarks | None = None,
+) -> Float[Floats, "K 3"]:
+    """Fit node vectors to samples in the core frame.
 
     Parameters
     ----------
+    vectors : (K, 3)
+        Where to start; their deformation gradients are the prior.
     landmarks : (template vertices (N,), positions (N, 3)), optional
-        Pairs that the fit honours.
-    one_sided : bool
-        The scan is a part of the shape: template points without a partner are left to the prior.
+        Pairs that the fit holds.
     """
     start = system.deformation_gradient(vectors)
     for step in range(config.steps):
         t = step / max(config.steps - 1, 1)
         strain = config.strain_first ** (1 - t) * config.strain_last**t
         scale = config.scale_first ** (1 - t) * config.scale_last**t
-        weights, pulls = pair_terms(system, scan, vectors, scale, config, one_sided)
+        terms = pair_terms(system, samples, vectors, scale, config)
         if landmarks is not None:
-            add_landmarks(weights, pulls, landmarks, config.landmark_weight)
+            add_landmarks(terms, landmarks, config.landmark_weight)
         targets = nearest_rotations(system.deformation_gradient(vectors), start) @ start
         share = 1.0 / len(targets)
-        vectors = system.solve(weights, pulls, strain * share, targets, config.damping / system.K, vectors)
+        vectors = system.solve(*terms, strain * share, targets, config.damping / system.K, vectors)
     return vectors
 
 
-def nearest_rotations(F: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Rotations R_g (G, 3, 3) that bring start_g closest to F_g (orthogonal Procrustes)."""
+def nearest_rotations(F: Float[Floats, "G 3 3"], start: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+    """Rotations R_g that bring start_g closest to F_g (orthogonal Procrustes)."""
     U, _, Vh = np.linalg.svd(F @ start.transpose(0, 2, 1))
     flip = np.linalg.det(U @ Vh)
     U[:, :, 2] *= flip[:, None]
@@ -103,79 +126,109 @@ def nearest_rotations(F: np.ndarray, start: np.ndarray) -> np.ndarray:
 
 def pair_terms(
     system: NodeSystem,
-    scan: Scan,
-    vectors: np.ndarray,
+    samples: OrientedPoints,
+    vectors: Float[Floats, "K 3"],
     scale: float,
     config: NodeRefineConfig,
     one_sided: bool = False,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (V, 6) and pulls (V, 3) of the current pairs; the weights sum to about one."""
-    moved = system.moved(vectors)
-    normals = system.normals(moved)
-    found = []
-    if config.shared < 1:
-        found.append(
-            (1 - config.shared, _nearest_pairs(system, scan, moved, normals, scale, config, one_sided))
-        )
-    if config.shared > 0:
-        found.append((config.shared, _shared_pairs(system, scan, moved, normals, scale, config)))
-    if len(found) == 1:
-        return found[0][1]
-    (near, nearest), (far, shared) = found
+) -> Terms:
+    """Data terms of the current pairs; their weights sum to about one, and follow those of the samples.
+
+    Parameters
+    ----------
+    scale : float
+        Of the robust weight.
+    one_sided : bool
+        The samples show a part of the shape: template vertices without a partner are left to the prior.
+    """
+    surface = system.surface(vectors)
+    if config.shared <= 0:
+        return _nearest_pairs(system, samples, surface, scale, config, one_sided)
+    shared = _shared_pairs(system, samples, surface, scale, config)
+    if config.shared >= 1:
+        return shared
+    nearest = _nearest_pairs(system, samples, surface, scale, config, one_sided)
+    near, far = 1 - config.shared, config.shared
     return near * nearest[0] + far * shared[0], near * nearest[1] + far * shared[1]
 
 
-def _nearest_pairs(system, scan, moved, normals, scale, config, one_sided) -> tuple[np.ndarray, np.ndarray]:
+def _nearest_pairs(
+    system: NodeSystem,
+    samples: OrientedPoints,
+    surface: OrientedPoints,
+    scale: float,
+    config: NodeRefineConfig,
+    one_sided: bool,
+) -> Terms:
     """Pairs of what is nearest and faces the same way, in both directions, each with half of the weight."""
-    V = len(moved)
-    seen = with_normals(moved, normals, PAIR_WEIGHT)
-    to_scan = scan.pair_tree.query(seen)[1]
+    moved, normals = surface.points, surface.normals
+    features = with_normals(moved, normals, PAIR_WEIGHT)
+    to_samples = samples.pair_tree.query(features)[1]
     area = vertex_areas(moved, system.faces)
-    forward = area / area.sum() * robust_weight(moved - scan.points[to_scan], scale)
-    forward *= (normals * scan.normals[to_scan]).sum(1) > config.normal_cosine
+    forward = area / area.sum() * robust_weight(moved - samples.points[to_samples], scale)
+    forward *= (normals * samples.normals[to_samples]).sum(1) > config.normal_cosine
     if one_sided:
-        forward *= np.linalg.norm(moved - scan.points[to_scan], axis=1) < 3 * scale
+        forward *= np.linalg.norm(moved - samples.points[to_samples], axis=1) < 3 * scale
 
-    pick = _picked(scan, config)
-    to_template = cKDTree(seen).query(with_normals(scan.points[pick], scan.normals[pick], PAIR_WEIGHT))[1]
-    back = robust_weight(moved[to_template] - scan.points[pick], scale) / len(pick)
-    back *= (normals[to_template] * scan.normals[pick]).sum(1) > config.normal_cosine
+    some = _thinned(samples, config)
+    to_template = cKDTree(features).query(with_normals(some.points, some.normals, PAIR_WEIGHT))[1]
+    back = robust_weight(moved[to_template] - some.points, scale) / len(some.points)
+    back *= (normals[to_template] * some.normals).sum(1) > config.normal_cosine
+    if samples.weights is not None and some.weights is not None:
+        forward *= samples.weights[to_samples]
+        back *= some.weights
 
-    at = np.concatenate([np.arange(V), to_template])
-    point = np.concatenate([scan.points[to_scan], scan.points[pick]])
-    normal = np.concatenate([scan.normals[to_scan], scan.normals[pick]])
+    at = np.concatenate([np.arange(len(moved)), to_template])
+    point = np.concatenate([samples.points[to_samples], some.points])
+    normal = np.concatenate([samples.normals[to_samples], some.normals])
     weight = 0.5 * np.concatenate([forward, back])
-    return _accumulate(at, point, normal, weight, config.point_share, V)
+    return _summed(at, point, normal, weight, config.point_share, len(moved))
 
 
-def _shared_pairs(system, scan, moved, normals, scale, config) -> tuple[np.ndarray, np.ndarray]:
-    """Every point of the scan pairs with all of the template from where noise may have brought it.
+def _shared_pairs(
+    system: NodeSystem,
+    samples: OrientedPoints,
+    surface: OrientedPoints,
+    scale: float,
+    config: NodeRefineConfig,
+) -> Terms:
+    """Every sample pairs with all of the template from where noise may have brought it.
 
-    The expectation step of a mixture of Gaussians at the template's vertices, as in *Coherent Point Drift* (TPAMI 2010).
-    A template among noisy points always has one close by, so it does not ask which; and directions across are its own.
+    The expectation step of a mixture of Gaussians at the template's vertices, as in Coherent Point Drift (Myronenko and
+    Song, TPAMI 2010). A template among noisy points always has one close by, so it does not ask which; and directions
+    across are its own.
     """
-    pick = _picked(scan, config)
-    apart, at = cKDTree(moved).query(scan.points[pick], min(_SHARERS, len(moved)))
-    apart, at = apart.reshape(len(pick), -1), at.reshape(len(pick), -1)
-    closer = np.square(apart) - np.square(apart[:, :1])  # the nearest one always has its share
-    share = vertex_areas(moved, system.faces)[at] * np.exp(-0.5 * closer / config.spread**2)
-    share /= np.maximum(share.sum(1, keepdims=True), 1e-300)
-    share *= 1.0 / np.square(1.0 + np.square(apart[:, :1] / scale)) / len(pick)
-    at, share = at.reshape(-1), share.reshape(-1)
+    some, moved = _thinned(samples, config), surface.points
     V = len(moved)
+    distance, at = cKDTree(moved).query(some.points, min(_SHARERS, V))
+    distance, at = distance.reshape(len(some.points), -1), at.reshape(len(some.points), -1)
+    further = np.square(distance) - np.square(distance[:, :1])  # the nearest one always has its share
+    share = vertex_areas(moved, system.faces)[at] * np.exp(-0.5 * further / config.spread**2)
+    share /= np.maximum(share.sum(1, keepdims=True), 1e-300)
+    share *= 1.0 / np.square(1.0 + np.square(distance[:, :1] / scale)) / len(some.points)
+    if some.weights is not None:
+        share *= some.weights[:, None]
+    point = np.repeat(some.points, at.shape[1], axis=0)
+    at, share = at.reshape(-1), share.reshape(-1)
     # Directions are the template's, so all that pulls at a vertex is summed before they are asked.
-    total = np.bincount(at, share, V)
-    point = np.repeat(scan.points[pick], apart.shape[1], axis=0)
-    pull = np.stack([np.bincount(at, share * point[:, k], V) for k in range(3)], 1)
+    total = _sums(at, share[:, None], V)[:, 0]
+    pull = _sums(at, share[:, None] * point, V)
     mean = pull / np.maximum(total, 1e-300)[:, None]
-    return _accumulate(np.arange(V), mean, normals, total, config.point_share, V)
+    return _summed(np.arange(V), mean, surface.normals, total, config.point_share, V)
 
 
-def _picked(scan: Scan, config: NodeRefineConfig) -> np.ndarray:
-    return np.arange(0, len(scan.points), max(1, len(scan.points) // config.back_points))
+def _thinned(samples: OrientedPoints, config: NodeRefineConfig) -> OrientedPoints:
+    return samples.thinned(config.back_points)
 
 
-def _accumulate(at, point, normal, weight, share, V) -> tuple[np.ndarray, np.ndarray]:
+def _summed(
+    at: Int[Ints, " N"],
+    point: Float[Floats, "N 3"],
+    normal: Float[Floats, "N 3"],
+    weight: Float[Floats, " N"],
+    share: float,
+    V: int,
+) -> Terms:
     """Sum w (n n^T + share I) and its product with the point, per template vertex."""
     x, y, z = normal.T
     entries = (
@@ -183,20 +236,21 @@ def _accumulate(at, point, normal, weight, share, V) -> tuple[np.ndarray, np.nda
     )
     along = (normal * point).sum(1, keepdims=True)
     pull = weight[:, None] * (normal * along + share * point)
-    weights = np.stack([np.bincount(at, entries[:, k], V) for k in range(6)], 1)
-    pulls = np.stack([np.bincount(at, pull[:, k], V) for k in range(3)], 1)
-    return weights, pulls
+    return _sums(at, entries, V), _sums(at, pull, V)
 
 
-def add_landmarks(
-    weights: np.ndarray, pulls: np.ndarray, landmarks: tuple[np.ndarray, np.ndarray], weight: float
-) -> None:
-    """Add pairs of template vertices (N,) and positions (N, 3) to `pair_terms`, in place."""
-    at, position = landmarks
+def _sums(at: Int[Ints, " N"], rows: Float[Floats, "N D"], V: int) -> Float[Floats, "V D"]:
+    """Sums of the rows at each vertex."""
+    return np.stack([np.bincount(at, column, V) for column in rows.T], 1).astype(np.float64, copy=False)
+
+
+def add_landmarks(terms: Terms, landmarks: Landmarks, weight: float) -> None:
+    """Add pairs of template vertices (N,) and positions (N, 3) to data terms, in place."""
+    (weights, pulls), (at, position) = terms, landmarks
     np.add.at(weights, (at[:, None], np.array([0, 3, 5])), weight)
     np.add.at(pulls, at, weight * position)
 
 
-def robust_weight(offset: np.ndarray, scale: float) -> np.ndarray:
-    """Geman-McClure weight of offsets (N, 3)."""
+def robust_weight(offset: Float[Floats, "N 3"], scale: float) -> Float[Floats, " N"]:
+    """Geman and McClure's weight of offsets."""
     return 1.0 / np.square(1.0 + np.square(offset).sum(1) / scale**2)

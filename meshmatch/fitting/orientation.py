@@ -1,44 +1,43 @@
-"""Which way is up, which way is front: core frames that the aligner proposes, and the best of them.
+"""Which way is up, which way is front: core frames that the aligner proposes, or that obey given axes.
 
-The aligner is asked about many turned copies of the scan. Every answer is a vote for one rotation of the
-scan; votes that agree form a hypothesis. Asking again from the voted frame sharpens it.
+The aligner is asked about many turned copies of the samples. Every answer is a vote for one rotation; votes that agree
+form a hypothesis. Asking again from the voted frame sharpens it.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
+from meshmatch.geometry.frames import RigidPose
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.neighbours import nearest
 
-
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """A proposed core frame: scan = R core + center. ``votes`` is the share of copies that agree."""
-
-    rotation: np.ndarray
-    center: np.ndarray
-    votes: float
+_AGREE = 30  # degrees: votes that are closer agree. Set by hand.
+# Turns of the core frame that a vote may be wrong by: about face, upside down, on its head, a quarter either way.
+_FLIPS = Rotation.from_rotvec(
+    np.pi * np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 1], [0, 0.5, 0], [0, -0.5, 0]])
+).as_matrix()
 
 
-def turned_copies(count: int, seed: int) -> np.ndarray:
-    """Well-spread rotations (count, 3, 3), the first of them the identity."""
+def turned_copies(count: int, seed: int) -> Float[Floats, "count 3 3"]:
+    """Well-spread rotations, the first of them the identity."""
     rotations = Rotation.random(count, random_state=np.random.default_rng(seed)).as_matrix()
     rotations[0] = np.eye(3)
     return rotations
 
 
 @torch.inference_mode()
-def ask_aligner(model: Deformer, points: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Core frames (N, 3, 3), (N, 3) of the scan, each read off one turned copy (rows x -> turn x)."""
+def ask_aligner(
+    model: Deformer, points: Float[Floats, "P 3"], turns: Float[Floats, "N 3 3"]
+) -> tuple[Float[Floats, "N 3 3"], Float[Floats, "N 3"]]:
+    """Rotations and centers of core frames of the points, each read off one turned copy (rows x -> turn x)."""
     assert model.aligner is not None
     middle = points.mean(0)
-    # Turning the basis the other way is cheaper than turning and indexing the scan N times.
+    # Turning the basis the other way is cheaper than turning and indexing the points N times.
     basis = model.aligner.basis.numpy()
     tree_queries = torch.from_numpy(np.einsum("mk,nkl->nml", basis, turns).reshape(1, -1, 3)).float()
     cloud = torch.from_numpy(points - middle).float()[None]
@@ -51,13 +50,13 @@ def ask_aligner(model: Deformer, points: np.ndarray, turns: np.ndarray) -> tuple
 
 
 def propose(
-    model: Deformer, points: np.ndarray, copies: int = 48, keep: int = 4, seed: int = 0
-) -> list[Hypothesis]:
+    model: Deformer, points: Float[Floats, "P 3"], copies: int = 48, keep: int = 4, seed: int = 0
+) -> list[RigidPose]:
     """Hypotheses of the core frame, most voted first.
 
     Parameters
     ----------
-    points : (P, 3) samples in the scan frame
+    points : samples
     copies : how many turned copies vote
     keep : how many hypotheses to return at most
     """
@@ -66,52 +65,41 @@ def propose(
     rotations, centers = ask_aligner(model, points, rotations.transpose(0, 2, 1))
     trace = np.einsum("nij,mij->nm", rotations, rotations)
     angle = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
-    close = angle < 30
+    close = angle < _AGREE
     free = np.ones(len(rotations), bool)
-    found: list[Hypothesis] = []
+    found: list[RigidPose] = []
     while free.any() and len(found) < keep:
-        support = (close & free).sum(1) * free
-        leader = int(support.argmax())
-        members = close[leader] & free
+        votes = (close & free).sum(1) * free
+        members = close[int(votes.argmax())] & free
         mean = Rotation.from_matrix(rotations[members]).mean().as_matrix()
-        found.append(Hypothesis(mean, np.median(centers[members], 0), members.mean()))
+        found.append(RigidPose(mean, np.median(centers[members], 0)))
         free &= ~members
     return found
 
 
-# Turns of the core frame that a vote may be wrong by: about face, upside down, on its head, a quarter either way.
-_FLIPS = Rotation.from_rotvec(
-    np.pi * np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 1], [0, 0.5, 0], [0, -0.5, 0]])
-).as_matrix()
+def with_flips(poses: list[RigidPose]) -> list[RigidPose]:
+    """Every pose and its flips; front and back of a body look alike to a vote, not to a fit."""
+    return [RigidPose(pose.rotation @ flip, pose.center) for flip in _FLIPS for pose in poses]
 
 
-def with_flips(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
-    """Every hypothesis and its flips; front and back of a body look alike to a vote, not to a fit."""
-    return [
-        Hypothesis(guess.rotation @ flip, guess.center, guess.votes)
-        for flip in _FLIPS
-        for guess in hypotheses
-    ]
-
-
-def standing_grid(center: np.ndarray) -> list[Hypothesis]:
+def standing_grid(center: Float[Floats, 3]) -> list[RigidPose]:
     """Six axes up, twelve turns about each: for networks without an aligner."""
-    grid = []
-    for axis in np.concatenate([np.eye(3), -np.eye(3)]):
-        grid += [Hypothesis(guess.rotation, center, guess.votes) for guess in forced_frames(axis, None)]
-    return grid
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    return [RigidPose(pose.rotation, center) for axis in axes for pose in forced_frames(axis, None)]
 
 
-def axis_vector(name: str) -> np.ndarray:
-    """Unit vector of an axis name such as "y", "+y" or "-z"."""
+def axis_vector(name: str) -> Float[Floats, 3]:
+    """Unit vector of an axis name such as "y", "+y" or "-z"; any other name is an `OptionError`."""
     sign = -1.0 if name.startswith("-") else 1.0
     axis = name.lstrip("+-").lower()
     if axis not in ("x", "y", "z") or len(name) > 2:
-        raise OptionError(f"{name!r} is no axis", "write x, y or z, with - for the opposite direction")
+        raise OptionError(f"invalid axis {name!r}", "write x, y or z, with - for the opposite direction")
     return sign * np.eye(3)["xyz".index(axis)]
 
 
-def forced_frames(up: np.ndarray | None, front: np.ndarray | None, turns: int = 12) -> list[Hypothesis]:
+def forced_frames(
+    up: Float[Floats, 3] | None, front: Float[Floats, 3] | None, turns: int = 12
+) -> list[RigidPose]:
     """Core frames that obey given axes: all turns about the one that is given, or the only one if both are."""
     along, other = (up, front) if up is not None else (front, None)
     assert along is not None
@@ -123,5 +111,5 @@ def forced_frames(up: np.ndarray | None, front: np.ndarray | None, turns: int = 
         angle = 2 * np.pi * turn / turns
         second = np.cos(angle) * across + np.sin(angle) * np.cross(along, across)
         y, z = (along, second) if up is not None else (second, along)
-        frames.append(Hypothesis(np.stack([np.cross(y, z), y, z], 1), np.zeros(3), 1.0 / turns))
+        frames.append(RigidPose(np.stack([np.cross(y, z), y, z], 1), np.zeros(3)))
     return frames

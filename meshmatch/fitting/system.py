@@ -19,7 +19,10 @@ from scipy.linalg import solveh_banded
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fields.field import Field, PointField
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.models.trained import TrainedModel, once_per_model
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 
@@ -27,7 +30,7 @@ from meshmatch.shapes.shape import Shape
 _BLOCK = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 _DIAGONAL = [0, 3, 5]
 # More products than this (about a gigabyte while they are sorted) are not kept.
-_MOST_PRODUCTS = 20_000_000
+_MAX_PRODUCTS = 20_000_000
 
 
 class NodeSystem:
@@ -80,31 +83,36 @@ class NodeSystem:
             strain_pairs = strain_pairs.toarray()
         self._strain_pairs = strain_pairs[row, column]
 
-    def moved(self, vectors: np.ndarray) -> np.ndarray:
-        """Template vertices (V, 3) under node vectors (K, 3), or whatever rows the field reads."""
+    def moved(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
+        """Template vertices under node vectors, or under whatever rows the field reads."""
         return self.verts + (self.phi @ vectors if self.linear else self._field.displaced(vectors))
 
-    def deformation_gradient(self, vectors: np.ndarray) -> np.ndarray:
-        """F (G, 3, 3) at the strain points, F[g, a, k] = d x'_a / d x_k."""
+    def deformation_gradient(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "G 3 3"]:
+        """F at the strain points, F[g, a, k] = d x'_a / d x_k."""
         if not self.linear:
             return self._field.strain(vectors, self.strain_points)
         return (self.slopes @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3)
 
-    def normals(self, moved: np.ndarray) -> np.ndarray:
-        """Area-weighted unit vertex normals (V, 3) of moved vertices."""
+    def surface(self, vectors: Float[Floats, "K 3"]) -> OrientedPoints:
+        """Template vertices under node vectors, with their normals."""
+        moved = self.moved(vectors)
+        return OrientedPoints(moved, self.normals(moved))
+
+    def normals(self, moved: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
+        """Area-weighted unit vertex normals of moved vertices."""
         a, b, c = (moved[self.faces[:, k]] for k in range(3))
         summed = self._incidence @ np.cross(b - a, c - a)
         return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20)
 
     def solve(
         self,
-        weights: np.ndarray,
-        pulls: np.ndarray,
+        weights: Float[Floats, "V 6"],
+        pulls: Float[Floats, "V 3"],
         strain: float,
-        targets: np.ndarray,
+        targets: Float[Floats, "G 3 3"],
         damping: float,
-        current: np.ndarray,
-    ) -> np.ndarray:
+        current: Float[Floats, "K 3"],
+    ) -> Float[Floats, "K 3"]:
         """Minimise sum_p |y_p - s_p|^2_{H_p} + strain sum_g |F_g - T_g|^2 + damping |u - current|^2.
 
         Parameters
@@ -140,6 +148,13 @@ class NodeSystem:
         return solved
 
 
+@once_per_model
+def node_system(model: TrainedModel) -> NodeSystem:
+    """The least-squares system of a model's template and field."""
+    shape = model.template.shape
+    return NodeSystem(shape, model.field(shape.verts))
+
+
 def _to_scipy(matrix: torch.Tensor) -> Any:
     """In float64: a sparse matrix, or a plain array where it is dense."""
     if matrix.layout == torch.strided:
@@ -153,22 +168,21 @@ def _to_scipy(matrix: torch.Tensor) -> Any:
 class _EveryPair:
     """The matrix (pairs, V) of Phi_pi Phi_pj where all nodes meet everywhere, formed when it is multiplied."""
 
-    def __init__(self, phi: np.ndarray, row: np.ndarray, column: np.ndarray) -> None:
+    def __init__(self, phi: Float[Floats, "V K"], row: Ints, column: Ints) -> None:
         self._phi, self._at = phi, (row, column)
 
-    def __matmul__(self, weights: np.ndarray) -> np.ndarray:
-        """(V, N) -> (pairs, N)."""
+    def __matmul__(self, weights: Float[Floats, "V N"]) -> Float[Floats, "pairs N"]:
         columns = [(self._phi.T * weight) @ self._phi for weight in weights.T]
         return np.stack([column[self._at] for column in columns], 1)
 
 
-def _pair_products(phi: Any) -> tuple[np.ndarray, np.ndarray, Any]:
+def _pair_products(phi: Any) -> tuple[Ints, Ints, Any]:
     """Node pairs (i <= j) that meet somewhere, and the sparse matrix (pairs, V) of Phi_pi Phi_pj."""
     V, K = phi.shape
     if not isinstance(phi, np.ndarray):
         counts = np.diff(phi.indptr).astype(np.int64)
         sizes = counts**2
-        phi = phi.toarray() if sizes.sum() > _MOST_PRODUCTS else phi
+        phi = phi.toarray() if sizes.sum() > _MAX_PRODUCTS else phi
     if isinstance(phi, np.ndarray):
         row, column = np.triu_indices(K)
         return row, column, _EveryPair(phi, row, column)
@@ -186,13 +200,13 @@ def _pair_products(phi: Any) -> tuple[np.ndarray, np.ndarray, Any]:
     return pairs // K, pairs % K, products
 
 
-def _band_order(row: np.ndarray, column: np.ndarray, K: int) -> np.ndarray:
-    """Nodes (K,) in an order in which those that meet are near one another."""
+def _band_order(row: Ints, column: Ints, K: int) -> Int[Ints, " K"]:
+    """Nodes in an order in which those that meet are near one another."""
     graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (K, K))
     return reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(np.int64)
 
 
-def _band_places(row: np.ndarray, column: np.ndarray, rank: np.ndarray) -> tuple[int, np.ndarray]:
+def _band_places(row: Ints, column: Ints, rank: Int[Ints, " K"]) -> tuple[int, Int[Ints, "pairs 9"]]:
     """Half width of the band of the 3 K unknowns, and where the 3 x 3 block of every pair lies in it (pairs, 9).
 
     The band is stored column by column, each from its diagonal down: entry (i, j), i >= j, lies at
@@ -204,7 +218,7 @@ def _band_places(row: np.ndarray, column: np.ndarray, rank: np.ndarray) -> tuple
     return width, np.minimum(i, j) * (width + 1) + np.abs(i - j)
 
 
-def _vertex_faces(faces: np.ndarray, V: int) -> csr_matrix:
+def _vertex_faces(faces: Int[Ints, "F 3"], V: int) -> csr_matrix:
     F = len(faces)
     ones = np.ones(3 * F)
     return csr_matrix((ones, (faces.T.reshape(-1), np.tile(np.arange(F), 3))), shape=(V, F))

@@ -2,7 +2,7 @@
 
 Blending node vectors would move every point along a straight line, and a turning arm would shrink on its way. Here
 the deformation gradient of each fit is split into a rotation and a stretch (polar decomposition). Stretches are
-blended by their logarithms. Rotations are told from neighbour to neighbour, along a spanning tree of the surface
+blended by their logarithms. Rotations are taken from neighbour to neighbour, along a spanning tree of the surface
 that prefers neighbours which turn alike: a forearm turns about its elbow and the elbow goes where the upper arm
 takes it. Then follow the node vectors that fit the blended gradients best (least squares), and a few rounds in which
 every point may choose its own rotation anew (local and global steps of Sorkine and Alexa, 2007).
@@ -18,20 +18,21 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.nodes import nearest_rotations
 from meshmatch.fitting.system import NodeSystem
 
-# From the weights of the key shapes (n,) to node vectors (K, 3).
-Path = Callable[[np.ndarray], np.ndarray]
+# From the weights of the n key shapes to node vectors.
+Path = Callable[[Float[Floats, " n"]], Float[Floats, "K 3"]]
 
-_SMALLEST = 1e-3  # a stretch below it is taken for it: a logarithm must stay finite
-_LARGEST = 5.0  # of a logarithm: a stretch of 150, which only a far extrapolation reaches
-_LIKE = 1e-6  # beside a jump, so that an edge without one is an edge still
+_MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
+_MAX_LOG = 5.0  # a stretch of 150, which only a far extrapolation reaches
+_MIN_COST = 1e-6  # of an edge over which rotations do not change: a graph drops edges of cost 0
 
 
 @dataclass(frozen=True)
 class TurnConfig:
-    """Rounds of local and global steps; damping of the first solve and of these."""
+    """Rounds of local and global steps; damping of the first solve and of these. Set by hand."""
 
     rounds: int = 3
     damping_first: float = 1e-7
@@ -49,7 +50,7 @@ class RotationBlend:
     keys : sequence of (N, 3, 3)
     """
 
-    def __init__(self, keys: Sequence[np.ndarray]) -> None:
+    def __init__(self, keys: Sequence[Floats]) -> None:
         quaternions = np.stack([Rotation.from_matrix(key).as_quat() for key in keys])  # n N 4
         # A quaternion and its negative are one rotation; their outer products are the same.
         outer = np.einsum("kni,knj->nij", quaternions, quaternions)
@@ -57,8 +58,8 @@ class RotationBlend:
         back = self._mean.inv()
         self._logs = np.stack([(back * Rotation.from_matrix(key)).as_rotvec() for key in keys])
 
-    def at(self, weights: np.ndarray) -> np.ndarray:
-        """Rotations (N, 3, 3) for weights (n,) that sum to one."""
+    def at(self, weights: Float[Floats, " n"]) -> Float[Floats, "N 3 3"]:
+        """Rotations for weights that sum to one."""
         return (self._mean * Rotation.from_rotvec(np.tensordot(weights, self._logs, 1))).as_matrix()
 
 
@@ -70,25 +71,25 @@ class StretchBlend:
     keys : sequence of (N, 3, 3) logarithms
     """
 
-    def __init__(self, keys: Sequence[np.ndarray]) -> None:
+    def __init__(self, keys: Sequence[Floats]) -> None:
         self._logs = np.stack(keys)
 
-    def at(self, weights: np.ndarray) -> np.ndarray:
-        """Stretches (N, 3, 3) for weights (n,) that sum to one."""
+    def at(self, weights: Float[Floats, " n"]) -> Float[Floats, "N 3 3"]:
+        """Stretches for weights that sum to one."""
         values, axes = np.linalg.eigh(np.tensordot(weights, self._logs, 1))
-        return (axes * np.exp(np.clip(values, -_LARGEST, _LARGEST))[:, None, :]) @ axes.transpose(0, 2, 1)
+        return (axes * np.exp(np.clip(values, -_MAX_LOG, _MAX_LOG))[:, None, :]) @ axes.transpose(0, 2, 1)
 
 
-def polar(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """F (N, 3, 3) = R S: the rotations R nearest to F, and the logarithms of the stretches S.
+def polar(F: Float[Floats, "N 3 3"]) -> tuple[Float[Floats, "N 3 3"], Float[Floats, "N 3 3"]]:
+    """Polar decomposition F = R S: the rotations R nearest to F, and the logarithms of the stretches S.
 
-    Where F turns space inside out the smallest stretch would be negative; it is taken for a very small one.
+    Where F turns space inside out the smallest stretch would be negative; it counts as a very small one.
     """
     U, sizes, Vh = np.linalg.svd(F)
     flip = np.where(np.linalg.det(U @ Vh) < 0, -1.0, 1.0)
     U[:, :, 2] *= flip[:, None]
     sizes[:, 2] *= flip
-    logs = np.log(np.maximum(sizes, _SMALLEST))
+    logs = np.log(np.maximum(sizes, _MIN_STRETCH))
     return U @ Vh, (Vh.transpose(0, 2, 1) * logs[:, None, :]) @ Vh
 
 
@@ -107,8 +108,8 @@ class FieldPath:
     def __init__(
         self,
         system: NodeSystem,
-        keys: Sequence[np.ndarray],
-        core: np.ndarray,
+        keys: Sequence[Floats],
+        core: Int[Ints, " C"],
         config: TurnConfig | None = None,
     ) -> None:
         self._system, self._config = system, config or TurnConfig()
@@ -122,8 +123,8 @@ class FieldPath:
         V = len(system.verts)
         self._free = np.zeros((V, 6)), np.zeros((V, 3))
 
-    def __call__(self, weights: np.ndarray) -> np.ndarray:
-        """Node vectors (K, 3) for weights (n,) of the keys that sum to one."""
+    def __call__(self, weights: Float[Floats, " n"]) -> Float[Floats, "K 3"]:
+        """Node vectors for weights of the keys that sum to one."""
         config, stretch = self._config, self.stretches.at(weights)
         straight = np.tensordot(weights, self._keys, 1)
         vectors = self._solve(self._rotations(weights) @ stretch, config.damping_first, straight, straight)
@@ -132,22 +133,26 @@ class FieldPath:
             vectors = self._solve(own @ stretch, config.damping, vectors, straight)
         return vectors
 
-    def _from_parent(self, rotations: np.ndarray) -> np.ndarray:
-        """Rotations (G, 3, 3) as seen from the parent of each point; those of roots as they are."""
-        seen = rotations.copy()
+    def _from_parent(self, rotations: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+        """Rotations relative to that of each point's parent; those of roots as they are."""
+        relative = rotations.copy()
         child = np.flatnonzero(self._parent >= 0)
-        seen[child] = rotations[self._parent[child]].transpose(0, 2, 1) @ rotations[child]
-        return seen
+        relative[child] = rotations[self._parent[child]].transpose(0, 2, 1) @ rotations[child]
+        return relative
 
-    def _rotations(self, weights: np.ndarray) -> np.ndarray:
+    def _rotations(self, weights: Float[Floats, " n"]) -> Float[Floats, "G 3 3"]:
         whole = self._joints.at(weights)
         for level in self._levels:
             whole[level] = whole[self._parent[level]] @ whole[level]
         return whole
 
     def _solve(
-        self, targets: np.ndarray, damping: float, near: np.ndarray, straight: np.ndarray
-    ) -> np.ndarray:
+        self,
+        targets: Float[Floats, "G 3 3"],
+        damping: float,
+        near: Float[Floats, "K 3"],
+        straight: Float[Floats, "K 3"],
+    ) -> Float[Floats, "K 3"]:
         """Node vectors with the gradients asked for; the core goes where it goes on the straight way."""
         system = self._system
         vectors = system.solve(*self._free, 1.0 / len(targets), targets, damping / system.K, near)
@@ -155,8 +160,8 @@ class FieldPath:
 
 
 def _spanning_order(
-    system: NodeSystem, rotations: Sequence[np.ndarray], core: np.ndarray
-) -> tuple[np.ndarray, list[np.ndarray]]:
+    system: NodeSystem, rotations: Sequence[Floats], core: Int[Ints, " C"]
+) -> tuple[Int[Ints, " G"], list[Ints]]:
     """Parents (G,) of the strain points, -1 for roots, and the other points level by level below their roots.
 
     One tree for each connected part, along the edges over which the rotations change least. Its root is the point
@@ -165,7 +170,7 @@ def _spanning_order(
     at = system.verts[system.strain_points]
     G = len(at)
     a, b = _neighbours(system)
-    jump = np.full(len(a), _LIKE)
+    jump = np.full(len(a), _MIN_COST)
     for R in rotations:
         jump += np.linalg.norm(R[a] - R[b], axis=(1, 2))
     tree = minimum_spanning_tree(coo_matrix((jump, (a, b)), (G, G)).tocsr())
@@ -183,7 +188,7 @@ def _spanning_order(
     return parent, levels[1:]
 
 
-def _neighbours(system: NodeSystem) -> tuple[np.ndarray, np.ndarray]:
+def _neighbours(system: NodeSystem) -> tuple[Ints, Ints]:
     """Pairs (a < b) of strain points whose regions of the surface touch."""
     G = len(system.strain_points)
     edges = np.concatenate([system.faces[:, [0, 1]], system.faces[:, [1, 2]], system.faces[:, [2, 0]]])
@@ -193,8 +198,8 @@ def _neighbours(system: NodeSystem) -> tuple[np.ndarray, np.ndarray]:
     return code // G, code % G
 
 
-def _regions(system: NodeSystem, edges: np.ndarray) -> np.ndarray:
-    """The nearest strain point (V,) of every vertex along the surface; -1 out of reach."""
+def _regions(system: NodeSystem, edges: Int[Ints, "E 2"]) -> Int[Ints, " V"]:
+    """The nearest strain point of every vertex along the surface; -1 out of reach."""
     V = len(system.verts)
     length = np.linalg.norm(system.verts[edges[:, 0]] - system.verts[edges[:, 1]], axis=1)
     graph = csr_matrix((np.maximum(length, 1e-12), (edges[:, 0], edges[:, 1])), (V, V))

@@ -5,60 +5,86 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.fitting.fit import FAIR_RESIDUAL, GOOD_RESIDUAL
-from meshmatch.fitting.network_fit import two_way_residual
-from meshmatch.fitting.scan import Scan
+from meshmatch.arrays import Float, Floats
+from meshmatch.fitting.completion import area_share, visible_vertices
+from meshmatch.fitting.fit import Reason, Verdict
+from meshmatch.fitting.network_fit import two_way_residual, weighted_mean
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.task import Registration
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
+# Mean two-way residuals (units of sqrt(area)) up to which a fit is called good, and fair; that of a part is one way, for
+# what is not visible adds nothing to it. Set by hand, from fits of bodies.
+GOOD_RESIDUAL, FAIR_RESIDUAL, PART_RESIDUAL = 0.0285, 0.031, 0.027
+# Further from the other surface than this (units of sqrt(area)), a point of shape or template is without counterpart.
+_REACH = 0.06
+# Shares without counterpart up to which a fit is good, and fair. Set by hand.
+_GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
 # More noise than this (units of sqrt(area), 3.4 cm on a person) is a wrong fit rather than noise.
-_MOST_NOISE = 0.025
-# One-way residual (units of sqrt(area)) of a part up to which it is called fair: what is not seen adds nothing to it.
-PART_RESIDUAL = 0.027
+_MAX_NOISE = 0.025
+
+
+def judge_registration(found: Registration, partial: bool) -> tuple[Verdict, tuple[Reason, ...]]:
+    """Verdict on a registration and the reasons; see `judge`."""
+    task, vectors = found.task, found.candidate.vectors
+    allowance = 0.0
+    if task.shape.is_cloud:
+        allowance = cloud_allowance(task.system, found.local, task.shape.V, vectors, task.config.seed)
+    hidden = None
+    if partial:
+        hidden = 1 - area_share(task.system, visible_vertices(task.system, found.local, vectors))
+    return judge(found.candidate.residual, found.local, found.surface.points, allowance, partial, hidden)
 
 
 def judge(
     residual: float,
-    scan: Scan,
-    points: np.ndarray,
+    local: OrientedPoints,
+    points: Float[Floats, "V 3"],
     allowance: float = 0.0,
     partial: bool = False,
-    unseen: float | None = None,
-) -> tuple[str, tuple[str, ...]]:
-    """Verdict on a fit and the reasons, in words.
+    hidden: float | None = None,
+) -> tuple[Verdict, tuple[Reason, ...]]:
+    """Verdict on a fit and the reasons.
 
     Parameters
     ----------
     residual : float
-        `two_way_residual` of the fit.
-    scan : Scan
+        Of the fit: `two_way_residual`, or `one_way_residual` of a part.
+    local : OrientedPoints
         Samples of the shape in the core frame.
     points : (V, 3)
-        Template vertices as fitted.
+        Template vertices as fitted, core frame.
     allowance : float
         The part of the residual that the shape itself explains (see `cloud_allowance`); squares add up.
     partial : bool
         The shape shows a part only: template without surface is as expected, and such a fit is fair at best.
-    unseen : float, optional
+    hidden : float, optional
         Of a part, the share (0..1) of the template that it does not show, where that is known better than by distance.
     """
+    good, fair = (PART_RESIDUAL, PART_RESIDUAL) if partial else (GOOD_RESIDUAL, FAIR_RESIDUAL)
     reasons = []
     excess = unexplained(residual, allowance)
-    if excess > (PART_RESIDUAL if partial else GOOD_RESIDUAL):
-        reasons.append(f"template and shape stay {100 * excess:.1f} % of sqrt(area) apart on average")
-    gap = cKDTree(points).query(scan.points)[0]
-    missed = float((gap > 0.06).mean())
-    if missed > 0.02:
-        reasons.append(f"{100 * missed:.0f} % of the shape is not reached by the template")
-    empty = empty_share(scan, points)
+    if excess > good:
+        words = f"template and shape stay {100 * excess:.1f} % of sqrt(area) apart on average"
+        reasons.append(Reason("residual", words))
+    gap = cKDTree(points).query(local.points)[0]
+    missed = float(weighted_mean(gap > _REACH, local.weights))
+    if missed > _GOOD_SHARE:
+        reasons.append(
+            Reason("unreached", f"{100 * missed:.0f} % of the shape is not reached by the template")
+        )
+    empty = empty_share(local, points)
     if partial:
-        lost = empty if unseen is None else unseen
-        reasons.append(f"taken for a part: {100 * lost:.0f} % of the template has no counterpart")
+        lost = empty if hidden is None else hidden
+        words = f"taken for a part: {100 * lost:.0f} % of the template has no counterpart"
+        reasons.append(Reason("part", words))
         empty = 0.0
-    if empty > 0.02:
-        reasons.append(f"{100 * empty:.0f} % of the template lies where the shape has no surface")
-    if excess > (PART_RESIDUAL if partial else FAIR_RESIDUAL) or missed > 0.06 or empty > 0.06:
+    if empty > _GOOD_SHARE:
+        words = f"{100 * empty:.0f} % of the template lies where the shape has no surface"
+        reasons.append(Reason("empty", words))
+    if excess > fair or missed > _FAIR_SHARE or empty > _FAIR_SHARE:
         return "poor", tuple(reasons)
     return ("fair" if reasons else "good"), tuple(reasons)
 
@@ -68,12 +94,14 @@ def unexplained(residual: float, allowance: float) -> float:
     return float(np.sqrt(max(residual**2 - allowance**2, 0.0)))
 
 
-def empty_share(scan: Scan, points: np.ndarray) -> float:
-    """Share (0..1) of the fitted template's vertices (V, 3) without any of the shape near."""
-    return float((cKDTree(scan.points).query(points)[0] > 0.06).mean())
+def empty_share(local: OrientedPoints, points: Float[Floats, "V 3"]) -> float:
+    """Share (0..1) of the fitted template's vertices without any of the shape near."""
+    return float((cKDTree(local.points).query(points)[0] > _REACH).mean())
 
 
-def cloud_allowance(system: NodeSystem, scan: Scan, V: int, vectors: np.ndarray, seed: int = 0) -> float:
+def cloud_allowance(
+    system: NodeSystem, local: OrientedPoints, V: int, vectors: Float[Floats, "K 3"], seed: int = 0
+) -> float:
     """The part of the residual that even a right fit has on a cloud of V points as noisy as this one.
 
     Squares add up: that of a right fit is the root of the squares of this and of a clean mesh's.
@@ -82,16 +110,17 @@ def cloud_allowance(system: NodeSystem, scan: Scan, V: int, vectors: np.ndarray,
     cloud's are, and once as a mesh is. The noise is read off the median distance of the cloud from the template's
     tangent planes, which a lost limb does not move.
     """
-    moved = system.moved(vectors)
-    normals = system.normals(moved)
-    near = cKDTree(moved).query(scan.points)[1]
-    apart = np.abs(((scan.points - moved[near]) * normals[near]).sum(1))
-    noise = min(1.4826 * float(np.median(apart)), _MOST_NOISE)
+    fitted = system.surface(vectors)
+    nearest = cKDTree(fitted.points).query(local.points)[1]
+    height = np.abs(((local.points - fitted.points[nearest]) * fitted.normals[nearest]).sum(1))
+    noise = min(1.4826 * float(np.median(height)), _MAX_NOISE)  # of a Gaussian with that median
     rng = np.random.default_rng(seed)
-    surface = Shape(moved, system.faces)
-    clean = sample_surface(surface, len(scan.points), rng)
-    rough = sample_surface(surface, min(V, len(scan.points)), rng).points
-    cloud = Shape(rough + noise * rng.standard_normal(rough.shape), np.empty((0, 3), np.int64))
-    expected = two_way_residual(system, Scan(cloud.verts, cloud.vertex_normals, signed=False), vectors)
-    clear = two_way_residual(system, Scan(clean.points, clean.normals), vectors)
+    surface = Shape(fitted.points, system.faces)
+    clean = sample_surface(surface, len(local.points), rng)
+    drawn = sample_surface(surface, min(V, len(local.points)), rng).points
+    cloud = Shape(drawn + noise * rng.standard_normal(drawn.shape), np.empty((0, 3), np.int64))
+    expected = two_way_residual(
+        system, OrientedPoints(cloud.verts, cloud.vertex_normals, signed=False), vectors
+    )
+    clear = two_way_residual(system, OrientedPoints(clean.points, clean.normals), vectors)
     return float(np.sqrt(max(expected**2 - clear**2, 0.0)))

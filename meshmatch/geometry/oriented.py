@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.geometry.frames import RigidPose
 
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area). Set by hand.
@@ -39,10 +39,15 @@ class OrientedPoints:
     signed: bool = True
     weights: Float[Floats, " P"] | None = None
 
+    @property
+    def features(self) -> Float[Floats, "P 6"]:
+        """Points and normals together, see `with_normals`."""
+        return with_normals(self.points, self.normals)
+
     @cached_property
     def tree(self) -> cKDTree:
-        """Over points and normals together, see `with_normals`."""
-        return cKDTree(with_normals(self.points, self.normals))
+        """Over the features."""
+        return cKDTree(self.features)
 
     @cached_property
     def pair_tree(self) -> cKDTree:
@@ -55,11 +60,11 @@ class OrientedPoints:
 
     def first(self, count: int) -> OrientedPoints:
         """The first samples."""
-        return self._rows(slice(count))
+        return self.rows(slice(count))
 
     def thinned(self, P: int) -> OrientedPoints:
         """About P of the samples, evenly taken from their order, which must be random."""
-        return self._rows(slice(None, None, max(1, len(self.points) // P)))
+        return self.rows(slice(None, None, max(1, len(self.points) // P)))
 
     def facing(self, points: Float[Floats, "N 3"], normals: Float[Floats, "N 3"]) -> OrientedPoints:
         """The same samples; normals without a sure sign are turned to agree with those of the nearest points given."""
@@ -73,7 +78,8 @@ class OrientedPoints:
         turned = np.where((back < out)[:, None], -self.normals, self.normals)
         return replace(self, normals=turned, signed=True)
 
-    def _rows(self, rows: slice) -> OrientedPoints:
+    def rows(self, rows: slice | Bool[Bools, " P"]) -> OrientedPoints:
+        """Some of the samples."""
         weights = None if self.weights is None else self.weights[rows]
         return replace(self, points=self.points[rows], normals=self.normals[rows], weights=weights)
 

@@ -62,20 +62,21 @@ def fits(monkeypatch: pytest.MonkeyPatch, sphere: Shape) -> Iterator[dict[str, A
     """Fits that wait for each other: the one of "bad" fails when the other has begun."""
     seen: dict[str, Any] = {"began": threading.Event(), "reports": 0, "ended": []}
 
-    def fit(model: object, shape: Shape, config: object, landmarks: object, progress: Any) -> None:
+    def fit(fitter: Fitter, shape: Shape) -> None:
         if shape.name == "bad":
             assert seen["began"].wait(10)
             raise OptionError("bad")
         try:
             for _ in range(1000):
                 seen["reports"] += 1
-                progress("orientation", 0.5)
+                assert fitter.progress is not None
+                fitter.progress("orientation", shape.name, 0.5)
                 seen["began"].set()
                 threading.Event().wait(0.01)
         finally:
             seen["ended"].append(shape.name)
 
-    monkeypatch.setattr(matching, "fit_shape", fit)
+    monkeypatch.setattr(Fitter, "fit", fit)
     yield seen
 
 

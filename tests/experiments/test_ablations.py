@@ -36,7 +36,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     make_small(monkeypatch)
     drawn = pool._drawn
     monkeypatch.setattr(pool, "_drawn", lambda setting, pose, shapes: drawn(setting, pose, 4))
-    quick = partial(FitConfig, samples=300, coarse_samples=60, laid=1)
+    quick = partial(FitConfig, samples=300, coarse_samples=60, careful=1)
     monkeypatch.setattr(cell_errors, "FitConfig", quick)
     monkeypatch.setattr(ablation_run, "Measure", partial(Measure, landmarks=20, samples=300, code_points=200))
     monkeypatch.setattr(ablation_run, "BODIES", 2)

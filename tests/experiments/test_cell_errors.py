@@ -22,9 +22,9 @@ from meshmatch.experiments.cell_errors import (
 from meshmatch.experiments.cells import BASE, CONSTRAINTS, Setting
 from meshmatch.experiments.descent import LINES, Line, descend
 from meshmatch.experiments.protocols import load_set
-from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.nodes import NodeRefineConfig
+from meshmatch.fitting.system import node_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.normalise import sqrt_area_frame
 from tests.experiments.egg_cells import prepare_eggs

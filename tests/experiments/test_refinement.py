@@ -20,7 +20,7 @@ from meshmatch.experiments.refinement import (
     pair_errors,
     refined,
 )
-from meshmatch.fitting.fit_shape import node_system
+from meshmatch.fitting.system import node_system
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.normalise import sqrt_area_frame

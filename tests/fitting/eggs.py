@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from meshmatch.fields.mls import Kernel
-from meshmatch.fitting.scan import Scan
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.card import write_card
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import NetworkConfig
@@ -48,10 +48,10 @@ def bent_egg(model: TrainedModel, seed: int = 0) -> Shape:
     return Shape(drawn, model.template.shape.faces, f"egg {seed}")
 
 
-def scan_of(shape: Shape, P: int = 800, seed: int = 0) -> Scan:
+def scan_of(shape: Shape, P: int = 800, seed: int = 0) -> OrientedPoints:
     """Samples of a shape where it is."""
     samples = sample_surface(shape, P, np.random.default_rng(seed))
-    return Scan(samples.points, samples.normals)
+    return OrientedPoints(samples.points, samples.normals)
 
 
 def gentle_vectors(model: TrainedModel, size: float = 0.04) -> np.ndarray:

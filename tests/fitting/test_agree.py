@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fitting.agree import AgreeConfig, agree, agreed_fits, mean_stretch
+from meshmatch.fitting.agree import AgreeConfig, Member, agree, agreed_fits, mean_stretch
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.nodes import NodeRefineConfig
-from meshmatch.fitting.scan import Scan
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.samples import Landmarks
+from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -54,10 +54,10 @@ def test_a_collapsed_point_has_a_finite_mean() -> None:
     assert np.isfinite(mean_stretch([np.zeros((1, 3, 3)), stretches(1, 1, 1)[:1]])).all()
 
 
-def scan_of(system: NodeSystem) -> Scan:
+def scan_of(system: NodeSystem) -> OrientedPoints:
     """The resting egg itself."""
     samples = sample_surface(Shape(system.verts, system.faces), 1500, np.random.default_rng(0))
-    return Scan(samples.points, samples.normals)
+    return OrientedPoints(samples.points, samples.normals)
 
 
 def slid(system: NodeSystem, nodes: np.ndarray, turn: float) -> np.ndarray:
@@ -71,22 +71,21 @@ def slid(system: NodeSystem, nodes: np.ndarray, turn: float) -> np.ndarray:
 
 
 def test_two_that_slid_apart_come_closer(system: NodeSystem, model: TrainedModel) -> None:
-    scan, nodes = scan_of(system), model.template.nodes
+    scan, nodes, config = scan_of(system), model.template.nodes, AgreeConfig(steps=6, strain=0.01)
     apart = [slid(system, nodes, 0.15), slid(system, nodes, -0.15)]
-    nearer = agree(system, [scan, scan], apart, [AgreeConfig(steps=6, strain=0.01)] * 2, NodeRefineConfig())
+    nearer = agree(system, [Member(scan, each, config) for each in apart], NodeRefineConfig())
 
     def gap(pair: list[np.ndarray]) -> float:
         return float(np.linalg.norm(system.moved(pair[0]) - system.moved(pair[1]), axis=1).mean())
 
     assert gap(nearer) < 0.75 * gap(apart)
-    alone = agree(system, [scan], apart[:1], [AgreeConfig(steps=6, strain=0.01)], NodeRefineConfig())
+    alone = agree(system, [Member(scan, apart[0], config)], NodeRefineConfig())
     assert gap([alone[0], apart[1]]) > gap(nearer)
 
 
 def test_two_that_are_equal_stay_so_and_the_same_twice(system: NodeSystem, model: TrainedModel) -> None:
-    scan, start = scan_of(system), slid(system, model.template.nodes, 0.1)
-    first = agree(system, [scan, scan], [start, start], [AgreeConfig()] * 2, NodeRefineConfig())
-    again = agree(system, [scan, scan], [start, start], [AgreeConfig()] * 2, NodeRefineConfig())
+    member = Member(scan_of(system), slid(system, model.template.nodes, 0.1), AgreeConfig())
+    first, again = (agree(system, [member, member], NodeRefineConfig()) for _ in range(2))
     assert np.array_equal(first[0], first[1])
     assert np.array_equal(first[0], again[0])
 
@@ -97,11 +96,11 @@ def test_landmarks_hold(system: NodeSystem, model: TrainedModel) -> None:
     places = system.moved(start)[at] + [0.15, 0.0, 0.0]
     config = AgreeConfig(steps=3)
 
-    def missed(known: object) -> float:
-        moved = system.moved(agree(system, [scan], [start], [config], NodeRefineConfig(), known)[0])  # type: ignore[arg-type]
+    def missed(known: Landmarks | None) -> float:
+        moved = system.moved(agree(system, [Member(scan, start, config, known)], NodeRefineConfig())[0])
         return float(np.linalg.norm(moved[at] - places, axis=1).max())
 
-    assert missed([(at, places)]) < 0.25 * missed(None)
+    assert missed((at, places)) < 0.25 * missed(None)
 
 
 def fit_of(system: NodeSystem, vectors: np.ndarray, verdict: str = "good") -> Fit:

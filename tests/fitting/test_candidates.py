@@ -1,19 +1,20 @@
-"""Readings of a pose: what is torn costs, readings that differ are all fitted to the end."""
+"""Interpretations of a pose: discontinuities cost, interpretations that differ are all refined in full."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from meshmatch.fitting.candidates import CandidateScorer, averaged, choose, differ, lying
-from meshmatch.fitting.fit_shape import node_system
+from meshmatch.fitting.candidates import CandidateScorer, averaged, choose, differ
 from meshmatch.fitting.network_fit import Candidate
-from meshmatch.fitting.scan import Scan
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.geometry.frames import RigidPose
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.progress import Progress
 from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import egg_model, scan_of
 
-EYE, ZERO = np.eye(3), np.zeros(3)
+STILL = RigidPose.identity()
 
 
 @pytest.fixture(scope="module")
@@ -22,12 +23,27 @@ def system() -> NodeSystem:
 
 
 @pytest.fixture(scope="module")
-def scan(system: NodeSystem) -> Scan:
+def scan(system: NodeSystem) -> OrientedPoints:
     return scan_of(Shape(system.verts, system.faces), 1500)
 
 
 def still(system: NodeSystem, residual: float = 0.03) -> Candidate:
-    return Candidate(EYE, ZERO, np.zeros((system.K, 3)), residual)
+    return Candidate(STILL, np.zeros((system.K, 3)), residual)
+
+
+class Scored:
+    """Compares candidates by their residual, and keeps a record of what is refined."""
+
+    def __init__(self, system: NodeSystem, refined: float | None = None, scorer=lambda c: c.residual) -> None:
+        self.system, self.residual, self.score = system, refined, scorer
+        self.calls: dict[bool, list[float]] = {False: [], True: []}
+
+    def refined(self, candidate: Candidate, in_full: bool) -> Candidate:
+        self.calls[in_full].append(candidate.residual)
+        return replace(candidate, residual=self.residual) if in_full and self.residual else candidate
+
+    def vertices(self, candidate: Candidate) -> np.ndarray:
+        return candidate.pose.to_world(self.system.moved(candidate.vectors))
 
 
 def folded(system: NodeSystem, residual: float = 0.03) -> Candidate:
@@ -35,83 +51,74 @@ def folded(system: NodeSystem, residual: float = 0.03) -> Candidate:
     nodes = egg_model().template.nodes
     vectors = np.zeros_like(nodes)
     vectors[:, 0] = np.where(nodes[:, 0] > 0, -2 * nodes[:, 0], 0)
-    return Candidate(EYE, ZERO, vectors, residual)
+    return Candidate(STILL, vectors, residual)
 
 
-def test_a_right_fit_tears_nothing_and_a_folded_one_much(system: NodeSystem, scan: Scan) -> None:
-    judge = CandidateScorer(system, scan)
-    whole = judge.torn(scan, still(system).vectors)
+def test_a_right_fit_is_continuous_and_a_folded_one_is_not(system: NodeSystem, scan: OrientedPoints) -> None:
+    scorer = CandidateScorer(system, scan)
+    whole = scorer.discontinuous_share(scan, still(system).vectors)
     assert whole < 0.02  # a template is coarse: neighbours may have vertices apart
-    torn = judge.torn(scan, folded(system).vectors)
-    assert 2 * whole < torn <= 1.0
-    assert judge.score(scan, folded(system)) == pytest.approx(0.03 + 0.1 * torn)
+    cut = scorer.discontinuous_share(scan, folded(system).vectors)
+    assert 2 * whole < cut <= 1.0
+    assert scorer.score(scan, folded(system)) == pytest.approx(0.03 + 0.1 * cut)
 
 
-def test_the_same_pose_in_another_frame_is_no_other_reading(system: NodeSystem) -> None:
+def test_the_same_pose_in_another_frame_is_no_other_interpretation(system: NodeSystem) -> None:
     here = still(system)
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     nodes = egg_model().template.nodes
     # scan = R core + c: the core moved by the opposite lies at the same place
-    there = Candidate(turn, np.array([1.0, 2, 3]), (nodes - np.array([1, 2, 3])) @ turn - nodes, 0.03)
-    assert np.allclose(lying(system, here), system.verts)
-    assert not differ(lying(system, here), lying(system, there))
-    assert differ(lying(system, here), lying(system, folded(system)))
-    assert differ(lying(system, here), lying(system, replace(here, center=np.array([0.2, 0, 0]))))
+    pose = RigidPose(turn, np.array([1.0, 2, 3]))
+    there = Candidate(pose, (nodes - np.array([1, 2, 3])) @ turn - nodes, 0.03)
+    shifted = replace(here, pose=RigidPose(np.eye(3), np.array([0.2, 0, 0])))
+    verts = Scored(system).vertices
+    assert np.allclose(verts(here), system.verts)
+    assert not differ(verts(here), verts(there))
+    assert differ(verts(here), verts(folded(system)))
+    assert differ(verts(here), verts(shifted))
 
 
-def test_what_looked_worse_at_first_wins_at_the_end(system: NodeSystem, scan: Scan) -> None:
-    """A folded reading leads before and after a few steps, and the right one catches up by refinement."""
+def test_what_looked_worse_at_first_wins_at_the_end(system: NodeSystem, scan: OrientedPoints) -> None:
+    """A folded interpretation leads before and after a few steps, and the right one catches up by refinement."""
     right, wrong = still(system, 0.040), folded(system, 0.030)
-    finished: list[float] = []
-
-    def fitted(candidate: Candidate, whole: bool) -> Candidate:
-        if whole:
-            finished.append(candidate.residual)
-        return replace(candidate, residual=0.02 if whole else candidate.residual)
-
-    told: list[float] = []
-    judge = CandidateScorer(system, scan)
-    readings = [wrong, replace(wrong, residual=0.031), right]
-    best = choose(
-        readings, 2, fitted, lambda c: judge.score(scan, c), lambda c: lying(system, c), told.append
-    )
+    scorer = CandidateScorer(system, scan)
+    comparison = Scored(system, 0.02, lambda candidate: scorer.score(scan, candidate))
+    shares: list[float] = []
+    progress = Progress(lambda stage, name, share: shares.append(share))
+    best = choose([wrong, replace(wrong, residual=0.031), right], 2, comparison, progress)
     assert np.array_equal(best.vectors, right.vectors)
-    assert finished == [0.03, 0.04]  # of two alike only the better one is fitted to the end
-    assert told[-1] == 1.0 and told == sorted(told)
+    assert comparison.calls[True] == [0.03, 0.04]  # of two alike only the better one is refined in full
+    assert shares[-1] == 1.0 and shares == sorted(shares)
 
 
-def test_readings_alike_cost_one_refinement(system: NodeSystem) -> None:
-    calls = {False: 0, True: 0}
-
-    def fitted(candidate: Candidate, whole: bool) -> Candidate:
-        calls[whole] += 1
-        return candidate
-
+def test_interpretations_alike_cost_one_refinement(system: NodeSystem) -> None:
     candidates = [still(system, 0.03 + 0.001 * k) for k in range(9)]
-    best = choose(candidates, 4, fitted, lambda c: c.residual, lambda c: lying(system, c))
-    assert best.residual == 0.03
-    assert calls == {False: 4, True: 1}
+    comparison = Scored(system)
+    assert choose(candidates, 4, comparison, Progress()).residual == 0.03
+    assert {in_full: len(calls) for in_full, calls in comparison.calls.items()} == {False: 4, True: 1}
 
 
-def test_readings_that_say_the_same_are_averaged_and_others_are_not(system: NodeSystem) -> None:
+def test_interpretations_that_say_the_same_are_averaged_and_others_are_not(system: NodeSystem) -> None:
     near = [replace(still(system), vectors=np.full((system.K, 3), size)) for size in (0.0, 0.01, 0.02)]
-    elsewhere = replace(near[1], rotation=np.eye(3))  # another frame, though an equal one
+    elsewhere = replace(near[1], pose=RigidPose.identity())  # another frame, though an equal one
     far = folded(system)
     mean = averaged(system, near[0], [*near, elsewhere, far])
     assert np.allclose(mean.vectors, 0.01)
     assert averaged(system, far, near) is far
 
 
-def test_of_a_rough_cloud_positions_alone_are_judged_and_squares(system: NodeSystem, scan: Scan) -> None:
+def test_of_a_rough_cloud_positions_alone_are_scorerd_and_squares(
+    system: NodeSystem, scan: OrientedPoints
+) -> None:
     shifted = replace(still(system), vectors=np.full((system.K, 3), [0.02, 0, 0]))
     apart = np.linalg.norm(system.verts[:, None] + [0.02, 0, 0] - scan.points, axis=2)
     wanted = np.sqrt(0.5 * np.square(apart.min(1)).mean() + 0.5 * np.square(apart.min(0)).mean())
     rough, smooth, half = (CandidateScorer(system, scan, share) for share in (1.0, 0.0, 0.5))
     assert rough.scatter(scan, shifted.vectors) == pytest.approx(wanted)
-    torn = 0.1 * rough.torn(scan, shifted.vectors)
-    assert rough.score(scan, shifted) == pytest.approx(wanted + torn)
-    assert smooth.score(scan, shifted) == pytest.approx(0.03 + torn)
-    assert half.score(scan, shifted) == pytest.approx(0.5 * (0.03 + wanted) + torn)
+    cut = 0.1 * rough.discontinuous_share(scan, shifted.vectors)
+    assert rough.score(scan, shifted) == pytest.approx(wanted + cut)
+    assert smooth.score(scan, shifted) == pytest.approx(0.03 + cut)
+    assert half.score(scan, shifted) == pytest.approx(0.5 * (0.03 + wanted) + cut)
     # a template out of reach: every distance counts as the cap
     away = replace(still(system), vectors=np.full((system.K, 3), 3.0))
     assert rough.scatter(scan, away.vectors) == pytest.approx(0.1)

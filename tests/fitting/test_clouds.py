@@ -1,4 +1,4 @@
-"""Clouds: a first fit settles their scale and their stray points, and the verdict forgives them their noise."""
+"""Clouds: a first fit settles their scale and their outliers, and the verdict forgives them their noise."""
 
 from dataclasses import replace
 
@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.agree import AgreeConfig, agreed_fits
-from meshmatch.fitting.cloud_scale import lonely_points, settle
-from meshmatch.fitting.fit import GOOD_RESIDUAL
+from meshmatch.fitting.cloud_scale import estimate_scale, isolated_points
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import fit_shape, node_system
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import Candidate, two_way_residual
 from meshmatch.fitting.nodes import pair_terms, refine_nodes
-from meshmatch.fitting.scan import Scan
-from meshmatch.fitting.system import NodeSystem
-from meshmatch.fitting.verdict import cloud_allowance, judge
+from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.verdict import GOOD_RESIDUAL, cloud_allowance, judge
+from meshmatch.geometry.frames import RigidPose
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import egg_model
 
-EYE, ZERO = np.eye(3), np.zeros(3)
+STILL = RigidPose.identity()
 
 
 @pytest.fixture(scope="module")
@@ -27,14 +27,14 @@ def system() -> NodeSystem:
     return node_system(egg_model())
 
 
-def cloud_of(system: NodeSystem, P: int, noise: float = 0.0, strays: int = 0) -> Scan:
-    """Points of the resting egg with normals as a cloud estimates them; stray points come last."""
+def cloud_of(system: NodeSystem, P: int, noise: float = 0.0, strays: int = 0) -> OrientedPoints:
+    """Points of the resting egg with normals as a cloud estimates them; outliers come last."""
     rng = np.random.default_rng(0)
     points = sample_surface(Shape(system.verts, system.faces), P, rng).points
     points = np.concatenate(
         [points + noise * rng.standard_normal(points.shape), rng.uniform(-1, 1, (strays, 3))]
     )
-    return Scan(points, Shape(points, np.empty((0, 3), np.int64)).vertex_normals)
+    return OrientedPoints(points, Shape(points, np.empty((0, 3), np.int64)).vertex_normals)
 
 
 class Scaler:
@@ -44,21 +44,21 @@ class Scaler:
         self.nodes, self.share, self.calls = nodes, share, 0
         self.size = float(np.median(np.linalg.norm(cloud_of(system, 600).points, axis=1)))
 
-    def lay(self, scan: Scan, start: Candidate) -> Candidate:
+    def fit(self, scan: OrientedPoints, start: RigidPose) -> Candidate:
         self.calls += 1
         larger = float(np.median(np.linalg.norm(scan.points, axis=1))) / self.size
         vectors = (larger**self.share - 1) * self.nodes
-        return Candidate(start.rotation, start.center, vectors, 0.0)
+        return Candidate(start, vectors, 0.0)
 
 
 @pytest.mark.parametrize("factor", [0.87, 1.0, 1.15])
 def test_the_scale_is_that_of_the_template(system: NodeSystem, factor: float) -> None:
     nodes = egg_model().template.nodes
     scan = cloud_of(system, 600)
-    wrong = Scan(scan.points * factor, scan.normals)
+    wrong = OrientedPoints(scan.points * factor, scan.normals)
     network = Scaler(system, nodes, 0.8)
-    first = network.lay(wrong, Candidate(EYE, ZERO, np.zeros_like(nodes), 0.0))
-    scale, settled, best = settle(system, wrong, first, network.lay)
+    first = network.fit(wrong, STILL)
+    scale, settled, best = estimate_scale(system, wrong, first, network.fit)
     assert scale == pytest.approx(factor, rel=0.03)
     assert np.allclose(settled.points * scale, wrong.points[: len(settled.points)])
     assert best.residual == 0.0
@@ -66,15 +66,15 @@ def test_the_scale_is_that_of_the_template(system: NodeSystem, factor: float) ->
 
 def test_a_wrong_fit_cannot_scale_without_end(system: NodeSystem) -> None:
     nodes = egg_model().template.nodes
-    blown = Candidate(EYE, ZERO, 4.0 * nodes, 0.0)
-    scale, _, _ = settle(system, cloud_of(system, 300), blown, lambda scan, start: blown)
+    blown = Candidate(STILL, 4.0 * nodes, 0.0)
+    scale, _, _ = estimate_scale(system, cloud_of(system, 300), blown, lambda scan, start: blown)
     assert scale == pytest.approx(1.3)
 
 
-def test_points_far_away_and_lonely_are_dropped_and_no_others(system: NodeSystem) -> None:
+def test_points_far_away_and_isolated_are_dropped_and_no_others(system: NodeSystem) -> None:
     scan = cloud_of(system, 800, strays=40)
-    rest = Candidate(EYE, ZERO, np.zeros((system.K, 3)), 0.0)
-    scale, settled, _ = settle(system, scan, rest, lambda part, start: rest)
+    rest = Candidate(STILL, np.zeros((system.K, 3)), 0.0)
+    scale, settled, _ = estimate_scale(system, scan, rest, lambda part, start: rest)
     assert scale == 1.0
     kept = {tuple(point) for point in settled.points}
     strays = scan.points[800:]
@@ -87,49 +87,52 @@ def test_what_is_far_is_told_where_the_template_lies(system: NodeSystem) -> None
     """A cloud that stands elsewhere, and a candidate that says so: the same points are dropped."""
     scan, none = cloud_of(system, 800, strays=40), np.zeros((system.K, 3))
     turn, center = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([0.4, -0.3, 0.2])
-    moved = Scan(scan.points @ turn.T + center, scan.normals @ turn.T)
+    moved = OrientedPoints(scan.points @ turn.T + center, scan.normals @ turn.T)
     left = []
     for cloud, rest in (
-        (scan, Candidate(EYE, ZERO, none, 0.0)),
-        (moved, Candidate(turn, center, none, 0.0)),
+        (scan, Candidate(STILL, none, 0.0)),
+        (moved, Candidate(RigidPose(turn, center), none, 0.0)),
     ):
-        left.append(settle(system, cloud, rest, lambda part, start, rest=rest: rest)[1])
+        left.append(estimate_scale(system, cloud, rest, lambda part, start, rest=rest: rest)[1])
     assert len(left[0].points) < 840
     assert np.allclose(left[1].points, left[0].points @ turn.T + center)
     assert np.allclose(left[1].normals, left[0].normals @ turn.T)
 
 
 def test_a_centre_is_scaled_with_its_cloud(system: NodeSystem) -> None:
-    larger, center = Candidate(EYE, np.array([0.4, -0.3, 0.2]), 0.1 * egg_model().template.nodes, 0.0), []
+    pose, center = RigidPose(np.eye(3), np.array([0.4, -0.3, 0.2])), []
+    larger = Candidate(pose, 0.1 * egg_model().template.nodes, 0.0)
 
-    def lay(scan: Scan, start: Candidate) -> Candidate:
+    def fit(scan: OrientedPoints, start: RigidPose) -> Candidate:
         center.append(start.center)
-        return start
+        return replace(larger, pose=start)
 
-    settle(system, cloud_of(system, 300), larger, lay)
-    assert np.allclose(center, larger.center / np.array([[1.1], [1.1**2], [1.3]]), rtol=1e-4)
+    estimate_scale(system, cloud_of(system, 300), larger, fit)
+    assert np.allclose(center, pose.center / np.array([[1.1], [1.1**2], [1.3]]), rtol=1e-4)
 
 
 def test_a_lost_limb_is_not_dropped(system: NodeSystem) -> None:
     """Far from the template, but as dense as a surface is."""
     scan = cloud_of(system, 800)
     limb = scan.points[:400] * 0.3 + [2.0, 0, 0]
-    both = Scan(np.concatenate([scan.points, limb]), np.concatenate([scan.normals, scan.normals[:400]]))
-    rest = Candidate(EYE, ZERO, np.zeros((system.K, 3)), 0.0)
-    assert len(settle(system, both, rest, lambda part, start: rest)[1].points) == 1200
+    both = OrientedPoints(
+        np.concatenate([scan.points, limb]), np.concatenate([scan.normals, scan.normals[:400]])
+    )
+    rest = Candidate(STILL, np.zeros((system.K, 3)), 0.0)
+    assert len(estimate_scale(system, both, rest, lambda part, start: rest)[1].points) == 1200
 
 
-def test_lonely_points_by_hand() -> None:
+def test_isolated_points_by_hand() -> None:
     grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 2, [0.0]), -1).reshape(-1, 3)
-    assert lonely_points(np.concatenate([grid, [[30.0, 0, 0]]])).nonzero()[0].tolist()[-1] == 64
-    assert not lonely_points(grid)[27]
+    assert isolated_points(np.concatenate([grid, [[30.0, 0, 0]]])).nonzero()[0].tolist()[-1] == 64
+    assert not isolated_points(grid)[27]
 
 
 @pytest.mark.parametrize(("P", "noise"), [(3000, 0.0), (3000, 0.03), (400, 0.0), (400, 0.03)])
 def test_a_right_fit_of_a_poor_cloud_is_forgiven(system: NodeSystem, P: int, noise: float) -> None:
     scan, still = cloud_of(system, P, noise), np.zeros((system.K, 3))
     clean = sample_surface(Shape(system.verts, system.faces), 3000, np.random.default_rng(1))
-    clear = two_way_residual(system, Scan(clean.points, clean.normals), still)
+    clear = two_way_residual(system, OrientedPoints(clean.points, clean.normals), still)
     residual = two_way_residual(system, scan, still)
     allowance = cloud_allowance(system, scan, P, still)
     explained = np.sqrt(max(residual**2 - allowance**2, 0))
@@ -140,7 +143,7 @@ def test_a_right_fit_of_a_poor_cloud_is_forgiven(system: NodeSystem, P: int, noi
 def test_noise_has_a_limit(system: NodeSystem) -> None:
     """A template far from the whole shape is a wrong fit, however noisy it would have to be."""
     scan = cloud_of(system, 2000)
-    far = Scan(scan.points * 1.5, scan.normals)
+    far = OrientedPoints(scan.points * 1.5, scan.normals)
     assert cloud_allowance(system, far, 2000, np.zeros((system.K, 3))) < 0.5 * two_way_residual(
         system, far, np.zeros((system.K, 3)), cap=1.0
     )
@@ -159,10 +162,10 @@ def test_the_verdict_is_of_what_is_not_explained(system: NodeSystem) -> None:
 def test_a_repeated_point_is_no_company(system: NodeSystem) -> None:
     """A cloud of few points is drawn from again and again, its strays too."""
     points = cloud_of(system, 300, strays=6).points
-    alone = lonely_points(points)
+    alone = isolated_points(points)
     again = np.concatenate([points, points[::-1], points])
     assert alone[-6:].all() and alone.mean() < 0.2
-    assert np.array_equal(lonely_points(again), np.concatenate([alone, alone[::-1], alone]))
+    assert np.array_equal(isolated_points(again), np.concatenate([alone, alone[::-1], alone]))
 
 
 def test_noise_makes_a_cloud_rough_and_its_fit_stiff(system: NodeSystem) -> None:
@@ -173,15 +176,15 @@ def test_noise_makes_a_cloud_rough_and_its_fit_stiff(system: NodeSystem) -> None
     assert clean < 0.05 < some < much <= 1.0
     assert Shape(system.verts, system.faces).roughness == 0.0
     config = FitConfig()
-    assert config.suited(clean).nodes.strain_last == pytest.approx(config.nodes.strain_last, rel=0.15)
-    stiff = config.suited(1.0)
+    assert config.for_noise(clean).nodes.strain_last == pytest.approx(config.nodes.strain_last, rel=0.15)
+    stiff = config.for_noise(1.0)
     assert stiff.nodes.strain_last == pytest.approx(10 * config.nodes.strain_last)
     assert stiff.nodes.scale_last > config.nodes.scale_last and stiff.samples > config.samples
-    assert config.suited(0.0) is config
+    assert config.for_noise(0.0) is config
     agree = AgreeConfig()
-    assert agree.suited(1.0).strain == pytest.approx(20 * agree.strain)
-    assert (stiff.nodes.shared, agree.suited(1.0).shared, agree.suited(0.25).shared) == (1.0, 1.0, 0.25)
-    assert agree.suited(0.0) == agree
+    assert agree.for_noise(1.0).strain == pytest.approx(20 * agree.strain)
+    assert (stiff.nodes.shared, agree.for_noise(1.0).shared, agree.for_noise(0.25).shared) == (1.0, 1.0, 0.25)
+    assert agree.for_noise(0.0) == agree
 
 
 def test_fits_of_rough_clouds_are_suited_to_them(system: NodeSystem, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,12 +206,12 @@ def test_fits_of_rough_clouds_are_suited_to_them(system: NodeSystem, monkeypatch
         paired.append(config.back_points)
         return pair_terms(system, scan, vectors, scale, config, one_sided)
 
-    monkeypatch.setattr("meshmatch.fitting.fit_shape.refine_nodes", refined)
-    config = FitConfig(partial="no", variants=2, finalists=1, laid=1)
+    monkeypatch.setattr("meshmatch.fitting.refinement.refine_nodes", refined)
+    config = FitConfig(partial="no", variants=2, finalists=1, careful=1)
     fits = []
     for cloud in clouds:
         asked.clear()
-        fits.append(replace(fit_shape(egg_model(), cloud, config), verdict="good"))
+        fits.append(replace(Fitter(egg_model(), config).fit(cloud), verdict="good"))
         expected = config.nodes.strain_last * 10**cloud.roughness
         assert asked and asked == pytest.approx([expected] * len(asked))
     assert clouds[1].roughness > clouds[0].roughness + 0.3

@@ -1,4 +1,4 @@
-"""Parts completed by the template: what counts as seen, what stands in, and a body that was cut."""
+"""Parts completed by the template: what counts as visible, what stands in, and a body that was cut."""
 
 from pathlib import Path
 
@@ -8,12 +8,13 @@ from scipy.spatial import cKDTree
 
 from meshmatch.experiments.partial import part_of
 from meshmatch.experiments.protocols import load_set
-from meshmatch.fitting.completion import completed, seen, seen_area
-from meshmatch.fitting.fit_shape import fit_shape, node_system
+from meshmatch.fitting.completion import area_share, completed, visible_vertices
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import Candidate
-from meshmatch.fitting.part import PartReading
-from meshmatch.fitting.scan import Scan
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.part import PartCandidate
+from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.geometry.frames import RigidPose
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.pipeline import read_model
 from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import egg_model, scan_of
@@ -24,22 +25,22 @@ def system() -> NodeSystem:
     return node_system(egg_model())
 
 
-def above(system: NodeSystem, height: float) -> Scan:
+def above(system: NodeSystem, height: float) -> OrientedPoints:
     whole = scan_of(Shape(system.verts, system.faces), 4000)
     keep = whole.points[:, 1] > height
-    return Scan(whole.points[keep], whole.normals[keep])
+    return OrientedPoints(whole.points[keep], whole.normals[keep])
 
 
 def test_all_of_a_whole_is_seen_and_nothing_beyond_a_cut(system: NodeSystem) -> None:
     still = np.zeros((system.K, 3))
-    assert seen(system, above(system, -9.0), still).mean() > 0.97
-    there = seen(system, above(system, 0.0), still)
+    assert visible_vertices(system, above(system, -9.0), still).mean() > 0.97
+    there = visible_vertices(system, above(system, 0.0), still)
     y = system.verts[:, 1]
     assert there[y > 0.06].mean() > 0.97
     assert not there[y < -0.07].any()
     area = Shape(system.verts, system.faces).vertex_areas
-    assert seen_area(system, there) == pytest.approx(area[y > 0].sum() / area.sum(), abs=0.08)
-    assert seen_area(system, np.ones(len(y), bool)) == pytest.approx(1.0)
+    assert area_share(system, there) == pytest.approx(area[y > 0].sum() / area.sum(), abs=0.08)
+    assert area_share(system, np.ones(len(y), bool)) == pytest.approx(1.0)
 
 
 class Threads:
@@ -48,11 +49,12 @@ class Threads:
     def __init__(self, verts: np.ndarray) -> None:
         self.verts = verts
 
-    def moved(self, vectors: np.ndarray) -> np.ndarray:
-        return self.verts + vectors
+    def surface(self, vectors: np.ndarray) -> OrientedPoints:
+        return facing_up(self.verts + vectors)
 
-    def normals(self, moved: np.ndarray) -> np.ndarray:
-        return np.tile([0.0, 0.0, 1.0], (len(moved), 1))
+
+def facing_up(points: np.ndarray) -> OrientedPoints:
+    return OrientedPoints(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
 
 
 def test_what_is_seen_is_near_and_belongs_there() -> None:
@@ -64,7 +66,7 @@ def test_what_is_seen_is_near_and_belongs_there() -> None:
     vectors[10] = [0, 0, 0.2]
     vectors[21:] = [-2.0, 0, 0.03]
     shown = np.delete(thread, 10, 0)
-    there = seen(both, Scan(shown, both.normals(shown)), vectors)  # type: ignore[arg-type]
+    there = visible_vertices(both, facing_up(shown), vectors)  # type: ignore[arg-type]
     assert there.nonzero()[0].tolist() == [n for n in range(21) if n != 10]
 
 
@@ -73,14 +75,14 @@ def test_the_edge_of_a_cut_is_no_counterpart_of_what_lies_beyond(system: NodeSys
     nodes = egg_model().template.nodes
     squeezed = np.zeros_like(nodes)
     squeezed[:, 1] = np.where(nodes[:, 1] < 0, -0.9 * nodes[:, 1], 0)
-    there = seen(system, above(system, 0.0), squeezed)
+    there = visible_vertices(system, above(system, 0.0), squeezed)
     assert there[system.verts[:, 1] < -0.12].mean() < 0.1
 
 
 def test_what_is_missing_stands_in_as_densely(system: NodeSystem) -> None:
     still, scan = np.zeros((system.K, 3)), above(system, 0.0)
-    there = seen(system, scan, still)
-    share = seen_area(system, there)
+    there = visible_vertices(system, scan, still)
+    share = area_share(system, there)
     whole = completed(system, scan, still, share, np.random.default_rng(0))
     bare = np.array([face for face in system.faces if not there[face].any()])
     count = round(len(scan.points) * Shape(system.verts, bare).area / share)
@@ -97,8 +99,8 @@ def test_what_is_missing_stands_in_as_densely(system: NodeSystem) -> None:
 
 def test_normals_of_no_sure_side_are_turned_first(system: NodeSystem) -> None:
     scan, still = above(system, 0.0), np.zeros((system.K, 3))
-    inward = Scan(scan.points, -scan.normals, signed=False)
-    assert (seen(system, inward, still) == seen(system, scan, still)).mean() > 0.97
+    inward = OrientedPoints(scan.points, -scan.normals, signed=False)
+    assert (visible_vertices(system, inward, still) == visible_vertices(system, scan, still)).mean() > 0.97
     whole = completed(system, inward, still, 0.5, np.random.default_rng(0))
     assert ((whole.normals * whole.points).sum(1) > 0).mean() > 0.97
 
@@ -108,7 +110,7 @@ def test_what_stands_in_lies_on_the_fit_and_is_mixed_in(system: NodeSystem) -> N
     longer[:, 1] = 0.3 * egg_model().template.nodes[:, 1]
     egg = scan_of(Shape(system.moved(longer), system.faces), 4000)
     upper = egg.points[:, 1] > 0
-    scan = Scan(egg.points[upper], egg.normals[upper])
+    scan = OrientedPoints(egg.points[upper], egg.normals[upper])
     whole = completed(system, scan, longer, 0.5, np.random.default_rng(0))
     assert cKDTree(egg.points).query(whole.points)[0].max() < 0.06
     assert whole.points[:, 1].min() == pytest.approx(egg.points[:, 1].min(), abs=0.02)
@@ -132,18 +134,18 @@ def test_what_is_seen_is_measured_by_area(system: NodeSystem) -> None:
         a, b, c = system.verts[face]
         area[face] += np.linalg.norm(np.cross(b - a, c - a)) / 6
     there = area > np.median(area)
-    assert seen_area(system, there) == pytest.approx(area[there].sum() / area.sum())
-    assert seen_area(system, there) > there.mean() + 0.05
+    assert area_share(system, there) == pytest.approx(area[there].sum() / area.sum())
+    assert area_share(system, there) > there.mean() + 0.05
 
 
-def test_a_reading_knows_its_size_and_what_it_costs() -> None:
+def test_a_candidate_knows_its_size_and_what_it_costs() -> None:
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    fit = Candidate(turn, np.array([1.0, 0, 0]), np.zeros((1, 3)), 0.02)
-    scan = Scan(np.array([[4.0, 2, 0]]), np.array([[1.0, 0, 0]]))
-    local = PartReading(0.25, fit).local(scan)
+    fit = Candidate(RigidPose(turn, np.array([1.0, 0, 0])), np.zeros((1, 3)), 0.02)
+    scan = OrientedPoints(np.array([[4.0, 2, 0]]), np.array([[1.0, 0, 0]]))
+    local = PartCandidate(0.25, fit).local(scan)
     assert np.allclose(local.points, (np.array([[2.0, 1, 0]]) - [1, 0, 0]) @ turn)
     assert np.allclose(local.normals, scan.normals @ turn)
-    assert PartReading(0.25, fit).cost > PartReading(0.5, fit).cost > fit.residual
+    assert PartCandidate(0.25, fit).cost > PartCandidate(0.5, fit).cost > fit.residual
 
 
 def test_half_of_a_body_is_read_as_what_it_is(bench: Path) -> None:
@@ -151,7 +153,7 @@ def test_half_of_a_body_is_read_as_what_it_is(bench: Path) -> None:
     body = known.shape(known.shapes[0])
     half, used = part_of(body, "cut", 0)
     model = read_model("human")
-    whole, part = fit_shape(model, body), fit_shape(model, half)
+    whole, part = Fitter(model).fit(body), Fitter(model).fit(half)
     assert part.partial and part.verdict == "fair"
     told = float(part.reasons[-1].split(": ")[1].split(" %")[0]) / 100
     assert told > 0.2  # of half of the body that is missing, some lies near to what is not

@@ -18,10 +18,10 @@ from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import Blend
 from meshmatch.fitting.dense import dense_shape
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import fit_shape, node_system
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.nodes import refine_nodes
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.models.deformer import NetworkConfig
 from meshmatch.models.trained import TrainedModel, load_model
 from meshmatch.shapes.files import load_shape, save_shape
@@ -36,7 +36,7 @@ QUICK = FitConfig(
     coarse_samples=200,
     copies=4,
     hypotheses=1,
-    laid=1,
+    careful=1,
     latent=LatentRefineConfig(steps=6, points=100),
 )
 
@@ -127,8 +127,8 @@ def test_answers_turn_with_the_points(model: TrainedModel) -> None:
 
 def test_it_is_laid_on_a_shape_and_refined(model: TrainedModel) -> None:
     shape = bent_egg(model)
-    none = fit_shape(model, shape, replace(QUICK, refine="none"))
-    fits = {name: fit_shape(model, shape, replace(QUICK, refine=name)) for name in ("nodes", "latent")}
+    none = Fitter(model, replace(QUICK, refine="none")).fit(shape)
+    fits = {name: Fitter(model, replace(QUICK, refine=name)).fit(shape) for name in ("nodes", "latent")}
     for fit in fits.values():
         assert np.isfinite(fit.points).all()
         assert np.array_equal(fit.points, node_system(model).moved(fit.vectors))
@@ -174,7 +174,7 @@ def test_gauss_newton_works_on_radial_basis_functions(rbf: TrainedModel) -> None
 
 def test_pointwise_fits_are_blended_by_codes_and_agree_as_they_are(pointwise: TrainedModel) -> None:
     shapes = [bent_egg(pointwise, seed) for seed in (0, 1)]
-    fits = [fit_shape(pointwise, shape, replace(QUICK, refine="none")) for shape in shapes]
+    fits = [Fitter(pointwise, replace(QUICK, refine="none")).fit(shape) for shape in shapes]
     believed = [replace(fit, verdict="good") for fit in fits]
     assert agreed_fits(pointwise, shapes, believed) == believed  # the same objects: nothing to solve for
     with pytest.raises(OptionError, match="pointwise") as caught:
@@ -191,7 +191,7 @@ def test_pointwise_fits_are_blended_by_codes_and_agree_as_they_are(pointwise: Tr
 def test_pointwise_models_hold_no_landmarks(pointwise: TrainedModel) -> None:
     known = np.array([0]), np.zeros((1, 3))
     with pytest.raises(OptionError, match="no nodes that landmarks could hold"):
-        fit_shape(pointwise, bent_egg(pointwise), QUICK, known)
+        Fitter(pointwise, QUICK).fit(bent_egg(pointwise), known)
 
 
 def test_a_field_that_does_not_exist_is_refused() -> None:

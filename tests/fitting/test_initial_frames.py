@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import fit_shape
-from meshmatch.fitting.initial_frames import placed, scan_frame
+from meshmatch.fitting.fitter import Fitter
+from meshmatch.fitting.initial_frames import aligned_frames, scan_frame
 from meshmatch.models.deformer import NetworkConfig
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
@@ -32,14 +32,14 @@ def turned_template(model: TrainedModel, vector: list[float]) -> Shape:
 
 def test_a_searched_category_asks_its_network() -> None:
     model = egg_model()
-    assert placed(model, scan_of(model.template.shape)) is None
+    assert aligned_frames(model, scan_of(model.template.shape)) is None
 
 
 def test_a_given_orientation_is_taken_as_it_is() -> None:
     model = wanting("none")
-    [only] = placed(model, scan_of(turned_template(model, [0, 0, 1.0]))) or []
+    [only] = aligned_frames(model, scan_of(turned_template(model, [0, 0, 1.0]))) or []
     assert np.array_equal(only.rotation, np.eye(3)) and not only.center.any()
-    fit = fit_shape(model, turned_template(model, [0, 0, 0.2]), QUICK)
+    fit = Fitter(model, QUICK).fit(turned_template(model, [0, 0, 0.2]))
     assert (fit.up, fit.front) == ("+y", "+z")
 
 
@@ -47,15 +47,15 @@ def test_a_given_orientation_is_taken_as_it_is() -> None:
 def test_an_orientation_is_found_by_alignment(orientation: str, vector: list[float]) -> None:
     model = wanting(orientation)
     shape = turned_template(model, vector)
-    found = placed(model, scan_of(shape)) or []
+    found = aligned_frames(model, scan_of(shape)) or []
     turn = Rotation.from_rotvec(vector).as_matrix()
     # an egg of three axes looks the same after half a turn about any of them
     halves = [np.eye(3), *(2 * np.outer(axis, axis) - np.eye(3) for axis in np.eye(3))]
     assert any(np.allclose(guess.rotation, turn @ half, atol=0.06) for guess in found for half in halves)
     assert len(found) == 1 if orientation == "near" else 1 < len(found) <= 4
-    fit = fit_shape(model, shape, QUICK)
+    fit = Fitter(model, QUICK).fit(shape)
     assert fit.residual < 0.06  # far more where the orientation is wrong
-    assert fit_shape(wanting("none"), shape, QUICK).residual > fit.residual
+    assert Fitter(wanting("none"), QUICK).fit(shape).residual > fit.residual
 
 
 def test_the_scale_of_the_card_is_used() -> None:
@@ -64,6 +64,6 @@ def test_the_scale_of_the_card_is_used() -> None:
     frame = scan_frame(model, egg)
     reach = np.linalg.norm(frame.apply(egg.verts), axis=1).max()
     assert reach == pytest.approx(template_radius(model.template))
-    assert fit_shape(model, egg, QUICK).frame.scale == pytest.approx(frame.scale)
+    assert Fitter(model, QUICK).fit(egg).frame.scale == pytest.approx(frame.scale)
     there = scan_frame(wanting("none"), egg).apply(egg.verts)
     assert Shape(there, egg.faces).area == pytest.approx(1)

@@ -13,9 +13,10 @@ from meshmatch.errors import ModelError, OptionError
 from meshmatch.fields.mls import KERNELS, Kernel, build_field
 from meshmatch.fitting.dense import dense_shape
 from meshmatch.fitting.fit_config import REFINEMENTS, FitConfig, Refine
-from meshmatch.fitting.fit_shape import fit_shape, node_system
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy
-from meshmatch.fitting.scan import Scan
+from meshmatch.fitting.system import node_system
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.registry import built_in_folder
 from meshmatch.models.trained import TrainedModel, load_model
 from tests.fitting.eggs import egg_model
@@ -60,7 +61,7 @@ def test_the_papers_energy_has_the_models_kernel(model: TrainedModel) -> None:
     points = rng.normal(0, 0.3, (50, 3))
     vectors = small_vectors(model)
     config = LatentRefineConfig(chamfer=1.0, volume=0.3, arap=0.7)
-    energy = PaperEnergy(model, Scan(points, points), config, rng)
+    energy = PaperEnergy(model, OrientedPoints(points, points), config, rng)
 
     moved = model.template.shape.verts + phi @ vectors
     squared = np.square(moved[:, None] - points).sum(-1)
@@ -78,7 +79,7 @@ def test_the_papers_energy_has_the_models_kernel(model: TrainedModel) -> None:
 @pytest.mark.parametrize("refine", REFINEMENTS)
 def test_a_fit_is_the_template_moved_with_the_models_kernel(model: TrainedModel, refine: Refine) -> None:
     config = FitConfig(refine=refine, samples=400, copies=4, variants=2, latent=LatentRefineConfig(steps=3))
-    fit = fit_shape(model, model.template.shape, config)
+    fit = Fitter(model, config).fit(model.template.shape)
     phi, _ = shape_functions(model, model.card.field["kernel"])
     assert np.allclose(fit.points, model.template.shape.verts + phi @ fit.vectors, atol=1e-6)
 
@@ -87,7 +88,7 @@ def test_the_dense_mesh_is_moved_with_the_models_kernel(model: TrainedModel) -> 
     # Where the dense mesh is the coarse one, a fit's dense shape is the fit.
     template = model.template
     assert np.array_equal(template.dense.verts, template.shape.verts)
-    fit = fit_shape(model, template.shape, FitConfig(refine="none", samples=400, copies=4))
+    fit = Fitter(model, FitConfig(refine="none", samples=400, copies=4)).fit(template.shape)
     strong = replace(fit, vectors=small_vectors(model))
     strong = replace(strong, points=node_system(model).moved(strong.vectors))
     assert np.allclose(dense_shape(model, strong).verts, strong.points_in_file, atol=1e-6)

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from meshmatch.fields.field import Field
-from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.mirror import Mirror, mirror_of
-from meshmatch.fitting.network_fit import Candidate, variants
+from meshmatch.fitting.network_fit import Predictor
+from meshmatch.fitting.system import node_system
+from meshmatch.geometry.frames import RigidPose
 from meshmatch.models.trained import TrainedModel
 from meshmatch.pipeline import read_model
 from meshmatch.shapes.shape import Shape
@@ -75,11 +76,11 @@ def test_a_mirror_adds_as_many_readings_which_a_network_without_sides_reads_the_
         def turned(self, vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
             return vectors
 
-    start = Candidate(np.eye(3), np.zeros(3), np.zeros((system.K, 3)), 0.0)
     network: Any = Still()
     mirror = Mirror(np.eye(system.K))
     # without a tilt and with all points the mirrored questions hold the mirrored points
-    found = variants(network, system, scan, scan, start, np.random.default_rng(0), 2, 0.0, mirror)
+    predictor = Predictor(network, system, model.template.core, mirror, np.random.default_rng(0))
+    found = predictor.variants(scan, scan, RigidPose.identity(), 2, 0.0)
     assert len(found) == 4
     first, last = (np.sort(asked[k][0].numpy() * flip, axis=0) for k, flip in ((0, 1.0), (3, FLIP)))
     assert np.allclose(first, last, atol=1e-6)

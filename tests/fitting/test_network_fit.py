@@ -1,15 +1,17 @@
 """The network's own fit: rigid motions, the residual, and readings from tilted frames."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fitting.fit_shape import node_system
-from meshmatch.fitting.network_fit import Candidate, lay_on, predict, two_way_residual, variants
-from meshmatch.fitting.scan import Scan, with_normals
-from meshmatch.fitting.system import NodeSystem
-from meshmatch.geometry.frames import kabsch
+from meshmatch.fitting.network_fit import Predictor, one_way_residual, two_way_residual
+from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.geometry.frames import RigidPose, kabsch
+from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.models.trained import TrainedModel
 from tests.fitting.eggs import bent_egg, egg_model, gentle_vectors, scan_of
 
@@ -25,11 +27,13 @@ def system(model: TrainedModel) -> NodeSystem:
 
 
 @pytest.fixture(scope="module")
-def scan(model: TrainedModel) -> Scan:
+def scan(model: TrainedModel) -> OrientedPoints:
     return scan_of(model.template.shape, 300)
 
 
-def test_the_residual_is_that_of_a_plain_loop(system: NodeSystem, scan: Scan, model: TrainedModel) -> None:
+def test_the_residual_is_that_of_a_plain_loop(
+    system: NodeSystem, scan: OrientedPoints, model: TrainedModel
+) -> None:
     vectors = gentle_vectors(model)
     moved = system.moved(vectors)
     ours, theirs = with_normals(moved, system.normals(moved)), with_normals(scan.points, scan.normals)
@@ -37,13 +41,17 @@ def test_the_residual_is_that_of_a_plain_loop(system: NodeSystem, scan: Scan, mo
     for cap in (0.1, 0.03):
         wanted = 0.5 * np.minimum(apart.min(1), cap).mean() + 0.5 * np.minimum(apart.min(0), cap).mean()
         assert two_way_residual(system, scan, vectors, stride=1, cap=cap) == pytest.approx(wanted)
-    own = Scan(moved, system.normals(moved))
+    own = OrientedPoints(moved, system.normals(moved))
     assert two_way_residual(system, own, vectors) == 0
-    assert two_way_residual(system, Scan(scan.points + 9, scan.normals), vectors) == pytest.approx(0.1)
+    assert two_way_residual(system, OrientedPoints(scan.points + 9, scan.normals), vectors) == pytest.approx(
+        0.1
+    )
 
 
-def test_predictions_are_means_of_seeded_draws(model: TrainedModel, scan: Scan) -> None:
-    one, again, other = (predict(model.network, scan, 3, np.random.default_rng(k), 100) for k in (0, 0, 1))
+def test_predictions_are_means_of_seeded_draws(model: TrainedModel, scan: OrientedPoints) -> None:
+    one, again, other = (
+        Predictor.of(model, np.random.default_rng(k)).predict(scan, 3, 100) for k in (0, 0, 1)
+    )
     assert np.array_equal(one, again)
     assert not np.array_equal(one, other)
     rng = np.random.default_rng(0)
@@ -53,7 +61,7 @@ def test_predictions_are_means_of_seeded_draws(model: TrainedModel, scan: Scan) 
             for _ in range(3)
         ]
     assert np.allclose(one, torch.stack(draws).mean(0), atol=1e-5)
-    all_of_it = predict(model.network, scan, 2, np.random.default_rng(5), 10**6)  # more than there are
+    all_of_it = Predictor.of(model, np.random.default_rng(5)).predict(scan, 2, 10**6)  # more than there are
     assert all_of_it.shape == (model.template.K, 3)
 
 
@@ -61,37 +69,42 @@ def test_laying_on_again_moves_the_frame_to_where_the_core_went(
     model: TrainedModel, system: NodeSystem
 ) -> None:
     scan = scan_of(bent_egg(model), 300)
-    scan = Scan(scan.points / 5, scan.normals)
+    scan = OrientedPoints(scan.points / 5, scan.normals)
     core = model.template.core
     R, c = Rotation.from_rotvec([0.1, 0.4, 0]).as_matrix(), np.array([0.1, 0, 0])
-    first = lay_on(model.network, system, core, scan, R, c, np.random.default_rng(0), rounds=1, draws=1)
-    assert np.array_equal(first.rotation, R)
-    assert np.array_equal(first.center, c)
-    second = lay_on(model.network, system, core, scan, R, c, np.random.default_rng(0), rounds=2, draws=1)
-    assert np.linalg.det(second.rotation) == pytest.approx(1)
+    pose = RigidPose(R, c)
+    first, second = (
+        Predictor.of(model, np.random.default_rng(0)).fit(scan, pose, rounds=rounds, draws=1)
+        for rounds in (1, 2)
+    )
+    assert first.pose is pose
+    assert np.linalg.det(second.pose.rotation) == pytest.approx(1)
     # the template's core in the new frame lies, in the scan's, where the first prediction put it, rigidly
     there = system.moved(first.vectors)[core] @ R.T + c
-    laid = system.verts[core] @ second.rotation.T + second.center
-    assert np.allclose(laid, kabsch(system.verts[core], there).to_world(system.verts[core]))
+    placed = second.pose.to_world(system.verts[core])
+    assert np.allclose(placed, kabsch(system.verts[core], there).to_world(system.verts[core]))
 
 
 def test_without_a_tilt_every_reading_is_the_networks_own(
-    model: TrainedModel, system: NodeSystem, scan: Scan
+    model: TrainedModel, system: NodeSystem, scan: OrientedPoints
 ) -> None:
-    candidate = Candidate(np.eye(3), np.zeros(3), np.zeros((system.K, 3)), 0.0)
+    pose = RigidPose.identity()
     # so few points that every draw is all of them: the order does not matter to the network
-    few = Scan(scan.points[:200], scan.normals[:200])
+    few = OrientedPoints(scan.points[:200], scan.normals[:200])
     plain = model.network(torch.from_numpy(few.points).float()[None])[0].detach().double().numpy()
     for degrees, count in ((0.0, 2), (15.0, 3)):
-        found = variants(model.network, system, few, few, candidate, np.random.default_rng(0), count, degrees)
+        predictor = replace(Predictor.of(model, np.random.default_rng(0)), mirror=None)
+        found = predictor.variants(few, few, pose, count, degrees)
         assert len(found) == count
         for each in found:
             assert each.residual == two_way_residual(system, few, each.vectors, 1)
-            assert np.array_equal(each.rotation, candidate.rotation)
+            assert each.pose is pose
             assert np.allclose(each.vectors, plain, atol=1e-5) == (degrees == 0)
 
 
-def test_a_tilted_reading_is_turned_back(model: TrainedModel, system: NodeSystem, scan: Scan) -> None:
+def test_a_tilted_reading_is_turned_back(
+    model: TrainedModel, system: NodeSystem, scan: OrientedPoints
+) -> None:
     """A network that follows every turn reads the same from every frame."""
     nodes = torch.from_numpy(model.template.nodes).float()
     first = torch.from_numpy(scan.points[:200]).float()
@@ -114,8 +127,29 @@ def test_a_tilted_reading_is_turned_back(model: TrainedModel, system: NodeSystem
             [points.mean(0), (points * lengths[:, None]).mean(0), (points * lengths[:, None] ** 2).mean(0)], 1
         )
 
-    few = Scan(scan.points[:200], scan.normals[:200])
-    candidate = Candidate(np.eye(3), np.zeros(3), np.zeros((system.K, 3)), 0.0)
-    found = variants(Follower(), system, few, few, candidate, np.random.default_rng(0), 3, 20.0)  # type: ignore[arg-type]
+    few = OrientedPoints(scan.points[:200], scan.normals[:200])
+    pose = RigidPose.identity()
+    network: Any = Follower()
+    predictor = Predictor(network, system, model.template.core, None, np.random.default_rng(0))
+    found = predictor.variants(few, few, pose, 3, 20.0)
     for each in found:
         assert np.abs(each.vectors).max() < 1e-3
+
+
+def test_residuals_and_predictions_follow_the_weights_of_samples(
+    model: TrainedModel, system: NodeSystem, scan: OrientedPoints
+) -> None:
+    vectors, half = gentle_vectors(model), np.arange(len(scan.points)) < 150
+    masked = replace(scan, weights=half.astype(float))
+    assert one_way_residual(system, masked, vectors, 1) == pytest.approx(
+        one_way_residual(system, scan.rows(half), vectors, 1)
+    )
+    everywhere = replace(scan, weights=np.full(len(scan.points), 0.3))
+    assert two_way_residual(system, everywhere, vectors) == pytest.approx(
+        two_way_residual(system, scan, vectors)
+    )
+    moved = replace(masked, points=np.where(half[:, None], scan.points, scan.points + 9))
+    first, second = (
+        Predictor.of(model, np.random.default_rng(0)).predict(each, 1, 300) for each in (masked, moved)
+    )
+    assert np.array_equal(first, second)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fitting.fit_shape import node_system
 from meshmatch.fitting.network_fit import two_way_residual
 from meshmatch.fitting.nodes import (
     NodeRefineConfig,
@@ -14,10 +13,10 @@ from meshmatch.fitting.nodes import (
     pair_terms,
     refine_nodes,
     robust_weight,
-    vertex_areas,
 )
-from meshmatch.fitting.scan import PAIR_WEIGHT, Scan, with_normals
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.geometry.oriented import PAIR_WEIGHT, OrientedPoints, with_normals
+from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import egg_model, gentle_vectors, scan_of
@@ -41,7 +40,7 @@ def truth(model: TrainedModel) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def scan(system: NodeSystem, truth: np.ndarray) -> Scan:
+def scan(system: NodeSystem, truth: np.ndarray) -> OrientedPoints:
     """Samples of the template under the true vectors."""
     return scan_of(Shape(system.moved(truth), system.faces), 2000)
 
@@ -129,7 +128,7 @@ def test_noise_that_shares_its_pairs_leaves_the_template_where_it_belongs(system
     """Points about a surface that rests: the nearest ones pull the template away, shared ones less."""
     clean = scan_of(Shape(system.verts, system.faces), 4000)
     noisy = clean.points + 0.03 * np.random.default_rng(0).standard_normal(clean.points.shape)
-    scan = Scan(noisy, clean.normals)
+    scan = OrientedPoints(noisy, clean.normals)
     start = np.zeros((system.K, 3))
     moves = []
     for shared in (0.0, 1.0):
@@ -139,8 +138,8 @@ def test_noise_that_shares_its_pairs_leaves_the_template_where_it_belongs(system
     assert moves[1] < 0.95 * moves[0]
 
 
-def test_a_surface_that_faces_the_other_way_is_no_partner(system: NodeSystem, scan: Scan) -> None:
-    inside_out = Scan(scan.points, -scan.normals)
+def test_a_surface_that_faces_the_other_way_is_no_partner(system: NodeSystem, scan: OrientedPoints) -> None:
+    inside_out = OrientedPoints(scan.points, -scan.normals)
     weights, _ = pair_terms(system, inside_out, np.zeros((system.K, 3)), 0.1, CONFIG)
     # a few pairs reach the far side of the egg, where normals agree and the robust weight is nearly nothing
     right = pair_terms(system, scan, np.zeros((system.K, 3)), 0.1, CONFIG)[0]
@@ -153,7 +152,7 @@ def off_surface(system: NodeSystem, vectors: np.ndarray, truth: np.ndarray) -> n
     return np.abs((apart * system.normals(system.moved(truth))).sum(1))
 
 
-def test_a_small_bend_is_found_again(system: NodeSystem, scan: Scan, truth: np.ndarray) -> None:
+def test_a_small_bend_is_found_again(system: NodeSystem, scan: OrientedPoints, truth: np.ndarray) -> None:
     still = np.zeros_like(truth)
     found = refine_nodes(system, scan, still, CONFIG)
     assert off_surface(system, still, truth).mean() > 0.015
@@ -161,14 +160,14 @@ def test_a_small_bend_is_found_again(system: NodeSystem, scan: Scan, truth: np.n
     assert two_way_residual(system, scan, found) < 0.8 * two_way_residual(system, scan, still)
 
 
-def test_what_fits_already_stays(system: NodeSystem, scan: Scan, truth: np.ndarray) -> None:
+def test_what_fits_already_stays(system: NodeSystem, scan: OrientedPoints, truth: np.ndarray) -> None:
     found = refine_nodes(system, scan, truth, CONFIG)
     assert off_surface(system, found, truth).max() < 0.01
     assert two_way_residual(system, scan, found) <= two_way_residual(system, scan, truth)
 
 
 def test_each_step_lowers_the_energy_that_it_is_given(
-    system: NodeSystem, scan: Scan, monkeypatch: pytest.MonkeyPatch
+    system: NodeSystem, scan: OrientedPoints, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pairs and weights change between the steps; within one, the quadratic energy goes down."""
     energies: list[tuple[float, float]] = []
@@ -194,9 +193,11 @@ def test_each_step_lowers_the_energy_that_it_is_given(
     assert energies[0][1] < energies[0][0]
 
 
-def test_turning_everything_turns_the_answer(system: NodeSystem, scan: Scan, model: TrainedModel) -> None:
+def test_turning_everything_turns_the_answer(
+    system: NodeSystem, scan: OrientedPoints, model: TrainedModel
+) -> None:
     Q = Rotation.from_rotvec([0.3, -0.9, 0.4]).as_matrix()
-    turned = Scan(scan.points @ Q.T, scan.normals @ Q.T)
+    turned = OrientedPoints(scan.points @ Q.T, scan.normals @ Q.T)
     nodes = model.template.nodes
     plain = refine_nodes(system, scan, np.zeros((system.K, 3)), CONFIG)
     other = refine_nodes(system, turned, nodes @ Q.T - nodes, CONFIG)
@@ -204,7 +205,7 @@ def test_turning_everything_turns_the_answer(system: NodeSystem, scan: Scan, mod
 
 
 def test_landmarks_are_met_and_the_rest_stays_on_the_surface(
-    system: NodeSystem, scan: Scan, truth: np.ndarray
+    system: NodeSystem, scan: OrientedPoints, truth: np.ndarray
 ) -> None:
     """Pairs a little beside where the surface alone would put them."""
     at = np.array([3, 40, 90])
@@ -223,9 +224,11 @@ def test_landmarks_are_met_and_the_rest_stays_on_the_surface(
     assert off_surface(system, held, truth).mean() < 0.01
 
 
-def test_of_a_part_only_what_is_near_it_is_pulled(system: NodeSystem, scan: Scan, truth: np.ndarray) -> None:
+def test_of_a_part_only_what_is_near_it_is_pulled(
+    system: NodeSystem, scan: OrientedPoints, truth: np.ndarray
+) -> None:
     upper = scan.points[:, 1] > 0
-    half, scale = Scan(scan.points[upper], scan.normals[upper]), 0.03
+    half, scale = OrientedPoints(scan.points[upper], scan.normals[upper]), 0.03
     moved = system.moved(truth)
     to_half = half.tree.query(with_normals(moved, system.normals(moved)))[1]
     far = np.linalg.norm(moved - half.points[to_half], axis=1) >= 3 * scale
@@ -240,7 +243,37 @@ def test_of_a_part_only_what_is_near_it_is_pulled(system: NodeSystem, scan: Scan
     assert np.array_equal(part[~far], whole[~far])
 
 
-def test_no_steps_change_nothing(system: NodeSystem, scan: Scan) -> None:
+def test_no_steps_change_nothing(system: NodeSystem, scan: OrientedPoints) -> None:
     assert np.array_equal(
         refine_nodes(system, scan, np.ones((system.K, 3)), replace(CONFIG, steps=0)), np.ones((system.K, 3))
     )
+
+
+def test_samples_of_weight_zero_have_no_say(
+    system: NodeSystem, scan: OrientedPoints, truth: np.ndarray
+) -> None:
+    """A quarter of the samples lies off the surface, where templates would follow them."""
+    wrong = np.arange(len(scan.points)) % 4 == 0
+    points = scan.points + 0.04 * wrong[:, None] * scan.normals
+    vectors = {
+        "clean": refine_nodes(system, scan, truth, CONFIG),
+        "trusted": refine_nodes(system, OrientedPoints(points, scan.normals), truth, CONFIG),
+        "masked": refine_nodes(
+            system, OrientedPoints(points, scan.normals, weights=np.where(wrong, 0.0, 1.0)), truth, CONFIG
+        ),
+    }
+    off = {name: off_surface(system, found, truth).mean() for name, found in vectors.items()}
+    assert off["trusted"] > 2 * off["clean"]
+    assert off["masked"] < 1.2 * off["clean"]
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.5, 1.0])
+def test_weights_of_samples_scale_their_pairs(
+    system: NodeSystem, scan: OrientedPoints, truth: np.ndarray, shared: float
+) -> None:
+    config = replace(CONFIG, shared=shared)
+    plain = pair_terms(system, scan, truth, 0.1, config)
+    for weight in (0.0, 0.5, 1.0):
+        weighted = replace(scan, weights=np.full(len(scan.points), weight))
+        for terms, expected in zip(pair_terms(system, weighted, truth, 0.1, config), plain, strict=True):
+            assert np.allclose(terms, weight * expected)

@@ -5,12 +5,13 @@ import pytest
 
 from meshmatch.errors import InputError
 from meshmatch.fitting.candidates import CandidateScorer
-from meshmatch.fitting.cloud_scale import without_outliers
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import fit_shape, node_system, take_samples
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import one_way_residual, two_way_residual
-from meshmatch.fitting.scan import Scan
-from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.samples import take_samples, without_outliers
+from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.geometry.frames import RigidPose
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.pipeline import register, usable
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
@@ -19,7 +20,7 @@ from meshmatch.templates.location import bundled_folder
 from tests.fitting.eggs import egg_model, scan_of
 
 NO_FACES = np.empty((0, 3), np.int64)
-FEW = FitConfig(variants=2, finalists=1, laid=1)
+FEW = FitConfig(variants=2, finalists=1, careful=1)
 
 
 @pytest.fixture(scope="module")
@@ -80,14 +81,14 @@ def test_samples_of_a_cloud_have_no_sure_side_and_no_strays(system: NodeSystem) 
     cloud = Shape(np.concatenate([points, [[0.0, 0.0, 0.9], [0.0, 0.9, 0.0]]]), NO_FACES)
     frame, scan = take_samples(cloud, 402, np.random.default_rng(0))
     assert not scan.signed
-    assert not scan.turned(np.eye(3), np.ones(3)).signed and not scan.first(10).signed
+    assert not scan.to_local(RigidPose(np.eye(3), np.ones(3))).signed and not scan.first(10).signed
     assert np.linalg.norm(frame.undo(scan.points), axis=1).max() < 0.8
 
 
 def test_normals_take_the_side_of_the_template(system: NodeSystem) -> None:
     scan = scan_of(Shape(system.verts, system.faces), 700)
     wrong = np.random.default_rng(0).random(700) < 0.5
-    mixed = Scan(scan.points, np.where(wrong[:, None], -scan.normals, scan.normals), signed=False)
+    mixed = OrientedPoints(scan.points, np.where(wrong[:, None], -scan.normals, scan.normals), signed=False)
     moved = system.moved(np.zeros((system.K, 3)))
     faced = mixed.facing(moved, system.normals(moved))
     assert faced.signed
@@ -97,18 +98,18 @@ def test_normals_take_the_side_of_the_template(system: NodeSystem) -> None:
 
 def test_residuals_and_tears_ignore_a_side_that_is_not_known(system: NodeSystem) -> None:
     scan, still = scan_of(Shape(system.verts, system.faces), 900), np.zeros((system.K, 3))
-    flipped = Scan(scan.points, -scan.normals)
+    flipped = OrientedPoints(scan.points, -scan.normals)
     for residual in (two_way_residual, one_way_residual):
         right = residual(system, scan, still)
         assert residual(system, flipped, still) > 2 * right
-        assert residual(system, Scan(scan.points, -scan.normals, signed=False), still) == pytest.approx(right)
-    assert CandidateScorer(system, flipped).torn(flipped, still) != CandidateScorer(system, scan).torn(
-        scan, still
+        assert residual(
+            system, OrientedPoints(scan.points, -scan.normals, signed=False), still
+        ) == pytest.approx(right)
+    unsure = OrientedPoints(scan.points, -scan.normals, signed=False)
+    right, wrong, turned = (
+        CandidateScorer(system, each).discontinuous_share(each, still) for each in (scan, flipped, unsure)
     )
-    unsure = Scan(scan.points, -scan.normals, signed=False)
-    assert CandidateScorer(system, unsure).torn(unsure, still) == CandidateScorer(system, scan).torn(
-        scan, still
-    )
+    assert wrong != right == turned
 
 
 def test_a_cloud_is_tried_as_a_part_only_where_it_leaves_the_template_bare(
@@ -117,19 +118,19 @@ def test_a_cloud_is_tried_as_a_part_only_where_it_leaves_the_template_bare(
     """A residual says that a cloud is sparse and noisy, not that something is missing."""
     tried = []
 
-    def part(model, shape, frame, scan, config, tell):
-        tried.append(frame)
+    def part(task):
+        tried.append(task)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("meshmatch.fitting.fit_shape._part", part)
+    monkeypatch.setattr("meshmatch.fitting.fitter.fit_part", part)
     points = sample_surface(Shape(system.verts, system.faces), 900, np.random.default_rng(0)).points
     noise = 0.05 * np.random.default_rng(1).standard_normal(points.shape)
-    fit_shape(egg_model(), Shape(points + noise, NO_FACES), FEW)
+    Fitter(egg_model(), FEW).fit(Shape(points + noise, NO_FACES))
     assert not tried
     half = sample_surface(Shape(system.verts, system.faces), 3000, np.random.default_rng(0)).points
     half = half[np.abs(half[:, 1]) > 0.18]  # two caps with nothing between
     with pytest.raises(KeyboardInterrupt):
-        fit_shape(egg_model(), Shape(half, NO_FACES), FEW)
+        Fitter(egg_model(), FEW).fit(Shape(half, NO_FACES))
 
 
 def test_a_tenth_of_strays_changes_little_and_nine_tenths_are_told() -> None:

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.fields.mls import KERNELS
-from meshmatch.fitting.fit_shape import node_system
-from meshmatch.fitting.system import NodeSystem, _EveryPair
+from meshmatch.fitting.system import NodeSystem, _EveryPair, node_system
 from meshmatch.models.trained import TrainedModel
 from tests.fitting.eggs import egg_model, gentle_vectors
 

@@ -11,7 +11,7 @@ from meshmatch import pipeline
 from meshmatch.cli import main
 from meshmatch.fields.mls import build_field
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fit_shape import fit_shape
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.models.trained import TrainedModel, load_model
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -82,7 +82,7 @@ def test_the_model_has_the_papers_choices(loaded: TrainedModel) -> None:
 
 
 def test_its_fits_are_moved_with_the_papers_kernel(loaded: TrainedModel, eggs: Path) -> None:
-    fit = fit_shape(loaded, load_shape(eggs / "egg0.ply"), QUICK)
+    fit = Fitter(loaded, QUICK).fit(load_shape(eggs / "egg0.ply"))
     template = loaded.template
     phi = {
         kernel: build_field(template.shape.verts, template.nodes, template.radius, kernel)

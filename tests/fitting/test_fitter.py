@@ -1,6 +1,8 @@
 """The whole fit on eggs that an untrained network reads: laws that hold however badly it reads."""
 
 import json
+import pickle
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +12,21 @@ import pytest
 from meshmatch import pipeline
 from meshmatch.cli import main
 from meshmatch.errors import OptionError
-from meshmatch.fitting.fit import FAIR_RESIDUAL, GOOD_RESIDUAL, Fit, axis_name
-from meshmatch.fitting.fit_config import REFINEMENTS, FitConfig, Refine
-from meshmatch.fitting.fit_shape import fit_shape, take_samples
+from meshmatch.fitting.choices import REFINE_NAMES, Refine
+from meshmatch.fitting.fit import Fit, axis_name
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.landmarks import template_vertices
 from meshmatch.fitting.latent import LatentRefineConfig
-from meshmatch.fitting.scan import Scan
-from meshmatch.fitting.verdict import judge
-from meshmatch.geometry.frames import Frame
+from meshmatch.fitting.mirror import Mirror
+from meshmatch.fitting.network_fit import Candidate, Predictor
+from meshmatch.fitting.orientation import axis_vector
+from meshmatch.fitting.refinement import REFINEMENTS
+from meshmatch.fitting.samples import take_samples
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.verdict import FAIR_RESIDUAL, GOOD_RESIDUAL, judge
+from meshmatch.geometry.frames import Frame, RigidPose
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
@@ -41,7 +50,7 @@ def egg(model: TrainedModel) -> Shape:
 
 @pytest.fixture(scope="module")
 def fits(model: TrainedModel, egg: Shape) -> dict[Refine, Fit]:
-    return {refine: fit_shape(model, egg, replace(QUICK, refine=refine)) for refine in REFINEMENTS}
+    return {refine: Fitter(model, replace(QUICK, refine=refine)).fit(egg) for refine in REFINEMENTS}
 
 
 @pytest.mark.parametrize("refine", REFINEMENTS)
@@ -69,7 +78,7 @@ def test_the_refinements_are_three(fits: dict[Refine, Fit]) -> None:
     assert np.abs(none.vectors - latent.vectors).max() > 1e-4
     assert np.abs(none.vectors - nodes.vectors).max() > 1e-2
     assert nodes.residual < none.residual
-    with pytest.raises(OptionError, match="no refinement 'lots'") as caught:
+    with pytest.raises(OptionError, match="unknown refinement 'lots'") as caught:
         FitConfig(refine="lots")  # type: ignore[arg-type]
     assert "nodes" in caught.value.hint
 
@@ -79,11 +88,11 @@ def test_the_same_seed_gives_the_same_fit(
     model: TrainedModel, egg: Shape, fits: dict[Refine, Fit], refine: Refine
 ) -> None:
     np.random.seed(7)  # noqa: NPY002 (a global state that must not matter)
-    again = fit_shape(model, egg, replace(QUICK, refine=refine))
+    again = Fitter(model, replace(QUICK, refine=refine)).fit(egg)
     for name in ("points", "vectors", "vertex_distance"):
         assert np.array_equal(getattr(again, name), getattr(fits[refine], name))
     assert (again.residual, again.verdict, again.seed) == (fits[refine].residual, fits[refine].verdict, 0)
-    other = fit_shape(model, egg, replace(QUICK, refine=refine, seed=1))
+    other = Fitter(model, replace(QUICK, refine=refine, seed=1)).fit(egg)
     assert not np.array_equal(other.vectors, again.vectors)
     assert other.seed == 1
 
@@ -92,7 +101,7 @@ def test_the_unit_and_the_place_of_a_shape_do_not_matter(
     model: TrainedModel, egg: Shape, fits: dict[Refine, Fit]
 ) -> None:
     moved = Shape(egg.verts / 2.54 + [30, -20, 5], egg.faces, "elsewhere")
-    fit = fit_shape(model, moved, replace(QUICK, refine="none"))
+    fit = Fitter(model, replace(QUICK, refine="none")).fit(moved)
     assert np.allclose(fit.points_in_file, fits["none"].points_in_file / 2.54 + [30, -20, 5], atol=1e-4)
 
 
@@ -112,18 +121,15 @@ def test_samples_are_of_a_shape_of_area_one_around_its_centroid(egg: Shape) -> N
 def test_axes_of_the_user_leave_no_other_hypothesis(
     model: TrainedModel, egg: Shape, monkeypatch: pytest.MonkeyPatch, up: str | None, front: str | None
 ) -> None:
-    from meshmatch.fitting import fit_shape as module
-    from meshmatch.fitting.orientation import axis_vector
-
     tried = []
-    plain = module.lay_on
+    plain = Predictor.fit
 
-    def watched(network, system, core, scan, rotation, *rest, **how):
-        tried.append(rotation)
-        return plain(network, system, core, scan, rotation, *rest, **how)
+    def watched(predictor: Predictor, samples: OrientedPoints, pose: RigidPose, **how: int) -> Candidate:
+        tried.append(pose.rotation)
+        return plain(predictor, samples, pose, **how)
 
-    monkeypatch.setattr(module, "lay_on", watched)
-    fit_shape(model, egg, replace(QUICK, refine="none", up=up, front=front, laid=1))
+    monkeypatch.setattr(Predictor, "fit", watched)
+    Fitter(model, replace(QUICK, refine="none", up=up, front=front, careful=1)).fit(egg)
     asked = np.stack(tried[:-1])  # the last is the best one again, with care
     for name, column in ((up, 1), (front, 2)):
         if name is not None:
@@ -132,7 +138,12 @@ def test_axes_of_the_user_leave_no_other_hypothesis(
 
 def test_progress_rises_to_the_whole(model: TrainedModel, egg: Shape) -> None:
     told: list[tuple[str, float]] = []
-    fit_shape(model, egg, QUICK, progress=lambda what, share: told.append((what, share)))
+
+    def progress(stage: str, name: str, share: float) -> None:
+        assert name == egg.name
+        told.append((stage, share))
+
+    Fitter(model, QUICK, progress).fit(egg)
     for stage in ("orientation", "refinement"):
         shares = [share for what, share in told if what == stage]
         assert shares == sorted(shares)
@@ -145,7 +156,7 @@ def test_landmarks_of_the_file_are_met(model: TrainedModel, egg: Shape, fits: di
     at = np.array([5, 60, 120])
     size = np.sqrt(egg.area)
     place = free.points_in_file[at] + 0.06 * size * np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
-    held = fit_shape(model, egg, QUICK, landmarks=(at, place))
+    held = Fitter(model, QUICK).fit(egg, landmarks=(at, place))
     apart = [np.linalg.norm(fit.points_in_file[at] - place, axis=1).mean() / size for fit in (free, held)]
     assert apart[0] == pytest.approx(0.06)
     assert apart[1] < 0.03
@@ -186,7 +197,7 @@ def test_a_verdict_never_improves_while_less_is_covered(lost: str) -> None:
     for rows in range(8):
         part = grid[20 * rows :]
         ours, theirs = (part, grid) if lost == "template" else (grid, part)
-        seen.append(judge(0.0, Scan(theirs, theirs), ours))
+        seen.append(judge(0.0, OrientedPoints(theirs, theirs), ours))
     ranks = [RANK[verdict] for verdict, _ in seen]
     assert ranks == sorted(ranks)
     # rows of 2.5 %; the first one is within reach (0.06) of the next
@@ -223,3 +234,37 @@ def test_every_refinement_makes_a_map_from_the_command_line(
     assert index.shape == (egg.V,)
     assert index.dtype == np.int64
     assert 0 <= index.min() <= index.max() < model.template.shape.V
+
+
+def test_two_threads_share_one_fitter_that_is_still_cold(egg: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What depends on the model alone is built once, and each shape is fitted as if it were alone."""
+    built: list[type] = []
+    for kind in (NodeSystem, Mirror):
+        plain = kind.__init__
+
+        def counted(self, *args, kind=kind, plain=plain):
+            built.append(kind)
+            plain(self, *args)
+
+        monkeypatch.setattr(kind, "__init__", counted)
+    model = egg_model()
+    fitter, shapes = Fitter(model, QUICK), [egg, bent_egg(model, 1)]
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(fitter.fit, shapes))
+    assert built == [NodeSystem, Mirror]
+    for shape, fit in zip(shapes, together, strict=True):
+        assert np.array_equal(fit.vectors, Fitter(model, QUICK).fit(shape).vectors)
+    assert built == [NodeSystem, Mirror]
+
+
+def test_reasons_are_sentences_with_codes(model: TrainedModel) -> None:
+    scan = scan_of(model.template.shape, 500)
+    (reason,) = judge(0.1, scan, model.template.shape.verts)[1]
+    assert reason.code == "residual"
+    assert str(reason) == "template and shape stay 10.0 % of sqrt(area) apart on average"
+    again = pickle.loads(pickle.dumps(reason))
+    assert (again, again.code) == (reason, reason.code)
+
+
+def test_every_refinement_has_a_name_that_can_be_listed_without_it() -> None:
+    assert tuple(REFINEMENTS) == REFINE_NAMES

@@ -1,0 +1,153 @@
+"""From the network's candidates to the surface: the refinements that a user can choose, in one table.
+
+A new refinement is a line of `REFINEMENTS`, and its name in `meshmatch.fitting.choices`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.fitting.candidates import CandidateScorer, averaged, choose
+from meshmatch.fitting.choices import Refine
+from meshmatch.fitting.completion import completed
+from meshmatch.fitting.latent import refine_code
+from meshmatch.fitting.network_fit import Candidate, one_way_residual, two_way_residual
+from meshmatch.fitting.nodes import refine_nodes
+from meshmatch.fitting.part import STAGE, PartCandidate, cost
+from meshmatch.fitting.task import FitTask
+
+# Interpretations of a part that get a few steps each. Set by hand.
+_PART_FINALISTS = 5
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What is done with the network's candidates, which come best first.
+
+    Attributes
+    ----------
+    whole : (FitTask, list of Candidate) -> Candidate
+        The fit of a shape that is taken for complete.
+    part : (FitTask, list of PartCandidate) -> PartCandidate
+        The fit of a part.
+    moves_nodes : bool
+        Node vectors themselves are refined: the model's field must have nodes; landmarks hold and fits agree.
+    tries_parts : bool
+        Quick enough to find out whether a shape is a part where the user does not say.
+    """
+
+    whole: Callable[[FitTask, list[Candidate]], Candidate]
+    part: Callable[[FitTask, list[PartCandidate]], PartCandidate]
+    moves_nodes: bool = False
+    tries_parts: bool = True
+
+
+def _first(task: FitTask, candidates: list[Candidate]) -> Candidate:
+    return candidates[0]
+
+
+def _first_part(task: FitTask, candidates: list[PartCandidate]) -> PartCandidate:
+    return candidates[0]
+
+
+def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
+    """The best candidate, refined by the paper's search over codes."""
+    best = candidates[0]
+    local = task.samples.to_local(best.pose)
+    surface = task.system.surface(best.vectors)
+    facing = local.facing(surface.points, surface.normals)
+    progress = task.progress.stage("refinement")
+    vectors = refine_code(task.model, facing, task.config.latent, task.predictor.rng, progress)
+    return Candidate(best.pose, vectors, two_way_residual(task.system, local, vectors))
+
+
+def _fit_nodes(task: FitTask, candidates: list[Candidate]) -> Candidate:
+    """The best of several interpretations, refined by Gauss-Newton on the nodes."""
+    found = _interpretations(task, candidates)
+    comparison = _WholeComparison(task, found)
+    return choose(found, task.config.finalists, comparison, task.progress.stage("refinement"))
+
+
+def _interpretations(task: FitTask, candidates: list[Candidate]) -> list[Candidate]:
+    """The candidates and variants of the best one, best first on the coarse samples."""
+    config, coarse, pose = task.config, task.coarse, candidates[0].pose
+    local = task.samples.to_local(pose)
+    pool = task.predictor.variants(local, coarse.to_local(pose), pose, config.variants, config.tilt)
+    for each in candidates:
+        residual = two_way_residual(task.system, coarse.to_local(each.pose), each.vectors, 1)
+        pool.append(replace(each, residual=residual))
+    return sorted(pool, key=lambda candidate: candidate.residual)
+
+
+class _WholeComparison:
+    """How interpretations of a whole are refined and told apart, see `meshmatch.fitting.candidates.Comparison`."""
+
+    def __init__(self, task: FitTask, candidates: list[Candidate]) -> None:
+        self._task, self._candidates = task, candidates
+        self._scorer = CandidateScorer(task.system, task.samples, task.roughness)
+        self._landmarks = None
+        if task.landmarks is not None:
+            self._landmarks = task.landmarks[0], task.frame.apply(task.landmarks[1])
+
+    def refined(self, candidate: Candidate, in_full: bool) -> Candidate:
+        task, config = self._task, self._task.config.nodes
+        if in_full:
+            candidate = averaged(task.system, candidate, self._candidates)
+        else:  # a few steps of the same schedule tell which interpretations the surface agrees with
+            config = replace(config, steps=task.config.screening)
+        fixed = None
+        if self._landmarks is not None:
+            fixed = self._landmarks[0], candidate.pose.to_local(self._landmarks[1])
+        local = task.samples.to_local(candidate.pose)
+        surface = task.system.surface(candidate.vectors)
+        facing = local.facing(surface.points, surface.normals)
+        vectors = refine_nodes(task.system, facing, candidate.vectors, config, fixed)
+        return Candidate(candidate.pose, vectors, two_way_residual(task.system, local, vectors))
+
+    def score(self, candidate: Candidate) -> float:
+        return self._scorer.score(self._task.samples.to_local(candidate.pose), candidate)
+
+    def vertices(self, candidate: Candidate) -> Float[Floats, "V 3"]:
+        return candidate.pose.to_world(self._task.system.moved(candidate.vectors))
+
+
+def _fit_nodes_to_part(task: FitTask, candidates: list[PartCandidate]) -> PartCandidate:
+    """The best of several interpretations of a part, refined by Gauss-Newton on the nodes."""
+    progress = task.progress.stage(STAGE, 0.6, 1.0)
+    return choose(candidates, _PART_FINALISTS, _PartComparison(task), progress)
+
+
+class _PartComparison:
+    """The same for interpretations of a part: what it does not show is held where the fit has it."""
+
+    def __init__(self, task: FitTask) -> None:
+        self._task, self._scorer = task, CandidateScorer(task.system, task.samples)
+
+    def refined(self, candidate: PartCandidate, in_full: bool) -> PartCandidate:
+        task, config = self._task, self._task.config.nodes
+        if not in_full:
+            config = replace(config, steps=task.config.screening)
+        local, vectors = candidate.local(task.samples), candidate.fit.vectors
+        both = completed(task.system, local, vectors, candidate.share, np.random.default_rng(0))
+        vectors = refine_nodes(task.system, both, vectors, config)
+        residual = one_way_residual(task.system, local, vectors)
+        return replace(candidate, fit=Candidate(candidate.fit.pose, vectors, residual))
+
+    def score(self, candidate: PartCandidate) -> float:
+        local = candidate.local(self._task.samples)
+        return cost(self._scorer.score(local, candidate.fit), candidate.share)
+
+    def vertices(self, candidate: PartCandidate) -> Float[Floats, "V 3"]:
+        moved = self._task.system.moved(candidate.fit.vectors)
+        return candidate.fit.pose.to_world(moved) / np.sqrt(candidate.share)
+
+
+REFINEMENTS: dict[Refine, Refinement] = {
+    "none": Refinement(_first, _first_part),
+    "latent": Refinement(_search_code, _first_part, tries_parts=False),
+    "nodes": Refinement(_fit_nodes, _fit_nodes_to_part, moves_nodes=True),
+}
