@@ -194,7 +194,7 @@ class Matcher:
     def _finished(self, fit: Fit, clean: Repaired, config: FitConfig) -> Fit:
         """The fit with its shape, and with what its user should know."""
         notes = [f"{clean.shape.name}: {note}" for note in clean.notes]
-        if config.for_model(self.model) != config:
+        if config.for_model(self.model).refine != config.refine:
             notes.append(
                 f"model {self.model.card.name} is pointwise and has no nodes: its code was refined instead"
             )

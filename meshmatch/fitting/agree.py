@@ -115,7 +115,7 @@ def agreed_fits(
 
 
 def _samples(shape: Shape, fit: Fit, config: FitConfig) -> OrientedPoints:
-    """Samples of a shape in the core frame of its fit, whose template has told the signs of their normals."""
+    """Samples of a shape in the core frame of its fit."""
     config = config.for_noise(shape.roughness)
     frame, samples = take_samples(shape, config.samples, np.random.default_rng(config.seed))
     points = fit.frame.apply(frame.undo(samples.points))

@@ -78,8 +78,8 @@ class Fit:
     faces: Int[Ints, "F 3"]
     residual: float
     vertex_distance: Float[Floats, " N"]
-    verdict: str
-    reasons: tuple[str, ...]
+    verdict: Verdict
+    reasons: tuple[Reason, ...]
     up: str
     front: str
     seconds: float

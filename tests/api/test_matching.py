@@ -13,6 +13,7 @@ from meshmatch.api import matching
 from meshmatch.api.matching import Matcher
 from meshmatch.api.results import MatchResult
 from meshmatch.errors import MeshmatchError, OptionError
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.shapes.shape import Shape
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"

@@ -258,11 +258,11 @@ def test_deviation_counts_from_the_stretch_that_the_fits_have(model: TrainedMode
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"fits": 1}, "fewer than two"),
+        ({"fits": 1}, "at least two shapes"),
         ({"times": [0.0, 0.0, 1.0]}, "later than the one before"),
         ({"times": [0.0, 1.0]}, "3 shapes need as many times"),
-        ({"way": "magic"}, "no way 'magic'"),
-        ({"way": "codes"}, "give a shape for each fit"),
+        ({"way": "magic"}, "unknown way to blend 'magic'"),
+        ({"way": "codes"}, "needs the shape of each fit"),
         ({"other": True}, "another template"),
     ],
 )

@@ -218,7 +218,7 @@ def test_train_save_load_and_register(
 
     for name in ("small_data", "clouds"):
         monkeypatch.setattr(recipes, name, partial(small, getattr(recipes, name)()))
-    monkeypatch.setattr(FitConfig, "possible", _short(FitConfig.possible))
+    monkeypatch.setattr(FitConfig, "for_model", _short(FitConfig.for_model))
     words = ["--field", field, "--steps", "3", "--workers", "0", "--name", "eggs", "-q"]
     if way == "clouds":
         words.append("--unsupervised")
@@ -246,11 +246,11 @@ def test_train_save_load_and_register(
     assert "another template, network or kernel" in capsys.readouterr().err
 
 
-def _short(possible):
+def _short(for_model):
     """A fit with fewer of everything, so that a test takes seconds."""
 
     def shorter(self: FitConfig, model: TrainedModel) -> FitConfig:
         asked = replace(QUICK, refine=self.refine, seed=self.seed)
-        return possible(asked, model)
+        return for_model(asked, model)
 
     return shorter

@@ -74,7 +74,7 @@ def test_products_too_many_to_be_kept_are_formed_anew(
     kept = int((np.diff(system.phi.indptr) ** 2).sum())
     shape, problem = model.template.shape, Problem(system)
     for most, formed in ((kept, False), (kept - 1, True)):
-        monkeypatch.setattr("meshmatch.fitting.system._MOST_PRODUCTS", most)
+        monkeypatch.setattr("meshmatch.fitting.system._MAX_PRODUCTS", most)
         other = NodeSystem(shape, model.field(shape.verts), strain_points=40)
         assert isinstance(other._pairs, _EveryPair) == formed
         assert np.allclose(problem.solve(other), problem.solve(system), atol=1e-8)
