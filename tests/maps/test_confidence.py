@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.frames import Frame
@@ -10,6 +11,7 @@ from meshmatch.maps.build import build_map
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from tests.maps.solids import bumpy_sphere
+from tests.transfer.known import brute_force
 
 
 def lying_on(shape: Shape) -> Fit:
@@ -65,3 +67,20 @@ def test_a_map_by_a_poor_fit_is_believed_half() -> None:
             found = build_map(part, source_fit, part, target_fit)
             assert np.allclose(found.confidence, believed)
             assert found.verdict == verdict
+
+
+@pytest.mark.parametrize("side", ["source", "target"])
+def test_distance_from_the_template_costs_confidence_on_both_sides(side: str) -> None:
+    """The fit of one side is a little too large all over; the other one is exact."""
+    ball = bumpy_sphere()
+    unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
+    part, fit = repair(unit), lying_on(unit)
+    large = replace(fit, points=1.05 * unit.verts)
+    if side == "source":
+        distance, _ = brute_force(unit.verts, large.points, unit.faces)
+        found = build_map(part, large, part, fit)
+    else:
+        distance, _ = brute_force(large.points, unit.verts, unit.faces)
+        found = build_map(part, fit, part, large)
+    assert distance.max() > 0.01
+    assert np.allclose(found.confidence, np.exp(-((distance / 0.03) ** 2)), atol=0.02)

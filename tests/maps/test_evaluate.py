@@ -92,3 +92,14 @@ def test_evaluate_map() -> None:
         evaluate_map(VertexMap.identity(shape), shape, grid(1, 1))
     with pytest.raises(InputError, match="no faces"):
         evaluate_map(VertexMap.identity(cloud), cloud, cloud, target_points=truth)
+
+
+def test_distortion_is_a_mean_over_pairs() -> None:
+    """A map to a single vertex loses all of every distance; that of a vertex to itself does not count."""
+    shape = bumpy_sphere(6, 7)
+    geodesics = GeodesicDistances(shape)
+    distances = geodesics.rows(np.arange(shape.V))
+    found = distortion(
+        np.zeros(shape.V, int), geodesics, geodesics, np.random.default_rng(0), samples=shape.V
+    )
+    assert found == pytest.approx(distances.sum() / (shape.V * (shape.V - 1)))

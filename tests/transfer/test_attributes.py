@@ -151,3 +151,12 @@ def test_other_kinds_of_numbers_are_carried_too(dtype: type) -> None:
     carried = pull_values(BACK, np.arange(COARSE.V).astype(dtype))
     assert carried.dtype == np.float64
     assert np.array_equal(carried[: COARSE.V], np.arange(COARSE.V))
+
+
+@pytest.mark.parametrize(("share", "known"), [(0.6, True), (0.4, False), (0.1, False)])
+def test_a_value_is_known_by_at_least_half_of_its_weight(share: float, known: bool) -> None:
+    triangle = Shape(np.eye(3), np.array([[0, 1, 2]]), "t")
+    point = Shape(np.zeros((1, 3)), np.empty((0, 3), int))
+    back = VertexMap.between(point, triangle, [0], face=[0], barycentric=[[share, 1 - share, 0]])
+    found = pull_values(back, np.array([7.0, np.nan, 1.0]))
+    assert np.allclose(found, [7.0 if known else np.nan], equal_nan=True)

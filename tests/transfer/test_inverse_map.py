@@ -239,3 +239,13 @@ def test_an_index_or_face_outside_the_target_is_refused() -> None:
     high = VertexMap("", "", FORWARD.index, face=np.full(COARSE.V, FINE.F))
     with pytest.raises(InputError, match=r"m\.csv: .*has only 320 faces"):
         high.for_shapes(COARSE, FINE, "m.csv")
+
+
+def test_uncertain_vertices_do_not_count_among_several() -> None:
+    """Three points in a row meet on one vertex: the middle one is a guess, so it is not the one in the middle."""
+    none = np.empty((0, 3), int)
+    row = Shape(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]]), none, "row")
+    pair = Shape(np.array([[0.0, 0, 0], [5, 0, 0]]), none, "pair")
+    for guess, chosen in ((0.1, 0), (1.0, 1)):
+        forward = VertexMap.between(row, pair, [0, 0, 0, 1], confidence=[1.0, guess, 0.9, 1.0])
+        assert invert_map(forward, row, pair).index.tolist() == [chosen, 3]

@@ -173,3 +173,15 @@ def test_vertices_without_weights_get_their_neighbours() -> None:
     out, doubt = replace_low_weights(csr_array(dense), np.ones(SHEET.V), SHEET, 0.3, True, 4)
     assert doubt == LowConfidence(SHEET.V, 1, 0, 1)
     assert np.allclose(out.toarray(), [[0, 1]] * SHEET.V)
+
+
+def test_what_is_filled_in_lies_between_what_is_known_to_the_last_bit() -> None:
+    """Colours must stay within 0..1, and labels' shares too: the solver alone ends a rounding error beyond."""
+    sheet = grid(4, 40)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        bent = Shape(sheet.verts + rng.uniform(-0.45, 0.45, sheet.verts.shape) * [1, 1, 0], sheet.faces)
+        known = rng.random(sheet.V) < 0.5
+        values = np.where(sheet.verts[:, :1] < 20, 0.1, 0.7)
+        out, filled = diffuse(vertex_graph(bent), known, values)
+        assert 0.1 <= out[filled].min() <= out[filled].max() <= 0.7

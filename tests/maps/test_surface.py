@@ -1,0 +1,42 @@
+"""Closest points: exact on the triangles around the nearest vertex, and of the sheet that faces the same way."""
+
+import numpy as np
+
+from meshmatch.maps.surface import Surface
+from meshmatch.shapes.shape import Shape
+from tests.conftest import icosphere
+from tests.maps.solids import grid
+from tests.transfer.known import brute_force
+
+
+def test_closest_points_of_a_fine_mesh_are_exact() -> None:
+    ball = icosphere(3)
+    points = 1.02 * np.random.default_rng(0).permutation(icosphere(2).verts)
+    found = Surface(ball.verts, ball.faces, ball.vertex_normals).query(points, points / 1.02)
+    distance, feet = brute_force(points, ball.verts, ball.faces)
+    assert np.allclose(found.distance, distance)
+    assert np.allclose(found.values(ball.faces, ball.verts), feet)
+
+
+def test_a_thin_wall_has_two_sides() -> None:
+    """Points in the wall, nearer to the side below: those that face up belong to the side above."""
+    sheet = grid(10, 10, 0.1)
+    above = sheet.verts + np.array([0, 0, 0.01])
+    wall = Shape(
+        np.concatenate([sheet.verts, above]), np.concatenate([sheet.faces[:, ::-1], sheet.faces + sheet.V])
+    )
+    points = sheet.verts + np.array([0, 0, 0.004])
+    up = np.tile([0.0, 0, 1], (sheet.V, 1))
+    surface = Surface(wall.verts, wall.faces, wall.vertex_normals)
+    assert (surface.query(points, up).vertex >= sheet.V).all()
+    assert (surface.query(points, -up).vertex < sheet.V).all()
+    assert (surface.query(points, np.zeros_like(up)).vertex < sheet.V).all()
+
+
+def test_updated_points_are_new_ones() -> None:
+    ball = icosphere(1)
+    surface = Surface(ball.verts, ball.faces, ball.vertex_normals)
+    one, other = surface.query(ball.verts, ball.verts), surface.query(ball.verts[::-1], ball.verts[::-1])
+    both = one.updated(np.array([3, 5]), surface.query(ball.verts[[8, 9]], ball.verts[[8, 9]]))
+    assert both.vertex[[2, 3, 5]].tolist() == [2, 8, 9]
+    assert one.vertex.tolist() == list(range(ball.V)) == other.vertex.tolist()[::-1]
