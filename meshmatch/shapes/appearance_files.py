@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError
 from meshmatch.shapes.appearance import Appearance, no_coordinates, vertex_colors_alone
@@ -47,7 +49,8 @@ def find_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
     path = Path(path)
     reader = ImageReader()
     picture = None if image is None else reader.decode(read_bytes(Path(image)), Path(image).name)
-    found = _read(path, shape, reader, picture)
+    with np.errstate(invalid="ignore", over="ignore"):  # coordinates are judged by the appearance
+        found = _read(path, shape, reader, picture)
     if len(found.material) != shape.F or (found.colors is not None and len(found.colors) != shape.V):
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
     return None if found.plain else found

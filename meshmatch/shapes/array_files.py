@@ -17,7 +17,7 @@ from meshmatch.errors import InputError
 
 # Uncompressed bytes of one array in an npz file; a million vertices with 120 dense weights fit.
 LARGEST = 1 << 30
-_LAST_LETTER = 0x10FFFF
+_LAST_CHARACTER = 0x10FFFF
 
 
 def read_npy(path: Path) -> NDArray[Any]:
@@ -34,7 +34,7 @@ def read_npy(path: Path) -> NDArray[Any]:
             if start == b"PK":
                 raise ValueError("it holds several arrays, as an npz does")
             if start != b"\x93N":
-                raise InputError(f"{path.name} is no npy file", "does the suffix fit the content?")
+                raise InputError(f"{path.name} is not an npy file", "does the suffix fit the content?")
             file.seek(0)
             return _array(file, path.name, path.stat().st_size)
     except InputError:
@@ -71,11 +71,11 @@ def _array(file: IO[bytes], name: str, most: int) -> NDArray[Any]:
         warnings.simplefilter("ignore")  # of headers as Python 2 wrote them
         version = npy_format.read_magic(file)
         if version not in ((1, 0), (2, 0), (3, 0)):
-            raise ValueError(f"{name} is of an unknown version")
+            raise ValueError(f"{name} has an unknown format version")
         read = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
         shape, _, kind = read(file)
         if kind.hasobject:
-            raise ValueError("objects are a pickle")
+            raise ValueError("it holds Python objects")
         # An item counts, also one of no bytes: so many of them would fill a list.
         size = math.prod((max(int(kind.itemsize), 1), *(int(axis) for axis in shape)))
         if min(shape, default=0) < 0 or size > most:
@@ -83,10 +83,12 @@ def _array(file: IO[bytes], name: str, most: int) -> NDArray[Any]:
         file.seek(0)
         array = np.asarray(npy_format.read_array(file, allow_pickle=False))
     if array.dtype.kind == "U" and array.size:
-        letters = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("=")).reshape(-1)
-        codes = letters.view(np.uint32)
-        if ((codes > _LAST_LETTER) | ((codes >= 0xD800) & (codes < 0xE000))).any():  # the latter are halves
-            raise ValueError(f"{name} holds letters that do not exist")
+        characters = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("=")).reshape(-1)
+        codes = characters.view(np.uint32)
+        if (
+            (codes > _LAST_CHARACTER) | ((codes >= 0xD800) & (codes < 0xE000))
+        ).any():  # the latter are halves
+            raise ValueError(f"{name} holds invalid characters")
     return array
 
 

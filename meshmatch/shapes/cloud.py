@@ -136,7 +136,7 @@ def _size(part: Floats, index: Ints) -> tuple[int, float]:
     few = min(int(np.clip(len(part) // 100, 12, 18)), index.shape[1] - 1)
     some = slice(None, None, max(len(part) // 3000, 1))
     values = np.linalg.eigvalsh(_spread(part, index[some, : min(12, index.shape[1] - 1) + 1]))
-    thick = np.median(values[:, 0] / np.maximum(values[:, 1], 1e-300))
+    thick = np.median(values[:, 0] / np.maximum(values[:, 1], np.maximum(1e-15 * values[:, 2], 1e-300)))
     # measured on bodies: below 0.15 without noise, 0.2 at noise of 0.3 % of the diagonal, 0.5 at 1 %
     blend = float(np.clip((thick - 0.15) / 0.35, 0.0, 1.0))
     k = round(few ** (1.0 - blend) * (index.shape[1] - 1) ** blend)

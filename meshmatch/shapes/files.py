@@ -56,7 +56,7 @@ def load_shape(path: str | Path) -> Shape:
     suffix = path.suffix.lower()
     if suffix not in _READERS:
         raise InputError(
-            f"{path.name}: unknown kind of file {suffix or '(no suffix)'}",
+            f"{path.name}: unsupported file format {suffix or '(no suffix)'}",
             f"meshmatch reads {', '.join(SUFFIXES)}",
         )
     data = read_bytes(path)

@@ -47,9 +47,7 @@ class ImageReader:
         except Image.DecompressionBombError as error:
             raise _too_large(label, "over 179 million pixels") from error
         except Image.UnidentifiedImageError as error:
-            raise InputError(
-                f"{label} is no image that can be read", "png and jpg always can: save it as one of them"
-            ) from error
+            raise InputError(f"{label} cannot be read as an image", "save it as png or jpg") from error
         except _DAMAGE as error:
             raise InputError(
                 f"{label} is a damaged image ({_first_line(error)})", "export it or copy it again"

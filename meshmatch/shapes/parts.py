@@ -11,7 +11,7 @@ from meshmatch.geometry.topology import face_parts
 from meshmatch.geometry.triangles import squared_lengths
 
 OUTLIER_SHARE = 0.02
-"""A part with less than this share of the largest part's area is stray."""
+"""A part with less than this share of the largest part's area is an outlier."""
 _FAR = 0.25  # gap between two big parts, in diagonals of the largest, from which they count as apart
 _NEAR = 0.05  # gap up to which a small part belongs to a shape that is made of small parts
 
@@ -22,18 +22,18 @@ class Parts:
 
     Parameters
     ----------
-    stray : (F,) bool
-        Faces of stray parts.
-    stray_parts, kept : int
-        How many parts are stray, and how many are not.
+    outlier : (F,) bool
+        Faces of outlier parts.
+    outlier_parts, kept : int
+        How many parts are outliers, and how many are not.
     far : int
         How many of the kept ones are big but lie far from the rest.
     far_share : float
         Their share of the surface, in 0..1.
     """
 
-    stray: Bool[Bools, " F"]
-    stray_parts: int
+    outlier: Bool[Bools, " F"]
+    outlier_parts: int
     kept: int
     far: int
     far_share: float
@@ -58,12 +58,12 @@ def find_parts(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], cross: Floa
             break
         body = np.concatenate([body, near])
     far = np.setdiff1d(big, body)
-    stray = small.copy()
+    outlier = small.copy()
     if areas[small].sum() > 0.1 * areas.sum():
         gap, diagonal = _gaps(verts, faces, face_areas, part, big, np.flatnonzero(small))
-        stray &= gap > _NEAR * diagonal
+        outlier &= gap > _NEAR * diagonal
     share = float(areas[far].sum() / areas.sum())
-    return Parts(stray[part], int(stray.sum()), len(areas) - int(stray.sum()), len(far), share)
+    return Parts(outlier[part], int(outlier.sum()), len(areas) - int(outlier.sum()), len(far), share)
 
 
 def _gaps(

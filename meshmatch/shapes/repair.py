@@ -67,11 +67,11 @@ def repair(shape: Shape) -> Repaired:
     In this order: vertices without a position and the faces that touch them; vertices at exactly the same
     position are merged if they lie on an open edge (texture seams of obj and glTF files, every corner of an
     stl; two layers that merely touch stay apart); faces without area; faces that occur twice (both of them,
-    where they are a flap of no volume on a closed surface); stray parts (see
+    where they are a flap of no volume on a closed surface); outlier parts (see
     `meshmatch.shapes.parts.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the
-    shape is made of small parts, and only those far from the rest are stray); vertices that no face uses.
+    shape is made of small parts, and only those far from the rest are outliers); vertices that no face uses.
     Then faces are turned so that neighbours agree and the shape is not inside out. Open and non-manifold
-    edges are counted, not mended. Of a cloud: points without a position, double ones, and strays far from all
+    edges are counted, not mended. Of a cloud: points without a position, double ones, and outliers far from all
     others.
 
     Raises
@@ -90,9 +90,9 @@ def _repair_cloud(shape: Shape) -> Repaired:
     kept = valid & (twin == np.arange(shape.V))
     _note(notes, int(valid.sum() - kept.sum()), "point", "merged with another at the same position")
     chosen = np.flatnonzero(kept)
-    stray = outlier_points(shape.verts[chosen])
-    _note(notes, int(stray.sum()), "stray point", "far from all others dropped")
-    kept[chosen[stray]] = False
+    outlier = outlier_points(shape.verts[chosen])
+    _note(notes, int(outlier.sum()), "outlier point", "far from all others dropped")
+    kept[chosen[outlier]] = False
     return _result(shape, kept, twin, shape.faces, np.arange(shape.F), valid, notes)
 
 
@@ -121,11 +121,11 @@ def _repair_mesh(shape: Shape) -> Repaired:
     if len(faces) == 0:
         raise InputError(f"{shape.name or 'the shape'} has no face with any area", "is it a mesh at all?")
     found = find_parts(shape.verts, faces, cross)
-    stray = found.stray
-    if stray.any():
-        what = f"dropped ({stray.sum():,} {'face' if stray.sum() == 1 else 'faces'})"
-        _note(notes, found.stray_parts, "stray part", what)
-        faces, cross, which = faces[~stray], cross[~stray], which[~stray]
+    outlier = found.outlier
+    if outlier.any():
+        what = f"dropped ({outlier.sum():,} {'face' if outlier.sum() == 1 else 'faces'})"
+        _note(notes, found.outlier_parts, "outlier part", what)
+        faces, cross, which = faces[~outlier], cross[~outlier], which[~outlier]
     if found.kept > 1:
         _note(notes, found.kept, "separate part", "kept")
     verb = "lies" if found.far == 1 else "lie"

@@ -71,7 +71,7 @@ class Shape:
         if len(faces) and (faces.min() < 0 or faces.max() >= len(verts)):
             worst = int(faces.min()) if faces.min() < 0 else int(faces.max())
             raise InputError(
-                f"{label}: a face names vertex {worst}, but there are only {len(verts)} vertices",
+                f"{label}: a face refers to vertex {worst}, but there are only {len(verts)} vertices",
                 "the file is damaged, or was cut short",
             )
         object.__setattr__(self, "verts", verts)

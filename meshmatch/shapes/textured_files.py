@@ -59,8 +59,8 @@ def claim_textured(path: str | Path) -> Iterator[TexturedFiles]:
     path = Path(path)
     if path.suffix.lower() not in TEXTURED_SUFFIXES:
         raise OptionError(
-            f"{path.name}: a texture cannot be kept in '{path.suffix or 'a file without a suffix'}'",
-            f"end the name in {' or '.join(TEXTURED_SUFFIXES)}",
+            f"{path.name}: cannot write a texture as {path.suffix or '(no suffix)'}",
+            f"choose {' or '.join(TEXTURED_SUFFIXES)}",
         )
     with ExitStack() as claims:  # the obj, which names the others, is claimed first and so renamed last
         temporary = tuple(claims.enter_context(replace_on_success(file)) for file in files_of(path))

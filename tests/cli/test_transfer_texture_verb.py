@@ -340,7 +340,7 @@ def test_a_missing_image_beside_an_obj(run: Run, pair: Path, no_fit: None) -> No
         (("--blank", "0", "--fill"), "contradict each other"),
         (("--up", "y", "--front", "y"), "lie along one axis"),
         (("--image", "gone.png"), "there is no file gone.png"),
-        (("--image", "b.ply"), "b.ply is no image that can be read"),
+        (("--image", "b.ply"), "b.ply cannot be read as an image"),
         (("--uv", "keep"), "b.ply has no texture coordinates to keep"),
         (("--model", "nobody"), "nobody"),
     ],

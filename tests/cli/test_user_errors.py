@@ -79,7 +79,7 @@ BAD_FILES = {
         lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0"),
         "is not an obj file",
     ),
-    "unknown kind": ("bad.docx", lambda path: write_text(path, "x"), "unknown kind"),
+    "unknown kind": ("bad.docx", lambda path: write_text(path, "x"), "unsupported file format"),
     "no suffix": ("bad", lambda path: write_text(path, "x"), "no suffix"),
     "truncated ply": ("bad.ply", truncated_ply, "fewer vertex rows than the 100"),
     "truncated glb": ("bad.glb", lambda path: path.write_bytes(b"glTF\2\0\0\0\xff\0\0\0"), "is only 12"),
@@ -87,7 +87,7 @@ BAD_FILES = {
     "face of a missing vertex": (
         "bad.obj",
         lambda path: write_text(path, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
-        "names vertex 9",
+        "refers to vertex 9",
     ),
     "all NaN": ("bad.obj", all_nan, "NaN"),
     "a cloud of NaN": ("bad.npy", nan_cloud, "NaN"),

@@ -54,7 +54,7 @@ def test_nan_vertices_keep_their_place(cube: Shape) -> None:
         (np.zeros((4, 2)), r"vertices must be an array of \(V, 3\), not \(4, 2\)"),
         ([["a", "b", "c"]], "not an array of numbers"),
         ((np.zeros((4, 3)), [[0, 1]]), r"faces must be an array of \(F, 3\)"),
-        ((np.zeros((4, 3)), [[0, 1, 9]]), "a face names vertex 9"),
+        ((np.zeros((4, 3)), [[0, 1, 9]]), "a face refers to vertex 9"),
         ((np.zeros((4, 3)), [[0, 1, 2.5]]), "faces must be integers"),
         (np.full((4, 3), np.nan), "no vertex has a finite position"),
         (np.zeros((0, 3)), "holds no vertices"),

@@ -137,7 +137,7 @@ def test_small_stray_parts_are_dropped(sphere: Shape, make_sphere: Callable[[int
     crumb = make_sphere(0)
     shape = join(move(crumb, [0, 3, 0], 0.01), sphere, move(crumb, [0, 0, 5], 0.05))
     done = repair(shape)
-    assert done.notes == ("2 stray parts dropped (40 faces)",)
+    assert done.notes == ("2 outlier parts dropped (40 faces)",)
     assert done.shape.V == sphere.V
     assert done.far_parts == 0
     check_answers(shape, done)
@@ -151,7 +151,7 @@ def test_shape_made_of_small_parts_is_not_taken_apart(make_sphere: Callable[[int
     around = 1.12 * np.stack([ring * np.cos(golden), ring * np.sin(golden), height], axis=1)
     beads = [move(ball, p, 0.1) for p in around]  # each with 1 % of the ball's area, together 60 %
     done = repair(join(ball, *beads, move(ball, [3, 0, 0], 0.1)))
-    assert done.notes == ("1 stray part dropped (80 faces)", "61 separate parts kept")
+    assert done.notes == ("1 outlier part dropped (80 faces)", "61 separate parts kept")
 
 
 def test_two_objects_in_one_file_are_kept_and_said(sphere: Shape) -> None:
@@ -324,13 +324,13 @@ def test_cloud_loses_doubles_strays_and_nan(sphere: Shape) -> None:
     assert done.notes == (
         "1 vertex without a position (NaN) dropped",
         "5 points merged with another at the same position",
-        "1 stray point far from all others dropped",
+        "1 outlier point far from all others dropped",
     )
     check_answers(shape, done)
 
 
 def test_cloud_with_dense_and_thin_regions_keeps_all(sphere: Shape, torus: Shape) -> None:
-    """Points that are merely further apart are no strays."""
+    """Points that are merely further apart are no outliers."""
     rng = np.random.default_rng(0)
     u = rng.random(4000) ** 3  # density falls by a thousand along z
     angle = rng.random(4000) * 2 * np.pi

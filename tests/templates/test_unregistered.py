@@ -189,7 +189,7 @@ def test_wrong_known_points_are_told(pears: Path, tmp_path: Path, values: list, 
         with pytest.raises(InputError, match="holds no landmarks"):
             read_landmarks(tmp_path / "x.txt", repair(load_shape(pears / "pear0.ply")))
     (tmp_path / "x.npy").write_bytes(b"no numbers")
-    with pytest.raises(InputError, match="is no npy file"):
+    with pytest.raises(InputError, match="is not an npy file"):
         read_landmarks(tmp_path / "x.npy", repair(load_shape(pears / "pear0.ply")))
 
 

@@ -71,7 +71,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     ),
     "a header alone": ("a.csv", lambda path: path.write_text("vertex,v\n"), "has 0 rows"),
     "not text": ("a.csv", lambda path: path.write_bytes(b"\xff\xfe\x00"), "can be read"),
-    "damaged": ("a.npy", lambda path: path.write_bytes(b"nonsense"), "is no npy file"),
+    "damaged": ("a.npy", lambda path: path.write_bytes(b"nonsense"), "is not an npy file"),
     "a suffix": ("a.mat", lambda path: path.write_text("x"), "not read from '.mat'"),
 }
 

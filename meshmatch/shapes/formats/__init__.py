@@ -35,7 +35,9 @@ NO_FACES = np.empty((0, 3), np.int64)
 
 def damaged(name: str, what: str) -> InputError:
     """The error for a file that does not hold what it promises."""
-    return InputError(f"{name}: {what}", "the file is damaged or was cut short; export or download it again")
+    return InputError(
+        f"{name}: {what[:300]}", "the file is damaged or was cut short; export or download it again"
+    )
 
 
 def fan(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:

@@ -103,7 +103,7 @@ class Document:
             own = self._placed(self.nodes[node], node, primitive)
             triangles = self.triangles(primitive, len(own))
             if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
-                raise damaged(self.name, f"a face names vertex {int(triangles.max())} of {len(own)}")
+                raise damaged(self.name, f"a face refers to vertex {int(triangles.max())} of {len(own)}")
             faces.append(triangles + sum(map(len, verts)))
             verts.append(own)
             colors.append(self.colors(primitive))
@@ -138,7 +138,7 @@ class Document:
         while stack:
             node, parent = stack.pop()
             if node in self.world:
-                raise damaged(self.name, f"node {node} hangs from two places")
+                raise damaged(self.name, f"node {node} has two parents")
             with np.errstate(all="ignore"):  # what is not finite is judged with the positions
                 self.world[node] = parent @ _local(self.nodes[node])
             order.append(node)

@@ -79,16 +79,16 @@ def _faces(name: str, text: bytes, lines: Ints, vertex_lines: Ints) -> Ints:
     if len(values) == 0:
         return NO_FACES
     if not (np.abs(values) < 2**53).all() or (values != np.trunc(values)).any():
-        raise damaged(name, "a face names a vertex that is not a whole number")
+        raise damaged(name, "a face refers to a vertex that is not a whole number")
     corners = values.astype(np.int64)
     V = len(vertex_lines)
     if (corners == 0).any():
-        raise damaged(name, "a face names vertex 0, but obj files count from 1")
+        raise damaged(name, "a face refers to vertex 0, but obj files count from 1")
     if (corners < 0).any():  # from the last vertex before the face backwards
         seen = np.repeat(np.searchsorted(vertex_lines, lines), sizes)
         corners = np.where(corners < 0, corners + seen + 1, corners)
     if corners.min() < 1 or corners.max() > V:
-        raise damaged(name, f"a face names vertex {int(corners.max())}, but there are only {V} vertices")
+        raise damaged(name, f"a face refers to vertex {int(corners.max())}, but there are only {V} vertices")
     return fan(corners - 1, sizes)
 
 

@@ -112,7 +112,7 @@ def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
     if b"/" in faces_text:
         values = numbers(name, second_index(faces_text))
         if not (np.abs(values) < 2**53).all():
-            raise damaged(name, "a face names a texture coordinate that is not a number")
+            raise damaged(name, "a face refers to a texture coordinate that is not a number")
         index = values.astype(np.int64)
     else:
         index = np.zeros(int(sizes.sum()), np.int64)
@@ -123,9 +123,9 @@ def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
         behind = index < 0
         index = np.where(behind, index + seen + 1, index)
         if (index[behind] < 1).any():
-            raise damaged(name, "a face names a texture coordinate that is not there")
+            raise damaged(name, "a face refers to a texture coordinate that is not there")
     if len(index) and index.max() > len(pairs):
-        raise damaged(name, f"a face names texture coordinate {int(index.max())} of {len(pairs)}")
+        raise damaged(name, f"a face refers to texture coordinate {int(index.max())} of {len(pairs)}")
     triangles = fan(index, sizes)
     laid = np.asarray((triangles > 0).all(axis=1))
     uv = np.zeros((len(triangles), 3, 2))
@@ -144,7 +144,7 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
                 entries |= _parse(file)
             elif shape.colors is None:
                 raise InputError(
-                    f"{path.name} has its materials in {name}, which is not there",
+                    f"{path.name} has its materials in {name[:200]}, which is not there",
                     f"copy it to {path.parent}, or name the picture with --image",
                 )
     return entries
@@ -248,7 +248,7 @@ class _Material:
         other = self._decode(wanted)
         if other.shape != image.shape:
             raise InputError(
-                f"{self.path.name}: the alpha image {wanted.file} has another size than the colours'",
+                f"{self.path.name}: the alpha image {wanted.file} differs in size from the colour image",
                 "save both in one size, or the alpha within the colours' png",
             )
         channel = other[..., 0] if (other[..., 3] == 255).all() else other[..., 3]
@@ -258,7 +258,7 @@ class _Material:
         file = _beside(self.entry.folder, wanted.file)
         if file is None:
             raise InputError(
-                f"{self.path.name} needs the image {wanted.file} of its material {self.name}, "
+                f"{self.path.name} needs the image {wanted.file[:200]} of its material {self.name}, "
                 "which is not there",
                 f"copy it to {self.entry.folder}, or name another with --image",
             )

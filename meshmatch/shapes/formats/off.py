@@ -64,7 +64,7 @@ def read(path: Path, data: bytes) -> Raw:
     within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     corners = values[np.repeat(starts + 1, sizes) + within]
     if not (np.abs(corners) < 2**53).all():
-        raise damaged(name, "a face names a vertex that is not a number")
+        raise damaged(name, "a face refers to a vertex that is not a number")
     return Raw(verts, fan(corners.astype(np.int64), sizes), colors)
 
 

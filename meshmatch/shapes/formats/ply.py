@@ -32,7 +32,7 @@ def read(path: Path, data: bytes) -> Raw:
     order, elements, start = _header(name, data)
     known = [element.name for element in elements]
     if "vertex" not in known:
-        raise InputError(f"{name}: the header names no vertices", "is it a mesh or a point cloud at all?")
+        raise InputError(f"{name}: the header declares no vertices", "is it a mesh or a point cloud at all?")
     wanted = [k for k, element in enumerate(elements) if element.name in ("vertex", "face", "tristrips")]
     body = Body(name, data, start, order)
     verts, faces, colors = None, NO_FACES, None
@@ -76,7 +76,8 @@ def write(
         Lines for the header.
     """
     verts = shape.verts
-    single = bool((verts.astype(np.float32) == verts).all())
+    with np.errstate(over="ignore"):  # what is too large for a float is not equal to it
+        single = bool((verts.astype(np.float32) == verts).all())
     real, kind = ("float", "<f4") if single else ("double", "<f8")
     fields = [("x", kind), ("y", kind), ("z", kind)]
     header = ["ply", "format binary_little_endian 1.0", "comment meshmatch"]
@@ -149,11 +150,11 @@ def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int]:
     except (KeyError, ValueError, IndexError) as error:
         raise damaged(name, f"the header line {line.strip()[:60]!r} makes no sense") from error
     if order == "":
-        raise damaged(name, "the header names no format")
+        raise damaged(name, "the header declares no format")
     for each in elements:
         names = [p.name for p in each.properties]
         if len(set(names)) < len(names):
-            raise damaged(name, f"its header names a property of the element {each.name} twice")
+            raise damaged(name, f"its header declares a property of the element {each.name} twice")
     return order, elements, end.end()
 
 
@@ -164,7 +165,7 @@ def _check_kinds(name: str, element: Element) -> None:
         number = element.name == "vertex" and p.name in _NUMBERS
         if (number and p.count_kind) or (lists and not p.count_kind):
             what = "lists" if p.count_kind else "numbers"
-            raise damaged(name, f"its header makes {what} of {p.name} of the element {element.name}")
+            raise damaged(name, f"its header declares {p.name} of the element {element.name} as {what}")
 
 
 def _strips(lists: Ints) -> Ints:

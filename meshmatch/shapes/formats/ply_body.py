@@ -146,5 +146,5 @@ class Body:
     def _indices(self, values: NDArray[Any]) -> Ints:
         """Whole numbers, or an error: floats are what text files are read as."""
         if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():
-            raise damaged(self.name, "a face names a vertex that is not a number")
+            raise damaged(self.name, "a face refers to a vertex that is not a number")
         return values.astype(np.int64)
