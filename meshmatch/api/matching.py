@@ -289,7 +289,7 @@ def checked_threads(threads: int | None) -> int:
 
 def _check_landmarks(model: TrainedModel, configs: Sequence[FitConfig]) -> None:
     for config in configs:
-        if not config.refinement.moves_nodes:
+        if not config.moves_nodes:
             raise OptionError(
                 f"landmarks need refine='nodes', not {config.refine!r}",
                 "leave out the landmarks, or choose nodes",

@@ -93,7 +93,7 @@ def agreed_fits(
         (a pointwise model has none).
     """
     config = (config or FitConfig()).for_model(model)
-    if any(fit.verdict == "poor" for fit in fits) or not config.refinement.moves_nodes:
+    if any(fit.verdict == "poor" for fit in fits) or not config.moves_nodes:
         return list(fits)
     system = node_system(model)
     if how is None:

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 from meshmatch.errors import OptionError
-from meshmatch.fitting.choices import PARTIALS, REFINE_NAMES, Partial, Refine
+from meshmatch.fitting.choices import ON_NODES, PARTIALS, REFINE_NAMES, Partial, Refine
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.nodes import NodeRefineConfig
-from meshmatch.fitting.refinement import REFINEMENTS, Refinement
-
-if TYPE_CHECKING:
-    from meshmatch.models.trained import TrainedModel
+from meshmatch.models.trained import TrainedModel
 
 
 @dataclass(frozen=True)
@@ -67,7 +63,7 @@ class FitConfig:
     latent: LatentRefineConfig = field(default_factory=LatentRefineConfig)
 
     def __post_init__(self) -> None:
-        if self.refine not in REFINEMENTS:
+        if self.refine not in REFINE_NAMES:
             raise OptionError(
                 f"unknown refinement {self.refine!r}", f"choose one of {', '.join(REFINE_NAMES)}"
             )
@@ -75,13 +71,13 @@ class FitConfig:
             raise OptionError(f"partial cannot be {self.partial!r}", f"choose one of {', '.join(PARTIALS)}")
 
     @property
-    def refinement(self) -> Refinement:
-        """What ``refine`` names."""
-        return REFINEMENTS[self.refine]
+    def moves_nodes(self) -> bool:
+        """Whether node vectors themselves are refined: only then landmarks hold and fits agree."""
+        return self.refine in ON_NODES
 
     def for_model(self, model: TrainedModel) -> FitConfig:
         """The same for a model: where there are no nodes to refine (pointwise), the code is refined instead."""
-        return replace(self, refine="latent") if self.refinement.moves_nodes and not model.has_nodes else self
+        return replace(self, refine="latent") if self.moves_nodes and not model.has_nodes else self
 
     def for_noise(self, roughness: float) -> FitConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): more samples, refined more stiffly."""

@@ -9,6 +9,7 @@ import numpy as np
 from meshmatch.fitting.fit import Fit, axis_name, vertex_distance
 from meshmatch.fitting.fit_config import FitConfig, check_landmarks
 from meshmatch.fitting.part import cost, fit_part
+from meshmatch.fitting.refinement import REFINEMENTS, Refinement
 from meshmatch.fitting.samples import Landmarks
 from meshmatch.fitting.task import FitTask, Registration
 from meshmatch.fitting.verdict import FAIR_RESIDUAL, empty_share, judge_registration
@@ -66,20 +67,21 @@ class Fitter:
         began = time.monotonic()
         progress = Progress(self.progress, shape.name)
         task = FitTask.of(self.model, self.config, shape, landmarks, progress)
-        found, partial = fit_whole(task), False
-        if landmarks is None and _may_be_part(found):
-            part = fit_part(task)
+        refinement = REFINEMENTS[task.config.refine]
+        found, partial = fit_whole(task, refinement.whole), False
+        if landmarks is None and _may_be_part(found, refinement):
+            part = fit_part(task, refinement.part)
             partial = _is_part(part, found)
             found = part if partial else found
         return _as_fit(found, partial, began)
 
 
-def _may_be_part(whole: Registration) -> bool:
+def _may_be_part(whole: Registration, refinement: Refinement) -> bool:
     """Whether a fit as a part is worth its time: asked for, or a bad fit of an open shape, or one that leaves it bare."""
     task = whole.task
     if task.config.partial != "auto":
         return task.config.partial == "yes"
-    if not task.config.refinement.tries_parts:
+    if not refinement.tries_parts:
         return False
     if not task.shape.is_cloud:
         if boundary_length(task.shape) < _OPEN * np.sqrt(task.shape.area):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.orientation import axis_vector, forced_frames, propose, standing_grid, with_flips
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
@@ -15,9 +14,6 @@ from meshmatch.models.trained import TrainedModel, once_per_model
 from meshmatch.shapes.align import ALIGNS, align
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.unregistered import SCALES, template_radius, template_samples, unit_frame
-
-if TYPE_CHECKING:
-    from meshmatch.fitting.fit_config import FitConfig
 
 # All of these were set by hand.
 _ALIGNED = 4  # orientations that are tried where the alignment has to search

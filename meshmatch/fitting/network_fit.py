@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,9 +16,7 @@ from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.models.deformer import Deformer
-
-if TYPE_CHECKING:
-    from meshmatch.models.trained import TrainedModel
+from meshmatch.models.trained import TrainedModel
 
 # How many points the network sees of tilted copies, in turn: thin samples tip it either way where it is in doubt.
 _VARIANT_POINTS = (700, 1400)

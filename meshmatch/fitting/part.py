@@ -6,6 +6,7 @@ must lie on the template; what the template has besides is left to the network a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,6 +49,10 @@ class PartCandidate:
         return cost(self.fit.residual, self.share)
 
 
+# Of candidates, best first, to the fit.
+RefinePart = Callable[[FitTask, list[PartCandidate]], PartCandidate]
+
+
 def cost(residual: float, share: float) -> float:
     """A residual, and a little for what is not visible: the smaller the part, the easier it lies on a template."""
     return residual + _SHARE_COST * (1 - share)
@@ -58,20 +63,20 @@ def sized(samples: OrientedPoints, share: float) -> OrientedPoints:
     return replace(samples, points=samples.points * np.sqrt(share))
 
 
-def fit_part(task: FitTask) -> Registration:
+def fit_part(task: FitTask, refine: RefinePart) -> Registration:
     """Fit the template to a shape that may show only a part; where that is poor, from more orientations.
 
-    The residual of the fit is from the samples to the template only.
+    ``refine`` turns the network's candidates into one fit, whose residual is from the samples to the template only.
     """
-    found = _search(task, wide=False)
+    found = _search(task, refine, wide=False)
     if judge_registration(found, partial=True)[0] != "poor":
         return found
     config = replace(task.config, copies=2 * task.config.copies, hypotheses=4 * task.config.hypotheses)
-    again = _search(replace(task, config=config), wide=True)
+    again = _search(replace(task, config=config), refine, wide=True)
     return min(found, again, key=lambda each: cost(each.candidate.residual, each.share))
 
 
-def _search(task: FitTask, wide: bool) -> Registration:
+def _search(task: FitTask, refine: RefinePart, wide: bool) -> Registration:
     """The best fit of a part from some orientations; each search draws the same random numbers."""
     task = replace(task, predictor=Predictor.of(task.model, np.random.default_rng(task.config.seed)))
     progress = task.progress.stage(STAGE)
@@ -85,7 +90,7 @@ def _search(task: FitTask, wide: bool) -> Registration:
     candidates = _best_first(candidates)
     for candidate in candidates[:_VARIED]:
         candidates += _variants(task, candidate)
-    best = task.config.refinement.part(task, _best_first(candidates))
+    best = refine(task, _best_first(candidates))
     root = float(np.sqrt(best.share))
     return Registration(task.rescaled(1 / root, sized(task.samples, best.share)), best.fit, best.share)
 

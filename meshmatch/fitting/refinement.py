@@ -5,7 +5,6 @@ A new refinement is a line of `REFINEMENTS`, and its name in `meshmatch.fitting.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +16,9 @@ from meshmatch.fitting.completion import completed
 from meshmatch.fitting.latent import refine_code
 from meshmatch.fitting.network_fit import Candidate, one_way_residual, two_way_residual
 from meshmatch.fitting.nodes import refine_nodes
-from meshmatch.fitting.part import STAGE, PartCandidate, cost
+from meshmatch.fitting.part import STAGE, PartCandidate, RefinePart, cost
 from meshmatch.fitting.task import FitTask
+from meshmatch.fitting.whole import RefineWhole
 
 # Interpretations of a part that get a few steps each. Set by hand.
 _PART_FINALISTS = 5
@@ -31,18 +31,15 @@ class Refinement:
     Attributes
     ----------
     whole : (FitTask, list of Candidate) -> Candidate
-        The fit of a shape that is taken for complete.
+        For `fit_whole`.
     part : (FitTask, list of PartCandidate) -> PartCandidate
-        The fit of a part.
-    moves_nodes : bool
-        Node vectors themselves are refined: the model's field must have nodes; landmarks hold and fits agree.
+        For `fit_part`.
     tries_parts : bool
         Quick enough to find out whether a shape is a part where the user does not say.
     """
 
-    whole: Callable[[FitTask, list[Candidate]], Candidate]
-    part: Callable[[FitTask, list[PartCandidate]], PartCandidate]
-    moves_nodes: bool = False
+    whole: RefineWhole
+    part: RefinePart
     tries_parts: bool = True
 
 
@@ -149,5 +146,5 @@ class _PartComparison:
 REFINEMENTS: dict[Refine, Refinement] = {
     "none": Refinement(_first, _first_part),
     "latent": Refinement(_search_code, _first_part, tries_parts=False),
-    "nodes": Refinement(_fit_nodes, _fit_nodes_to_part, moves_nodes=True),
+    "nodes": Refinement(_fit_nodes, _fit_nodes_to_part),
 }

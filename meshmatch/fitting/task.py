@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.initial_frames import scan_frame
 from meshmatch.fitting.network_fit import Candidate, Predictor
 from meshmatch.fitting.samples import Landmarks, take_samples, without_outliers
@@ -17,9 +17,6 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress
 from meshmatch.shapes.shape import Shape
-
-if TYPE_CHECKING:
-    from meshmatch.fitting.fit_config import FitConfig
 
 
 @dataclass(frozen=True, eq=False)

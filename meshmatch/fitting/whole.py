@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from meshmatch.fitting.cloud_scale import estimate_scale
 from meshmatch.fitting.initial_frames import frames_to_try
 from meshmatch.fitting.network_fit import Candidate
@@ -10,9 +12,12 @@ from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
 
+# Of candidates, best first, to the fit.
+RefineWhole = Callable[[FitTask, list[Candidate]], Candidate]
 
-def fit_whole(task: FitTask) -> Registration:
-    """Fit the template to a shape that is taken for complete.
+
+def fit_whole(task: FitTask, refine: RefineWhole) -> Registration:
+    """Fit the template to a shape that is taken for complete; ``refine`` turns the network's candidates into one fit.
 
     Raises
     ------
@@ -25,7 +30,7 @@ def fit_whole(task: FitTask) -> Registration:
         task, candidates = _rescaled(task, candidates)
     careful = [task.predictor.fit(task.samples, each.pose) for each in candidates[: task.config.careful]]
     orientation(1.0)
-    return Registration(task, task.config.refinement.whole(task, _best_first(careful)))
+    return Registration(task, refine(task, _best_first(careful)))
 
 
 def _screened(task: FitTask, progress: Progress) -> list[Candidate]:

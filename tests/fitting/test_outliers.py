@@ -118,7 +118,7 @@ def test_a_cloud_is_tried_as_a_part_only_where_it_leaves_the_template_bare(
     """A residual says that a cloud is sparse and noisy, not that something is missing."""
     tried = []
 
-    def part(task):
+    def part(task, refine):
         tried.append(task)
         raise KeyboardInterrupt
 

@@ -14,6 +14,7 @@ from meshmatch.fitting.fitter import Fitter, boundary_length
 from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
 from meshmatch.fitting.network_fit import one_way_residual
 from meshmatch.fitting.part import SHARES, cost
+from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.samples import take_samples
 from meshmatch.fitting.system import node_system
 from meshmatch.fitting.task import FitTask
@@ -125,7 +126,7 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
         monkeypatch.setattr(part, "frames_of_part", frames)
         monkeypatch.setattr(part, "judge_registration", lambda found, partial, verdict=verdict: (verdict, ()))
         asked.clear()
-        best = part.fit_part(task)
+        best = part.fit_part(task, REFINEMENTS["none"].part)
         found[verdict] = cost(best.candidate.residual, best.share)
         assert asked == ({(48, 2, False)} if verdict == "fair" else {(48, 2, False), (96, 8, True)})
     assert found["poor"] <= found["fair"]
