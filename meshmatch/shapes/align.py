@@ -40,7 +40,7 @@ def align(shape: OrientedPoints, target: OrientedPoints, how: Align, keep: int =
     Parameters
     ----------
     shape, target : OrientedPoints
-        Both centred, of one scale, their points in random order.
+        Both centered, of one scale, their points in random order.
     how : {"none", "near", "rigid"}
         Take the orientation as it is; improve it; search all orientations.
     keep : int

@@ -109,10 +109,8 @@ class Document:
             colors.append(self.colors(primitive))
         if not verts:
             raise InputError(f"{self.name} holds no triangles and no points", "is there a mesh in its scene?")
-        painted = None
-        if any(color is not None for color in colors):
-            white = [np.ones((len(own), 4)) for own in verts]
-            painted = np.vstack([w if c is None else c for c, w in zip(colors, white, strict=True)])
+        painted = joined_colors(colors, [len(own) for own in verts])
+        if painted is not None:
             painted[:, :3] = to_srgb(painted[:, :3])
         return Raw(np.vstack(verts), np.vstack([NO_FACES, *faces]), painted)
 
@@ -271,6 +269,15 @@ class Document:
                 "copy it beside the gltf",
             )
         return read_bytes(file)
+
+
+def joined_colors(
+    colors: list[Float[Floats, "_ 4"] | None], counts: list[int]
+) -> Float[Floats, "V 4"] | None:
+    """Colours of primitives one after the other, white for those without; None if none has any."""
+    if all(color is None for color in colors):
+        return None
+    return np.vstack([np.ones((n, 4)) if c is None else c for c, n in zip(colors, counts, strict=True)])
 
 
 def _local(node: dict[str, Any]) -> Floats:

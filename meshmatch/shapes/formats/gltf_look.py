@@ -16,7 +16,7 @@ from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.appearance import Alpha, Appearance, Material, Wrap, no_coordinates
 from meshmatch.shapes.formats import damaged
-from meshmatch.shapes.formats.gltf import NONSENSE, Document
+from meshmatch.shapes.formats.gltf import NONSENSE, Document, joined_colors
 from meshmatch.shapes.images import ImageReader, Pixels
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -70,16 +70,11 @@ class _Look:
             uv = self._coordinates(primitive) if len(faces) else None
             kinds.append(np.full(len(faces), self._material(primitive.get("material", -1), uv is not None)))
             uvs.append(np.zeros((len(faces), 3, 2)) if uv is None else uv[faces])
-        painted = None
-        if any(color is not None for color in colors):
-            painted = np.vstack(
-                [np.ones((n, 4)) if c is None else c for c, n in zip(colors, counts, strict=True)]
-            )
         found = Appearance(
             tuple(self.materials),
             np.concatenate([np.empty(0, np.int64), *kinds]),
             np.concatenate([np.empty((0, 3, 2)), *uvs]),
-            painted,
+            joined_colors(colors, counts),
         )
         if self.picture is not None and not found.textured:
             raise no_coordinates(self.document.name)

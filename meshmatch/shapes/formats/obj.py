@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import NO_FACES, Raw, damaged, fan
 from meshmatch.shapes.formats.text import columns, first_index, lines_of, numbers, words_per_line
@@ -78,18 +78,35 @@ def _faces(name: str, text: bytes, lines: Ints, vertex_lines: Ints) -> Ints:
     values = numbers(name, text)
     if len(values) == 0:
         return NO_FACES
-    if not (np.abs(values) < 2**53).all() or (values != np.trunc(values)).any():
-        raise damaged(name, "a face refers to a vertex that is not a whole number")
-    corners = values.astype(np.int64)
-    V = len(vertex_lines)
-    if (corners == 0).any():
+    if (values == 0).any():
         raise damaged(name, "a face refers to vertex 0, but obj files count from 1")
-    if (corners < 0).any():  # from the last vertex before the face backwards
-        seen = np.repeat(np.searchsorted(vertex_lines, lines), sizes)
-        corners = np.where(corners < 0, corners + seen + 1, corners)
-    if corners.min() < 1 or corners.max() > V:
-        raise damaged(name, f"a face refers to vertex {int(corners.max())}, but there are only {V} vertices")
-    return fan(corners - 1, sizes)
+    return fan(from_one(name, "vertex", values, vertex_lines, np.repeat(lines, sizes)) - 1, sizes)
+
+
+def from_one(
+    name: str, what: str, values: Float[Floats, " N"], listed: Int[Ints, " M"], lines: Int[Ints, " N"]
+) -> Int[Ints, " N"]:
+    """Numbers of faces that count from 1, also those that counted backwards from the last entry before their line.
+
+    Parameters
+    ----------
+    values : (N,)
+        As the faces have them; 0 stays 0.
+    listed : (M,)
+        The lines of the entries.
+    lines : (N,)
+        The line of the face of each value.
+    """
+    if not (np.abs(values) < 2**53).all() or (values != np.trunc(values)).any():
+        raise damaged(name, f"a face refers to a {what} that is not a whole number")
+    index = values.astype(np.int64)
+    if (index < 0).any():
+        behind = index < 0
+        index[behind] += np.searchsorted(listed, lines[behind]) + 1
+        index[behind & (index < 1)] = len(listed) + 1  # before the first one
+    if len(index) and index.max() > len(listed):
+        raise damaged(name, f"a face refers to {what} {index.max()}, but there are only {len(listed)}")
+    return index
 
 
 def _channels(values: Floats) -> Floats:

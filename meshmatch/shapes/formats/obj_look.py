@@ -15,7 +15,7 @@ from meshmatch.arrays import Bools, Float, Floats, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.appearance import Alpha, Appearance, Material, Wrap, no_coordinates, vertex_colors_alone
 from meshmatch.shapes.formats import damaged, fan
-from meshmatch.shapes.formats.obj import joined_lines, with_old
+from meshmatch.shapes.formats.obj import from_one, joined_lines, with_old
 from meshmatch.shapes.formats.text import columns, lines_of, numbers, second_index, words_per_line
 from meshmatch.shapes.images import ImageReader, Pixels
 from meshmatch.shapes.paths import beside, read_bytes
@@ -102,6 +102,8 @@ def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
     (text, vt_lines), *faces_found = lines_of(data, b"vt", b"f", b"fo")
     faces_text, face_lines = with_old(faces_found)
     sizes = words_per_line(faces_text)
+    if len(sizes) < len(face_lines):
+        raise damaged(name, "a face has no corners")
     counts = words_per_line(text)
     if len(counts) < len(vt_lines):
         raise damaged(name, "a texture coordinate has no numbers")
@@ -111,21 +113,9 @@ def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
         pairs[:, :width] = columns(numbers(name, text), counts, 0, width)
     if b"/" in faces_text:
         values = numbers(name, second_index(faces_text))
-        if not (np.abs(values) < 2**53).all():
-            raise damaged(name, "a face refers to a texture coordinate that is not a number")
-        index = values.astype(np.int64)
+        index = from_one(name, "texture coordinate", values, vt_lines, np.repeat(face_lines, sizes))
     else:
         index = np.zeros(int(sizes.sum()), np.int64)
-    if len(sizes) < len(face_lines):
-        raise damaged(name, "a face has no corners")
-    if (index < 0).any():  # from the last one before the face backwards
-        seen = np.repeat(np.searchsorted(vt_lines, face_lines), sizes)
-        behind = index < 0
-        index = np.where(behind, index + seen + 1, index)
-        if (index[behind] < 1).any():
-            raise damaged(name, "a face refers to a texture coordinate that is not there")
-    if len(index) and index.max() > len(pairs):
-        raise damaged(name, f"a face refers to texture coordinate {int(index.max())} of {len(pairs)}")
     triangles = fan(index, sizes)
     laid = np.asarray((triangles > 0).all(axis=1))
     uv = np.zeros((len(triangles), 3, 2))
