@@ -321,7 +321,6 @@ def test_light_modules_load_nothing_heavy(statement: str) -> None:
     assert loaded_by(statement) & (HEAVY | {"numpy", "rich"}) == set()
 
 
-@pytest.mark.xfail(strict=False, reason="not all of it holds yet")
 def test_what_needs_no_network_loads_no_torch() -> None:
     """Nobody waits for it, or for another heavy library that not every call needs, to carry a map or draw."""
     found = loaded_by("\n".join(all_modules(room) for room in NO_TORCH))
