@@ -6,7 +6,6 @@ Smooth things are interpolated between the corners of the source's face; labels 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from meshmatch.arrays import Floats, Ints
@@ -16,7 +15,7 @@ from meshmatch.shapes.shape import Shape
 NO_LABEL = -1
 
 
-def pull_values(back: VertexMap, values: NDArray[np.float64]) -> Floats:
+def pull_values(back: VertexMap, values: Floats) -> Floats:
     """Numbers (V_source,) or (V_source, D) on the target: (V_target,) or (V_target, D).
 
     As `VertexMap.apply`, except that a value that is not finite takes no part, unless it has more than half of the

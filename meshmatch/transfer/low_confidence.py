@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Bools, Floats, Ints
 from meshmatch.geometry.topology import edges_of, same_rows
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import sparse_rows
@@ -74,7 +73,7 @@ def _graph(points: Floats, pairs: Ints) -> csr_array:
     )
 
 
-def nearest_known(graph: csr_array, known: NDArray[np.bool_]) -> Ints:
+def nearest_known(graph: csr_array, known: Bools) -> Ints:
     """(N,) for each node the nearest known one along the graph; itself if it is known; -1 out of reach."""
     nearest = np.where(known, np.arange(len(known)), -1)
     # Only the unknown and those beside them matter, however large the rest is.
@@ -93,7 +92,7 @@ def nearest_known(graph: csr_array, known: NDArray[np.bool_]) -> Ints:
     return nearest
 
 
-def diffuse(graph: csr_array, known: NDArray[np.bool_], values: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def diffuse(graph: csr_array, known: Bools, values: Floats) -> tuple[Floats, Bools]:
     """Values (N, D) whose unknown rows are the weighted mean of their neighbours, nearer ones counting more.
 
     Returns

@@ -8,10 +8,10 @@ from scipy.ndimage import maximum_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from meshmatch.arrays import Floats
+from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.triangles import cross_product, squared_lengths
 from meshmatch.shapes.appearance import Alpha, Appearance, Material
-from meshmatch.transfer.pyramid import Light, Pyramid, wrapped
+from meshmatch.transfer.pyramid import Pyramid, wrapped
 from meshmatch.transfer.surface_walk import SurfaceWalker, duals
 from meshmatch.transfer.texels import MOST_ROWS, rows_of, spans
 
@@ -68,11 +68,11 @@ class MaterialSampler:
             out.append(made[key])
         return out
 
-    def footprint(self, face: NDArray[np.integer], reach: Light) -> Light:
+    def footprint(self, face: NDArray[np.integer], reach: Floats32) -> Floats32:
         """How many texels of its image a step of `reach` (N,) covers on faces (N,)."""
         return reach * self._density.take(face)
 
-    def colors(self, face: NDArray[np.integer], weights: Light, footprint: Light) -> Light:
+    def colors(self, face: NDArray[np.integer], weights: Floats32, footprint: Floats32) -> Floats32:
         """Linear colours and alpha (4, N) on faces (N,) at weights (3, N), as wide as `footprint` (N,) texels."""
         if len(self.materials) == 1:
             return self._of_one(0, face, weights, footprint)
@@ -83,7 +83,9 @@ class MaterialSampler:
             out[:, rows] = self._of_one(number, face[rows], weights[:, rows], footprint[rows])
         return out
 
-    def _of_one(self, number: int, face: NDArray[np.integer], weights: Light, footprint: Light) -> Light:
+    def _of_one(
+        self, number: int, face: NDArray[np.integer], weights: Floats32, footprint: Floats32
+    ) -> Floats32:
         made, pyramid = self.materials[number], self._pyramids[number]
         out = np.ones((4, len(face)), np.float32)
         if pyramid is not None:
@@ -103,7 +105,7 @@ class MaterialSampler:
         return out
 
 
-def _interpolated(weights: Light, columns: list[Light], face: NDArray[np.integer]) -> Light:
+def _interpolated(weights: Floats32, columns: list[Floats32], face: NDArray[np.integer]) -> Floats32:
     a, b, c = (weight * column.take(face) for weight, column in zip(weights, columns, strict=True))
     return a + b + c
 
@@ -119,7 +121,7 @@ def _meaning(used: list[Material], colors: Floats | None) -> tuple[Alpha, float,
     return "opaque", 0.5, False
 
 
-def known_texels(material: Material, uv: Floats) -> NDArray[np.bool_] | None:
+def known_texels(material: Material, uv: Floats) -> Bools | None:
     """(H, W) True for the texels of an image that lie on the surface, by the coordinates (F, 3, 2) of its faces.
 
     None where it is not worth asking: an image that is tiled, or laid over itself many times.
@@ -149,17 +151,15 @@ def known_texels(material: Material, uv: Floats) -> NDArray[np.bool_] | None:
     return known
 
 
-def _texels_at(
-    points: Floats, material: Material, shape: tuple[int, ...]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _texels_at(points: Floats, material: Material, shape: tuple[int, ...]) -> tuple[Ints, Ints]:
     """Row and column of the texels on which points (N, 2) lie."""
     column, row = np.floor(points).astype(np.int64).T
     return wrapped(row, shape[0], material.wrap[1]), wrapped(column, shape[1], material.wrap[0])
 
 
 def _densities(
-    walker: SurfaceWalker, materials: tuple[Material, ...], material: NDArray[np.int64], uv: Floats
-) -> NDArray[np.float32]:
+    walker: SurfaceWalker, materials: tuple[Material, ...], material: Ints, uv: Floats
+) -> Floats32:
     """(F,) texels of its image that lie along a unit of length on each face.
 
     As an area has them, or half of what the densest direction has if that is more. Without an image a face counts
@@ -186,7 +186,7 @@ def reach_of(first: Floats, second: Floats) -> Floats:
     return np.maximum(np.sqrt(area), longest / 2)
 
 
-def _charts(walker: SurfaceWalker, look: Appearance, pictured: NDArray[np.bool_]) -> NDArray[np.int32]:
+def _charts(walker: SurfaceWalker, look: Appearance, pictured: Bools) -> Ints32:
     """(F,) faces joined over edges where material and texture coordinates agree; without an image, by material."""
     F = len(walker.faces)
     joined = []

@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Bools, Floats32, Ints, Ints32, UInts8
 from meshmatch.shapes.appearance import Material, Wrap
 from meshmatch.shapes.images import Pixels
 from meshmatch.shapes.srgb import LINEAR_OF_BYTE, bytes_of
 
 _ROWS = 256  # at a time
-Light = NDArray[np.float32]
 
 
-def fill(pixels: Pixels, weight: NDArray[np.float32]) -> list[Pixels]:
+def fill(pixels: Pixels, weight: Floats32) -> list[Pixels]:
     """Smaller levels of (H, W, 4) pixels, each half as large, down to one texel; unknown texels are filled.
 
     Parameters
@@ -52,7 +52,7 @@ def fill(pixels: Pixels, weight: NDArray[np.float32]) -> list[Pixels]:
     return levels
 
 
-def _halved(pixels: Pixels, weight: NDArray[np.float32]) -> tuple[Pixels, NDArray[np.float32]]:
+def _halved(pixels: Pixels, weight: Floats32) -> tuple[Pixels, Floats32]:
     height, width = pixels.shape[:2]
     out = np.zeros(((height + 1) // 2, (width + 1) // 2, 4), np.uint8)
     total = np.zeros(out.shape[:2], np.float32)
@@ -73,7 +73,7 @@ def _halved(pixels: Pixels, weight: NDArray[np.float32]) -> tuple[Pixels, NDArra
     return out, np.minimum(total, 1.0)
 
 
-def _sum_of_fours(values: Light) -> Light:
+def _sum_of_fours(values: Floats32) -> Floats32:
     return (values[0::2, 0::2] + values[1::2, 0::2]) + (values[0::2, 1::2] + values[1::2, 1::2])
 
 
@@ -92,14 +92,14 @@ class Pyramid:
     """
 
     texels: NDArray[np.uint32]
-    starts: NDArray[np.int64]
-    widths: NDArray[np.int64]
-    heights: NDArray[np.int64]
+    starts: Ints
+    widths: Ints
+    heights: Ints
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
     nearest: bool = False
 
     @classmethod
-    def of(cls, material: Material, known: NDArray[np.bool_] | None = None) -> Pyramid:
+    def of(cls, material: Material, known: Bools | None = None) -> Pyramid:
         """The pyramid of a material's image; what is not `known` (H, W), or fully transparent, is made up from
         its surroundings.
         """
@@ -130,7 +130,7 @@ class Pyramid:
             material.nearest,
         )
 
-    def look(self, u: Light, v: Light, footprint: Light) -> Light:
+    def look(self, u: Floats32, v: Floats32, footprint: Floats32) -> Floats32:
         """Linear colours and alpha (4, N) at (N,), (N,), as wide as `footprint` (N,) texels of the largest level."""
         level = np.log2(np.maximum(footprint, np.float32(1.0)))
         level = np.minimum(level, np.float32(len(self.starts) - 1))
@@ -143,7 +143,7 @@ class Pyramid:
             out[:, between] = _mixed(out[:, between], next_level, rest[between])
         return out
 
-    def _blended(self, u: Light, v: Light, level: NDArray[np.int32]) -> Light:
+    def _blended(self, u: Floats32, v: Floats32, level: Ints32) -> Floats32:
         one = len(level) == 0 or bool((level == level[0]).all())
         pick = level[0] if one and len(level) else level
         width, height, start = self.widths[pick], self.heights[pick], self.starts[pick]
@@ -167,21 +167,21 @@ class Pyramid:
         return out
 
 
-_SHARE: Light = (np.arange(256) / 255.0).astype(np.float32)
+_SHARE: Floats32 = (np.arange(256) / 255.0).astype(np.float32)
 
 
-def _light(texels: NDArray[np.uint32], channel: int) -> Light:
-    """Light of red, green or blue, or alpha as it is, of texels whose bytes come in this order."""
+def _light(texels: NDArray[np.uint32], channel: int) -> Floats32:
+    """Floats32 of red, green or blue, or alpha as it is, of texels whose bytes come in this order."""
     shift = 8 * channel if sys.byteorder == "little" else 24 - 8 * channel
     byte = (texels >> np.uint32(shift)).astype(np.uint8)
     return (_SHARE if channel == 3 else LINEAR_OF_BYTE).take(byte)
 
 
-def _mixed(a: Light, b: Light, share: Light) -> Light:
+def _mixed(a: Floats32, b: Floats32, share: Floats32) -> Floats32:
     return a + share * (b - a)
 
 
-def _means(alpha: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+def _means(alpha: UInts8) -> list[UInts8]:
     """Smaller levels of an alpha channel; beyond its edge there is nothing that counts."""
     values, weight = alpha.astype(np.float32), np.ones(alpha.shape, np.float32)
     out = []
@@ -194,7 +194,7 @@ def _means(alpha: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
     return out
 
 
-def wrapped(index: NDArray[np.int64], size: NDArray[np.int64] | int, wrap: Wrap) -> NDArray[np.int64]:
+def wrapped(index: Ints, size: Ints | int, wrap: Wrap) -> Ints:
     """Texel numbers brought into 0 <= index < size as a sampler does."""
     if wrap == "clamp":
         return np.clip(index, 0, np.asarray(size) - 1)

@@ -1,7 +1,8 @@
-"""The surface that colours are taken from: points near it closest on it to the closest place.
+"""Closest points on the surface that colours are taken from, by walking over it.
 
-A point knows a face to begin with, and goes from face to face over shared edges. So it never changes to another
-sheet that merely passes by, and neighbouring points end on neighbouring places.
+A search begins at a known face, and goes from face to face over shared edges. So it never changes to another sheet that
+merely passes by, and neighbouring points end at neighbouring places: the tree searches of `meshmatch.maps.surface` and
+`meshmatch.transfer.mapped_mesh` keep neither, and are too slow for millions of texels.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.topology import same_rows
 from meshmatch.geometry.triangles import (
     blend,
@@ -23,12 +24,10 @@ from meshmatch.shapes.shape import Shape
 
 _INSIDE = np.float32(-1e-5)
 _STEPS, _STEPS_AGAIN = 32, 12
-Near = NDArray[np.float32]
-Faces = NDArray[np.int32]
 
 
 class SurfaceWalker:
-    """A mesh arranged for sliding; lengths in units of `unit`, seen from `center`.
+    """A mesh arranged for walks; lengths in units of `unit`, seen from `center`.
 
     Parameters
     ----------
@@ -63,8 +62,8 @@ class SurfaceWalker:
         """(N, 3) points of faces (N,) by weights (N, 3)."""
         return interpolate(self.verts, self.faces[face], weights)
 
-    def closest(self, points: Near, face: Faces) -> tuple[Faces, Near, Near]:
-        """The closest place on the surface, as far as sliding gets.
+    def closest(self, points: Floats32, face: Ints32) -> tuple[Ints32, Floats32, Floats32]:
+        """The closest place on the surface that a walk reaches.
 
         Parameters
         ----------
@@ -81,15 +80,15 @@ class SurfaceWalker:
         if len(lost):
             face = face.copy()
             face[lost] = self._nearest_center(points[:, lost])
-        face, weights, outside, tired = self._walk(points, face, _STEPS)
+        face, weights, outside, unfinished = self._walk(points, face, _STEPS)
         if self._flat.any():  # a face without area lets nothing pass
-            tired = np.union1d(tired, np.flatnonzero(self._flat[face]))
-        if len(tired):  # a long way, or round and round: begin near the end of it
-            some = points[:, tired]
-            face[tired], weights[:, tired], out, _ = self._walk(
+            unfinished = np.union1d(unfinished, np.flatnonzero(self._flat[face]))
+        if len(unfinished):  # a long way, or round and round: begin near the end of it
+            some = points[:, unfinished]
+            face[unfinished], weights[:, unfinished], out, _ = self._walk(
                 some, self._nearest_center(some), _STEPS_AGAIN
             )
-            outside = np.concatenate([np.setdiff1d(outside, tired), tired[out]])
+            outside = np.concatenate([np.setdiff1d(outside, unfinished), unfinished[out]])
         distance = np.zeros(len(face), np.float32)
         if len(outside):
             corners = self.verts[self.faces[face[outside]]]
@@ -102,8 +101,8 @@ class SurfaceWalker:
         weights /= weights[0] + weights[1] + weights[2]
         return face, weights, distance
 
-    def _walk(self, points: Near, face: Faces, steps: int) -> tuple[Faces, Near, Ints, Ints]:
-        """Faces and weights where each walk ended; those that ended at an edge; those that did not end.
+    def _walk(self, points: Floats32, face: Ints32, steps: int) -> tuple[Ints32, Floats32, Ints, Ints]:
+        """Ints32 and weights where each walk ended; those that ended at an edge; those that did not end.
 
         Column by column: reductions over three numbers take NumPy fifty times as long.
         """
@@ -139,7 +138,7 @@ class SurfaceWalker:
             active, at = active[go], at[:, go]
         return face, weights, np.concatenate([*ended, active]), active
 
-    def _nearest_center(self, points: Near) -> Faces:
+    def _nearest_center(self, points: Floats32) -> Ints32:
         if self._tree is None:
             centers = self.verts[self.faces].mean(axis=1)
             centers[self._broken | self._flat] = 1e6
@@ -150,7 +149,7 @@ class SurfaceWalker:
 class PointWalker(SurfaceWalker):
     """A point cloud as a walker: each point with its two nearest neighbours stands for a face.
 
-    Sliding is a search for the nearest point; weights fall with the square of the distance.
+    A walk is a search for the nearest point; weights fall with the square of the distance.
     """
 
     def __init__(self, shape: Shape) -> None:
@@ -167,7 +166,7 @@ class PointWalker(SurfaceWalker):
         """The face of a point has its number."""
         return vertex
 
-    def closest(self, points: Near, face: Faces) -> tuple[Faces, Near, Near]:
+    def closest(self, points: Floats32, face: Ints32) -> tuple[Ints32, Floats32, Floats32]:
         """The nearest points, wherever the search began; see `SurfaceWalker.closest`."""
         place = self._valid[self._points.query(points.T)[1]].astype(np.int32)
         away = self.verts[self.faces[place]] - points.T[:, None]
@@ -180,7 +179,7 @@ def walker_of(shape: Shape) -> SurfaceWalker:
     return PointWalker(shape) if shape.is_cloud else SurfaceWalker(shape)
 
 
-def _product(a: list[Near], b: list[Near]) -> Near:
+def _product(a: list[Floats32], b: list[Floats32]) -> Floats32:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -203,7 +202,7 @@ def _a_face_of_each_vertex(faces: Ints, V: int) -> Ints:
     return around
 
 
-def _neighbours(faces: Ints, same: Ints) -> tuple[Faces, NDArray[np.int8]]:
+def _neighbours(faces: Ints, same: Ints) -> tuple[Ints32, NDArray[np.int8]]:
     """The face across each edge (F, 3), -1 for none, and which of its edges that is; edge k is opposite corner k.
 
     Edges that two faces share by their vertices come first; then those that meet at the same places. Where more

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Bools, Floats, Ints, Ints32
 
 _AT_ONCE = 1 << 21  # texels
 MOST_ROWS = 40_000_000
@@ -79,7 +78,7 @@ def _crossing(begin: Floats, end: Floats, y: Floats) -> Floats:
     return np.asarray(begin[:, 0] + (end[:, 0] - begin[:, 0]) * share)
 
 
-def faces_on(corners: Floats, size: int) -> tuple[NDArray[np.int32], int]:
+def faces_on(corners: Floats, size: int) -> tuple[Ints32, int]:
     """The triangle on each texel of a square image, (size, size) with -1 for none, and how many texels are held
     more than once. Where several hold one, the last stays.
     """
@@ -92,7 +91,7 @@ def faces_on(corners: Floats, size: int) -> tuple[NDArray[np.int32], int]:
     return found.reshape(size, size), total - int((found >= 0).sum())
 
 
-def grown(found: NDArray[np.int32], steps: int) -> NDArray[np.int32]:
+def grown(found: Ints32, steps: int) -> Ints32:
     """The same with each texel that is free, but has a neighbour that is not, taking over from it; `steps` times."""
     for _ in range(steps):
         out = found.copy()
@@ -115,7 +114,7 @@ def _shifted(down: int, right: int) -> tuple[tuple[slice, slice], tuple[slice, s
     return (pick[down][0], pick[right][0]), (pick[down][1], pick[right][1])
 
 
-def beside_another(values: NDArray[np.int32]) -> NDArray[np.bool_]:
+def beside_another(values: Ints32) -> Bools:
     """(H, W) True for texels with a value (0 or more) that have a neighbour with another one."""
     out = np.zeros(values.shape, bool)
     for a, b in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):

@@ -1,4 +1,4 @@
-"""A texture carried from one shape to another along a map: the parts put together."""
+"""A texture transferred from one shape to another along a map: the parts put together."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ class BakedMesh:
     baked: Baked
 
 
-def check_bake_options(choices: BakeOptions) -> None:
+def check_bake_options(options: BakeOptions) -> None:
     """Refuse sizes that cannot be (`OptionError`)."""
-    if not 16 <= choices.size <= LARGEST:
+    if not 16 <= options.size <= LARGEST:
         raise OptionError(
-            f"a texture has 16 to {LARGEST} texels a side, not {choices.size}", "1024 or 2048 suit most"
+            f"a texture has 16 to {LARGEST} texels a side, not {options.size}", "1024 or 2048 suit most"
         )
-    if not 1 <= choices.samples <= 8:
-        raise OptionError(f"a texel takes 1 to 8 samples each way, not {choices.samples}", "2 or 3 suit most")
-    if not 0 <= choices.padding <= choices.size // 4:
+    if not 1 <= options.samples <= 8:
+        raise OptionError(f"a texel takes 1 to 8 samples each way, not {options.samples}", "2 or 3 suit most")
+    if not 0 <= options.padding <= options.size // 4:
         raise OptionError(
-            f"padding of {choices.padding} texels does not go with {choices.size}",
-            f"choose 0 to {choices.size // 4}",
+            f"padding of {options.padding} texels does not go with {options.size}",
+            f"choose 0 to {options.size // 4}",
         )
 
 
@@ -52,8 +52,8 @@ def transfer_texture(
     target: Shape,
     back: VertexMap,
     atlas: Atlas,
-    choices: BakeOptions = BakeOptions(),  # noqa: B008  # frozen
-    tell: Callable[[float], None] = lambda share: None,
+    options: BakeOptions = BakeOptions(),  # noqa: B008  # frozen
+    progress: Callable[[float], None] = lambda share: None,
 ) -> BakedMesh:
     """Bake the look of a source for a target mesh.
 
@@ -62,40 +62,40 @@ def transfer_texture(
     look : Appearance
         Of the source's file (`load_appearance`).
     back : VertexMap
-        From target to source (`pipeline.carry(...).back`).
+        From target to source (`meshmatch.maps.build`, or `meshmatch.transfer.inverse_map`).
     atlas : Atlas
-        Of the target (`meshmatch.transfer.unwrap.atlas_of`), for the size and padding of `choices`.
-    tell : callable
-        Gets the share that is done.
+        Of the target (`meshmatch.transfer.unwrap.atlas_of`), for the size and padding of `options`.
+    progress
+        Is called with the share that is done.
 
     Raises
     ------
     OptionError
         Sizes that are out of range.
     """
-    check_bake_options(choices)
-    ground = walker_of(source)
-    coat = MaterialSampler(_of_faces(look, source), ground)
+    check_bake_options(options)
+    walker = walker_of(source)
+    sampler = MaterialSampler(_with_faces(look, source), walker)
     uv = atlas.uv
-    if target.invalid is not None:  # a face with a corner nowhere is no face
-        sound = ~target.invalid[target.faces].any(axis=1)
-        target, uv = Shape(target.verts, target.faces[sound], target.name), uv[sound]
-    baked = bake(coat, ground, target, back, uv, choices, tell)
+    if target.invalid is not None:  # faces with a corner that has no position
+        valid = ~target.invalid[target.faces].any(axis=1)
+        target, uv = Shape(target.verts, target.faces[valid], target.name), uv[valid]
+    baked = bake(sampler, walker, target, back, uv, options, progress)
     mesh = Textured(target.verts, target.faces, uv, baked.alpha, baked.cutoff)
     return BakedMesh(mesh, baked)
 
 
 def colors_of_vertices(source: Shape, look: Appearance, target: Shape, back: VertexMap) -> Floats:
     """(V_tgt, 4) linear colours and alpha of a target's vertices or points, as wide as the gaps between them."""
-    ground = walker_of(source)
-    coat = MaterialSampler(_of_faces(look, source), ground)
-    points, start = images_of(ground, back)
-    place, weights, _ = ground.closest(points.T.astype(np.float32, order="C"), start.astype(np.int32))
+    walker = walker_of(source)
+    sampler = MaterialSampler(_with_faces(look, source), walker)
+    points, start = images_of(walker, back)
+    place, weights, _ = walker.closest(points.T.astype(np.float32, order="C"), start.astype(np.int32))
     reach = np.sqrt(target.vertex_areas / max(target.area, 1e-300)).astype(np.float32)
-    return coat.colors(place, weights, coat.footprint(place, reach)).T.astype(np.float64)
+    return sampler.colors(place, weights, sampler.footprint(place, reach)).T.astype(np.float64)
 
 
-def _of_faces(look: Appearance, source: Shape) -> Appearance:
+def _with_faces(look: Appearance, source: Shape) -> Appearance:
     """The look; that of a cloud with each point as a face."""
     if not source.is_cloud:
         return look
