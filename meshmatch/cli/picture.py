@@ -117,7 +117,7 @@ def picture(
     set_threads(1)  # sums in another order would differ in their last bits
     from meshmatch.errors import OptionError
     from meshmatch.outputs import replace_on_success
-    from meshmatch.render.framing import VIEWS
+    from meshmatch.render.layout import VIEWS
     from meshmatch.render.picture import Look
 
     options.check_axes(up, front)

@@ -1,52 +1,52 @@
-"""Which way is up, and which side is shown, where nobody says: how a shape stands by itself.
+"""Guess which way is up and which side is the front, where the user does not say.
 
-What is tall and would not fall over stands on its feet: its chest says where left and right are, its feet where the
-front is. Everything else stands on the axis that modelling programs call up, with a broad side to the viewer.
+A shape that is tall and would not fall over stands on its feet: its chest gives the lateral axis, its feet the front.
+Everything else stands on the axis that modelling programs call up, with a broad side to the viewer.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
-FloatArray = NDArray[np.float64]
-Rotations = tuple[FloatArray | None, FloatArray | None]
+Rotations = tuple[Float[Floats, "3 3"] | None, Float[Floats, "3 3"] | None]
+"""Of source and target into y up, z to the viewer; None where unknown."""
 
 _AXES = {
     sign + name: (-1.0 if sign else 1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in ("", "-")
 }
-_MOST = 20_000  # places of a larger shape are thinned to so many
-# Lengths in units of sqrt(area). Measured on bodies in many poses, quadrupeds and furniture.
-_TALL = 1.05  # bodies that stand are taller
-_FALLS = -0.03  # how far the middle may lie outside the feet: scans are cut
-_LEANS = -0.2  # and where y or z, which are usually up, point up: poses are alive
-_SOLE = 0.035  # what is that near the ground carries
+_MAX_POINTS = 20_000  # a larger shape is thinned to so many
+# Lengths in units of sqrt(area), tuned on bodies in many poses, quadrupeds and furniture.
+_TALL = 1.05  # minimum height of a standing body
+_BALANCE = -0.03  # how far the center of mass may lie outside the feet: scans are cut
+_BALANCE_USUAL = -0.2  # the same where y or z, the usual axes, point up: people lean while they move
+_SOLE = 0.035  # what is this near the ground carries the shape
 _NEAR_AXIS = np.cos(np.radians(35.0))
-_TORSO = 0.2  # half width in which there is the chest, and no arm
+_TORSO = 0.2  # half width of the chest without arms
 
 
-def facing(shape: Shape, up: str | None = None, front: str | None = None) -> FloatArray:
-    """Rotation ``(3, 3)`` into y up, z front, by named axes of the file; what is not named is guessed.
+def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Float[Floats, "3 3"]:
+    """Rotation into y up, z front, by named axes of the file; what is not named is guessed.
 
     Raises
     ------
     OptionError
-        An axis that is none of x, y, z, -x, -y, -z, or the same axis twice.
+        An axis other than x, y, z, -x, -y, -z, or the same axis twice.
     """
     for name, axis in (("up", up), ("front", front)):
         if axis is not None and axis.lstrip("+").lower() not in _AXES:
-            raise OptionError(f"{name} is no axis: '{axis}'", f"choose from {', '.join(_AXES)}")
+            raise OptionError(f"{name}: invalid axis '{axis}'", f"choose from {', '.join(_AXES)}")
     ahead = None if front is None else _axis(front)
-    places, weights = _places(shape)
-    upward, stands = (_axis(up), False) if up is not None else _upward(places, weights, ahead)
+    points, weights = _samples(shape)
+    upward, stands = (_axis(up), False) if up is not None else _upward(points, ahead)
     if ahead is None and stands:
-        ahead = _chest(places, weights, upward)
+        ahead = _chest(points, weights, upward)
     if ahead is None:
-        extents = np.ptp(places, axis=0)
+        extents = np.ptp(points, axis=0)
         free = [k for k in range(3) if upward[k] == 0]
         ahead = np.eye(3)[min(free, key=lambda k: extents[k])]
     if abs(upward @ ahead) > 1e-6:
@@ -54,10 +54,10 @@ def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Flo
     return np.stack([np.cross(upward, ahead), upward, ahead])
 
 
-def upright(rotation: FloatArray) -> FloatArray:
-    """A rotation ``(3, 3)`` whose up is made an axis of the file, if it lies near one.
+def upright(rotation: Float[Floats, "3 3"]) -> Float[Floats, "3 3"]:
+    """The rotation with its up direction snapped to an axis of the file, if it lies near one.
 
-    The frame of a fit is that of a torso, which leans; files nearly always have an axis that points up.
+    The frame of a fit follows the torso, which may lean; files nearly always have an axis that points up.
     """
     axis = int(np.abs(rotation[1]).argmax())
     upward = np.sign(rotation[1, axis]) * np.eye(3)[axis]
@@ -75,7 +75,7 @@ def same_side(
     rotations: Rotations = (None, None),
     up: str | None = None,
     front: str | None = None,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float[Floats, "3 3"], Float[Floats, "3 3"]]:
     """Rotations of source and target into y up, z to the viewer that show both from the same side.
 
     ``rotations`` are those of fits (`Frame.rotation`), if known; otherwise the named axes count, and without these the
@@ -92,24 +92,24 @@ def same_side(
     return first, second
 
 
-def facing_alike(shape: Shape, points: FloatArray, seen: FloatArray) -> FloatArray:
-    """Rotation ``(3, 3)`` that shows a shape from the side from which another is seen.
+def facing_alike(
+    shape: Shape, points: Float[Floats, "N 3"], seen: Float[Floats, "N 3"]
+) -> Float[Floats, "3 3"]:
+    """Rotation that shows a shape from the side from which another one is seen; if it stands by itself, upright.
 
     Parameters
     ----------
-    points : (N, 3)
+    points
         Of this shape, in its file's frame.
-    seen : (N, 3)
+    seen
         The same points of the other one, y up and z to the viewer.
-
-    A shape that stands by itself stays upright.
     """
     a, b = points - points.mean(axis=0), seen - seen.mean(axis=0)
     left, sizes, right = np.linalg.svd(b.T @ a)
-    if not sizes[1] > 1e-9 * sizes[0]:  # all of it was matched to a line, or a point
+    if not sizes[1] > 1e-9 * sizes[0]:  # everything was matched to a line or a point
         return facing(shape)
     turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right)) or 1.0]) @ right
-    upward, stands = _upward(*_places(shape), None)
+    upward, stands = _upward(_samples(shape)[0], None)
     if not stands or upward @ turn[1] < 0.5:
         return np.asarray(turn)
     ahead = turn[2] - (turn[2] @ upward) * upward
@@ -117,49 +117,49 @@ def facing_alike(shape: Shape, points: FloatArray, seen: FloatArray) -> FloatArr
     return np.stack([np.cross(upward, ahead), upward, ahead])
 
 
-def _axis(name: str) -> FloatArray:
+def _axis(name: str) -> Float[Floats, 3]:
     return _AXES[name.lstrip("+").lower()]
 
 
-def _places(shape: Shape) -> tuple[FloatArray, FloatArray]:
-    """Points (N, 3) all over the surface in units of sqrt(area), and the share (N,) of it around each."""
+def _samples(shape: Shape) -> tuple[Float[Floats, "N 3"], Float[Floats, N]]:
+    """Points all over the surface, centered, in units of sqrt(area), and the share of the area around each."""
     if shape.is_cloud:
-        places = shape.verts if shape.invalid is None else shape.verts[~shape.invalid]
-        weights = np.ones(len(places))
+        points = shape.verts if shape.invalid is None else shape.verts[~shape.invalid]
+        weights = np.ones(len(points))
     else:
-        places, weights = shape.verts[shape.faces].mean(axis=1), shape.face_areas
-        places, weights = places[weights > 0], weights[weights > 0]
-    if len(places) == 0:
-        places, weights = shape.verts, np.ones(shape.V)
-    step = -(-len(places) // _MOST)
-    places, weights = places[::step], weights[::step]
-    unit = np.sqrt(shape.area) if shape.area > 0 else float(np.ptp(places, axis=0).max()) or 1.0
-    return (places - np.average(places, axis=0, weights=weights)) / unit, weights / weights.sum()
+        points, weights = shape.verts[shape.faces].mean(axis=1), shape.face_areas
+        points, weights = points[weights > 0], weights[weights > 0]
+    if len(points) == 0:
+        points, weights = shape.verts, np.ones(shape.V)
+    step = -(-len(points) // _MAX_POINTS)
+    points, weights = points[::step], weights[::step]
+    unit = np.sqrt(shape.area) if shape.area > 0 else float(np.ptp(points, axis=0).max()) or 1.0
+    return (points - np.average(points, axis=0, weights=weights)) / unit, weights / weights.sum()
 
 
-def _upward(places: FloatArray, weights: FloatArray, ahead: FloatArray | None) -> tuple[FloatArray, bool]:
+def _upward(points: Float[Floats, "N 3"], ahead: Float[Floats, 3] | None) -> tuple[Float[Floats, 3], bool]:
     """The axis that points up, and whether the shape stands on it by itself."""
-    extents = np.ptp(places, axis=0)
+    extents = np.ptp(points, axis=0)
     free = [k for k in range(3) if ahead is None or ahead[k] == 0]
     for axis in sorted(free, key=lambda k: -extents[k] * (1.1 if k == 1 else 1.0)):
         for sign in (1.0, -1.0):
-            least = _LEANS if sign > 0 and axis != 0 else _FALLS
-            if extents[axis] >= _TALL and _support(places, sign * np.eye(3)[axis]) > least:
+            minimum = _BALANCE_USUAL if sign > 0 and axis != 0 else _BALANCE
+            if extents[axis] >= _TALL and _support(points, sign * np.eye(3)[axis]) > minimum:
                 return sign * np.eye(3)[axis], True
     usual = {1: 0.1, 2: 0.0, 0: -0.4}
     score = {
-        k: usual[k] + 0.3 * extents[k] + float(np.clip(_support(places, np.eye(3)[k]), -0.3, 0.15))
+        k: usual[k] + 0.3 * extents[k] + float(np.clip(_support(points, np.eye(3)[k]), -0.3, 0.15))
         for k in free
     }
     return np.eye(3)[max(free, key=lambda k: score[k])], False
 
 
-def _support(places: FloatArray, upward: FloatArray) -> float:
-    """How far inside the sole the middle lies; negative: outside."""
+def _support(points: Float[Floats, "N 3"], upward: Float[Floats, 3]) -> float:
+    """How far inside the footprint the center of mass lies; negative: outside."""
     from scipy.spatial import ConvexHull, QhullError
 
-    height = places @ upward
-    sole = places[height < height.min() + _SOLE][:, upward == 0]
+    height = points @ upward
+    sole = points[height < height.min() + _SOLE][:, upward == 0]
     try:
         hull = ConvexHull(sole)
     except (QhullError, ValueError):  # a point, or a line
@@ -167,12 +167,14 @@ def _support(places: FloatArray, upward: FloatArray) -> float:
     return float(-hull.equations[:, 2].max())
 
 
-def _chest(places: FloatArray, weights: FloatArray, upward: FloatArray) -> FloatArray | None:
+def _chest(
+    points: Float[Floats, "N 3"], weights: Float[Floats, N], upward: Float[Floats, 3]
+) -> Float[Floats, 3] | None:
     """Unit vector to the front of a standing body; None if its chest is round."""
     level = np.flatnonzero(upward == 0)
-    height = places @ upward
+    height = points @ upward
     share = (height - height.min()) / np.ptp(height)
-    flat = places[:, level]
+    flat = points[:, level]
     chest = (share > 0.5) & (share < 0.8)
     if chest.sum() < 20:
         return None
@@ -187,8 +189,8 @@ def _chest(places: FloatArray, weights: FloatArray, upward: FloatArray) -> Float
     ahead[level] = axes[:, 0]
     feet, shins = share < 0.035, (share > 0.05) & (share < 0.12)
     if feet.any() and shins.any():
-        forward = np.average(places[feet], axis=0, weights=weights[feet])
-        forward = forward - np.average(places[shins], axis=0, weights=weights[shins])
+        forward = np.average(points[feet], axis=0, weights=weights[feet])
+        forward = forward - np.average(points[shins], axis=0, weights=weights[shins])
         if abs(forward @ ahead) > 0.006:
             return ahead * np.sign(forward @ ahead)
     return ahead * (np.sign(ahead[np.abs(ahead).argmax()]) or 1.0)

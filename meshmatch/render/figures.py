@@ -6,19 +6,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
 from meshmatch.render.colors import CLAY, to_linear
 from meshmatch.render.facing import facing
-from meshmatch.render.framing import Stand, leant, stand, turned
+from meshmatch.render.layout import GroundPose, ground_pose, rotation_about_x, rotation_about_y
 from meshmatch.render.surface import FacePaint, Paint, Surface, VertexPaint, balls, discs, mesh_surface
 from meshmatch.render.texture import TexturePaint
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.shape import Shape
-
-FloatArray = NDArray[np.float64]
 
 MOST_POINTS = 60_000
 """Of a larger cloud every n-th point is drawn: more would be smaller than a pixel."""
@@ -37,29 +36,27 @@ class Panel:
     shape
         A mesh, or a cloud: its points are drawn as small discs or balls.
     colors : (V, 3) or (V, 4) float, optional
-        0..1 for each vertex; the shape's own colours, or the colour of clay, if there are none. Alpha is
-        ignored.
-    sharp
-        Each point takes the colour of its nearest vertex: for labels, which have no mixtures.
+        sRGB in 0..1 per vertex; by default the shape's own colors, or the color of clay. Alpha is ignored.
     label
         Name below it.
+    sharp
+        Each point takes the color of its nearest vertex: for labels, which do not mix.
     face_colors : (F, 3) float, optional
-        0..1 for each triangle, instead of ``colors``.
-    appearance : Appearance, optional
-        Materials and textures of the shape's file, drawn if no other colours are given.
+        sRGB in 0..1 per triangle, instead of ``colors``.
+    appearance
+        Materials and textures of the shape's file, drawn if no other colors are given.
     points : (K, 3) float, optional
         Drawn as balls on top, in the shape's own frame: nodes, landmarks.
     point_colors : (K, 3) float, optional
-        Their colours.
-    point_radius : float, optional
+        Their colors.
+    point_radius
         Their radius, in the unit of the shape.
     rotation : (3, 3) float, optional
-        Into a frame with y up and z to the front, as `Frame.rotation` of a fit has it; overrides the axes of
-        the picture.
-    glass : bool
-        The shape is clear around its points.
-    over : Shape, optional
-        Another shape in the same frame, laid over this one as coloured glass.
+        Into a frame with y up and z to the front, as `Frame.rotation` of a fit; overrides the axes of the picture.
+    glass
+        Whether the shape is transparent around its points.
+    over
+        Another shape in the same frame, drawn over this one as blue glass.
     """
 
     shape: Shape
@@ -80,28 +77,32 @@ class Panel:
 class Figure:
     """A panel in view coordinates, its foot at the origin.
 
-    solid, glass : lists of Surface
-    box : (2, 2) left, bottom; right, top of all that is seen
-    spot : (4,) where its shadow falls: x, y, half width, half height of an ellipse in the picture plane
-    hollow : whether the shape itself is glass
+    Parameters
+    ----------
+    box
+        Left, bottom; right, top of all that is seen.
+    spot
+        Where its shadow falls: x, y, half width, half height of an ellipse in the picture plane.
+    hollow
+        Whether the shape itself is glass.
     """
 
     solid: list[Surface]
     glass: list[Surface]
-    box: FloatArray
-    spot: FloatArray
+    box: Float[Floats, "2 2"]
+    spot: Float[Floats, 4]
     hollow: bool
 
 
-def figures(
+def build_figures(
     panels: Sequence[Panel], up: str | None, front: str | None, turn: float, tilt: float
 ) -> list[Figure]:
-    """Build the surfaces of all panels, all seen from the same side.
+    """Build the surfaces of all panels, all seen from the same side (`Look` has the parameters).
 
     Raises
     ------
     OptionError
-        An axis that is none, or colours of the wrong shape.
+        An invalid axis, or colors of the wrong shape.
     """
     return [_figure(panel, up, front, turn, tilt) for panel in panels]
 
@@ -110,42 +111,39 @@ def _figure(panel: Panel, up: str | None, front: str | None, turn: float, tilt: 
     shape = panel.shape
     towards = facing(shape, up, front) if panel.rotation is None else np.asarray(panel.rotation, np.float64)
     points = np.empty((0, 3)) if panel.points is None else np.asarray(panel.points, dtype=np.float64)
-    parts = [drawn_points(shape), points]
-    if panel.over is not None:
-        parts.append(drawn_points(panel.over))
-    on_ground = stand(shape, np.concatenate(parts), turned(turn) @ towards)
-    lean = leant(tilt)
+    drawn = [drawn_points(shape), points, *([] if panel.over is None else [drawn_points(panel.over)])]
+    pose = ground_pose(shape, np.concatenate(drawn), rotation_about_y(turn) @ towards)
+    camera = rotation_about_x(tilt)
 
-    def seen(positions: FloatArray) -> FloatArray:
-        return np.asarray(on_ground.place(positions) @ lean.T)
+    def view(positions: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
+        return np.asarray(pose.apply(positions) @ camera.T)
 
-    skin = _skin(shape, _paint(panel, on_ground.scale), seen, on_ground, lean)
+    skin = _skin(shape, _paint(panel, pose.scale), view, pose, camera)
     solid, glass = ([], [skin]) if panel.glass else ([skin], [])
     if len(points):
-        radius = 0.011 if panel.point_radius is None else panel.point_radius / on_ground.scale
-        tint = _given(panel.point_colors, len(points), _NODE_COLOR)
-        solid.append(balls(seen(points), radius, tint))
+        radius = 0.011 if panel.point_radius is None else panel.point_radius / pose.scale
+        solid.append(balls(view(points), radius, _linear(panel.point_colors, len(points), _NODE_COLOR)))
     if panel.over is not None:
-        veil = VertexPaint(_given(None, panel.over.V, _VEIL_COLOR), panel.over.faces)
-        glass.append(_skin(panel.over, veil, seen, on_ground, lean))
+        veil = VertexPaint(_linear(None, panel.over.V, _VEIL_COLOR), panel.over.faces)
+        glass.append(_skin(panel.over, veil, view, pose, camera))
     used = np.concatenate([part.extent for part in [*solid, *glass]])[:, :2]
-    width, _, depth = on_ground.half
+    width, _, depth = pose.half
     flat = max(np.sin(np.radians(tilt)), 0.0)
     spot = np.array([0.0, 0.0, width + _SHADOW, (depth + _SHADOW) * flat])
     return Figure(solid, glass, np.stack([used.min(axis=0), used.max(axis=0)]), spot, panel.glass)
 
 
-def drawn_points(shape: Shape) -> FloatArray:
-    """The vertices that will be seen: not those without a position, nor strays that no face uses."""
+def drawn_points(shape: Shape) -> Float[Floats, "N 3"]:
+    """The vertices that will be seen: neither those without a position nor those that no face uses."""
     if shape.is_cloud:
         return shape.verts if shape.invalid is None else shape.verts[~shape.invalid]
     used = np.zeros(shape.V, bool)
-    used[shape.faces[_sound(shape)]] = True
+    used[shape.faces[_valid_faces(shape)]] = True
     return shape.verts[used] if used.any() else shape.verts[:1]
 
 
-def _sound(shape: Shape) -> NDArray[np.int64]:
-    """Numbers of the faces whose corners all have a position."""
+def _valid_faces(shape: Shape) -> Int[Ints, N]:
+    """Indices of the faces whose corners all have a position."""
     if shape.invalid is None:
         return np.arange(shape.F)
     return np.flatnonzero(~shape.invalid[shape.faces].any(axis=1))
@@ -154,51 +152,57 @@ def _sound(shape: Shape) -> NDArray[np.int64]:
 def _paint(panel: Panel, scale: float) -> Paint:
     shape = panel.shape
     if panel.face_colors is not None:
-        return FacePaint(_given(panel.face_colors, shape.F, CLAY))
+        return FacePaint(_linear(panel.face_colors, shape.F, CLAY))
     look = panel.appearance
     if panel.colors is None and look is not None and not shape.is_cloud:
         return TexturePaint(look, shape, scale)
     if panel.colors is None and look is not None and look.colors is not None:
         return VertexPaint(np.nan_to_num(look.colors[:, :3]), shape.faces)
     given = panel.colors if panel.colors is not None else shape.colors
-    return VertexPaint(_given(given, shape.V, CLAY), shape.faces, panel.sharp)
+    return VertexPaint(_linear(given, shape.V, CLAY), shape.faces, panel.sharp)
 
 
 def _skin(
-    shape: Shape, paint: Paint, seen: Callable[[FloatArray], FloatArray], placed: Stand, lean: FloatArray
+    shape: Shape,
+    paint: Paint,
+    view: Callable[[Float[Floats, "N 3"]], Float[Floats, "N 3"]],
+    pose: GroundPose,
+    camera: Float[Floats, "3 3"],
 ) -> Surface:
-    verts = seen(shape.verts)
+    verts = view(shape.verts)
     if not shape.is_cloud:
-        sound = _sound(shape)
-        if not len(sound):  # nothing that has a place: a speck, for even an empty scene needs a triangle
+        valid = _valid_faces(shape)
+        if not len(valid):  # embree needs a triangle even for an empty scene
             return mesh_surface(verts[:1], np.zeros((1, 3), np.int64), FacePaint(np.ones((1, 3))))
-        return mesh_surface(verts, shape.faces, paint, None if len(sound) == shape.F else sound)
+        return mesh_surface(verts, shape.faces, paint, None if len(valid) == shape.F else valid)
     colors = (
         paint.colors if isinstance(paint, VertexPaint) else np.tile(to_linear(np.array(CLAY)), (shape.V, 1))
     )
     drawn = np.arange(shape.V) if shape.invalid is None else np.flatnonzero(~shape.invalid)
     step = max(1, -(-len(drawn) // MOST_POINTS))
     drawn = drawn[::step]
-    gaps = _gaps(verts[drawn])
-    usual = float(np.clip(np.median(gaps), 1e-3, 0.06))
+    spacing = _spacing(verts[drawn])
+    typical = float(np.clip(np.median(spacing), 1e-3, 0.06))
     if len(drawn) < _SPARSE:
-        return balls(verts[drawn], 0.5 * usual, colors[drawn])
-    normals = shape.vertex_normals[drawn] @ (lean @ placed.rotation).T
-    return discs(verts[drawn], normals, 1.1 * np.clip(gaps, 0.4 * usual, 1.6 * usual), colors[drawn])
+        return balls(verts[drawn], 0.5 * typical, colors[drawn])
+    normals = shape.vertex_normals[drawn] @ (camera @ pose.rotation).T
+    return discs(verts[drawn], normals, 1.1 * np.clip(spacing, 0.4 * typical, 1.6 * typical), colors[drawn])
 
 
-def _given(colors: ArrayLike | None, count: int, plain: tuple[float, float, float]) -> FloatArray:
-    """Linear colours (count, 3) of written ones, or of the plain one if none are given."""
+def _linear(
+    colors: ArrayLike | None, count: int, plain: tuple[float, float, float]
+) -> Float[Floats, "count 3"]:
+    """Linear colors of sRGB ones, or of the plain one if none are given."""
     if colors is None:
         return np.tile(to_linear(np.array(plain)), (count, 1))
     array = np.asarray(colors, dtype=np.float64)
     if array.shape not in ((count, 3), (count, 4)):
-        raise OptionError(f"colours must be an array of ({count}, 3) or ({count}, 4), not {array.shape}")
+        raise OptionError(f"colors must be an array of ({count}, 3) or ({count}, 4), not {array.shape}")
     return to_linear(np.clip(np.nan_to_num(array[:, :3]), 0.0, 1.0))
 
 
-def _gaps(points: FloatArray) -> FloatArray:
-    """Distance (N,) of each point of a cloud to its fifth neighbour: discs as large nearly close the surface."""
+def _spacing(points: Float[Floats, "N 3"]) -> Float[Floats, N]:
+    """Distance of each point of a cloud to its fifth neighbor: discs as large nearly close the surface."""
     if len(points) < 2:
         return np.full(len(points), 0.05)
     return np.asarray(cKDTree(points).query(points, k=min(6, len(points)))[0][:, -1])

@@ -7,53 +7,50 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from PIL import Image
 
+from meshmatch.arrays import UInts8
 from meshmatch.errors import OptionError
 from meshmatch.outputs import replace_on_success
 from meshmatch.render import raster
 from meshmatch.render.colors import to_linear, to_srgb
-from meshmatch.render.figures import Figure, Panel, figures
-from meshmatch.render.framing import VIEWS, leant
-from meshmatch.render.layout import Page, lay_out
+from meshmatch.render.figures import Figure, Panel, build_figures
+from meshmatch.render.layout import VIEWS, Page, lay_out, rotation_about_x
 from meshmatch.render.legend import Legend, draw_legend
 from meshmatch.render.lettering import Ink, fitting, write
 from meshmatch.render.scene import Ground, Scene
 
-FloatArray = NDArray[np.float64]
-
-LARGEST = 8192, 36_000_000
-"""The longest side and the most pixels that a picture may have."""
+MAX_SIDE, MAX_PIXELS = 8192, 36_000_000
 _GLASS = 0.34  # opacity of glass seen straight on
-_NEAR = 0.006  # glass further behind a surface than this is hidden by it
+_HIDDEN = 0.006  # glass further behind a surface than this is hidden by it
 BACKGROUNDS: dict[str, Ink | None] = {"white": (255, 255, 255), "dark": (24, 26, 31), "transparent": None}
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a picture has apart from its shapes.
+    """How shapes are drawn.
 
     Parameters
     ----------
-    size : (width, height), optional
-        Of the whole picture, in pixels. Otherwise `layout.HEIGHT` high, and as wide as the shapes need.
-    background : str
-        "white", "dark", "transparent", or a colour as #rrggbb.
-    up, front : str, optional
-        The file's axis that points up, and the one that the shape faces: x, y, z, -x, -y or -z. Guessed from
-        the extents if not given: tall is up, flat is to the front; the sign cannot be guessed.
-    turn, tilt : float
-        Degrees: turned to its own left, and leant towards the viewer. 0, 0 is straight from the front.
-    ground : bool
-        Whether the shapes throw a shadow on the ground.
-    legend : Scale or Swatches, optional
-        What the colours mean.
+    size
+        Width and height of the picture in pixels; by default `layout.HEIGHT` high and as wide as the shapes need.
+    background
+        "white", "dark", "transparent", or a color as #rrggbb.
+    up, front
+        The file's axes that point up and to the front of the shape: x, y, z, -x, -y or -z. By default guessed from
+        the extents: tall is up, flat is to the front; the sign cannot be guessed.
+    turn, tilt
+        Degrees by which shapes are rotated to their own left, and tilted towards the viewer; 0, 0 is the front.
+    ground
+        Whether the shapes cast a shadow on the ground.
+    legend
+        What the colors mean.
 
     Raises
     ------
     OptionError
-        A size that is too small or too large, or a background that is none.
+        The size is too small or too large, or the background is invalid.
     """
 
     size: tuple[int, int] | None = None
@@ -68,42 +65,37 @@ class Look:
     def __post_init__(self) -> None:
         if self.size is not None:
             check_size(self.size)
-        paper_of(self.background)
+        background_color(self.background)
 
 
 def check_size(size: tuple[int, int]) -> None:
-    """Refuse a picture too small to see, or too large to hold (`OptionError`)."""
+    """Refuse a picture too small to show anything, or too large to hold in memory (`OptionError`)."""
     width, height = size
-    side, pixels = LARGEST
     if min(size) < 16:
-        raise OptionError(f"a picture of {width} x {height} pixels shows nothing", "16 x 16 is the smallest")
-    if max(size) > side or width * height > pixels:
+        raise OptionError(f"a picture of {width} x {height} pixels shows nothing", "the minimum is 16 x 16")
+    if max(size) > MAX_SIDE or width * height > MAX_PIXELS:
         raise OptionError(
             f"a picture of {width} x {height} pixels is too large",
-            f"at most {side} a side and {pixels // 1_000_000} million pixels",
+            f"at most {MAX_SIDE} pixels per side and {MAX_PIXELS // 1_000_000} million in total",
         )
 
 
-def paper_of(background: str) -> Ink | None:
-    """The colour of a background in 0..255; None if it is transparent. `OptionError` if it is none."""
+def background_color(background: str) -> Ink | None:
+    """The color of a background in 0..255; None if it is transparent. `OptionError` if it is invalid."""
     if background in BACKGROUNDS:
         return BACKGROUNDS[background]
     digits = background.removeprefix("#")
     if background.startswith("#") and len(digits) == 6 and set(digits.lower()) <= set("0123456789abcdef"):
         return int(digits[:2], 16), int(digits[2:4], 16), int(digits[4:], 16)
     raise OptionError(
-        f"'{background}' is no background", f"choose {', '.join(BACKGROUNDS)}, or a colour such as #e8f0f8"
+        f"invalid background '{background}'", f"choose {', '.join(BACKGROUNDS)}, or a color such as #e8f0f8"
     )
 
 
 def render_shapes(
-    panels: Sequence[Panel | tuple[object, ArrayLike | None]],
-    path: str | Path,
-    look: Look | None = None,
-    *,
-    labels: Sequence[str] | None = None,
+    panels: Sequence[Panel | tuple[object, ArrayLike | None]], path: str | Path, look: Look | None = None
 ) -> tuple[int, int]:
-    """Draw shapes side by side into a PNG, each on the same ground and as large as the picture allows.
+    """Draw shapes side by side into a PNG, all on one ground and as large as the picture allows.
 
     Parameters
     ----------
@@ -111,10 +103,6 @@ def render_shapes(
         `Panel` objects, or pairs ``(shape, colors or None)``.
     path
         Ends in .png.
-    look
-        Size, background, view and legend.
-    labels
-        Names, one for each panel; they override those of the panels.
 
     Returns
     -------
@@ -124,7 +112,7 @@ def render_shapes(
     Raises
     ------
     OptionError
-        Nothing to draw, a suffix other than .png, an axis that is none, or colours of the wrong shape.
+        Nothing to draw, a suffix other than .png, an invalid axis, or colors of the wrong shape.
     OutputError
         The file cannot be written.
     """
@@ -134,60 +122,61 @@ def render_shapes(
     wanted = [panel if isinstance(panel, Panel) else Panel(*panel) for panel in panels]  # type: ignore[arg-type]
     if not wanted:
         raise OptionError("a picture needs a shape")
-    if labels is not None and len(labels) != len(wanted):
-        raise OptionError(f"{len(wanted)} shapes need {len(wanted)} labels, not {len(labels)}")
-    names = list(labels) if labels is not None else [panel.label for panel in wanted]
-    image = _drawn(wanted, names, look or Look())
+    image = _image(wanted, look or Look())
     with replace_on_success(path) as temporary:
         image.save(temporary, format="PNG", compress_level=9)
     return image.size
 
 
-def _drawn(panels: list[Panel], names: list[str], look: Look) -> Image.Image:
-    made = figures(panels, look.up, look.front, look.turn, look.tilt)
-    page = lay_out([figure.box for figure in made], any(names), look.legend, look.size)
-    paper = paper_of(look.background)
-    image = Image.fromarray(_on_paper(_light(made, page, look), paper))
-    dark = paper is not None and np.dot(paper, (0.3, 0.59, 0.11)) < 110
+def _image(panels: list[Panel], look: Look) -> Image.Image:
+    figures = build_figures(panels, look.up, look.front, look.turn, look.tilt)
+    names = [panel.label for panel in panels]
+    page = lay_out([figure.box for figure in figures], any(names), look.legend, look.size)
+    background = background_color(look.background)
+    image = Image.fromarray(_on_background(_trace(figures, page, look), background))
+    dark = background is not None and np.dot(background, (0.3, 0.59, 0.11)) < 110
     ink: Ink = (226, 228, 232) if dark else (52, 54, 60)
-    for name, place, room in zip(names, page.names.tolist(), page.room.tolist(), strict=True):
-        text, size = fitting(name, page.letters, room)
+    for name, (x, y), room in zip(names, page.names.tolist(), page.room.tolist(), strict=True):
+        text, size = fitting(name, page.font_size, room)
         if text:
-            write(image, (place[0], place[1]), text, size, ink)
+            write(image, (x, y), text, size, ink)
     if look.legend is not None:
-        draw_legend(image, look.legend, page.legend, 0.9 * page.letters, ink)
+        draw_legend(image, look.legend, page.legend, 0.9 * page.font_size, ink)
     return image
 
 
-def _light(made: list[Figure], page: Page, look: Look) -> raster.Image:
+def _trace(figures: list[Figure], page: Page, look: Look) -> raster.Layer:
     shifts = [np.array([foot, 0.0, 0.0]) for foot in page.feet]
-    solid = [part.moved(shift) for figure, shift in zip(made, shifts, strict=True) for part in figure.solid]
-    glass = [part.moved(shift) for figure, shift in zip(made, shifts, strict=True) for part in figure.glass]
+    solid = [
+        part.moved(shift) for figure, shift in zip(figures, shifts, strict=True) for part in figure.solid
+    ]
+    glass = [
+        part.moved(shift) for figure, shift in zip(figures, shifts, strict=True) for part in figure.glass
+    ]
     ground = None
     if look.ground and look.tilt > 0:
-        lean = leant(look.tilt)
-        spots = np.stack([figure.spot for figure in made])
+        spots = np.stack([figure.spot for figure in figures])
         spots[:, 0] += page.feet
-        ground = Ground(lean @ np.array([0.0, 1.0, 0.0]), 0.0, spots)
-    through = all(figure.hollow for figure in made)
-    drawn = None
+        ground = Ground(rotation_about_x(look.tilt) @ np.array([0.0, 1.0, 0.0]), 0.0, spots)
+    hollow = all(figure.hollow for figure in figures)
+    layer = None
     if solid:
-        drawn = raster.draw(Scene(solid, None if through else ground), page.window)
+        layer = raster.draw(Scene(solid, None if hollow else ground), page.viewport)
     if glass:
-        veil = raster.draw(Scene(glass, ground if through else None, _GLASS), page.window)
-        drawn = veil if drawn is None else raster.laid_over(veil, drawn, _NEAR)
-    assert drawn is not None
-    return drawn
+        veil = raster.draw(Scene(glass, ground if hollow else None, _GLASS), page.viewport)
+        layer = veil if layer is None else raster.composite(veil, layer, _HIDDEN)
+    assert layer is not None
+    return layer
 
 
-def _on_paper(drawn: raster.Image, paper: Ink | None) -> NDArray[np.uint8]:
-    """Bytes (H, W, 3) on paper, or (H, W, 4) without."""
+def _on_background(layer: raster.Layer, background: Ink | None) -> UInts8:
+    """Bytes (H, W, 3) on a background, or (H, W, 4) without one."""
     rows = []
-    for first in range(0, len(drawn.alpha), 256):  # by parts: float64 of a large picture is much
-        light, alpha = drawn.light[first : first + 256], drawn.alpha[first : first + 256, :, None]
-        if paper is None:
+    for first in range(0, len(layer.alpha), 256):  # in parts: float64 of a large picture is much
+        light, alpha = layer.light[first : first + 256], layer.alpha[first : first + 256, :, None]
+        if background is None:
             clear = np.concatenate([to_srgb(light / np.maximum(alpha, 1e-6)), alpha], axis=2)
         else:
-            clear = to_srgb(light + (1 - alpha) * to_linear(np.array(paper) / 255))
+            clear = to_srgb(light + (1 - alpha) * to_linear(np.array(background) / 255))
         rows.append(np.round(255 * clear).astype(np.uint8))
     return np.concatenate(rows)

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.render.layout import Viewport
 from meshmatch.render.scene import Floats32, Hits, Scene
 from meshmatch.render.shading import BLOCK, GROUND_BLOCK, seen_light, shade, shadow
 from meshmatch.render.slivers import edge_points, slivers
-from meshmatch.render.viewport import Window
 
 BAND = 100_000
 """How many pixels are worked on at once."""
@@ -31,7 +31,7 @@ _RIM, _INNER = _lattice(16, 7), _lattice(8, 3)  # where an outline runs through 
 
 
 @dataclass(frozen=True, eq=False)
-class Image:
+class Layer:
     """Light (H, W, 3) times alpha, alpha (H, W), and depth (H, W): z of what is seen, -inf where nothing is."""
 
     light: Floats32
@@ -39,24 +39,24 @@ class Image:
     depth: Floats32
 
 
-def draw(scene: Scene, window: Window) -> Image:
+def draw(scene: Scene, viewport: Viewport) -> Layer:
     """Draw a scene. The same scene gives the same picture, whatever the bands."""
-    H, W = window.height, window.width
-    whole = Image(
+    H, W = viewport.height, viewport.width
+    whole = Layer(
         np.zeros((H, W, 3), np.float32), np.zeros((H, W), np.float32), np.full((H, W), -np.inf, np.float32)
     )
-    left, top, right, bottom = _inked(scene, window)
+    left, top, right, bottom = _inked(scene, viewport)
     if left >= right or top >= bottom:
         return whole
     part = replace(
-        window,
+        viewport,
         width=right - left,
         height=bottom - top,
-        left=window.left + left * window.pixel,
-        top=window.top - top * window.pixel,
+        left=viewport.left + left * viewport.pixel,
+        top=viewport.top - top * viewport.pixel,
     )
     inner = slice(top, bottom), slice(left, right)
-    inked = Image(whole.light[inner], whole.alpha[inner], whole.depth[inner])
+    inked = Layer(whole.light[inner], whole.alpha[inner], whole.depth[inner])
     edges = edge_points(scene, part)
     rows = max(1, BAND // part.width)
     for first in range(0, part.height, rows):
@@ -64,41 +64,41 @@ def draw(scene: Scene, window: Window) -> Image:
     return whole
 
 
-def _inked(scene: Scene, window: Window) -> tuple[int, int, int, int]:
+def _inked(scene: Scene, viewport: Viewport) -> tuple[int, int, int, int]:
     """Left, top, right, bottom of the pixels in which anything can be; a pixel of room on each side."""
     low, high = scene.bounds
-    columns = (np.array([low[0], high[0]]) - window.left) / window.pixel
-    rows = (window.top - np.array([high[1], low[1]])) / window.pixel
-    left, right = np.clip([np.floor(columns[0]) - 1, np.ceil(columns[1]) + 1], 0, window.width).astype(int)
-    top, bottom = np.clip([np.floor(rows[0]) - 1, np.ceil(rows[1]) + 1], 0, window.height).astype(int)
+    columns = (np.array([low[0], high[0]]) - viewport.left) / viewport.pixel
+    rows = (viewport.top - np.array([high[1], low[1]])) / viewport.pixel
+    left, right = np.clip([np.floor(columns[0]) - 1, np.ceil(columns[1]) + 1], 0, viewport.width).astype(int)
+    top, bottom = np.clip([np.floor(rows[0]) - 1, np.ceil(rows[1]) + 1], 0, viewport.height).astype(int)
     return int(left), int(top), int(right), int(bottom)
 
 
 def _band(
     scene: Scene,
-    window: Window,
+    viewport: Viewport,
     edges: Floats32,
     first: int,
     last: int,
     corner: tuple[int, int],
-    whole: Image,
+    whole: Layer,
 ) -> None:
-    """Draw rows of a window whose corner is at a column and row of the picture: blocks are counted from there."""
-    low, high = max(0, first - _HALO), min(window.height, last + _HALO)
-    shape = (high - low, window.width)
-    row, column = np.divmod(np.arange(shape[0] * shape[1]), window.width)
+    """Draw rows of a viewport whose corner is at a column and row of the picture: blocks are counted from there."""
+    low, high = max(0, first - _HALO), min(viewport.height, last + _HALO)
+    shape = (high - low, viewport.width)
+    row, column = np.divmod(np.arange(shape[0] * shape[1]), viewport.width)
     row += low
-    hits = scene.look(*window.at(column + 0.5, row + 0.5), window.pixel)
+    hits = scene.look(*viewport.at(column + 0.5, row + 0.5), viewport.pixel)
     met = np.flatnonzero(hits.face != -1)
     seen = np.ones((len(hits.face), 2), np.float32)
     seen[met] = seen_light(scene, hits, met, row[met] + corner[1], column[met] + corner[0])
     for side, which in ((BLOCK, hits.face >= 0), (GROUND_BLOCK, hits.face == -2)):
-        _smooth(seen.reshape(*shape, 2), hits, which.reshape(shape), window.pixel, side)
+        _smooth(seen.reshape(*shape, 2), hits, which.reshape(shape), viewport.pixel, side)
     light, alpha = _finished(scene, hits, seen)
     light, alpha = light.reshape(*shape, 3), alpha.reshape(shape)
     depth = np.where(hits.face >= 0, hits.place[:, 2], -np.inf).reshape(shape).astype(np.float32)
     kind = hits.face.reshape(shape) >= 0
-    rim = _differs(kind.astype(np.float32)[..., None], 0.5) | slivers(edges, low, depth, window)
+    rim = _differs(kind.astype(np.float32)[..., None], 0.5) | slivers(edges, low, depth, viewport)
     inner = (
         _differs(np.sqrt(np.clip(np.concatenate([light, alpha[..., None]], axis=2), 0, 1)), _CONTRAST) & ~rim
     )
@@ -106,7 +106,7 @@ def _band(
         chosen[: first - low] = chosen[last - low :] = False
         found = np.flatnonzero(chosen)
         if len(found):
-            fine = _fine(scene, window, hits, seen, shape, low, corner, found, places)
+            fine = _fine(scene, viewport, hits, seen, shape, low, corner, found, places)
             light.reshape(-1, 3)[found], alpha.reshape(-1)[found] = fine
     own = slice(first - low, last - low)
     whole.light[first:last], whole.alpha[first:last] = light[own], alpha[own]
@@ -129,7 +129,7 @@ def _finished(scene: Scene, hits: Hits, seen: Floats32) -> tuple[Floats32, Float
     return light, alpha
 
 
-def laid_over(glass: Image, base: Image, reach: float) -> Image:
+def composite(glass: Layer, base: Layer, reach: float) -> Layer:
     """Glass in front of a picture; where it lies further behind than ``reach`` the base hides it."""
     with np.errstate(invalid="ignore"):
         ahead = np.nan_to_num(
@@ -137,7 +137,7 @@ def laid_over(glass: Image, base: Image, reach: float) -> Image:
         )
     shown = np.clip(ahead, 0, 1).astype(np.float32)
     through = 1 - glass.alpha * shown
-    return Image(
+    return Layer(
         glass.light * shown[..., None] + base.light * through[..., None],
         glass.alpha * shown + base.alpha * through,
         np.maximum(glass.depth, base.depth),
@@ -198,7 +198,7 @@ def _differs(values: Floats32, by: float) -> NDArray[np.bool_]:
 
 def _fine(
     scene: Scene,
-    window: Window,
+    viewport: Viewport,
     hits: Hits,
     seen: Floats32,
     shape: tuple[int, int],
@@ -211,12 +211,12 @@ def _fine(
     row, column = np.divmod(np.repeat(chosen, len(places)), shape[1])
     offsets = np.tile(places, (len(chosen), 1))
     finer = scene.look(
-        *window.at(column + 0.5 + offsets[:, 0], row + low + 0.5 + offsets[:, 1]),
-        window.pixel / np.sqrt(len(places)),
+        *viewport.at(column + 0.5 + offsets[:, 0], row + low + 0.5 + offsets[:, 1]),
+        viewport.pixel / np.sqrt(len(places)),
     )
     met = np.flatnonzero(finer.face != -1)
     light_seen = np.ones((len(row), 2), np.float32)
-    light_seen[met], known = _borrowed(finer, met, row[met], column[met], hits, seen, shape, window.pixel)
+    light_seen[met], known = _borrowed(finer, met, row[met], column[met], hits, seen, shape, viewport.pixel)
     asking = met[~known]
     # Each ray of a pixel asks other directions, whichever band it is in.
     number = asking % len(places)

@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.render.layout import Viewport
 from meshmatch.render.scene import Floats32, Scene
-from meshmatch.render.viewport import Window
 
 MOST_POINTS = 6_000_000
 """Along the edges of each of the three sides of the triangles."""
 
 
-def edge_points(scene: Scene, window: Window) -> Floats32:
+def edge_points(scene: Scene, viewport: Viewport) -> Floats32:
     """Points (N, 3) along all edges of the scene, not more than a pixel apart: column, row, depth.
 
     What is thinner than a pixel may slip between the rays; but it has edges, and these are met.
     """
-    column = (scene.verts[:, 0] - np.float32(window.left)) / np.float32(window.pixel)
-    row = (np.float32(window.top) - scene.verts[:, 1]) / np.float32(window.pixel)
+    column = (scene.verts[:, 0] - np.float32(viewport.left)) / np.float32(viewport.pixel)
+    row = (np.float32(viewport.top) - scene.verts[:, 1]) / np.float32(viewport.pixel)
     points = np.stack([column, row, scene.verts[:, 2]], axis=1)
     parts = [points]
     for first, second in ((0, 1), (1, 2), (2, 0)):
@@ -35,7 +35,7 @@ def edge_points(scene: Scene, window: Window) -> Floats32:
     return np.concatenate(parts)
 
 
-def slivers(edges: Floats32, low: int, depth: Floats32, window: Window) -> NDArray[np.bool_]:
+def slivers(edges: Floats32, low: int, depth: Floats32, viewport: Viewport) -> NDArray[np.bool_]:
     """Pixels in which an edge lies in front of everything that the rays around it met."""
     H, W = depth.shape
     row, column = edges[:, 1] - low, edges[:, 0]
@@ -43,7 +43,7 @@ def slivers(edges: Floats32, low: int, depth: Floats32, window: Window) -> NDArr
     row, column = row[inside].astype(np.int64), column[inside].astype(np.int64)
     padded = np.pad(depth, 1, constant_values=-np.inf)
     front = np.max([padded[i : i + H, j : j + W] for i in range(3) for j in range(3)], axis=0)
-    before = edges[inside, 2] > front[row, column] + 1.5 * window.pixel
+    before = edges[inside, 2] > front[row, column] + 1.5 * viewport.pixel
     result = np.zeros((H, W), bool)
     result[row[before], column[before]] = True
     return result

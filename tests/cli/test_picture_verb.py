@@ -356,7 +356,7 @@ BAD: list[tuple[str, str]] = [
     ("a.ply -o o.png --size 8000x8000", "too large"),
     ("a.ply -o o.png --size 99999999999999999999x9", "too large"),
     ("a.ply -o o.png --size 3x3", "shows nothing"),
-    ("a.ply -o o.png --background mauve", "no background"),
+    ("a.ply -o o.png --background mauve", "invalid background"),
     ("a.ply -o o.png --up y --front -y", "lie along one axis"),
     ("a.ply b.ply -o o.png --name one", "2 shapes need 2 names"),
     ("a.ply -o o.png --map map.npz", "a map is of two shapes"),

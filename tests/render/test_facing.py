@@ -47,9 +47,9 @@ def test_named_axes_are_taken_as_they_are(up: str, front: str) -> None:
     assert np.linalg.det(rotation) == pytest.approx(1)
 
 
-def test_what_is_no_axis_is_refused() -> None:
+def test_an_invalid_axis_is_refused() -> None:
     for words in ({"up": "w"}, {"front": "up"}, {"up": ""}, {"front": "xx"}):
-        with pytest.raises(OptionError, match="is no axis"):
+        with pytest.raises(OptionError, match="invalid axis"):
             facing(box((1, 1, 1)), **words)
 
 

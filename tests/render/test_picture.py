@@ -46,9 +46,9 @@ def something(picture: np.ndarray) -> np.ndarray:
     return np.asarray((picture < 250).any(axis=2))
 
 
-def draw(tmp_path: Path, *panels: object, look: Look = SMALL, labels: list[str] | None = None) -> np.ndarray:
+def draw(tmp_path: Path, *panels: object, look: Look = SMALL) -> np.ndarray:
     path = tmp_path / "picture.png"
-    size = render_shapes(list(panels), path, look, labels=labels)  # type: ignore[arg-type]
+    size = render_shapes(list(panels), path, look)  # type: ignore[arg-type]
     picture = pixels(path)
     assert picture.shape == (size[1], size[0], 3)
     return picture
@@ -304,7 +304,7 @@ def test_shapes_stand_in_a_row_on_one_ground_with_their_names(
     assert halves[0].min(axis=0)[0] > halves[1].min(axis=0)[0] + 10
     written: list[tuple[str, float]] = []
     monkeypatch.setattr(module, "write", lambda image, place, text, *rest: written.append((text, place[0])))
-    draw(tmp_path, (low, None), Panel(high, label="hidden"), look=look, labels=["", "a"])
+    draw(tmp_path, (low, None), Panel(high, label="a"), look=look)
     named = something(draw(tmp_path, Panel(low, label="b"), (high, None), look=look))
     assert [text for text, _ in written] == ["a", "b"]
     columns = np.flatnonzero(named.any(axis=0))
@@ -403,9 +403,8 @@ def test_refusals(tmp_path: Path) -> None:
     for panels, where, rest, message in (
         ([(shape, None)], tmp_path / "a.jpg", {}, "PNG"),
         ([], path, {}, "needs a shape"),
-        ([(shape, None)], path, {"labels": ["a", "b"]}, "1 labels"),
-        ([(shape, None)], path, {"look": Look(up="w")}, "up is no axis"),
-        ([(shape, None)], path, {"look": Look(front="up")}, "front is no axis"),
+        ([(shape, None)], path, {"look": Look(up="w")}, "invalid axis 'w'"),
+        ([(shape, None)], path, {"look": Look(front="up")}, "invalid axis 'up'"),
         ([(shape, None)], path, {"look": Look(up="y", front="-y")}, "the same axis"),
         ([(shape, np.ones((7, 3)))], path, {}, r"\(8, 3\)"),
         ([Panel(shape, points=[[0, 0, 0]], point_colors=np.ones((2, 3)))], path, {}, r"\(1, 3\)"),
@@ -426,7 +425,7 @@ def test_sizes_that_cannot_be(size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("background", ["blue", "#12345", "#gggggg", "", "0x1234"])
 def test_backgrounds_that_cannot_be(background: str) -> None:
-    with pytest.raises(OptionError, match="no background"):
+    with pytest.raises(OptionError, match="invalid background"):
         Look(background=background)
 
 

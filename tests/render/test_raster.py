@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from meshmatch.render import raster, shading, slivers
-from meshmatch.render.framing import leant
-from meshmatch.render.raster import Image, draw, laid_over
+from meshmatch.render.layout import Viewport, rotation_about_x
+from meshmatch.render.raster import Layer, composite, draw
 from meshmatch.render.scene import Ground, Scene
 from meshmatch.render.surface import FacePaint, Surface, VertexPaint, balls, discs, mesh_surface
-from meshmatch.render.viewport import Window
 
-WINDOW = Window(90, 70, -0.45, 0.35, 0.01)
+WINDOW = Viewport(90, 70, -0.45, 0.35, 0.01)
 GREY = np.array([0.5, 0.5, 0.5])
 
 
@@ -89,7 +88,7 @@ def test_what_is_thinner_than_a_pixel_is_drawn_thinly(width: float, degrees: flo
 def test_bands_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     cloud = balls(rng.uniform(-0.3, 0.3, (60, 3)), 0.04, rng.random((60, 3)))
-    floor = leant(20) @ np.array([0.0, 1, 0])
+    floor = rotation_about_x(20) @ np.array([0.0, 1, 0])
     scene = Scene([cloud, square(0.5, -0.4)], Ground(floor, -0.35, np.array([[0, -0.2, 0.5, 0.2]])))
     whole = draw(scene, WINDOW)
     monkeypatch.setattr(raster, "BAND", 90 * 7)
@@ -210,19 +209,19 @@ def test_holes_of_a_texture_show_what_is_behind() -> None:
     assert through.alpha[60, 70] == 0
 
 
-def test_glass_is_laid_over_what_it_does_not_lie_behind() -> None:
-    def plane(color: float, alpha: float, depth: float) -> Image:
+def test_glass_is_drawn_over_what_it_does_not_lie_behind() -> None:
+    def plane(color: float, alpha: float, depth: float) -> Layer:
         color, alpha, depth = np.float32([color * alpha, alpha, depth])
-        return Image(np.full((1, 1, 3), color), np.full((1, 1), alpha), np.full((1, 1), depth))
+        return Layer(np.full((1, 1, 3), color), np.full((1, 1), alpha), np.full((1, 1), depth))
 
     base = plane(0.2, 1.0, 0.0)
-    assert laid_over(plane(1.0, 0.5, 0.1), base, 0.02).light[0, 0, 0] == pytest.approx(0.6)
-    assert laid_over(plane(1.0, 0.5, -0.1), base, 0.02).light[0, 0, 0] == pytest.approx(0.2)
-    assert laid_over(plane(1.0, 0.5, -0.01), base, 0.02).light[0, 0, 0] == pytest.approx(0.4)
+    assert composite(plane(1.0, 0.5, 0.1), base, 0.02).light[0, 0, 0] == pytest.approx(0.6)
+    assert composite(plane(1.0, 0.5, -0.1), base, 0.02).light[0, 0, 0] == pytest.approx(0.2)
+    assert composite(plane(1.0, 0.5, -0.01), base, 0.02).light[0, 0, 0] == pytest.approx(0.4)
     nothing = plane(0.0, 0.0, -np.inf)
-    over = laid_over(plane(1.0, 0.5, -9.0), nothing, 0.02)
+    over = composite(plane(1.0, 0.5, -9.0), nothing, 0.02)
     assert (over.alpha[0, 0], over.light[0, 0, 0]) == (0.5, 0.5)
-    assert laid_over(nothing, base, 0.02).light[0, 0, 0] == pytest.approx(0.2)
+    assert composite(nothing, base, 0.02).light[0, 0, 0] == pytest.approx(0.2)
 
 
 def test_edges_are_thinned_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from meshmatch.render.layout import Viewport
 from meshmatch.render.raster import draw
 from meshmatch.render.scene import Scene
 from meshmatch.render.surface import mesh_surface
 from meshmatch.render.texture import TexturePaint
-from meshmatch.render.viewport import Window
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import to_linear
@@ -85,7 +85,7 @@ def test_alpha_means_what_the_material_says(alpha: str, factor: float, wanted: l
 def test_a_textured_square_in_a_picture() -> None:
     appearance = look(Material(image=quarters(64)))
     surface = mesh_surface(CORNERS, FACES, TexturePaint(appearance, SQUARE, 1.0))
-    light = draw(Scene([surface]), Window(40, 40, 0.0, 1.0, 0.025)).light
+    light = draw(Scene([surface]), Viewport(40, 40, 0.0, 1.0, 0.025)).light
     red, green, blue, white = (light[r, c] for r, c in ((10, 10), (10, 30), (30, 10), (30, 30)))
     assert red[0] > 5 * red[1:].max()
     assert green[1] > 5 * green[[0, 2]].max()
@@ -100,7 +100,7 @@ def test_the_middle_of_a_border_is_blended_by_many_rays() -> None:
     image[...] = np.where((v + 0.1 * u < 0.5)[..., None], [255, 255, 255, 255], [0, 0, 0, 255])
     appearance = look(Material(image=image))
     surface = mesh_surface(CORNERS, FACES, TexturePaint(appearance, SQUARE, 1.0))
-    light = draw(Scene([surface]), Window(40, 40, 0.0, 1.0, 0.025)).light[..., 0]
+    light = draw(Scene([surface]), Viewport(40, 40, 0.0, 1.0, 0.025)).light[..., 0]
     share = (light - light.min()) / (light.max() - light.min())
     height = share.sum(axis=0)[2:38]
     assert height == pytest.approx(np.linspace(height[0], height[-1], 36), abs=0.25)

@@ -121,7 +121,7 @@ def test_figures_stand_on_one_line_inside_the_margins() -> None:
     boxes = [np.array([[-0.3, -0.02], [0.2, 1.0]]), np.array([[-0.5, 0.0], [0.5, 0.7]])]
     for size in ((640, 400), (400, 640), (3000, 300), None):
         page = lay_out(boxes, True, Scale(0, 1, "x"), size)
-        window = page.window
+        window = page.viewport
         if size is not None:
             assert (window.width, window.height) == size
         for box, foot in zip(boxes, page.feet, strict=True):
@@ -137,5 +137,5 @@ def test_figures_stand_on_one_line_inside_the_margins() -> None:
 def test_a_larger_picture_is_the_same_picture() -> None:
     boxes = [np.array([[-0.3, 0.0], [0.2, 1.0]])]
     small, large = (lay_out(boxes, True, None, size) for size in ((300, 400), (1200, 1600)))
-    assert small.window.pixel == pytest.approx(4 * large.window.pixel, rel=0.02)
-    assert small.letters == pytest.approx(large.letters / 4, rel=0.02)
+    assert small.viewport.pixel == pytest.approx(4 * large.viewport.pixel, rel=0.02)
+    assert small.font_size == pytest.approx(large.font_size / 4, rel=0.02)
