@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.errors import InputError
 from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
 from meshmatch.maps.vertex_map import VertexMap
@@ -19,7 +20,7 @@ CM_PER_UNIT = 100.0 * float(np.sqrt(SKIN_M2))
 """Centimetres in one sqrt(area) of a person with 1.9 m2 of skin."""
 
 LOST_CM = 15.0
-"""An error above this is a lost limb; a pair whose mean lies above it is a flip."""
+"""An error above this is a point on the wrong limb; a pair whose mean lies above it is a left-right flip."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,19 +34,19 @@ class Errors:
         area.
     """
 
-    values: NDArray[np.floating[Any]]
+    values: Float[Floats32, " N"]
 
     def __post_init__(self) -> None:
         values = np.array(self.values, dtype=np.float32).reshape(-1)
         if not values.size or not np.isfinite(values).all() or values.min() < 0:
-            raise ValueError("errors must be finite and 0 or more, and there must be one")
+            raise ValueError("there must be errors, all finite and 0 or more")
         values.setflags(write=False)
         object.__setattr__(self, "values", values)
 
     @property
-    def cm(self) -> NDArray[np.floating[Any]]:
+    def cm(self) -> Float[Floats32, " N"]:
         """The same in centimetres, the target scaled to 1.9 m2 of skin."""
-        scaled: NDArray[np.floating[Any]] = self.values * np.float32(CM_PER_UNIT)
+        scaled: Floats32 = self.values * np.float32(CM_PER_UNIT)
         return scaled
 
     @property
@@ -72,12 +73,10 @@ class Errors:
         """Share (0..1) of the points whose error exceeds `cm`."""
         return float((self.values > cm / CM_PER_UNIT).mean())
 
-    def curve(self, thresholds: ArrayLike) -> NDArray[np.float64]:
+    def curve(self, thresholds: ArrayLike) -> Floats:
         """Share (0..1) of the points with an error of at most each threshold, in units of sqrt(area)."""
         ordered = np.sort(self.values.astype(np.float64))
-        shares: NDArray[np.float64] = np.searchsorted(ordered, np.asarray(thresholds), side="right") / len(
-            ordered
-        )
+        shares: Floats = np.searchsorted(ordered, np.asarray(thresholds), side="right") / len(ordered)
         return shares
 
     @classmethod
@@ -88,10 +87,10 @@ class Errors:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How much of a target a map reaches: low where many source vertices crowd on few of the target.
+    """How much of a target a map reaches: little where many source vertices share few of the target's.
 
-    A source with fewer vertices than the target cannot reach all of them: `vertices` is at most V_src /
-    V_tgt.
+    A source with fewer vertices than the target cannot reach all of them: `vertices` is at most V_source /
+    V_target.
     """
 
     vertices: float
@@ -107,7 +106,7 @@ def map_errors(
 
     Parameters
     ----------
-    index : (V_src,) int
+    index : (V_source,) int
         The map.
     source_points, target_points : (N,) int
         Vertex ids of the same N points on the source and on the target.
@@ -131,7 +130,7 @@ def map_errors(
 
 
 def coverage(index: ArrayLike, target: Shape) -> Coverage:
-    """Share of the target's vertices, and of its area, that ``index`` ``(V_src,)`` hits."""
+    """Share of the target's vertices, and of its area, that ``index`` ``(V_source,)`` hits."""
     hit = np.zeros(target.V, dtype=bool)
     hit[np.asarray(index)] = True
     total = float(target.vertex_areas.sum())
@@ -163,9 +162,7 @@ def distortion(
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All that can be said about one map. `errors` is there where the truth is known, `distortion` between
-    meshes.
-    """
+    """All measures of one map; `errors` only where the truth is known, `distortion` only between meshes."""
 
     coverage: Coverage
     distortion: float | None = None

@@ -11,23 +11,21 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Float, Floats, Int, Ints, Ints32
 from meshmatch.errors import InputError
 from meshmatch.shapes.shape import Shape
 
 CHUNK_BYTES = 64_000_000
 GEODESIC = "Dijkstra on edges and unfolded diagonals"
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-Arcs = tuple[IntArray, IntArray, FloatArray]
+Arcs = tuple[Ints, Ints, Floats]
 
 
-def edge_arcs(verts: FloatArray, faces: IntArray) -> Arcs:
+def edge_arcs(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Arcs:
     """Every edge once: ends ``(E,)``, ends ``(E,)``, length ``(E,)`` in the unit of ``verts``."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0)
@@ -35,7 +33,7 @@ def edge_arcs(verts: FloatArray, faces: IntArray) -> Arcs:
     return i, j, np.linalg.norm(verts[i] - verts[j], axis=1)
 
 
-def diagonal_arcs(verts: FloatArray, faces: IntArray) -> Arcs:
+def diagonal_arcs(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Arcs:
     """Straight lines between the far corners of every two neighbouring faces, unfolded into one plane.
 
     Only lines that cross the shared edge are kept: elsewhere the shortest way runs over a vertex, and the
@@ -63,12 +61,12 @@ def diagonal_arcs(verts: FloatArray, faces: IntArray) -> Arcs:
     return c[valid], d[valid], np.hypot(x_c - x_d, height)[valid]
 
 
-def _in_the_plane_of(offset: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _in_the_plane_of(offset: Floats, along: Floats) -> tuple[Floats, Floats]:
     x = np.einsum("ij,ij->i", offset, along)
     return x, np.linalg.norm(offset - x[:, None] * along, axis=1)
 
 
-def surface_graph(verts: FloatArray, faces: IntArray) -> csr_matrix:
+def surface_graph(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> csr_matrix:
     """Symmetric sparse graph ``(V, V)`` of edges, diagonals, seams and bridges.
 
     *Seams*: vertices at the same place are joined at no cost (OBJ and glTF files split them). *Bridges*: a
@@ -101,13 +99,13 @@ def surface_graph(verts: FloatArray, faces: IntArray) -> csr_matrix:
     return csr_matrix((np.concatenate([length, length]), (rows, columns)), shape=(size, size))
 
 
-def _coincident(verts: FloatArray) -> tuple[IntArray, IntArray]:
+def _coincident(verts: Floats) -> tuple[Ints, Ints]:
     order = np.lexsort(verts.T)
     same = np.flatnonzero((verts[order[1:]] == verts[order[:-1]]).all(axis=1))
     return order[same].astype(np.int64), order[same + 1].astype(np.int64)
 
 
-def _bridges(verts: FloatArray, part: NDArray[np.int32]) -> tuple[IntArray, IntArray]:
+def _bridges(verts: Floats, part: Ints32) -> tuple[Ints, Ints]:
     largest = int(np.bincount(part).argmax())
     main = np.flatnonzero(part == largest)
     rest = np.flatnonzero(part != largest)
@@ -142,7 +140,7 @@ class GeodesicDistances:
         if not self.unit > 0:
             raise InputError(f"{shape.name or 'the shape'} has no surface area")
         faces = shape.faces
-        if shape.invalid is not None:  # its place is a stand-in: a path over it would cut through the body
+        if shape.invalid is not None:  # its position is a stand-in: a path over it would cut through the body
             faces = faces[~shape.invalid[faces].any(axis=1)]
         self.graph = surface_graph(shape.verts, faces)
 
@@ -151,12 +149,12 @@ class GeodesicDistances:
         """Number of vertices."""
         return int(self.graph.shape[0])
 
-    def rows(self, sources: IntArray) -> FloatArray:
-        """All distances from ``sources`` ``(S,)``: ``(S, V)`` float64. See `chunks` for bounded memory."""
+    def rows(self, sources: Int[Ints, " S"]) -> Float[Floats, "S V"]:
+        """All distances from vertices. See `chunks` for bounded memory."""
         found = dijkstra(self.graph, directed=True, indices=np.asarray(sources, dtype=np.int64))
         return np.asarray(found).reshape(-1, self.V) / self.unit
 
-    def chunks(self, sources: IntArray, chunk_bytes: int = CHUNK_BYTES) -> Iterator[tuple[int, FloatArray]]:
+    def chunks(self, sources: Ints, chunk_bytes: int = CHUNK_BYTES) -> Iterator[tuple[int, Floats]]:
         """The rows of many sources, a chunk at a time: ``(first, rows)`` with ``rows`` of shape ``(<=n,
         V)``.
         """
@@ -164,23 +162,23 @@ class GeodesicDistances:
         for first in range(0, len(sources), step):
             yield first, self.rows(sources[first : first + step])
 
-    def between(self, a: IntArray, b: IntArray) -> FloatArray:
-        """Distances ``(N,)`` between vertices ``a[n]`` and ``b[n]``, one Dijkstra for each different one in
+    def between(self, a: Int[Ints, " N"], b: Int[Ints, " N"]) -> Float[Floats, " N"]:
+        """Distances between vertices ``a[n]`` and ``b[n]``, one Dijkstra for each different one in
         the side that has fewer of them."""
         a, b = np.asarray(a, dtype=np.int64), np.asarray(b, dtype=np.int64)
         if a.shape != b.shape or a.ndim != 1:
             raise ValueError(f"two lists of vertices of one length are needed, not {a.shape} and {b.shape}")
-        # Where the two agree there is nothing to measure: an identity costs nothing.
+        # Where the two agree the distance is 0: an identity costs nothing.
         result = np.zeros(len(a))
-        apart = np.flatnonzero(a != b)
-        starts, column = np.unique(a[apart], return_inverse=True)
-        other = b[apart]
+        differ = np.flatnonzero(a != b)
+        starts, column = np.unique(a[differ], return_inverse=True)
+        other = b[differ]
         ends, end_column = np.unique(other, return_inverse=True)
         if len(ends) < len(starts):
-            starts, column, other = ends, end_column, a[apart]
+            starts, column, other = ends, end_column, a[differ]
         order = np.argsort(column, kind="stable")
         bounds = np.searchsorted(column[order], np.arange(len(starts) + 1))
         for first, rows in self.chunks(starts):
             mine = order[bounds[first] : bounds[first + len(rows)]]
-            result[apart[mine]] = rows[column[mine] - first, other[mine]]
+            result[differ[mine]] = rows[column[mine] - first, other[mine]]
         return result

@@ -1,6 +1,6 @@
 """Known points: pairs of vertices of two shapes (landmarks, a partial truth), and lists of vertices of one.
 
-Text files hold one pair, or one vertex, a line: numbers apart by spaces, tabs, commas or semicolons; ``#`` begins a
+Text files hold one pair, or one vertex, a line: numbers separated by spaces, tabs, commas or semicolons; ``#`` begins a
 comment; a first line of words is taken for a header. ``.npy`` files hold the same as an integer array. Vertices are
 counted from 0, in the order of the shape's file.
 """
@@ -10,8 +10,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.array_files import read_npy
 
@@ -19,8 +19,8 @@ _PAIRS = "one pair a line: a vertex of the source, then a vertex of the target, 
 _POINTS = "one vertex a line, counted from 0"
 
 
-def load_pairs(path: str | Path) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Read pairs: vertices of the source (N,), and the same N points on the target (N,).
+def load_pairs(path: str | Path) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
+    """Read pairs: vertices of the source, and the same N points on the target.
 
     Raises
     ------
@@ -31,8 +31,8 @@ def load_pairs(path: str | Path) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return table[:, 0].copy(), table[:, 1].copy()
 
 
-def load_points(path: str | Path) -> NDArray[np.int64]:
-    """Read a list of vertices (N,) of one shape.
+def load_points(path: str | Path) -> Int[Ints, " N"]:
+    """Read a list of vertices of one shape.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def load_points(path: str | Path) -> NDArray[np.int64]:
     return _table(Path(path), 1, _POINTS)[:, 0].copy()
 
 
-def _table(path: Path, columns: int, hint: str) -> NDArray[np.int64]:
+def _table(path: Path, columns: int, hint: str) -> Ints:
     if not path.is_file():
         raise InputError(f"there is no file {path}", hint)
     try:
@@ -61,14 +61,14 @@ def _table(path: Path, columns: int, hint: str) -> NDArray[np.int64]:
     return rows
 
 
-def _from_npy(path: Path) -> NDArray[np.int64]:
+def _from_npy(path: Path) -> Ints:
     array = read_npy(path)
     if array.dtype.kind not in "iu":
         raise ValueError("its numbers are not whole")
     return array.astype(np.int64)
 
 
-def _from_text(path: Path) -> NDArray[np.int64]:
+def _from_text(path: Path) -> Ints:
     rows: list[list[int]] = []
     words_allowed = True
     for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_array
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
@@ -36,30 +36,32 @@ def pull_values(back: VertexMap, values: Floats) -> Floats:
     return np.where(share >= 0.5, sums / np.maximum(share, 0.5), np.nan)
 
 
-def pull_labels(back: VertexMap, source: Shape, labels: Ints, on_faces: bool = False) -> Ints:
+def pull_labels(
+    back: VertexMap, source: Shape, labels: Int[Ints, " N"], on_faces: bool = False
+) -> Int[Ints, " V_target"]:
     """Labels of the target's vertices: those with most weight around their places on the source.
 
     Parameters
     ----------
-    labels : (V_src,) or, ``on_faces``, (F_src,) int64
+    labels : (V_source,) or, ``on_faces``, (F_source,) int64
         A number for each label from 0; `NO_LABEL` for none.
 
     Returns
     -------
-    (V_tgt,) int64
+    (V_target,) int64
         `NO_LABEL` where nothing around has a label.
     """
     return most_votes(vertex_votes(back, source, labels, on_faces))
 
 
 def vertex_votes(back: VertexMap, source: Shape, labels: Ints, on_faces: bool = False) -> csr_array:
-    """(V_tgt, labels) sparse: how much speaks for each label at each target vertex."""
+    """(V_target, labels) sparse: the weight of each label at each target vertex."""
     places = face_weights(back, source) if on_faces else back.sparse()
     return csr_array(places @ one_hot(labels))
 
 
 def face_weights(back: VertexMap, source: Shape) -> csr_array:
-    """(V_tgt, F_src) sparse: the source's face at each place; at a vertex all faces around, by their area."""
+    """(V_target, F_source) sparse: the source's face at each place; at a vertex all faces around, by their area."""
     V = back.source_vertices
     within = (back.face >= 0) & (back.barycentric.max(axis=1) < 1.0 - 1e-9)
     rows = np.flatnonzero(within)
@@ -70,21 +72,21 @@ def face_weights(back: VertexMap, source: Shape) -> csr_array:
     return csr_array(direct + at @ faces_at_vertices(source, area))
 
 
-def faces_at_vertices(shape: Shape, weight: Floats) -> csr_array:
+def faces_at_vertices(shape: Shape, weight: Float[Floats, " F"]) -> csr_array:
     """(V, F) sparse: `weight` (F,) of each face at each of its corners."""
     entries = np.repeat(weight, 3), (shape.faces.ravel(), np.repeat(np.arange(shape.F), 3))
     return csr_array(entries, shape=(shape.V, shape.F))
 
 
-def one_hot(labels: Ints) -> csr_array:
+def one_hot(labels: Int[Ints, " N"]) -> csr_array:
     """(N, labels) sparse: 1 at the label of each; rows without a label are empty."""
     rows = np.flatnonzero(labels >= 0)
     width = int(labels.max(initial=-1)) + 1
     return csr_array((np.ones(len(rows)), (rows, labels[rows])), shape=(len(labels), max(width, 1)))
 
 
-def most_votes(votes: csr_array) -> Ints:
-    """(N,) the label with most votes in each row, the lowest of equal ones; `NO_LABEL` in an empty row."""
+def most_votes(votes: csr_array) -> Int[Ints, " N"]:
+    """The label with most votes in each row, the lowest of equal ones; `NO_LABEL` in an empty row."""
     votes = csr_array(votes)
     rows = np.repeat(np.arange(votes.shape[0]), np.diff(votes.indptr))
     # Sums of thirds differ in the last bits: equal votes should count as equal.
@@ -96,21 +98,21 @@ def most_votes(votes: csr_array) -> Ints:
     return result
 
 
-def pull_weights(back: VertexMap, weights: csr_array, most: int = 4) -> csr_array:
-    """Skin weights (V_src, J) on the target (V_tgt, J): interpolated, at most `most` a vertex, rows sum to 1.
+def pull_weights(back: VertexMap, weights: csr_array, max_joints: int = 4) -> csr_array:
+    """Skin weights (V_source, J) on the target (V_target, J), interpolated; rows have at most `max_joints`, and sum to 1.
 
-    A vertex of which every source vertex is without weights stays without.
+    A vertex stays without weights where the source has none.
     """
-    return sparse_rows(csr_array(back.sparse() @ weights), most)
+    return largest_weights(csr_array(back.sparse() @ weights), max_joints)
 
 
-def sparse_rows(weights: csr_array, most: int) -> csr_array:
-    """The `most` largest weights of each row, scaled to sum to 1; not positive ones are dropped."""
+def largest_weights(weights: csr_array, limit: int) -> csr_array:
+    """The `limit` largest weights of each row, scaled to sum to 1; those that are not positive are dropped."""
     weights = csr_array(weights)
     rows = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
     order = np.lexsort((weights.indices, -weights.data, rows))
     rank = np.arange(len(order)) - weights.indptr[rows[order]]
-    order = order[(rank < most) & (weights.data[order] > 0)]
+    order = order[(rank < limit) & (weights.data[order] > 0)]
     kept = csr_array((weights.data[order], (rows[order], weights.indices[order])), shape=weights.shape)
     total = np.bincount(rows[order], weights.data[order], weights.shape[0])
     kept.data /= total[np.repeat(np.arange(kept.shape[0]), np.diff(kept.indptr))]

@@ -1,4 +1,4 @@
-"""Landmarks go forward: from their places on the source to exact places on the target."""
+"""Landmarks are pushed forward: from their places on the source to exact places on the target."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
+from meshmatch.maps.map_checks import corners_of
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals
 
-# A landmark this far from the surface (of the diagonal) is not meant for this shape.
+# A landmark this far from the surface, in diagonals of the shape, belongs to another shape.
 _ELSEWHERE = 0.25
 
 
@@ -34,15 +35,15 @@ class Landmarks:
     barycentric : (N, 3) float64
         Weights of the face's corners; (1, 0, 0) where the face is -1.
     confidence : (N,) float64
-        0 (a guess) to 1 (sure).
+        0 (a guess) to 1 (certain).
     """
 
     names: tuple[str, ...]
-    points: Floats
-    vertex: Ints
-    face: Ints
-    barycentric: Floats
-    confidence: Floats
+    points: Float[Floats, "N 3"]
+    vertex: Int[Ints, " N"]
+    face: Int[Ints, " N"]
+    barycentric: Float[Floats, "N 3"]
+    confidence: Float[Floats, " N"]
 
     def rows(self, rows: Ints) -> Landmarks:
         """Some of them, in this order."""
@@ -51,7 +52,7 @@ class Landmarks:
         return Landmarks(names, self.points[rows], self.vertex[rows], face, weights, confidence)
 
 
-def at_vertices(shape: Shape, vertex: Ints, names: tuple[str, ...] = ()) -> Landmarks:
+def at_vertices(shape: Shape, vertex: Int[Ints, " N"], names: tuple[str, ...] = ()) -> Landmarks:
     """Landmarks that are vertices (N,) of `shape`.
 
     Raises
@@ -73,7 +74,9 @@ def at_vertices(shape: Shape, vertex: Ints, names: tuple[str, ...] = ()) -> Land
     return Landmarks(names, shape.verts[vertex], vertex, np.full(N, -1), weights, np.ones(N))
 
 
-def at_points(shape: Shape, points: Floats, names: tuple[str, ...] = ()) -> tuple[Landmarks, Floats]:
+def at_points(
+    shape: Shape, points: Float[Floats, "N 3"], names: tuple[str, ...] = ()
+) -> tuple[Landmarks, Float[Floats, " N"]]:
     """Landmarks at the points of a surface (or cloud) nearest to points (N, 3) of its frame.
 
     Returns
@@ -104,7 +107,9 @@ def at_points(shape: Shape, points: Floats, names: tuple[str, ...] = ()) -> tupl
     return found, places.distance
 
 
-def at_faces(shape: Shape, face: Ints, barycentric: Floats, names: tuple[str, ...] = ()) -> Landmarks:
+def at_faces(
+    shape: Shape, face: Int[Ints, " N"], barycentric: Float[Floats, "N 3"], names: tuple[str, ...] = ()
+) -> Landmarks:
     """Landmarks in faces (N,), by the weights (N, 3) of their corners.
 
     Raises
@@ -146,7 +151,7 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
     """Landmarks of the source on the target, exactly on its surface.
 
     A vertex goes where the map puts it. A point of a face goes to the surface nearest to the mean of where its
-    corners go; where these are torn apart, with its heaviest corner.
+    corners go; where the map is discontinuous there, with its heaviest corner.
 
     Parameters
     ----------
@@ -160,8 +165,8 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
     points = forward.points(target)
     inside = np.flatnonzero((landmarks.face >= 0) & (landmarks.barycentric.max(axis=1) < 1.0 - 1e-9))
     if len(inside):
-        torn = discontinuous_faces(forward, source, target)
-        inside = inside[~torn[landmarks.face[inside]]]
+        discontinuous = discontinuous_faces(forward, source, target)
+        inside = inside[~discontinuous[landmarks.face[inside]]]
     if len(inside):
         corners = source.faces[landmarks.face[inside]]
         share = landmarks.barycentric[inside]
@@ -176,9 +181,7 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
 def _on_surface(
     shape: Shape, names: tuple[str, ...], vertex: Ints, face: Ints, weights: Floats, confidence: Floats
 ) -> Landmarks:
-    points = shape.verts[vertex]
-    inside = face >= 0
-    points[inside] = interpolate(shape.verts, shape.faces[face[inside]], weights[inside])
+    points = interpolate(shape.verts, corners_of(shape.faces, face, vertex), weights)
     return Landmarks(names, points, vertex, face, weights, confidence)
 
 

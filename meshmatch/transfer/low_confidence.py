@@ -1,4 +1,4 @@
-"""What to do where the map is not to be trusted: leave blank, or fill in from the neighbours."""
+"""What to do where a map has little confidence: leave blank, or fill in from the neighbours."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Bools, Floats, Ints
+from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.topology import edges_of, same_rows
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.attributes import sparse_rows
+from meshmatch.transfer.attributes import largest_weights
 
-_NEIGHBOURS = 8
+_NEIGHBOURS = 8  # of a point of a cloud
 
 
 @dataclass(frozen=True)
 class LowConfidence:
-    """How much of a result is in doubt, and what became of it.
+    """How much of a result has low confidence, and what was done with it.
 
     Parameters
     ----------
     total, low : int
-        How many entries there are, and how many below the least confidence.
+        How many entries there are, and how many of low confidence.
     blank, filled : int
         How many of all were left blank, and filled in. The rest of `low` was kept as it came.
     """
@@ -93,7 +93,9 @@ def nearest_known(graph: csr_array, known: Bools) -> Ints:
 
 
 def diffuse(graph: csr_array, known: Bools, values: Floats) -> tuple[Floats, Bools]:
-    """Values (N, D) whose unknown rows are the weighted mean of their neighbours, nearer ones counting more.
+    """Values (N, D) with the unknown rows filled in: each is the mean of its neighbours, weighted by 1 / distance.
+
+    That is the discrete harmonic function with the known values as its boundary; solved by conjugate gradients.
 
     Returns
     -------
@@ -119,50 +121,55 @@ def diffuse(graph: csr_array, known: Bools, values: Floats) -> tuple[Floats, Boo
     for column in range(out.shape[1]):
         start = out[rows, column]
         found, _ = cg(system, right[:, column], x0=start, rtol=1e-8, maxiter=2000, M=scale)
-        # Means lie between what they are means of, whatever the last bits say.
-        least, most = fixed[known, column].min(), fixed[known, column].max()
-        out[rows, column] = np.clip(found, least, most)
+        # A mean lies between the known values; the solver's last bits may not.
+        lowest, highest = fixed[known, column].min(), fixed[known, column].max()
+        out[rows, column] = np.clip(found, lowest, highest)
     return out, ask
 
 
 def replace_low_values(
     values: Floats,
-    confidence: Floats,
+    confidence: Float[Floats, " V"],
     target: Shape,
-    least: float,
+    min_confidence: float,
     blank: Floats | float | None = None,
     fill: bool = False,
 ) -> tuple[Floats, LowConfidence]:
-    """Values (V, D) of the target with those below the least confidence left blank, filled in, or kept.
+    """Values (V,) or (V, D) of the target; those of low confidence are left blank, filled in, or kept.
 
-    Values that are nan are always in doubt: the source had none there.
+    Values that are nan always count as low: the source had none there.
     """
-    flat = values if values.ndim == 2 else values[:, None]
-    low = (confidence < least) | ~np.isfinite(flat).all(axis=1)
-    N = len(low)
+    table = values if values.ndim == 2 else values[:, None]
+    low = (confidence < min_confidence) | ~np.isfinite(table).all(axis=1)
+    N, count = len(low), int(low.sum())
     if fill:
-        out, filled = diffuse(vertex_graph(target), ~low, flat)
-        return out.reshape(values.shape), LowConfidence(N, int(low.sum()), 0, int(filled.sum()))
+        out, filled = diffuse(vertex_graph(target), ~low, table)
+        return out.reshape(values.shape), LowConfidence(N, count, 0, int(filled.sum()))
     if blank is not None:
-        out = flat.copy()
+        out = table.copy()
         out[low] = blank
-        return out.reshape(values.shape), LowConfidence(N, int(low.sum()), int(low.sum()))
-    return values, LowConfidence(N, int(low.sum()))
+        return out.reshape(values.shape), LowConfidence(N, count, count)
+    return values, LowConfidence(N, count)
 
 
 def replace_low_weights(
-    weights: csr_array, confidence: Floats, target: Shape, least: float, fill: bool, most: int
+    weights: csr_array,
+    confidence: Float[Floats, " V"],
+    target: Shape,
+    min_confidence: float,
+    fill: bool,
+    max_joints: int,
 ) -> tuple[csr_array, LowConfidence]:
-    """Skin weights (V, J) of the target with those in doubt filled in, or kept; rows still sum to 1.
+    """Skin weights (V, J) of the target; those of low confidence are filled in, or kept. Rows still sum to 1.
 
-    Vertices without weights are always in doubt.
+    Vertices without weights always count as low.
     """
-    low = (confidence < least) | (np.diff(weights.indptr) == 0)
-    N = len(low)
-    if not fill or not low.any():
-        return weights, LowConfidence(N, int(low.sum()))
+    low = (confidence < min_confidence) | (np.diff(weights.indptr) == 0)
+    N, count = len(low), int(low.sum())
+    if not fill or not count:
+        return weights, LowConfidence(N, count)
     graph = vertex_graph(target)
-    # Dense numbers only where they are needed: of the vertices in doubt and those beside them.
+    # Dense numbers only where they are needed: for the low vertices and those beside them.
     some = np.flatnonzero(low | (np.asarray(graph @ low.astype(np.float64)) > 0))
     dense, done = diffuse(csr_array(graph[some][:, some]), ~low[some], weights[some].toarray())
     filled = np.zeros(N, bool)
@@ -170,22 +177,30 @@ def replace_low_weights(
     kept = csr_array(diags_array((~filled).astype(np.float64)) @ weights)
     row, column = np.nonzero(np.where(done[:, None], dense, 0.0) > 0)
     new = csr_array((dense[row, column], (some[row], column)), shape=weights.shape)
-    return sparse_rows(csr_array(kept + new), most), LowConfidence(N, int(low.sum()), 0, int(filled.sum()))
+    return largest_weights(csr_array(kept + new), max_joints), LowConfidence(N, count, 0, int(filled.sum()))
 
 
 def replace_low_labels(
-    labels: Ints, confidence: Floats, target: Shape, least: float, blank: bool, fill: bool, on_faces: bool
-) -> tuple[Ints, LowConfidence]:
-    """Labels (V,) or (F,) of the target with those in doubt left blank (-1), taken from the nearest sure
-    vertex or face along the surface, or kept.
+    labels: Int[Ints, " N"],
+    confidence: Float[Floats, " N"],
+    target: Shape,
+    min_confidence: float,
+    blank: bool,
+    fill: bool,
+    on_faces: bool,
+) -> tuple[Int[Ints, " N"], LowConfidence]:
+    """Labels of the target's vertices or faces; those of low confidence are left blank (-1), taken from the nearest
+    other vertex or face along the surface, or kept.
+
+    Those without a label (-1) always count as low.
     """
-    low = (confidence < least) | (labels < 0)
-    out, N = labels.copy(), len(labels)
+    low = (confidence < min_confidence) | (labels < 0)
+    out, filled = labels.copy(), 0
     if fill:
         nearest = nearest_known(face_graph(target) if on_faces else vertex_graph(target), ~low)
         ask = low & (nearest >= 0)
         out[ask] = labels[nearest[ask]]
-        return out, LowConfidence(N, int(low.sum()), int((out < 0).sum()), int(ask.sum()))
-    if blank:
+        filled = int(ask.sum())
+    elif blank:
         out[low] = -1
-    return out, LowConfidence(N, int(low.sum()), int((out < 0).sum()))
+    return out, LowConfidence(len(labels), int(low.sum()), int((out < 0).sum()), filled)

@@ -1,10 +1,10 @@
-"""A shape's own mesh, carried by the template that was laid on it."""
+"""A shape's own mesh, moved by the template that was fitted to it."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from meshmatch.arrays import Floats
+from meshmatch.arrays import Float, Floats
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.template_footpoints import template_footpoints
@@ -13,21 +13,21 @@ from meshmatch.shapes.shape import Shape
 
 
 class SurfaceBinding:
-    """Every vertex of a shape rides on its place on the fitted template.
+    """Every vertex of a shape is bound to its footpoint on the fitted template.
 
-    What lies between the vertex and its place is kept, and turns with the template: so the pose of the fit gives back
-    the shape, with all its detail.
+    The offset from the footpoint is kept, and turns with the template: so the pose of the fit reproduces the shape
+    with all its detail.
 
     Parameters
     ----------
     part : Repaired
-        The shape; all vertices of its original ride.
+        The shape; all vertices of its original are bound.
     fit : Fit
     turns : (V, 3, 3)
-        How the fitted template is turned at each of its vertices.
+        Rotation of the fitted template at each of its vertices.
     """
 
-    def __init__(self, part: Repaired, fit: Fit, turns: Floats, workers: int = 1) -> None:
+    def __init__(self, part: Repaired, fit: Fit, turns: Float[Floats, "V 3 3"], workers: int = 1) -> None:
         self._shape = part.original
         foot, _ = template_footpoints(part.shape, fit, workers)
         rows = part.original_to_repaired
@@ -35,15 +35,15 @@ class SurfaceBinding:
         offset = fit.frame.apply(part.original.verts) - self._on(fit.points)
         self._offsets = [np.einsum("nji,nj->ni", turns[self._corners[:, k]], offset) for k in range(3)]
 
-    def at(self, points: Floats, turns: Floats) -> Floats:
-        """Vertices (N, 3) of the shape where the template has its points (V, 3) and is turned (V, 3, 3); core frame."""
+    def at(self, points: Float[Floats, "V 3"], turns: Float[Floats, "V 3 3"]) -> Float[Floats, "N 3"]:
+        """Vertices (N, 3) of the shape for points (V, 3) and rotations (V, 3, 3) of the template; core frame."""
         verts = self._on(points)
         for k, offset in enumerate(self._offsets):
             turned = np.einsum("nij,nj->ni", turns[self._corners[:, k]], offset)
             verts += self._weights[:, k, None] * turned
         return verts
 
-    def shape(self, verts: Floats, name: str = "") -> Shape:
+    def shape(self, verts: Float[Floats, "N 3"], name: str = "") -> Shape:
         """The shape with other positions (N, 3) of its vertices."""
         return Shape(verts, self._shape.faces, name, self._shape.colors, self._shape.invalid)
 

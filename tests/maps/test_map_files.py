@@ -103,7 +103,7 @@ def test_maps_of_other_programs(tmp_path: Path) -> None:
     ("name", "content", "message"),
     [
         ("a.npy", b"", "is empty"),
-        ("a.npy", b"not an array", "no npy file"),
+        ("a.npy", b"not an array", "not an npy file"),
         ("a.npz", b"PK\x03\x04 cut", "can be read"),
         ("a.mat", b"MATLAB 5.0 MAT-file" + b" " * 200, "no MAT-file of version 5"),
         ("a.mat", b"short", "no MAT-file of version 5"),

@@ -9,11 +9,11 @@ from scipy.sparse import csr_array
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import (
+    largest_weights,
     most_votes,
     pull_labels,
     pull_values,
     pull_weights,
-    sparse_rows,
 )
 from meshmatch.transfer.inverse_map import invert_map
 from tests.conftest import icosphere
@@ -70,7 +70,7 @@ def test_the_identity_carries_exactly(sphere: Shape) -> None:
     assert np.array_equal(pull_values(same, values), values)
     labels = rng.integers(-1, 6, sphere.V)
     assert np.array_equal(pull_labels(same, sphere, labels), labels)
-    weights = sparse_rows(csr_array(rng.random((sphere.V, 9))), 4)
+    weights = largest_weights(csr_array(rng.random((sphere.V, 9))), 4)
     assert abs(pull_weights(same, weights) - weights).max() < 1e-15
 
 
@@ -129,7 +129,7 @@ def test_equal_votes_go_to_the_lowest_label() -> None:
 @given(st.integers(0, 1000), st.integers(1, 6))
 def test_weights_stay_sparse_and_sum_to_one(seed: int, most: int) -> None:
     rng = np.random.default_rng(seed)
-    weights = sparse_rows(csr_array(rng.random((COARSE.V, 12)) * (rng.random((COARSE.V, 12)) < 0.4)), 12)
+    weights = largest_weights(csr_array(rng.random((COARSE.V, 12)) * (rng.random((COARSE.V, 12)) < 0.4)), 12)
     bare = np.flatnonzero(np.diff(weights.indptr) == 0)
     carried = pull_weights(random_map(seed), weights, most)
     count, total = np.diff(carried.indptr), np.asarray(carried.sum(axis=1)).ravel()
@@ -142,7 +142,7 @@ def test_weights_stay_sparse_and_sum_to_one(seed: int, most: int) -> None:
 
 def test_the_heaviest_joints_are_kept() -> None:
     weights = csr_array(np.array([[0.1, 0.4, 0.2, 0.3], [0, 0, 0, 1.0], [0, 0, 0, 0]]))
-    kept = sparse_rows(weights, 2).toarray()
+    kept = largest_weights(weights, 2).toarray()
     assert np.allclose(kept, [[0, 4 / 7, 0, 3 / 7], [0, 0, 0, 1], [0, 0, 0, 0]])
 
 

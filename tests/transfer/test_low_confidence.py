@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse import csr_array
 
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.attributes import sparse_rows
+from meshmatch.transfer.attributes import largest_weights
 from meshmatch.transfer.low_confidence import (
     LowConfidence,
     diffuse,
@@ -153,7 +153,7 @@ def test_blank_labels_and_kept_ones() -> None:
 
 def test_weights_are_filled_and_still_sum_to_one() -> None:
     rng = np.random.default_rng(0)
-    weights = sparse_rows(csr_array(rng.random((SHEET.V, 6))), 4)
+    weights = largest_weights(csr_array(rng.random((SHEET.V, 6))), 4)
     confidence = np.where(SHEET.verts[:, 0] > 6, 0.0, 1.0)
     out, doubt = replace_low_weights(weights, confidence, SHEET, 0.3, True, 3)
     assert doubt.filled == doubt.low == 20

@@ -12,7 +12,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.table_files import write_json
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.attributes import sparse_rows
+from meshmatch.transfer.attributes import largest_weights
 from meshmatch.transfer.weight_files import SkinWeights, load_weights, save_weights, weights_of
 from tests.conftest import icosphere
 from tests.transfer.skinned import write_skinned_glb
@@ -25,7 +25,7 @@ def some_weights() -> SkinWeights:
     rng = np.random.default_rng(0)
     dense = rng.random((SHAPE.V, 7)) * (rng.random((SHAPE.V, 7)) < 0.5)
     dense[:, 2] += 0.1
-    return SkinWeights(sparse_rows(csr_array(dense), 4), NAMES)
+    return SkinWeights(largest_weights(csr_array(dense), 4), NAMES)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".json", ".NPZ"])
