@@ -20,6 +20,7 @@ from meshmatch.geometry.oriented import OrientedPoints
 Align = Literal["none", "near", "rigid"]
 ALIGNS: tuple[Align, ...] = get_args(Align)
 
+# Set by hand.
 _SCALE = 0.1  # of the robust weight, units of sqrt(area)
 _CAP = 0.2  # of a distance in the residual
 _CLEARLY = 0.9  # a turn must fit better than the given orientation by this factor

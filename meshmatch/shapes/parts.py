@@ -11,7 +11,7 @@ from meshmatch.geometry.topology import face_parts
 from meshmatch.geometry.triangles import squared_lengths
 
 OUTLIER_SHARE = 0.02
-"""A part with less than this share of the largest part's area is an outlier."""
+"""A part with less than this share of the largest part's area is an outlier. This and the next two are set by hand."""
 _FAR = 0.25  # gap between two big parts, in diagonals of the largest, from which they count as apart
 _NEAR = 0.05  # gap up to which a small part belongs to a shape that is made of small parts
 

@@ -120,6 +120,11 @@ class Shape:
         return cls(verts, faces, name, colors, ~usable)
 
     @property
+    def verts_or_nan(self) -> Float[Floats, "V 3"]:
+        """Positions as a file should have them: NaN where a vertex is invalid."""
+        return self.verts if self.invalid is None else np.where(self.invalid[:, None], np.nan, self.verts)
+
+    @property
     def V(self) -> int:
         """Number of vertices."""
         return len(self.verts)

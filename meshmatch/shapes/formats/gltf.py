@@ -157,18 +157,25 @@ class Document:
             inverse = self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
             bones = bones @ inverse[: len(bones)]
         moved, total = np.zeros((len(own), 4)), np.zeros((len(own), 1))
-        for k in range(8):
-            if f"JOINTS_{k}" not in attributes:
-                break
-            joints = self.accessor(attributes[f"JOINTS_{k}"], whole=True).astype(np.int64)
-            weights = self.accessor(attributes[f"WEIGHTS_{k}"])
+        for joints, weights in self.influences(primitive):
             for column in range(4):
                 weight = weights[:, column : column + 1]
-                moved += weight * np.einsum("vij,vj->vi", bones[joints[:, column]], own)
+                moved += weight * np.einsum("vij,vj->vi", bones[joints[:, column].astype(np.int64)], own)
                 total += weight
         return np.asarray(
             np.where(total > 0, moved / np.where(total > 0, total, 1.0), own @ self.world[number].T)
         )[:, :3]
+
+    def influences(
+        self, primitive: dict[str, Any]
+    ) -> Iterator[tuple[Float[Floats, "V 4"], Float[Floats, "V 4"]]]:
+        """Numbers of joints and their weights for each vertex, four at a time."""
+        attributes = primitive["attributes"]
+        for k in range(8):
+            if f"JOINTS_{k}" not in attributes:
+                return
+            numbers = self.accessor(attributes[f"JOINTS_{k}"], whole=True)
+            yield numbers, self.accessor(attributes[f"WEIGHTS_{k}"])
 
     def triangles(self, primitive: dict[str, Any], V: int) -> Int[Ints, "F 3"]:
         mode = primitive.get("mode", _TRIANGLES)

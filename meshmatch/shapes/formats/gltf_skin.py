@@ -71,11 +71,7 @@ def _skin(document: Document) -> Skin:
         node = document.nodes[number]
         if "skin" in node and "JOINTS_0" in attributes:
             own = np.array([place[int(joint)] for joint in skins[node["skin"]]["joints"]])
-            for k in range(8):
-                if f"JOINTS_{k}" not in attributes:
-                    break
-                numbers = document.accessor(attributes[f"JOINTS_{k}"], whole=True)
-                amount = document.accessor(attributes[f"WEIGHTS_{k}"])
+            for numbers, amount in document.influences(primitive):
                 if numbers.shape != (V, 4) or amount.shape != (V, 4):
                     raise ValueError("joints or weights are not four for each vertex")
                 row, column = np.nonzero(np.isfinite(amount) & (amount > 0))

@@ -57,9 +57,7 @@ def with_old(found: list[tuple[bytes, Ints]]) -> tuple[bytes, Ints]:
 
 def write(path: Path, shape: Shape) -> None:
     """Positions with every digit that they have."""
-    verts = shape.verts
-    if shape.invalid is not None:
-        verts = np.where(shape.invalid[:, None], np.nan, verts)
+    verts = shape.verts_or_nan
     if shape.colors is None:
         lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in verts.tolist()]
     else:

@@ -70,7 +70,7 @@ def read(path: Path, data: bytes) -> Raw:
 
 def write(path: Path, shape: Shape) -> None:
     """Positions with every digit that they have; colours as COFF."""
-    verts = shape.verts if shape.invalid is None else np.where(shape.invalid[:, None], np.nan, shape.verts)
+    verts = shape.verts_or_nan
     rows = verts if shape.colors is None else np.hstack([verts, shape.colors])
     lines = ["OFF" if shape.colors is None else "COFF", f"{shape.V} {shape.F} 0"]
     lines += [" ".join(map(repr, row)) for row in rows.tolist()]

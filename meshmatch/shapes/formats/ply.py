@@ -92,8 +92,8 @@ def write(
     header += more_header
     for label, values in (vertex or {}).items():
         table[label] = values
-    for axis, values in zip("xyz", verts.T, strict=True):
-        table[axis] = values if shape.invalid is None else np.where(shape.invalid, np.nan, values)
+    for axis, values in zip("xyz", shape.verts_or_nan.T, strict=True):
+        table[axis] = values
     if shape.colors is not None:
         for channel, values in zip(("red", "green", "blue", "alpha"), shape.colors.T, strict=True):
             table[channel] = np.rint(np.clip(values, 0, 1) * 255)

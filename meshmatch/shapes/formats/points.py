@@ -47,12 +47,10 @@ def read_npy(path: Path, data: bytes) -> Raw:
 
 def write_xyz(path: Path, shape: Shape) -> None:
     """A line for each point, with every digit that it has."""
-    verts = shape.verts if shape.invalid is None else np.where(shape.invalid[:, None], np.nan, shape.verts)
-    path.write_text("".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in verts.tolist()))
+    path.write_text("".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in shape.verts_or_nan.tolist()))
 
 
 def write_npy(path: Path, shape: Shape) -> None:
     """(N, 3) float64."""
-    verts = shape.verts if shape.invalid is None else np.where(shape.invalid[:, None], np.nan, shape.verts)
     with path.open("wb") as file:
-        np.save(file, verts, allow_pickle=False)
+        np.save(file, shape.verts_or_nan, allow_pickle=False)
