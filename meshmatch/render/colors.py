@@ -1,32 +1,24 @@
-"""Colours that tell places on a shape apart."""
+"""Colors that distinguish places on a shape."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.shapes.palette import oklab_to_linear
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import to_linear, to_srgb
-
-FloatArray = NDArray[np.float64]
 
 __all__ = ["CLAY", "oklab_to_linear", "position_colors", "to_linear", "to_srgb"]
 
 CLAY: tuple[float, float, float] = (0.85, 0.82, 0.78)
 
 
-def position_colors(shape: Shape, rotation: FloatArray | None = None) -> FloatArray:
-    """A colour ``(V, 3)`` in 0..1 for every vertex, smooth over space: carried by a map, it shows where
-    points went.
+def position_colors(shape: Shape, rotation: Float[Floats, "3 3"] | None = None) -> Float[Floats, "V 3"]:
+    """An sRGB color in 0..1 for every vertex, smooth over space: transferred by a map, it shows where points went.
 
-    Parameters
-    ----------
-    rotation
-        ``(3, 3)`` into a frame with x to the shape's left, y up and z to its front; the file's own axes
-        otherwise.
-
-    Height turns the hue once round most of the circle; left and right shift it and are darker and lighter.
+    Height turns the hue nearly once around the circle; left and right shift it and are darker and lighter.
+    ``rotation`` leads into a frame with x to the shape's left, y up and z to its front; by default the file's own axes.
     """
     points = shape.verts if rotation is None else shape.verts @ np.asarray(rotation, dtype=np.float64).T
     used = points if shape.invalid is None else points[~shape.invalid]

@@ -1,4 +1,4 @@
-"""What the colours of a picture mean: a bar with numbers, or names with their colours."""
+"""The legend of a picture: a color bar with numbers, or names with their colors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _FINE = 4  # shapes are drawn this many times larger and then shrunk: smooth cor
 
 
 def legend_height(legend: Legend, width: int, unit: float) -> int:
-    """How many pixels a legend needs under a picture of this width; ``unit`` is the size of its letters."""
+    """Rows of pixels that a legend needs under a picture of this width; ``unit`` is its font size."""
     if isinstance(legend, Scale):
         return round((4.1 if legend.title else 2.9) * unit)
     lines = len(_lines(legend, width, unit))
@@ -21,7 +21,7 @@ def legend_height(legend: Legend, width: int, unit: float) -> int:
 
 
 def draw_legend(image: Image.Image, legend: Legend, top: int, unit: float, ink: Ink) -> None:
-    """Draw a legend into a picture, in the middle, from a row of pixels on."""
+    """Draw a centered legend into a picture, from row ``top`` on."""
     if isinstance(legend, Scale):
         _draw_bar(image, legend, top, unit, ink)
     else:

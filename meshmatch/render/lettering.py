@@ -1,4 +1,4 @@
-"""Words in a picture, in the one font that Pillow brings along."""
+"""Text in a picture, in the font that Pillow includes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def width_of(text: str, size: float) -> float:
 
 
 def readable(text: str) -> str:
-    """The text in letters that the font has, on one line: without accents where need be, else "?"."""
+    """The text on one line in letters that the font has: without accents if necessary, else "?"."""
     out = []
     for letter in " ".join(text.split()):
         plain = letter if _has(letter) else unicodedata.normalize("NFKD", letter)
@@ -43,7 +43,7 @@ def _has(letter: str) -> bool:
 
 
 def fitting(text: str, size: float, room: float) -> tuple[str, float]:
-    """The text and the size at which it fits into so many pixels: smaller first, then cut in the middle."""
+    """The text and its size so that it fits into ``room`` pixels: smaller first, then cut in the middle."""
     text = readable(text)
     while size > 9 and width_of(text, size) > room:
         size *= 0.95
@@ -57,6 +57,6 @@ def fitting(text: str, size: float, room: float) -> tuple[str, float]:
 def write(
     image: Image.Image, place: tuple[float, float], text: str, size: float, ink: Ink, anchor: str = "mm"
 ) -> None:
-    """Write a line; ``anchor`` as in Pillow. On a picture with alpha the letters are solid."""
+    """Write a line; ``anchor`` as in Pillow. On a picture with alpha the letters are opaque."""
     fill = (*ink, 255) if image.mode == "RGBA" else ink
     ImageDraw.Draw(image).text(place, text, fill=fill, font=font(size), anchor=anchor)

@@ -1,7 +1,7 @@
-"""From a scene to pixels: one ray for each, and many where that would leave a jagged edge.
+"""From a scene to pixels: one ray per pixel, and many where that would leave a jagged edge.
 
-Light is asked for once a pixel, spread over neighbours that lie on the same surface, and then shared by all rays of
-the pixel. Work goes on in bands, so that memory does not grow with the picture.
+Visibility is computed once per pixel, filtered over neighbors on the same surface, and then shared by all rays of the
+pixel. Work proceeds in bands of rows, so that memory does not grow with the picture.
 """
 
 from __future__ import annotations
@@ -9,21 +9,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.render.layout import Viewport
-from meshmatch.render.scene import Floats32, Hits, Scene
-from meshmatch.render.shading import BLOCK, GROUND_BLOCK, seen_light, shade, shadow
+from meshmatch.render.scene import Hits, Scene
+from meshmatch.render.shading import BLOCK, GROUND_BLOCK, shade, shadow, visibility
 from meshmatch.render.slivers import edge_points, slivers
 
 BAND = 100_000
-"""How many pixels are worked on at once."""
+"""Pixels worked on at once."""
 _HALO = GROUND_BLOCK // 2 + 2  # rows above and below a band that its filter and its edges need
-_CONTRAST = 0.035  # between neighbours, as written, from which an edge is drawn finely
+_CONTRAST = 0.035  # sRGB difference between neighbors from which an edge gets more rays
 
 
-def _lattice(count: int, step: int) -> NDArray[np.float64]:
-    """(count, 2) places in a pixel around its middle, one in every row and column: no slope of an edge shows steps."""
+def _lattice(count: int, step: int) -> Float[Floats, "count 2"]:
+    """Places in a pixel around its middle, one in every row and column: no slope of an edge shows steps."""
     return (np.stack([np.arange(count), (step * np.arange(count)) % count], axis=1) + 0.5) / count - 0.5
 
 
@@ -32,20 +32,20 @@ _RIM, _INNER = _lattice(16, 7), _lattice(8, 3)  # where an outline runs through 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """Light (H, W, 3) times alpha, alpha (H, W), and depth (H, W): z of what is seen, -inf where nothing is."""
+    """Linear light times alpha, alpha, and depth: z of what is seen, -inf where nothing is."""
 
-    light: Floats32
-    alpha: Floats32
-    depth: Floats32
+    light: Float[Floats32, "H W 3"]
+    alpha: Float[Floats32, "H W"]
+    depth: Float[Floats32, "H W"]
 
 
 def draw(scene: Scene, viewport: Viewport) -> Layer:
-    """Draw a scene. The same scene gives the same picture, whatever the bands."""
+    """Draw a scene. The same scene gives the same picture, whatever the size of a band."""
     H, W = viewport.height, viewport.width
     whole = Layer(
         np.zeros((H, W, 3), np.float32), np.zeros((H, W), np.float32), np.full((H, W), -np.inf, np.float32)
     )
-    left, top, right, bottom = _inked(scene, viewport)
+    left, top, right, bottom = _extent(scene, viewport)
     if left >= right or top >= bottom:
         return whole
     part = replace(
@@ -56,16 +56,16 @@ def draw(scene: Scene, viewport: Viewport) -> Layer:
         top=viewport.top - top * viewport.pixel,
     )
     inner = slice(top, bottom), slice(left, right)
-    inked = Layer(whole.light[inner], whole.alpha[inner], whole.depth[inner])
+    drawn = Layer(whole.light[inner], whole.alpha[inner], whole.depth[inner])
     edges = edge_points(scene, part)
     rows = max(1, BAND // part.width)
     for first in range(0, part.height, rows):
-        _band(scene, part, edges, first, min(part.height, first + rows), (left, top), inked)
+        _band(scene, part, edges, first, min(part.height, first + rows), (left, top), drawn)
     return whole
 
 
-def _inked(scene: Scene, viewport: Viewport) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of the pixels in which anything can be; a pixel of room on each side."""
+def _extent(scene: Scene, viewport: Viewport) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of the pixels in which anything can be, with a margin of one pixel."""
     low, high = scene.bounds
     columns = (np.array([low[0], high[0]]) - viewport.left) / viewport.pixel
     rows = (viewport.top - np.array([high[1], low[1]])) / viewport.pixel
@@ -77,13 +77,13 @@ def _inked(scene: Scene, viewport: Viewport) -> tuple[int, int, int, int]:
 def _band(
     scene: Scene,
     viewport: Viewport,
-    edges: Floats32,
+    edges: Float[Floats32, "E 3"],
     first: int,
     last: int,
     corner: tuple[int, int],
     whole: Layer,
 ) -> None:
-    """Draw rows of a viewport whose corner is at a column and row of the picture: blocks are counted from there."""
+    """Draw rows of a viewport whose corner is at this column and row of the picture, from where blocks are counted."""
     low, high = max(0, first - _HALO), min(viewport.height, last + _HALO)
     shape = (high - low, viewport.width)
     row, column = np.divmod(np.arange(shape[0] * shape[1]), viewport.width)
@@ -91,10 +91,10 @@ def _band(
     hits = scene.look(*viewport.at(column + 0.5, row + 0.5), viewport.pixel)
     met = np.flatnonzero(hits.face != -1)
     seen = np.ones((len(hits.face), 2), np.float32)
-    seen[met] = seen_light(scene, hits, met, row[met] + corner[1], column[met] + corner[0])
+    seen[met] = visibility(scene, hits, met, row[met] + corner[1], column[met] + corner[0])
     for side, which in ((BLOCK, hits.face >= 0), (GROUND_BLOCK, hits.face == -2)):
         _smooth(seen.reshape(*shape, 2), hits, which.reshape(shape), viewport.pixel, side)
-    light, alpha = _finished(scene, hits, seen)
+    light, alpha = _shaded(scene, hits, seen)
     light, alpha = light.reshape(*shape, 3), alpha.reshape(shape)
     depth = np.where(hits.face >= 0, hits.place[:, 2], -np.inf).reshape(shape).astype(np.float32)
     kind = hits.face.reshape(shape) >= 0
@@ -113,8 +113,10 @@ def _band(
     whole.depth[first:last] = depth[own]
 
 
-def _finished(scene: Scene, hits: Hits, seen: Floats32) -> tuple[Floats32, Floats32]:
-    """Light (N, 3) times alpha, and alpha (N,), of all rays."""
+def _shaded(
+    scene: Scene, hits: Hits, seen: Float[Floats32, "N 2"]
+) -> tuple[Float[Floats32, "N 3"], Float[Floats32, N]]:
+    """Light times alpha, and alpha, of all rays."""
     light = np.zeros((len(hits.face), 3), np.float32)
     alpha = np.zeros(len(hits.face), np.float32)
     solid = np.flatnonzero(hits.face >= 0)
@@ -130,7 +132,7 @@ def _finished(scene: Scene, hits: Hits, seen: Floats32) -> tuple[Floats32, Float
 
 
 def composite(glass: Layer, base: Layer, reach: float) -> Layer:
-    """Glass in front of a picture; where it lies further behind than ``reach`` the base hides it."""
+    """Glass over a base layer, which hides it where it lies further behind than ``reach``."""
     with np.errstate(invalid="ignore"):
         ahead = np.nan_to_num(
             (glass.depth - base.depth) / np.float32(reach) + 1, nan=1.0, posinf=1.0, neginf=0.0
@@ -144,10 +146,12 @@ def composite(glass: Layer, base: Layer, reach: float) -> Layer:
     )
 
 
-def _smooth(values: Floats32, hits: Hits, which: NDArray[np.bool_], pixel: float, side: int) -> None:
-    """Spread light (H, W, 2) over blocks of pixels of this side, as far as they belong to one surface; in place.
+def _smooth(
+    values: Float[Floats32, "H W 2"], hits: Hits, which: Bool[Bools, "H W"], pixel: float, side: int
+) -> None:
+    """Filter visibility in place over blocks of pixels of this side, as far as they belong to one surface.
 
-    Only pixels ``which`` (H, W) take part.
+    Only pixels ``which`` take part.
     """
     if not which.any():
         return
@@ -164,13 +168,18 @@ def _smooth(values: Floats32, hits: Hits, which: NDArray[np.bool_], pixel: float
             here, there = _shifted(step, axis, (H, W))
             gap = np.einsum("hwi,hwi->hw", place[there] - place[here], flat[here])
             turn = np.einsum("hwi,hwi->hw", normal[there], normal[here])
-            weight = np.clip(3.0 - np.abs(gap) / np.float32(pixel), 0, 1) * np.clip(4 * turn - 2.4, 0, 1)
+            weight = _same_surface(gap, turn, pixel)
             # Half at both ends: each residue of a block then weighs the same.
             weight *= np.float32(0.5 if abs(step) == half else 1.0) * (which[there] & which[here])
             total[here] += weight[..., None] * found[there]
             weights[here] += weight
         found = total / weights[..., None]
     values[part] = np.where(which[..., None], found, values[part])
+
+
+def _same_surface(gap: Floats32, cosine: Floats32, pixel: float) -> Floats32:
+    """0..1: 1 for two places within two pixels of one plane (``gap`` apart), with normals that nearly agree."""
+    return np.clip(3.0 - np.abs(gap) / np.float32(pixel), 0, 1) * np.clip(4 * cosine - 2.4, 0, 1)
 
 
 def _shifted(step: int, axis: int, shape: tuple[int, int]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
@@ -184,8 +193,8 @@ def _shifted(step: int, axis: int, shape: tuple[int, int]) -> tuple[tuple[slice,
     return (everything, here), (everything, there)
 
 
-def _differs(values: Floats32, by: float) -> NDArray[np.bool_]:
-    """Pixels (H, W) of values (H, W, C) that differ from a neighbour so much that an edge may run through them."""
+def _differs(values: Float[Floats32, "H W C"], by: float) -> Bool[Bools, "H W"]:
+    """Pixels that differ from a neighbor so much that an edge may run through them."""
     H, W = values.shape[0], values.shape[1]
     result = np.zeros((H, W), bool)
     for axis in (0, 1):
@@ -200,14 +209,14 @@ def _fine(
     scene: Scene,
     viewport: Viewport,
     hits: Hits,
-    seen: Floats32,
+    seen: Float[Floats32, "P 2"],
     shape: tuple[int, int],
     low: int,
     corner: tuple[int, int],
-    chosen: NDArray[np.int64],
-    places: NDArray[np.float64],
-) -> tuple[Floats32, Floats32]:
-    """Light (N, 3) times alpha, and alpha (N,), of pixels (N,) of a band, each the mean over places (R, 2) in it."""
+    chosen: Int[Ints, N],
+    places: Float[Floats, "R 2"],
+) -> tuple[Float[Floats32, "N 3"], Float[Floats32, N]]:
+    """Light times alpha, and alpha, of chosen pixels of a band, each the mean over places in it."""
     row, column = np.divmod(np.repeat(chosen, len(places)), shape[1])
     offsets = np.tile(places, (len(chosen), 1))
     finer = scene.look(
@@ -216,30 +225,30 @@ def _fine(
     )
     met = np.flatnonzero(finer.face != -1)
     light_seen = np.ones((len(row), 2), np.float32)
-    light_seen[met], known = _borrowed(finer, met, row[met], column[met], hits, seen, shape, viewport.pixel)
-    asking = met[~known]
-    # Each ray of a pixel asks other directions, whichever band it is in.
-    number = asking % len(places)
-    deal = (
-        (row[asking] + low + corner[1]) * BLOCK + number // BLOCK,
-        (column[asking] + corner[0]) * BLOCK + number % BLOCK,
+    light_seen[met], known = _reused(finer, met, row[met], column[met], hits, seen, shape, viewport.pixel)
+    missing = met[~known]
+    # Each ray of a pixel uses other directions, whichever band it is in.
+    number = missing % len(places)
+    block = (
+        (row[missing] + low + corner[1]) * BLOCK + number // BLOCK,
+        (column[missing] + corner[0]) * BLOCK + number % BLOCK,
     )
-    light_seen[asking] = seen_light(scene, finer, asking, deal[0], deal[1])
-    light, alpha = _finished(scene, finer, light_seen)
+    light_seen[missing] = visibility(scene, finer, missing, block[0], block[1])
+    light, alpha = _shaded(scene, finer, light_seen)
     return light.reshape(len(chosen), -1, 3).mean(axis=1), alpha.reshape(len(chosen), -1).mean(axis=1)
 
 
-def _borrowed(
+def _reused(
     finer: Hits,
-    met: NDArray[np.int64],
-    row: NDArray[np.int64],
-    column: NDArray[np.int64],
+    met: Int[Ints, N],
+    row: Int[Ints, N],
+    column: Int[Ints, N],
     hits: Hits,
-    seen: Floats32,
+    seen: Float[Floats32, "P 2"],
     shape: tuple[int, int],
     pixel: float,
-) -> tuple[Floats32, NDArray[np.bool_]]:
-    """Light (N, 2) of fine rays from the pixels around them that lie on the same surface, and where there is one."""
+) -> tuple[Float[Floats32, "N 2"], Bool[Bools, N]]:
+    """Visibility of fine rays from the pixels around them that lie on the same surface, and where there is one."""
     place, flat, normal = finer.place[met], finer.flat[met], finer.normal[met]
     solid = finer.face[met] >= 0
     total = np.zeros((len(met), 2), np.float32)
@@ -248,7 +257,7 @@ def _borrowed(
         there = np.clip(row + down, 0, shape[0] - 1) * shape[1] + np.clip(column + right, 0, shape[1] - 1)
         gap = np.einsum("ni,ni->n", hits.place[there] - place, flat)
         turn = np.einsum("ni,ni->n", hits.normal[there], normal)
-        weight = np.clip(3.0 - np.abs(gap) / np.float32(pixel), 0, 1) * np.clip(4 * turn - 2.4, 0, 1)
+        weight = _same_surface(gap, turn, pixel)
         face = hits.face[there]
         weight *= ((face >= 0) == solid) & (face != -1)
         total += weight[:, None] * seen[there]

@@ -1,4 +1,4 @@
-"""Numbers and labels as colours, and what a legend says about them."""
+"""Color scales for numbers and labels, and their legends."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.render.colors import oklab_to_linear, to_srgb
 from meshmatch.shapes.palette import UNKNOWN, label_colors
 
-FloatArray = NDArray[np.float64]
-
 __all__ = ["UNKNOWN", "Scale", "Swatches", "label_colors", "label_swatches", "nice_step"]
 
 # Lightness, chroma, hue in degrees (Oklab). Lightness alone orders them, so a grey print can be read too.
-_HEAT = (
+_WARM = (
     (0.93, 0.025, 85),
     (0.86, 0.12, 88),
     (0.74, 0.165, 58),
@@ -29,8 +28,8 @@ _COLD = ((0.93, 0.025, 85), (0.80, 0.09, 230), (0.62, 0.14, 252), (0.44, 0.15, 2
 _FINE = 256
 
 
-def _ramp(stops: Sequence[tuple[float, float, float]]) -> FloatArray:
-    """Written colours (_FINE, 3) between stops, in even steps through Oklab."""
+def _ramp(stops: Sequence[tuple[float, float, float]]) -> Float[Floats, "256 3"]:
+    """sRGB colors between stops, in even steps through Oklab."""
     at = np.linspace(0, 1, len(stops))
     light, chroma, hue = np.array(stops, dtype=np.float64).T
     points = np.stack([light, chroma * np.cos(np.radians(hue)), chroma * np.sin(np.radians(hue))], axis=1)
@@ -41,19 +40,19 @@ def _ramp(stops: Sequence[tuple[float, float, float]]) -> FloatArray:
 
 @dataclass(frozen=True)
 class Scale:
-    """A scale from numbers to colours.
+    """A scale from numbers to colors.
 
     Parameters
     ----------
-    low, high : float
-        The ends; what lies beyond takes the colour of the end.
-    title : str
+    low, high
+        The ends; numbers beyond take the color of the end.
+    title
         What is measured, with its unit.
-    reverse : bool
-        True where the low numbers are those to look at, such as confidence.
-    beyond : tuple of bool
+    reverse
+        True where low numbers deserve attention, such as confidence.
+    beyond
         Whether some numbers lie below ``low``, and above ``high``.
-    unknown : bool
+    unknown
         Whether some have no value.
     """
 
@@ -98,27 +97,27 @@ class Scale:
 
     @property
     def diverging(self) -> bool:
-        """Whether it runs through 0, so that both signs need a colour."""
+        """Whether it runs through 0, so that both signs need a color."""
         return self.low < 0 < self.high and not self.reverse
 
-    def colors(self, values: ArrayLike) -> FloatArray:
-        """Written colours (N, 3) of numbers (N,)."""
+    def colors(self, values: ArrayLike) -> Float[Floats, "N 3"]:
+        """sRGB colors in 0..1 of numbers (N,); grey for nan."""
         numbers = np.asarray(values, dtype=np.float64)
         known = np.isfinite(numbers)
         safe = np.where(known, numbers, self.low)
         if self.diverging:
             share = np.clip(safe / max(-self.low, self.high), -1, 1)
-            warm, cold = _ramp(_HEAT), _ramp(_COLD)
+            warm, cold = _ramp(_WARM), _ramp(_COLD)
             at = np.round(np.abs(share) * (_FINE - 1)).astype(int)
             found = np.where((share < 0)[..., None], cold[at], warm[at])
         else:
             share = np.clip((safe - self.low) / (self.high - self.low), 0, 1)
             share = 1 - share if self.reverse else share
-            found = _ramp(_HEAT)[np.round(share * (_FINE - 1)).astype(int)]
+            found = _ramp(_WARM)[np.round(share * (_FINE - 1)).astype(int)]
         return np.where(known[..., None], found, UNKNOWN)
 
     def ticks(self) -> list[tuple[float, str]]:
-        """Round numbers on the scale, each with its words; the ends are among them."""
+        """Round numbers on the scale, each as text; the ends are among them."""
         step = nice_step(self.high - self.low, 5)
         inner = np.arange(np.ceil(self.low / step), np.floor(self.high / step) + 1) * step
         near = 0.3 * step
@@ -132,7 +131,7 @@ class Scale:
         return list(zip(places, words, strict=True))
 
 
-def _round_ends(finite: FloatArray) -> tuple[float, float]:
+def _round_ends(finite: Float[Floats, N]) -> tuple[float, float]:
     low, high = float(finite.min()), float(finite.max())
     bulk = float(np.quantile(finite, 0.99))
     if bulk > 0 and high > 1.6 * bulk:
@@ -166,7 +165,7 @@ def _word(value: float, step: float) -> str:
 
 @dataclass(frozen=True)
 class Swatches:
-    """Names and their written colours, for a legend."""
+    """Names and their sRGB colors, for a legend."""
 
     names: tuple[str, ...]
     colors: tuple[tuple[float, float, float], ...]
@@ -174,7 +173,7 @@ class Swatches:
 
 
 def label_swatches(labels: ArrayLike, names: Sequence[str] = (), most: int = 24) -> Swatches:
-    """The legend of labels (N,): those that occur, at most so many. Negative ones are called "none"."""
+    """The legend of the labels (N,) that occur, at most ``most``. Negative ones are called "none"."""
     present = np.unique(np.asarray(labels, dtype=np.int64))
     present = np.concatenate([present[present >= 0], present[present < 0][:1]])
     shown = present if len(present) <= most else present[: most - 1]

@@ -1,6 +1,6 @@
-"""What a ray hits: embree holds the triangles, and a hit knows its place, normal and colour.
+"""What rays hit: embree finds the triangles, and a hit knows its position, normal and color.
 
-The picture is an orthographic look along -z.
+The camera is orthographic and looks along -z.
 """
 
 from __future__ import annotations
@@ -11,42 +11,35 @@ from functools import cached_property
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from numpy.typing import NDArray
 
-from meshmatch.render.surface import FloatArray, IntArray, Surface
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
+from meshmatch.render.surface import Surface
 
-# Between a facet and the smooth normal of a corner, as cosines: up to here smooth, from there on a crease.
+# Cosines of the angle between a facet and the smooth normal of a corner: up to here smooth, from there on a crease.
 _SMOOTH, _CREASE = np.cos(np.radians(28.0)), np.cos(np.radians(42.0))
 
 _LIFT = 3e-3
 _LAYERS = 12  # of surfaces with holes behind each other
 
-Floats32 = NDArray[np.float32]
-
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """A plane that only catches shadows: points x with ``x @ normal = height``, near some spots of the picture.
+    """A plane that only receives shadows: points x with ``x @ normal = height``, near some spots of the picture.
 
-    Parameters
-    ----------
-    normal : (3,)
-    height : float
-    spots : (N, 4)
-        Ellipses in the picture plane, outside of which nothing is drawn: x, y, half width, half height.
+    ``spots`` are ellipses in the picture plane, outside of which nothing is drawn: x, y, half width, half height.
     """
 
-    normal: FloatArray
+    normal: Float[Floats, 3]
     height: float
-    spots: FloatArray
+    spots: Float[Floats, "K 4"]
 
-    def depth(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """z (N,) of the plane at points (N,) of the picture."""
+    def depth(self, x: Float[Floats, N], y: Float[Floats, N]) -> Float[Floats, N]:
+        """z of the plane at points of the picture."""
         a, b, c = self.normal
         return np.asarray((self.height - a * x - b * y) / c)
 
-    def strength(self, x: FloatArray, y: FloatArray) -> Floats32:
-        """How strongly (N,) shadows are drawn at points of the picture, 0 to 1: they fade out to the rims."""
+    def strength(self, x: Float[Floats, N], y: Float[Floats, N]) -> Float[Floats32, N]:
+        """How strongly shadows are drawn at points of the picture, 0 to 1: they fade out towards the rims."""
         strength = np.zeros(len(x), np.float32)
         for left, top, width, height in self.spots:
             near = np.clip(1 - ((x - left) / width) ** 2 - ((y - top) / height) ** 2, 0, 1)
@@ -56,30 +49,36 @@ class Ground:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What N rays of the picture met. Rows of misses hold nothing of use.
+    """What N rays met. Rows of misses hold nothing of use.
 
-    face : (N,) int64, number in the whole scene, -1 for a miss, -2 for the ground
-    place : (N, 3), flat : (N, 3) normal of the facet, normal : (N, 3) smooth one; both face the viewer
-    color : (N, 3) linear; of the ground the strength of its shadows, three times
-    lift : (N,) how far above the place light is asked for, so that a surface does not shade itself
+    Parameters
+    ----------
+    face
+        Triangle in the whole scene; -1 for a miss, -2 for the ground.
+    flat, normal
+        Normal of the facet, and the smooth one; both face the viewer.
+    color
+        Linear; of the ground the strength of its shadows, three times.
+    lift
+        Height above the surface from which light is looked for, so that a surface does not shade itself.
     """
 
-    face: IntArray
-    place: Floats32
-    flat: Floats32
-    normal: Floats32
-    color: Floats32
-    lift: Floats32
+    face: Int[Ints, N]
+    place: Float[Floats32, "N 3"]
+    flat: Float[Floats32, "N 3"]
+    normal: Float[Floats32, "N 3"]
+    color: Float[Floats32, "N 3"]
+    lift: Float[Floats32, N]
 
     @classmethod
-    def none(cls, face: IntArray) -> Hits:
-        """Hits of nothing yet, for faces (N,) that are all -1."""
+    def none(cls, face: Int[Ints, N]) -> Hits:
+        """No hits yet: ``face`` is -1 everywhere."""
         place, flat, normal, color = np.zeros((4, len(face), 3), np.float32)
         return cls(face, place, flat, normal, color, np.full(len(face), _LIFT, np.float32))
 
 
 class Scene:
-    """Surfaces, and perhaps a ground, ready to be asked what lies along a ray."""
+    """Surfaces, and perhaps a ground, ready for rays."""
 
     def __init__(self, surfaces: list[Surface], ground: Ground | None = None, opacity: float = 1.0) -> None:
         self.surfaces, self.ground, self.opacity = surfaces, ground, opacity
@@ -99,15 +98,17 @@ class Scene:
         self._mesh = TriangleMesh(self._embree, self.verts, self.faces)
 
     @cached_property
-    def bounds(self) -> FloatArray:
-        """(2, 2) left, bottom; right, top of the part of the picture where anything can be."""
+    def bounds(self) -> Float[Floats, "2 2"]:
+        """Left, bottom; right, top of the part of the picture where anything can be."""
         ends = [part.extent[:, :2] for part in self.surfaces]
         if self.ground is not None:
             ends += [np.stack([spot[:2] - spot[2:], spot[:2] + spot[2:]]) for spot in self.ground.spots]
         return np.stack([np.min(ends, axis=(0, 1)), np.max(ends, axis=(0, 1))])
 
-    def blocked(self, places: Floats32, directions: Floats32, reach: float) -> NDArray[np.bool_]:
-        """(N,) whether anything lies within reach of places (N, 3) along unit directions (N, 3)."""
+    def blocked(
+        self, places: Float[Floats32, "N 3"], directions: Float[Floats32, "N 3"], reach: float
+    ) -> Bool[Bools, N]:
+        """Whether anything lies within reach of each place along a unit direction."""
         found = self._embree.run(
             np.ascontiguousarray(places, np.float32),
             np.ascontiguousarray(directions, np.float32),
@@ -116,8 +117,8 @@ class Scene:
         )
         return np.asarray(found >= 0)
 
-    def look(self, x: FloatArray, y: FloatArray, pixel: float) -> Hits:
-        """What is seen at points (N,) of the picture plane."""
+    def look(self, x: Float[Floats, N], y: Float[Floats, N], pixel: float) -> Hits:
+        """What is seen at points of the picture plane; ``pixel`` is the size of a pixel, for textures."""
         count = len(x)
         face = np.full(count, -1, np.int64)
         hits = Hits.none(face)
@@ -146,8 +147,10 @@ class Scene:
             hits.color[there] = strength[:, None]
         return hits
 
-    def _describe(self, hits: Hits, rows: IntArray, weights: Floats32, pixel: float) -> NDArray[np.bool_]:
-        """Fill in rows (N,) of the hits; whether (N,) each is a hole in its texture."""
+    def _describe(
+        self, hits: Hits, rows: Int[Ints, N], weights: Float[Floats32, "N 3"], pixel: float
+    ) -> Bool[Bools, N]:
+        """Fill in rows of the hits; whether each is a hole in its texture."""
         face = hits.face[rows]
         holes = np.zeros(len(rows), bool)
         corners = self.faces[face]

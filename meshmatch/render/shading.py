@@ -1,28 +1,27 @@
-"""Light: a large soft lamp, a fill, a sky that hollows see little of.
+"""Light: a large soft key lamp, a fill, and a sky with ambient occlusion.
 
-Nothing is drawn by chance. Each lamp is a fixed set of directions, dealt out to the pixels in blocks of 4 x 4, on
-the ground of 8 x 8; a filter over such blocks gives every pixel the mean over the whole set, so there are soft shadows
-without noise.
+Nothing is random. Each lamp is a fixed set of directions, dealt out to the pixels in blocks of 4 x 4, on the ground of
+8 x 8; a filter over such blocks gives every pixel the mean over the whole set: soft shadows without noise.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from meshmatch.render.scene import Floats32, Hits, Scene
+from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
+from meshmatch.render.scene import Hits, Scene
 
 BLOCK, GROUND_BLOCK = 4, 8
-"""Sides of a block of pixels on a surface and on the ground: each pixel of a block asks other directions."""
+"""Sides of a block of pixels on a surface and on the ground: each pixel of a block uses other directions."""
 _SUBSETS = GROUND_BLOCK**2
 _KEY_RAYS = 4  # a pixel
 _SKY_RAYS = 8
-_REACH = 0.75  # how far away something may stand and still take sky from a place
+_REACH = 0.75  # how far away something may be and still occlude the sky
 _SHADOW_REACH = 1.6
 _AT_ONCE = 20_000  # rows: what belongs to them then stays in the processor's cache
 
 
-def _unit(x: float, y: float, z: float) -> NDArray[np.float32]:
+def _unit(x: float, y: float, z: float) -> Float[Floats32, 3]:
     return (np.array([x, y, z]) / np.linalg.norm([x, y, z])).astype(np.float32)
 
 
@@ -32,14 +31,14 @@ _FILL_COLOR = np.array([0.93, 0.98, 1.08], np.float32)
 _LAMP = 0.40  # radius of the key lamp's disc at distance 1
 
 
-def _spread(count: int) -> NDArray[np.float64]:
-    """(count, 3) numbers in 0..1, evenly spread, and any run of them too (Roberts' R3 sequence)."""
+def _spread(count: int) -> Float[Floats, "count 3"]:
+    """Numbers in 0..1, evenly spread, and any run of them too (Roberts' R3 sequence)."""
     root = 1.22074408460575947536  # of x^4 = x + 1
     return (0.5 + np.arange(1, count + 1)[:, None] * np.array([1 / root, root**-2, root**-3])) % 1.0
 
 
-def _key_directions() -> tuple[Floats32, Floats32]:
-    """Directions (_SUBSETS, rays, 3) towards points of the lamp, and how far each ray looks."""
+def _key_directions() -> tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]:
+    """Unit directions towards points of the lamp, and how far each ray looks, in S subsets of R rays."""
     numbers = _spread(_SUBSETS * _KEY_RAYS)
     side = np.cross(_KEY, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
@@ -54,8 +53,8 @@ def _key_directions() -> tuple[Floats32, Floats32]:
     )
 
 
-def _sky_directions() -> tuple[Floats32, Floats32]:
-    """Directions (_SUBSETS, rays, 3) around +z, as dense as their cosine, and how far each ray looks."""
+def _sky_directions() -> tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]:
+    """Unit directions around +z, distributed by their cosine, and how far each ray looks."""
     numbers = _spread(_SUBSETS * _SKY_RAYS)
     angle, radius = 2 * np.pi * numbers[:, 0], np.sqrt(numbers[:, 1])
     local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)
@@ -70,12 +69,12 @@ _KEY_SET, _KEY_FAR = _key_directions()
 _SKY_SET, _SKY_FAR = _sky_directions()
 
 
-def seen_light(
-    scene: Scene, hits: Hits, rows: NDArray[np.int64], row: NDArray[np.int64], column: NDArray[np.int64]
-) -> Floats32:
-    """Shares (N, 2) of the key lamp and of the sky that reach ``rows`` (N,) of the hits.
+def visibility(
+    scene: Scene, hits: Hits, rows: Int[Ints, N], row: Int[Ints, N], column: Int[Ints, N]
+) -> Float[Floats32, "N 2"]:
+    """Shares of the key lamp and of the sky that reach ``rows`` of the hits.
 
-    ``row`` and ``column`` (N,) of their pixels say which subset of the directions each asks.
+    ``row`` and ``column`` of their pixels select the subset of the directions that each uses.
     """
     result = np.empty((len(rows), 2), np.float32)
     ground = hits.face[rows] == -2
@@ -86,7 +85,9 @@ def seen_light(
     for number, end in enumerate(ends):  # rows of one subset share their directions
         own = order[ends[number - 1] if number else 0 : end]
         subset = number % _SUBSETS
-        few = slice(None, None, 2 if number >= _SUBSETS else 1)  # the ground's larger blocks need fewer each
+        few = slice(
+            None, None, 2 if number >= _SUBSETS else 1
+        )  # the larger blocks of the ground need fewer per pixel
         lamp = _KEY_SET[subset, few], _KEY_FAR[subset, few]
         sky = _SKY_SET[subset, few], _SKY_FAR[subset, few]
         for first in range(0, len(own), _AT_ONCE):
@@ -99,9 +100,14 @@ def seen_light(
 
 
 def _lamp_seen(
-    scene: Scene, places: Floats32, flat: Floats32, normal: Floats32, aims: Floats32, reaches: Floats32
-) -> Floats32:
-    # At a grazing angle a facet shades its neighbours although the smooth surface is lit: shadows fade there.
+    scene: Scene,
+    places: Float[Floats32, "N 3"],
+    flat: Float[Floats32, "N 3"],
+    normal: Float[Floats32, "N 3"],
+    aims: Float[Floats32, "R 3"],
+    reaches: Float[Floats32, R],
+) -> Float[Floats32, N]:
+    # At a grazing angle a facet shades its neighbors although the smooth surface is lit: shadows fade there.
     grazing = np.clip((flat @ _KEY) / np.float32(0.3), 0.0, 1.0)
     facing = np.flatnonzero((normal @ _KEY > -0.2) & (grazing > 0))
     hidden = np.zeros(len(places), np.float32)
@@ -112,20 +118,25 @@ def _lamp_seen(
 
 
 def _sky_seen(
-    scene: Scene, places: Floats32, flat: Floats32, normal: Floats32, aims: Floats32, reaches: Floats32
-) -> Floats32:
+    scene: Scene,
+    places: Float[Floats32, "N 3"],
+    flat: Float[Floats32, "N 3"],
+    normal: Float[Floats32, "N 3"],
+    aims: Float[Floats32, "R 3"],
+    reaches: Float[Floats32, R],
+) -> Float[Floats32, N]:
     side, up = _tangents(normal)
     taken = np.zeros(len(places), np.float32)
     for (x, y, z), reach in zip(aims, reaches, strict=True):
         aim = x * side + y * up + z * normal
         below = np.minimum(2 * np.einsum("ni,ni->n", aim, flat), 0)
-        aim -= below[:, None] * flat  # a ray into the facet goes back out
+        aim -= below[:, None] * flat  # a ray into the facet is reflected out
         taken += scene.blocked(places, aim, reach)
     return np.asarray(1.0 - taken / len(aims), np.float32)
 
 
-def _tangents(normal: Floats32) -> tuple[Floats32, Floats32]:
-    """Two unit vectors across each normal that change smoothly with it (Duff et al. 2017); z > -1."""
+def _tangents(normal: Float[Floats32, "N 3"]) -> tuple[Float[Floats32, "N 3"], Float[Floats32, "N 3"]]:
+    """Two unit tangents of each normal (z > -1) that change smoothly with it (Duff et al. 2017)."""
     x, y, z = normal[:, 0], normal[:, 1], np.maximum(normal[:, 2], -0.999)
     a = -1.0 / (1.0 + z)
     b = x * y * a
@@ -135,14 +146,14 @@ def _tangents(normal: Floats32) -> tuple[Floats32, Floats32]:
     )
 
 
-def shade(hits: Hits, rows: NDArray[np.int64], seen: Floats32) -> Floats32:
-    """Light (N, 3) that rows (N,) of the hits send to the viewer; ``seen`` (N, 2) as from `seen_light`."""
+def shade(hits: Hits, rows: Int[Ints, N], seen: Float[Floats32, "N 2"]) -> Float[Floats32, "N 3"]:
+    """Linear light that rows of the hits send to the viewer; ``seen`` as from `visibility`."""
     normal, color = hits.normal[rows], hits.color[rows]
     lamp, sky = seen[:, 0], seen[:, 1]
     key = np.clip((normal @ _KEY + 0.15) / 1.15, 0, None) * (0.25 + 0.75 * lamp)
     fill = np.clip((normal @ _FILL + 0.3) / 1.3, 0, None) * sky
     above = 0.62 + 0.38 * normal[:, 1]
-    # Light that bounces in a hollow takes the colour of its walls (Jimenez et al. 2016).
+    # Light that bounces in a hollow takes the color of its walls (Jimenez et al. 2016).
     first, second, third = 2.0404 * color - 0.3324, -4.7951 * color + 0.6417, 2.7552 * color + 0.6903
     deep = sky[:, None]
     around = np.maximum(deep, ((deep * first + second) * deep + third) * deep)
@@ -154,7 +165,7 @@ def shade(hits: Hits, rows: NDArray[np.int64], seen: Floats32) -> Floats32:
     return np.asarray(color * light + (gloss + 0.06 * edge)[:, None], np.float32)
 
 
-def shadow(seen: Floats32) -> Floats32:
-    """How dark (N,) the ground is, 0 to 1, where shares ``seen`` (N, 2) of lamp and sky reach it."""
+def shadow(seen: Float[Floats32, "N 2"]) -> Float[Floats32, N]:
+    """How dark the ground is, 0 to 1, where shares ``seen`` of lamp and sky reach it."""
     dark = 0.30 * (1.0 - seen[:, 0]) + 0.52 * (1.0 - seen[:, 1])
     return np.asarray(np.clip(dark, 0.0, 0.85), np.float32)

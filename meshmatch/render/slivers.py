@@ -1,22 +1,19 @@
-"""What is thinner than a pixel, and so slips between the rays: it has edges, and these are met."""
+"""Parts thinner than a pixel, which slip between the rays: their edges are sampled and so found."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Bool, Bools, Float, Floats32
 from meshmatch.render.layout import Viewport
-from meshmatch.render.scene import Floats32, Scene
+from meshmatch.render.scene import Scene
 
 MOST_POINTS = 6_000_000
-"""Along the edges of each of the three sides of the triangles."""
+"""Maximum along each of the three sides of all triangles."""
 
 
-def edge_points(scene: Scene, viewport: Viewport) -> Floats32:
-    """Points (N, 3) along all edges of the scene, not more than a pixel apart: column, row, depth.
-
-    What is thinner than a pixel may slip between the rays; but it has edges, and these are met.
-    """
+def edge_points(scene: Scene, viewport: Viewport) -> Float[Floats32, "N 3"]:
+    """Points along all edges of the scene, not more than a pixel apart: column, row, depth."""
     column = (scene.verts[:, 0] - np.float32(viewport.left)) / np.float32(viewport.pixel)
     row = (np.float32(viewport.top) - scene.verts[:, 1]) / np.float32(viewport.pixel)
     points = np.stack([column, row, scene.verts[:, 2]], axis=1)
@@ -35,8 +32,10 @@ def edge_points(scene: Scene, viewport: Viewport) -> Floats32:
     return np.concatenate(parts)
 
 
-def slivers(edges: Floats32, low: int, depth: Floats32, viewport: Viewport) -> NDArray[np.bool_]:
-    """Pixels in which an edge lies in front of everything that the rays around it met."""
+def slivers(
+    edges: Float[Floats32, "N 3"], low: int, depth: Float[Floats32, "H W"], viewport: Viewport
+) -> Bool[Bools, "H W"]:
+    """Pixels, from row ``low`` on, in which an edge lies in front of everything that the rays around it hit."""
     H, W = depth.shape
     row, column = edges[:, 1] - low, edges[:, 0]
     inside = np.flatnonzero((row >= 0) & (row < H) & (column >= 0) & (column < W))

@@ -1,6 +1,6 @@
-"""Triangles as the picture needs them: places, smooth normals, and paint.
+"""Triangles as the picture needs them: vertices, smooth normals, and paint.
 
-View coordinates everywhere in this room: x to the right, y up, z towards the viewer, lengths of about 1.
+View coordinates: x to the right, y up, z towards the viewer, lengths of about 1. Colors are linear.
 """
 
 from __future__ import annotations
@@ -12,40 +12,44 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.topology import same_rows
 from meshmatch.geometry.triangles import vertex_normals
 
-FloatArray = NDArray[np.floating[Any]]
-IntArray = NDArray[np.int64]
+AnyFloats = NDArray[np.floating[Any]]
 
 
 class Paint(Protocol):
-    """What gives a triangle its colour at each of its points."""
+    """What gives a triangle its color at each of its points."""
 
-    def at(self, faces: IntArray, weights: FloatArray, footprint: float) -> FloatArray:
-        """Linear colours (N, 3) at points of triangles (N,) with weights (N, 3) of their corners; or (N, 4), where
-        the last below a half is a hole.
+    def at(
+        self, faces: Int[Ints, N], weights: Float[AnyFloats, "N 3"], footprint: float
+    ) -> Float[AnyFloats, "N C"]:
+        """Colors, three or four columns, at points of triangles given by barycentric weights; a fourth value below a
+        half is a hole.
 
-        ``footprint`` is the size of a pixel in view coordinates: what is finer than that is averaged.
+        ``footprint`` is the size of a pixel in view coordinates: finer detail is averaged.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class VertexPaint:
-    """Linear colours (V, 3) of the vertices of triangles (F, 3).
+    """Colors of the vertices of triangles.
 
-    ``sharp``: each point has the colour of the corner nearest to it, for labels; otherwise colours are mixed.
+    ``sharp``: each point has the color of the corner nearest to it, for labels; otherwise colors are interpolated.
     """
 
-    colors: FloatArray
-    faces: IntArray
+    colors: Float[AnyFloats, "V 3"]
+    faces: Int[Ints, "F 3"]
     sharp: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "colors", np.asarray(self.colors, np.float32))
 
-    def at(self, faces: IntArray, weights: FloatArray, footprint: float) -> FloatArray:
+    def at(
+        self, faces: Int[Ints, N], weights: Float[AnyFloats, "N 3"], footprint: float
+    ) -> Float[AnyFloats, "N C"]:
         corners = self.faces[faces]
         if self.sharp:
             return self.colors[np.take_along_axis(corners, weights.argmax(axis=1)[:, None], axis=1)[:, 0]]
@@ -54,14 +58,16 @@ class VertexPaint:
 
 @dataclass(frozen=True, eq=False)
 class FacePaint:
-    """One linear colour for each triangle (F, 3)."""
+    """One color per triangle."""
 
-    colors: FloatArray
+    colors: Float[AnyFloats, "F 3"]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "colors", np.asarray(self.colors, np.float32))
 
-    def at(self, faces: IntArray, weights: FloatArray, footprint: float) -> FloatArray:
+    def at(
+        self, faces: Int[Ints, N], weights: Float[AnyFloats, "N 3"], footprint: float
+    ) -> Float[AnyFloats, "N C"]:
         return self.colors[faces]
 
 
@@ -71,49 +77,51 @@ class Surface:
 
     Parameters
     ----------
-    verts : (V, 3)
-    faces : (F, 3) int64
-    normals : (V, 3)
+    normals
         Unit, or zero where the triangle's own is to be used.
     paint
-        Asked with numbers of these faces.
-    loose : float
+        Called with indices of these faces.
+    loose
         How far triangles that belong to one surface may lie above each other, as the discs of a cloud do; their
-        normals are then taken as they are.
+        normals are then used as they are.
     """
 
-    verts: FloatArray
-    faces: IntArray
-    normals: FloatArray
+    verts: Float[AnyFloats, "V 3"]
+    faces: Int[Ints, "F 3"]
+    normals: Float[AnyFloats, "V 3"]
     paint: Paint
     loose: float = 0.0
 
     @cached_property
-    def extent(self) -> FloatArray:
-        """(2, 3) lowest and highest corner of all triangles."""
+    def extent(self) -> Float[AnyFloats, "2 3"]:
+        """Lowest and highest corner of all triangles."""
         used = np.zeros(len(self.verts), bool)
         used[self.faces] = True
         drawn = self.verts[used]
         return np.stack([drawn.min(axis=0), drawn.max(axis=0)])
 
-    def moved(self, shift: FloatArray) -> Surface:
-        """The same elsewhere."""
+    def moved(self, shift: Float[Floats, 3]) -> Surface:
+        """The surface translated by ``shift``."""
         return replace(self, verts=self.verts + shift)
 
 
 @dataclass(frozen=True, eq=False)
 class SomeFaces:
-    """The paint of a mesh of which only some triangles, ``chosen`` (N,), are drawn."""
+    """The paint of a mesh of which only some triangles are drawn."""
 
     paint: Paint
-    chosen: IntArray
+    chosen: Int[Ints, N]
 
-    def at(self, faces: IntArray, weights: FloatArray, footprint: float) -> FloatArray:
+    def at(
+        self, faces: Int[Ints, N], weights: Float[AnyFloats, "N 3"], footprint: float
+    ) -> Float[AnyFloats, "N C"]:
         return self.paint.at(self.chosen[faces], weights, footprint)
 
 
-def mesh_surface(verts: FloatArray, faces: IntArray, paint: Paint, chosen: IntArray | None = None) -> Surface:
-    """A mesh, or the ``chosen`` of its triangles; normals are smooth, also across the double vertices of texture
+def mesh_surface(
+    verts: Float[AnyFloats, "V 3"], faces: Int[Ints, "F 3"], paint: Paint, chosen: Int[Ints, N] | None = None
+) -> Surface:
+    """A mesh, or the ``chosen`` of its triangles; normals are smooth, also across the duplicate vertices of texture
     seams and stl files.
     """
     if chosen is not None:
@@ -123,16 +131,27 @@ def mesh_surface(verts: FloatArray, faces: IntArray, paint: Paint, chosen: IntAr
     return Surface(verts, faces, normals, paint)
 
 
-def balls(centers: FloatArray, radius: float, colors: FloatArray) -> Surface:
-    """A ball for every center (K, 3) in its linear colour (K, 3), round enough for its number."""
+def balls(centers: Float[AnyFloats, "K 3"], radius: float, colors: Float[AnyFloats, "K 3"]) -> Surface:
+    """A ball around every center in its color; the fewer, the finer."""
     verts, faces = _ball(
         4 if len(centers) <= 60 else 3 if len(centers) <= 1_000 else 2 if len(centers) <= 5_000 else 1
     )
-    return _copies(verts, faces, verts, centers, radius, colors)
+    count = len(centers)
+    return Surface(
+        (centers[:, None] + radius * verts).reshape(-1, 3),
+        (faces + len(verts) * np.arange(count)[:, None, None]).reshape(-1, 3),
+        np.tile(verts, (count, 1)),
+        FacePaint(np.repeat(colors, len(faces), axis=0)),
+    )
 
 
-def discs(centers: FloatArray, normals: FloatArray, radius: FloatArray, colors: FloatArray) -> Surface:
-    """A flat disc of eight sides for every center (K, 3), across its normal (K, 3), with its radius (K,)."""
+def discs(
+    centers: Float[AnyFloats, "K 3"],
+    normals: Float[AnyFloats, "K 3"],
+    radius: Float[AnyFloats, K],
+    colors: Float[AnyFloats, "K 3"],
+) -> Surface:
+    """A flat octagon for every center, perpendicular to its normal, with its radius."""
     turn = 2 * np.pi * np.arange(8) / 8
     side = np.where(np.abs(normals[:, :1]) < 0.8, [[1.0, 0, 0]], [[0, 1.0, 0]])
     first = np.cross(normals, side)
@@ -148,24 +167,7 @@ def discs(centers: FloatArray, normals: FloatArray, radius: FloatArray, colors: 
     return Surface(rim.reshape(-1, 3), faces, np.repeat(normals, 8, axis=0), paint, loose)
 
 
-def _copies(
-    verts: FloatArray,
-    faces: IntArray,
-    normals: FloatArray,
-    centers: FloatArray,
-    radius: float,
-    colors: FloatArray,
-) -> Surface:
-    count = len(centers)
-    return Surface(
-        (centers[:, None] + radius * verts).reshape(-1, 3),
-        (faces + len(verts) * np.arange(count)[:, None, None]).reshape(-1, 3),
-        np.tile(normals, (count, 1)),
-        FacePaint(np.repeat(colors, len(faces), axis=0)),
-    )
-
-
-def _ball(subdivisions: int) -> tuple[FloatArray, IntArray]:
+def _ball(subdivisions: int) -> tuple[Float[Floats, "V 3"], Int[Ints, "F 3"]]:
     verts = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
     for _ in range(subdivisions):

@@ -1,29 +1,22 @@
-"""The textures of a file, laid on the triangles of a picture."""
+"""The textures of a file on the triangles of a picture."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from meshmatch.render.surface import FloatArray, IntArray
+from meshmatch.arrays import Bool, Bools, Float, Floats32, Int, Ints
+from meshmatch.render.surface import AnyFloats
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.pyramid import Pyramid
 
-Floats32 = NDArray[np.float32]
-_NOTHING = 0.05  # an alpha below this is meant to be invisible
+_INVISIBLE = 0.05  # an alpha below this is meant to be invisible
 
 
 class TexturePaint:
-    """Paint by the materials of a file: image times factor times vertex colour, as glTF defines it.
+    """Paint by the materials of a file: image times factor times vertex color, as glTF defines it.
 
-    Parameters
-    ----------
-    look : Appearance
-    shape : Shape
-        Of the same file.
-    scale : float
-        Length in the file that is 1 in view coordinates.
+    ``shape`` is of the same file, and ``scale`` the length in it that is 1 in view coordinates.
     """
 
     def __init__(self, look: Appearance, shape: Shape, scale: float) -> None:
@@ -39,15 +32,17 @@ class TexturePaint:
                 if key not in shared:
                     shared[key] = Pyramid.of(material)
                 self._pyramids[number] = shared[key]
-        # Texels along a unit of length of each face: as wide as a pixel is, so much is averaged.
+        # Texels per unit of length on each face: a pixel averages as many as it is wide.
         a, b = look.uv[:, 1] - look.uv[:, 0], look.uv[:, 2] - look.uv[:, 0]
         flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
         solid = 2.0 * shape.face_areas / scale**2
         sizes = np.array([_texels(material) for material in look.materials])[look.material]
         self._density = np.sqrt(flat * sizes / np.maximum(solid, 1e-20)).astype(np.float32)
 
-    def at(self, faces: IntArray, weights: FloatArray, footprint: float) -> FloatArray:
-        """Linear colours (N, 4); the last is 1, or 0 for a hole."""
+    def at(
+        self, faces: Int[Ints, N], weights: Float[AnyFloats, "N 3"], footprint: float
+    ) -> Float[Floats32, "N 4"]:
+        """Linear colors and 1, or 0 for a hole (see `Paint.at`)."""
         weights = np.asarray(weights, np.float32)
         out = np.ones((len(faces), 4), np.float32)
         materials = self._look.material[faces]
@@ -67,8 +62,8 @@ class TexturePaint:
         return out
 
 
-def _solid(material: Material, image: Floats32, factor: Floats32) -> NDArray[np.bool_]:
-    """(N,) whether there is anything, by the alpha of the image and of what it is multiplied by.
+def _solid(material: Material, image: Float[Floats32, N], factor: Float[Floats32, N]) -> Bool[Bools, N]:
+    """Whether there is anything, by the alpha of the image and of its factor.
 
     Half-transparent glass is drawn as if it were solid; what an image cuts out, such as hair from its card, is not.
     """
@@ -76,7 +71,7 @@ def _solid(material: Material, image: Floats32, factor: Floats32) -> NDArray[np.
         return np.ones(len(image), bool)
     if material.alpha == "mask":
         return np.asarray(image * factor >= material.cutoff)
-    return np.asarray((image >= 0.5) & (factor >= _NOTHING))
+    return np.asarray((image >= 0.5) & (factor >= _INVISIBLE))
 
 
 def _texels(material: Material) -> float:

@@ -123,10 +123,10 @@ def test_light_that_nothing_blocks_is_whole_and_a_lid_takes_it() -> None:
     x = np.array([0.0, 0.1])
     hits = open_floor.look(x, x, 0.01)
     rows = np.arange(2)
-    assert (shading.seen_light(open_floor, hits, rows, rows, rows) == 1).all()
+    assert (shading.visibility(open_floor, hits, rows, rows, rows) == 1).all()
     lid = square(8.0, 0.02)
     covered = Scene([square(0.8), Surface(lid.verts, lid.faces, lid.normals, lid.paint)])
-    seen = shading.seen_light(covered, hits, rows, rows, rows)
+    seen = shading.visibility(covered, hits, rows, rows, rows)
     assert (seen[:, 0] == 0).all()
     assert (seen[:, 1] < 0.35).all()  # some rays end before the lid: what is near counts most
 
