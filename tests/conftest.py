@@ -13,7 +13,11 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from meshmatch.shapes.shape import Shape
+from tests import array_annotations
+
+array_annotations.install(["meshmatch"])  # before any of its modules is loaded
+
+from meshmatch.shapes.shape import Shape  # noqa: E402
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -36,13 +40,13 @@ def remembering(folder: Path) -> Iterator[None]:
 
     fit = Fitter.fit
 
-    def remembered(fitter, shape, landmarks=None):
-        model = fitter.model
-        key = (model.card.weights_sha256, model.template.hash, fitter.config, landmarks, shape.name)
-        file = folder / sha256(pickle.dumps((key, shape.verts, shape.faces))).hexdigest()
+    def remembered(self, shape, landmarks=None):
+        model = self.model.card.weights_sha256, self.model.template.hash
+        key = (*model, self.config, landmarks, shape.name, shape.verts, shape.faces)
+        file = folder / sha256(pickle.dumps(key)).hexdigest()
         with FileLock(f"{file}.lock"):
             if not file.exists():
-                file.write_bytes(pickle.dumps(fit(fitter, shape, landmarks)))
+                file.write_bytes(pickle.dumps(fit(self, shape, landmarks)))
             return pickle.loads(file.read_bytes())
 
     with pytest.MonkeyPatch.context() as patch:
