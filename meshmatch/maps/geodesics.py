@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints, Ints32
 from meshmatch.errors import InputError
+from meshmatch.geometry.topology import edges_of, same_rows
 from meshmatch.shapes.shape import Shape
 
 CHUNK_BYTES = 64_000_000
@@ -27,9 +28,8 @@ Arcs = tuple[Ints, Ints, Floats]
 
 def edge_arcs(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Arcs:
     """Every edge once: ends ``(E,)``, ends ``(E,)``, length ``(E,)`` in the unit of ``verts``."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0)
-    i, j = edges[:, 0], edges[:, 1]
+    i, j = edges_of(faces).vertices.T
+    i, j = i[i != j], j[i != j]
     return i, j, np.linalg.norm(verts[i] - verts[j], axis=1)
 
 
@@ -77,7 +77,9 @@ def surface_graph(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> csr_m
     i, j, length = (
         np.concatenate(p) for p in zip(edge_arcs(verts, faces), diagonal_arcs(verts, faces), strict=True)
     )
-    first, other = _coincident(verts)
+    first = same_rows(verts)
+    other = np.flatnonzero(first != np.arange(size))
+    first = first[other]
     i, j = np.concatenate([i, first]), np.concatenate([j, other])
     length = np.concatenate([length, np.zeros(len(first))])
     count, part = connected_components(
@@ -97,12 +99,6 @@ def surface_graph(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> csr_m
     i, j, length = i[keep], j[keep], length[keep]
     rows, columns = np.concatenate([i, j]), np.concatenate([j, i])
     return csr_matrix((np.concatenate([length, length]), (rows, columns)), shape=(size, size))
-
-
-def _coincident(verts: Floats) -> tuple[Ints, Ints]:
-    order = np.lexsort(verts.T)
-    same = np.flatnonzero((verts[order[1:]] == verts[order[:-1]]).all(axis=1))
-    return order[same].astype(np.int64), order[same + 1].astype(np.int64)
 
 
 def _bridges(verts: Floats, part: Ints32) -> tuple[Ints, Ints]:

@@ -17,7 +17,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.topology import edges_of, is_discontinuous
 from meshmatch.maps.surface import Footpoints
 
-# A piece with this share of the surface is no island. Set by hand.
+# A piece with at least this share of the surface is not an island. Set by hand.
 _MAINLAND = 0.06
 # Steps from the rim into an island over which images of the surroundings are extended.
 _STEPS = 120

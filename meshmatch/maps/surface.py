@@ -2,8 +2,8 @@
 
 For many queries that lie near the surface, such as the vertices of a shape around a fitted template: the nearest vertex
 in a space of positions and normals, then the closest of its triangles. It is fast and knows the resting template, but
-not exact for triangles that are large beside the distance. `meshmatch.transfer.mapped_mesh` is exact whatever the size
-of the triangles; `meshmatch.transfer.surface_walk` starts from a known face and never changes to another sheet.
+not exact for triangles that are large compared with the distance. `meshmatch.transfer.mapped_mesh` is exact for
+triangles of any size; `meshmatch.transfer.surface_walk` starts from a known face and never changes to another sheet.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import blend, closest_on_triangles, interpolate, squared_lengths
 from meshmatch.maps.map_checks import corners_of
 
-# How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area): enough to tell
-# the sides of a thin wall. More would drag points along the surface to where it bends the same way. Set by hand.
+# By how much a neighbour whose normal points the other way (2 units) is further away than it is, in units of
+# sqrt(area): enough to separate the sides of a thin wall. A larger weight would move points along the surface to where
+# it bends the same way. Set by hand.
 NORMAL_WEIGHT = 0.02
-# How much a distance on the resting template counts beside one in space. Set by hand.
+# How much a distance on the resting template counts compared with one in space. Set by hand.
 RESTING_WEIGHT = 0.4
 # Queries at a time: what belongs to them then stays in the processor's cache.
 _CHUNK = 8192
@@ -104,8 +105,8 @@ class Surface:
 
         def answer(low: int) -> None:
             part = slice(low, min(low + _CHUNK, N))
-            sought = _features(points[part], normals[part], None if resting is None else resting[part])
-            vertex[part] = self._used[self._tree.query(sought)[1]]
+            features = _features(points[part], normals[part], None if resting is None else resting[part])
+            vertex[part] = self._used[self._tree.query(features)[1]]
             if len(self.faces):
                 face[part], weights[part], distance[part] = self._on_faces(points[part], vertex[part])
             else:

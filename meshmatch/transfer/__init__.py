@@ -1,5 +1,5 @@
-"""Carrying what lies on one shape to another, along a map. Arrays in, arrays out.
+"""Transfer of what lies on one shape to another, along a map. Arrays in, arrays out; no torch.
 
-Everything is pulled back: a map from the target to the source says for each vertex of the target where on the
-source its value comes from (`direction`); landmarks alone go forward.
+Values, labels, weights and textures are pulled back: a map from the target to the source says for each vertex of the
+target where on the source its value comes from. Landmarks alone are pushed forward, by a map from source to target.
 """

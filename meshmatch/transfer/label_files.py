@@ -103,7 +103,7 @@ def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
     Parameters
     ----------
     on : optional
-        What they belong to; told by their count if not given.
+        What they belong to; taken from their count if not given.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
     name = Path(path).name
     if on is not None and written is not None and on != written:
         raise OptionError(f"{name} says that it holds labels of {written}, not of {on}", "leave out --on")
-    return _labels(name, values, _belongs(name, len(values), shape, on or written))
+    return _labels(name, values, _on(name, len(values), shape, on or written))
 
 
 def labels_of(values: ArrayLike, shape: Shape, on: On | None = None) -> Labels:
@@ -130,10 +130,10 @@ def labels_of(values: ArrayLike, shape: Shape, on: On | None = None) -> Labels:
     array = np.asarray(values)
     if array.ndim != 1 or array.dtype.kind not in "iufbUO":
         raise InputError(f"labels must be a list of (N,), not an array of {array.shape} {array.dtype}", _HINT)
-    return _labels("the array", array.tolist(), _belongs("the array", len(array), shape, on))
+    return _labels("the array", array.tolist(), _on("the array", len(array), shape, on))
 
 
-def _belongs(name: str, count: int, shape: Shape, on: str | None) -> On:
+def _on(name: str, count: int, shape: Shape, on: str | None) -> On:
     """Vertices or faces, by what was said and by the count."""
     owner = shape.name or "the source"
     fits = [kind for kind, size in (("vertices", shape.V), ("faces", shape.F)) if size == count]
@@ -159,7 +159,7 @@ def _labels(name: str, values: Sequence[Any], on: On) -> Labels:
     else:
         for raw in values:
             if isinstance(raw, float):
-                raise InputError(f"{name}: {raw} is no label", "transfer-color interpolates numbers")
+                raise InputError(f"{name}: {raw} is not a label", "transfer-color interpolates numbers")
             if not isinstance(raw, str | int | None):
                 raise InputError(f"{name}: a label is a whole number or a word, not {str(raw)[:40]!r}", _HINT)
             word = plain_text(" ".join(str(raw).split()))  # one line each
@@ -233,7 +233,7 @@ def _parts(record: dict[str, Any], shape: Shape, on: On | None) -> list[Any]:
         whole = isinstance(members, list) and all(type(member) is int for member in members)
         if not whole or (members and not 0 <= min(members) <= max(members) < size):
             raise InputError(
-                f"'{part[:40]}' is no list of {on or 'vertices'} of {shape.name or 'the source'}",
+                f"'{part[:40]}' is not a list of {on or 'vertices'} of {shape.name or 'the source'}",
                 f"its {on or 'vertices'} are 0 to {size - 1}",
             )
         for member in members:

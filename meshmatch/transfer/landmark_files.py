@@ -171,7 +171,7 @@ def _entry(record: dict[str, Any], number: int) -> _Entry:
 
 def _whole(value: Any, name: str) -> int:
     if isinstance(value, bool) or int(value) != value or abs(int(value)) >= 2**62:
-        raise InputError(f"landmark {name}: {str(value)[:40]} is no number of a vertex or face")
+        raise InputError(f"landmark {name}: {str(value)[:40]} is not the number of a vertex or face")
     return int(value)
 
 
@@ -190,7 +190,7 @@ def _read_pp(path: Path) -> list[_Entry]:
     except ElementTree.ParseError as error:
         raise InputError(f"it is not XML: {error}") from error
     if root.tag != "PickedPoints":
-        raise InputError(f"it is no file of MeshLab's picked points: its root is '{root.tag}'")
+        raise InputError(f"it is not a file of MeshLab's picked points: its root is '{root.tag}'")
     entries: list[_Entry] = []
     for point in root.iter("point"):
         if point.get("active", "1") == "0":
@@ -228,7 +228,8 @@ def save_landmarks(path: Path, landmarks: Landmarks) -> None:
     )
     if suffix == ".csv":
         cells = (
-            [name, vertex, *xyz, face, *weights, sure] for name, vertex, xyz, face, weights, sure in rows
+            [name, vertex, *xyz, face, *weights, confidence]
+            for name, vertex, xyz, face, weights, confidence in rows
         )
         write_rows(path, COLUMNS, cells)
         return

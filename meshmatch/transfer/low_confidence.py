@@ -39,7 +39,7 @@ class LowConfidence:
 def vertex_graph(shape: Shape) -> csr_array:
     """(V, V) sparse, symmetric: lengths of the edges of a mesh, or to the nearest points in a cloud.
 
-    Vertices at one place are joined, so that texture seams cut nothing apart.
+    Vertices at one place are joined, so that texture seams do not separate.
     """
     if shape.is_cloud:
         near = cKDTree(shape.verts).query(shape.verts, min(_NEIGHBOURS + 1, shape.V))[1].reshape(shape.V, -1)
@@ -76,9 +76,9 @@ def _graph(points: Floats, pairs: Ints) -> csr_array:
 def nearest_known(graph: csr_array, known: Bools) -> Ints:
     """(N,) for each node the nearest known one along the graph; itself if it is known; -1 out of reach."""
     nearest = np.where(known, np.arange(len(known)), -1)
-    # Only the unknown and those beside them matter, however large the rest is.
-    beside = np.asarray(graph @ (~known).astype(np.float64)) > 0
-    some = np.flatnonzero(~known | beside)
+    # Only the unknown and their neighbours matter, however large the rest is.
+    adjacent = np.asarray(graph @ (~known).astype(np.float64)) > 0
+    some = np.flatnonzero(~known | adjacent)
     if not known[some].any():
         return nearest
     distance, _, first = dijkstra(
@@ -169,7 +169,7 @@ def replace_low_weights(
     if not fill or not count:
         return weights, LowConfidence(N, count)
     graph = vertex_graph(target)
-    # Dense numbers only where they are needed: for the low vertices and those beside them.
+    # Dense numbers only where they are needed: for the low vertices and their neighbours.
     some = np.flatnonzero(low | (np.asarray(graph @ low.astype(np.float64)) > 0))
     dense, done = diffuse(csr_array(graph[some][:, some]), ~low[some], weights[some].toarray())
     filled = np.zeros(N, bool)

@@ -29,7 +29,7 @@ from meshmatch.shapes.shape import Shape
 _DISTANCE_SCALE = 0.03
 # By how much a part of the image that faces the other way is further away than it is.
 _FACING = 0.15
-# How much a distance on the source counts beside one on the target, where it is known where a place should be.
+# How much a distance on the source counts compared with one on the target, where a nearby point of the source is given.
 _NEAR = 0.2
 # Above this confidence the closest point wins. A less certain part of the image counts as further away, by little: by
 # 1.2 % of sqrt(area) where the map knows nothing, so that of parts that lie on one another the certain one wins.
@@ -115,7 +115,7 @@ class MappedMesh:
         normals : (N, 3), optional
             Unit normals of the target there; zeros where unknown.
         near : (N, 3), optional
-            Points of the source, in its file's frame, near which the places should be. They tell the right one
+            Points of the source, in its file's frame, near which the places should be. They select the right one
             of two sheets that touch.
         """
         points = np.asarray(points, np.float64)
@@ -192,8 +192,8 @@ class MappedMesh:
         a, b, c = (self.points[corners[:, k]] for k in range(3))
         weights = closest_on_triangles(points, a, b, c)
         foot = weights[:, :1] * a + weights[:, 1:2] * b + weights[:, 2:] * c
-        sure = np.einsum("nk,nk->n", weights, self.confidence[corners])
-        doubt = np.log(_TRUSTED / np.clip(sure, 1e-6, _TRUSTED))
+        confidence = np.einsum("nk,nk->n", weights, self.confidence[corners])
+        doubt = np.log(_TRUSTED / np.clip(confidence, 1e-6, _TRUSTED))
         opposed = self._opposed(normals, corners)
         squared = squared_lengths(foot - points)
         return weights, squared + self.unit**2 * (_UNCERTAIN**2 * doubt + (_FACING * opposed) ** 2)
@@ -220,8 +220,8 @@ def discontinuous_faces(
     own = np.linalg.norm(source.verts[source.faces] - source.verts[around], axis=2)
     image = np.linalg.norm(points[source.faces] - points[around], axis=2)
     usual = image <= np.quantile(image, 0.95)
-    whole = float(own[usual].sum())
-    scale = float(image[usual].sum()) / whole if whole > 0 else 0.0
+    total = float(own[usual].sum())
+    scale = float(image[usual].sum()) / total if total > 0 else 0.0
     length = float(np.sqrt(target.area)) or target.diagonal or 1.0
     rounded = np.where(source_to_target.on_vertex, _edge_lengths(target)[source_to_target.index], 0.0)
     allowed = _STRETCH * scale * own + rounded[source.faces] + rounded[around] + _SLACK * length

@@ -1,4 +1,4 @@
-"""What lies on the source's faces, ready to be asked for its colour anywhere."""
+"""The colour of a source at any point of its faces, from its materials, images and vertex colours."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class MaterialSampler:
         pictured = np.array([m.image is not None for m in self.materials])[look.material]
         uv = look.uv - 2.0 * np.floor(
             look.uv.min(axis=1, keepdims=True) / 2.0
-        )  # whole turns of an image say nothing
+        )  # whole repeats of an image change nothing
         held = np.array(["clamp" in m.wrap for m in self.materials])[look.material]
         uv[held] = look.uv[held]
         self._uv = [list(uv[:, :, k].T.astype(np.float32, order="C")) for k in range(2)]

@@ -40,7 +40,7 @@ class SurfaceWalker:
         self.unit = float(np.sqrt(shape.area)) or shape.diagonal or 1.0
         self.verts = (shape.verts - self.center) / self.unit
         self.faces = shape.faces
-        self.same = same_rows(shape.verts)[shape.faces]  # corners by place: seams cut nothing apart
+        self.same = same_rows(shape.verts)[shape.faces]  # corners by position: seams do not separate
         self.opposite, self.opposite_edge = _neighbours(shape.faces, self.same)
         a, b, c = (self.verts[shape.faces[:, k]] for k in range(3))
         self.areas = triangle_areas(self.verts, shape.faces)
@@ -81,9 +81,9 @@ class SurfaceWalker:
             face = face.copy()
             face[lost] = self._nearest_center(points[:, lost])
         face, weights, outside, unfinished = self._walk(points, face, _STEPS)
-        if self._flat.any():  # a face without area lets nothing pass
+        if self._flat.any():  # a walk cannot cross a face without area
             unfinished = np.union1d(unfinished, np.flatnonzero(self._flat[face]))
-        if len(unfinished):  # a long way, or round and round: begin near the end of it
+        if len(unfinished):  # a long walk, or a circular one: start near its end
             some = points[:, unfinished]
             face[unfinished], weights[:, unfinished], out, _ = self._walk(
                 some, self._nearest_center(some), _STEPS_AGAIN

@@ -32,7 +32,7 @@ class BakedMesh:
 
 
 def check_bake_options(options: BakeOptions) -> None:
-    """Refuse sizes that cannot be (`OptionError`)."""
+    """Refuse sizes that are out of range (`OptionError`)."""
     if not 16 <= options.size <= LARGEST:
         raise OptionError(
             f"a texture has 16 to {LARGEST} texels a side, not {options.size}", "1024 or 2048 suit most"

@@ -1,6 +1,6 @@
-"""The atlas of a target: its own texture coordinates where they serve, else new ones.
+"""The atlas of a target: its own texture coordinates where they are valid, else new ones.
 
-New ones are xatlas's: charts that hardly stretch, packed side by side.
+New ones are made by xatlas: charts with little stretch, packed side by side.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.texels import MOST_ROWS, faces_on, rows_of
 
 Keep = Literal["auto", "keep", "new"]
-# Of the texels that are used, so many may lie under two triangles: rounding at the edges of charts.
+# Share of the used texels that two triangles may share: rounding at the edges of charts.
 _OVERLAP = 0.002
-# Coordinates must use this much of the image, and may leave this much of the surface without room.
-_LEAST_USED, _MOST_STARVED = 0.05, 0.02
+# Coordinates must use this share of the image, and may leave this share of the surface without room.
+_MIN_USED, _MAX_STARVED = 0.05, 0.02
 # A triangle is starved if it has this share of the room that its area deserves.
 _STARVED = 1e-3
-# Charts are packed on a grid of at most this size, with so much of it covered at first.
+# Charts are packed on a grid of at most this size, at several densities; the best result is taken.
 _GRID, _DENSITIES = 1024, (0.6, 0.5, 0.4)
-# Way round a chart, in units of sqrt(area): a longer one leaves much of a square empty.
-_LONGEST = 3.0
+# Length of a chart's border, in units of sqrt(area): a longer one leaves much of a square empty.
+_MAX_BORDER = 3.0
 _MARGIN = 2
 # Length of an edge, in units of sqrt(area): xatlas takes seconds at this one, and hours at a few times as much.
-_THREAD = 500.0
+_MAX_EDGE = 500.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +61,12 @@ def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Ke
     size, padding : int
         Of the image; and the least number of texels between new charts.
     keep : {"auto", "keep", "new"}
-        Own ones where they serve; own ones or an error; new ones.
+        Own ones where they are valid; own ones or an error; new ones.
 
     Raises
     ------
     OptionError
-        A cloud; or "keep", and there are no coordinates, or they do not serve.
+        A cloud; or "keep", and there are no coordinates, or they are not valid.
     InputError
         No triangle has an area, or xatlas fails.
     """
@@ -112,16 +112,16 @@ def _within(uv: Floats, shape: Shape) -> tuple[Floats, str]:
 
 
 def _problem(uv: Floats, shape: Shape, size: int) -> str:
-    """Why coordinates within 0..1 are no atlas; empty if they are one."""
+    """Why coordinates within 0..1 are not an atlas; empty if they are."""
     one, two = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     room = 0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
-    if room.sum() < _LEAST_USED:
+    if room.sum() < _MIN_USED:
         return f"they use only {100 * room.sum():.1f} % of the image"
     if room.sum() > 1.0 + _OVERLAP or rows_of(uv * size).sum() > MOST_ROWS:
         return f"they overlap ({room.sum():.1f} times the image)"
     deserved = shape.face_areas / shape.face_areas.sum()
     starved = float(deserved[room < _STARVED * deserved].sum())
-    if starved > _MOST_STARVED:
+    if starved > _MAX_STARVED:
         return f"{100 * starved:.0f} % of the surface has no room in the image"
     found, twice = faces_on(uv * size, size)
     share = twice / max(int((found >= 0).sum()), 1)
@@ -142,14 +142,14 @@ def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
     verts = (verts - verts.mean(axis=0)) / max(float(np.sqrt(shape.face_areas.sum())), 1e-300)
     corners = corners.reshape(-1, 3)
     edges = verts[corners] - verts[corners[:, [1, 2, 0]]]
-    if np.sqrt((edges**2).sum(axis=2).max()) > _THREAD:
+    if np.sqrt((edges**2).sum(axis=2).max()) > _MAX_EDGE:
         raise _failed(shape, "it has triangles as thin as a thread")
     try:
         maker, pack = xatlas.Atlas(), xatlas.PackOptions()
         pack.resolution, pack.padding = 256, 0
         maker.add_mesh(verts.astype(np.float32), corners.astype(np.uint32))
         options = xatlas.ChartOptions()
-        options.max_boundary_length = _LONGEST
+        options.max_boundary_length = _MAX_BORDER
         maker.generate(options, pack)
         origin, faces, uv = maker[0]
         if not np.array_equal(origin[faces], corners):

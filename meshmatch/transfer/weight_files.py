@@ -130,7 +130,7 @@ def _table(key: str, values: ArrayLike, kind: type) -> np.ndarray:
         if kind is np.int64 and (array != np.round(array)).any():
             raise ValueError("its numbers are not whole")
     except ValueError as error:
-        raise InputError(f"'{key}' is no table of numbers: {error}", _HINT) from error
+        raise InputError(f"'{key}' is not a table of numbers: {error}", _HINT) from error
     return array.astype(kind)
 
 

@@ -126,8 +126,8 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "promising": ("a.npz", promising, "promises"),
     "objects": ("a.npz", objects, "Python objects"),
     "no weights": ("a.npz", table(w=np.eye(3)), "there is no 'weights'"),
-    "flat": ("a.npz", table(weights=np.ones(SHAPE.V)), "no table of numbers"),
-    "nan": ("a.npz", table(weights=np.full((SHAPE.V, 2), np.nan)), "no table of numbers"),
+    "flat": ("a.npz", table(weights=np.ones(SHAPE.V)), "not a table of numbers"),
+    "nan": ("a.npz", table(weights=np.full((SHAPE.V, 2), np.nan)), "not a table of numbers"),
     "negative": ("a.npz", table(weights=np.tile([2.0, -1.0], (SHAPE.V, 1))), "negative"),
     "all zero": ("a.npz", table(weights=np.zeros((SHAPE.V, 2))), "all weights are 0"),
     "wrong length": ("a.npz", table(weights=np.ones((9, 2))), "9 vertices, but sphere1 has 42"),
@@ -153,10 +153,14 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     ),
     "no json": ("a.json", lambda path: path.write_text("{"), "can be read"),
     "a list": ("a.json", lambda path: path.write_text("[1]"), "there is no 'weights'"),
-    "ragged": ("a.json", lambda path: path.write_text('{"weights": [[1], [1, 2]]}'), "no table of numbers"),
-    "joints of a word": ("a.json", json_of(joints="x"), "'joints' is no table"),
-    "joints of words": ("a.json", json_of(joints=[["a"]] * SHAPE.V), "'joints' is no table"),
-    "no joints": ("a.json", json_of(joints=None), "'joints' is no table"),
+    "ragged": (
+        "a.json",
+        lambda path: path.write_text('{"weights": [[1], [1, 2]]}'),
+        "not a table of numbers",
+    ),
+    "joints of a word": ("a.json", json_of(joints="x"), "'joints' is not a table"),
+    "joints of words": ("a.json", json_of(joints=[["a"]] * SHAPE.V), "'joints' is not a table"),
+    "no joints": ("a.json", json_of(joints=None), "'joints' is not a table"),
     "ragged names": ("a.json", json_of(names=[["a"], ["b", "c"]]), "can be read"),
     "a suffix": ("a.fbx", lambda path: path.write_text("x"), "not read from '.fbx'"),
     "no skin": ("a.glb", glb_without_skin, "has no skin"),
@@ -192,7 +196,7 @@ def test_weights_from_a_table() -> None:
         found = weights_of(given, SHAPE)
         assert np.allclose(found.matrix.toarray(), table.toarray())
         assert found.names == tuple("0123456")
-    with pytest.raises(InputError, match="no table of numbers"):
+    with pytest.raises(InputError, match="not a table of numbers"):
         weights_of(np.ones(SHAPE.V), SHAPE)
     with pytest.raises(InputError, match="the array has weights of 3 vertices"):
         weights_of(np.ones((3, 2)), SHAPE)
