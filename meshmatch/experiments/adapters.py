@@ -52,7 +52,7 @@ def placed(shape: Shape, seed: int = 0, faces: int | None = None) -> Placed:
     drawn = sample_surface(shape, _SAMPLES, np.random.default_rng(seed))
     whole = Shape(frame.apply(shape.verts), shape.faces, shape.name, invalid=shape.invalid)
     thin = whole if faces is None or whole.is_cloud else decimate(whole, faces)
-    return Placed(whole, thin, OrientedPoints(frame.apply(drawn.points), drawn.normals))
+    return Placed(whole, thin, drawn.in_frame(frame))
 
 
 def turn_to(source: Placed, target: Placed) -> Frame:

@@ -21,7 +21,6 @@ from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.build import build_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.pipeline import read_model, usable
@@ -203,7 +202,7 @@ def nearest_all(
     seen, places = {}, {}
     for name, shape in shapes.items():
         samples = sample_surface(shape, 2400, np.random.default_rng(0))
-        seen[name] = OrientedPoints(frames[name].apply(samples.points), samples.normals)
+        seen[name] = samples.in_frame(frames[name])
         places[name] = frames[name].apply(shape.verts)
     trees = {name: cKDTree(points) for name, points in places.items()}
     found = {}

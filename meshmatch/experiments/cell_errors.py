@@ -97,7 +97,7 @@ def subject(bench: BenchSet, name: str, frame: Frame, measure: Measure, cache: P
     """A shape whose core frame is known, sampled, with its landmarks and the distances from them."""
     shape, landmarks = bench.seen(name), bench.landmarks(name)
     samples = sample_surface(usable(shape).shape, measure.samples, np.random.default_rng(measure.seed))
-    scan = OrientedPoints(frame.apply(samples.points), samples.normals @ frame.rotation.T)
+    scan = samples.in_frame(frame)
     count = min(measure.landmarks, len(landmarks))
     chosen = np.linspace(0, len(landmarks) - 1, count).round().astype(int)
     distances = TruthDistances(bench.shape(name), landmarks, cache).of(chosen)
@@ -139,7 +139,7 @@ def begin(model: TrainedModel, one: Subject, reference: str, measure: Measure) -
     turn = Frame(1.0, np.eye(3), np.zeros(3))
     if theirs.shape.V == ours.shape.V and np.array_equal(theirs.core, ours.core):
         turn = kabsch(ours.shape.verts[ours.core], theirs.shape.verts[theirs.core]).frame
-    scan = OrientedPoints(turn.apply(one.scan.points), one.scan.normals @ turn.rotation.T)
+    scan = one.scan.in_frame(turn)
     rng = np.random.default_rng(measure.seed)
     found = Predictor.of(model, rng).fit(scan, RigidPose.identity())
     frame = one.frame.compose(turn).compose(found.pose.frame)

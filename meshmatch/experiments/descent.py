@@ -22,7 +22,6 @@ from meshmatch.fitting.network_fit import Predictor
 from meshmatch.fitting.nodes import NodeRefineConfig
 from meshmatch.fitting.system import node_system
 from meshmatch.geometry.frames import kabsch
-from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -90,7 +89,7 @@ def _start(model: TrainedModel, verts: np.ndarray, measure: Measure) -> tuple[St
     frame = sqrt_area_frame(shape)
     places = frame.apply(verts)
     samples = sample_surface(shape, measure.samples, np.random.default_rng(measure.seed))
-    scan = OrientedPoints(frame.apply(samples.points), samples.normals @ frame.rotation.T)
+    scan = samples.in_frame(frame)
     pose = kabsch(template.shape.verts[template.core], places[template.core])
     rng = np.random.default_rng(measure.seed)
     found = Predictor.of(model, rng).fit(scan, pose, rounds=1)

@@ -115,7 +115,7 @@ def _start(model: TrainedModel, shape: Shape, seed: int) -> tuple[Fit, OrientedP
     config = FitConfig(refine="none", seed=seed)
     fit = Fitter(model, config).fit(clean)
     samples = sample_surface(clean, config.samples, np.random.default_rng(seed))
-    return fit, OrientedPoints(fit.frame.apply(samples.points), samples.normals @ fit.frame.rotation.T)
+    return fit, samples.in_frame(fit.frame)
 
 
 def choose_shapes(model: TrainedModel, name: str, count: int, seed: int, data: Path) -> list[Shape]:

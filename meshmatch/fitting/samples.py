@@ -43,7 +43,4 @@ def take_samples(
     The outliers of a cloud are not drawn; the normals of a cloud are not signed.
     """
     frame = sqrt_area_frame(shape) if frame is None else frame
-    samples = sample_surface(without_outliers(shape), P, rng)
-    return frame, OrientedPoints(
-        frame.apply(samples.points), samples.normals @ frame.rotation.T, not shape.is_cloud
-    )
+    return frame, sample_surface(without_outliers(shape), P, rng).in_frame(frame)

@@ -122,5 +122,5 @@ def cloud_allowance(
     expected = two_way_residual(
         system, OrientedPoints(cloud.verts, cloud.vertex_normals, signed=False), vectors
     )
-    clear = two_way_residual(system, OrientedPoints(clean.points, clean.normals), vectors)
+    clear = two_way_residual(system, clean, vectors)
     return float(np.sqrt(max(expected**2 - clear**2, 0.0)))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats
-from meshmatch.geometry.frames import RigidPose
+from meshmatch.geometry.frames import Frame, RigidPose
 
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area). Set by hand.
 NORMAL_WEIGHT = 0.15
@@ -58,6 +59,10 @@ class OrientedPoints:
         """The same samples in the local coordinates of a pose."""
         return replace(self, points=pose.to_local(self.points), normals=self.normals @ pose.rotation)
 
+    def in_frame(self, frame: Frame) -> OrientedPoints:
+        """The same samples through a frame: moved, turned and scaled; normals turned."""
+        return replace(self, points=frame.apply(self.points), normals=self.normals @ frame.rotation.T)
+
     def first(self, count: int) -> OrientedPoints:
         """The first samples."""
         return self.rows(slice(count))
@@ -80,8 +85,11 @@ class OrientedPoints:
 
     def rows(self, rows: slice | Bool[Bools, " P"]) -> OrientedPoints:
         """Some of the samples."""
-        weights = None if self.weights is None else self.weights[rows]
-        return replace(self, points=self.points[rows], normals=self.normals[rows], weights=weights)
+        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        taken: dict[str, Any] = {
+            name: array[rows] for name, array in arrays.items() if isinstance(array, np.ndarray)
+        }
+        return replace(self, **taken)
 
 
 def with_normals(

@@ -8,19 +8,17 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.shapes.shape import Shape
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """Points on a shape, in its own frame.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Samples(OrientedPoints):
+    """Points on a shape in its own frame, with the normals of their faces; a cloud's are estimated, not signed.
 
     Parameters
     ----------
-    points : (P, 3) float64
-    normals : (P, 3) float64
-        Unit normal of the face; for a cloud its estimated normal.
     face : (P,) int64
         Face that each point lies on; -1 for a cloud.
     barycentric : (P, 3) float64
@@ -29,8 +27,6 @@ class Samples:
         The face's corner of the largest weight; for a cloud the very point that was drawn.
     """
 
-    points: Float[Floats, "P 3"]
-    normals: Float[Floats, "P 3"]
     face: Int[Ints, " P"]
     barycentric: Float[Floats, "P 3"]
     vertex: Int[Ints, " P"]
@@ -60,7 +56,10 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
         weights = np.zeros((P, 3))
         weights[:, 0] = 1.0
         normals = shape.vertex_normals[chosen]
-        return Samples(shape.verts[chosen], normals, np.full(P, -1, np.int64), weights, chosen)
+        face = np.full(P, -1, np.int64)
+        return Samples(
+            shape.verts[chosen], normals, signed=False, face=face, barycentric=weights, vertex=chosen
+        )
     # side="right" steps over faces without area
     face = np.searchsorted(total, rng.random(P) * total[-1], side="right").astype(np.int64)
     face = np.minimum(face, np.flatnonzero(areas)[-1])
@@ -70,7 +69,7 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
     corners = shape.faces[face]  # P 3
     points = interpolate(shape.verts, corners, weights)
     vertex = corners[np.arange(P), weights.argmax(axis=1)]
-    return Samples(points, shape.face_normals[face], face, weights, vertex)
+    return Samples(points, shape.face_normals[face], face=face, barycentric=weights, vertex=vertex)
 
 
 def farthest_points(points: Float[Floats, "N 3"], K: int, start: int = 0) -> Int[Ints, " K"]:

@@ -75,8 +75,7 @@ def template_radius(template: Template) -> float:
 
 def template_samples(template: Template, P: int = 3000, seed: int = 0) -> OrientedPoints:
     """What shapes are aligned to."""
-    samples = sample_surface(template.shape, P, np.random.default_rng(seed))
-    return OrientedPoints(samples.points, samples.normals)
+    return sample_surface(template.shape, P, np.random.default_rng(seed))
 
 
 def medoid(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int) -> int:
@@ -90,7 +89,7 @@ def medoid(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int) -> i
     for k in pool:
         shape = shapes[k].shape
         samples = sample_surface(shape, 800, np.random.default_rng(seed))
-        part = OrientedPoints(unit_frame(shape, scale, 0.5).apply(samples.points), samples.normals)
+        part = samples.in_frame(unit_frame(shape, scale, 0.5))
         if aligned:
             best = align(part, aligned[0], how)[0]
             part = part.to_local(best.pose)
@@ -132,8 +131,7 @@ def collect_samples(
     frames, residuals = [], []
     for number, (one, marks) in enumerate(zip(shapes, landmarks, strict=True)):
         frame = unit_frame(one.shape, scale, radius)
-        samples = sample_surface(one.shape, P, rng)
-        part = OrientedPoints(frame.apply(samples.points), samples.normals)
+        part = sample_surface(one.shape, P, rng).in_frame(frame)
         best = align(part, target, how)[0]
         part = part.to_local(best.pose)
         points.append(part.points)

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from meshmatch.geometry.frames import RigidPose
+from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import NORMAL_WEIGHT, OrientedPoints, with_normals
 from meshmatch.geometry.topology import is_discontinuous
 
@@ -20,6 +20,13 @@ def test_a_pose_moves_points_and_turns_normals() -> None:
     assert np.allclose(pose.to_world(moved.points), ball().points)
     assert np.allclose(moved.normals @ pose.rotation.T, ball().normals)
     assert moved.weights is not None and moved.weights[-1] == 1
+
+
+def test_a_frame_scales_points_alone() -> None:
+    frame = Frame(2.0, Rotation.from_rotvec([0, 0, 1.0]).as_matrix(), np.array([1.0, 0, 0]))
+    moved = ball().in_frame(frame)
+    assert np.allclose(moved.points, frame.apply(ball().points))
+    assert np.allclose(moved.normals, ball().normals @ frame.rotation.T)
 
 
 def test_thinning_keeps_every_third_with_its_weight() -> None:
