@@ -35,7 +35,7 @@ _MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
 
 @dataclass(frozen=True)
 class AgreeConfig:
-    """How fits are refined together. Tuned on bodies.
+    """How fits are refined together. Set by hand.
 
     Attributes
     ----------

@@ -124,7 +124,7 @@ class CandidateScorer:
     def discontinuous_share(self, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
         """Share (0..1) of neighbours among the samples that belong far apart on the template."""
         surface = self._system.surface(vectors)
-        local = local.facing(surface.points, surface.normals)
+        local = local.facing(surface)
         home = self._system.verts[surface.tree.query(local.features)[1]]
         start, end = self._from, self._to
         length = np.linalg.norm(local.points[start] - local.points[end], axis=1)

@@ -31,7 +31,7 @@ def visible_vertices(
     Vertices beyond a cut have the edge of the samples near by, but the edge belongs elsewhere on the template.
     """
     surface = system.surface(vectors)
-    local = local.facing(surface.points, surface.normals)
+    local = local.facing(surface)
     distance, nearest = local.tree.query(surface.features)
     home = surface.tree.query(local.features)[1]
     away = np.linalg.norm(system.verts[home[nearest]] - system.verts, axis=1)
@@ -57,7 +57,7 @@ def completed(
     P = len(local.points)
     count = min(round(P * missing.area / share), _MAX_ADDED * P)
     added = sample_surface(missing, count, rng)
-    local = local.facing(surface.points, surface.normals)
+    local = local.facing(surface)
     order = rng.permutation(P + count)
     return replace(
         local,

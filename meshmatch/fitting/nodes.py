@@ -28,7 +28,7 @@ Terms = tuple[Float[Floats, "V 6"], Float[Floats, "V 3"]]
 
 @dataclass(frozen=True)
 class NodeRefineConfig:
-    """Schedule and weights of the node refinement; lengths in units of sqrt(area). Tuned on generated bodies.
+    """Schedule and weights of the node refinement; lengths in units of sqrt(area). Set by hand.
 
     Attributes
     ----------
@@ -69,7 +69,8 @@ class NodeRefineConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`).
 
         Noise does not tell across from along, and asks for the mean of many points rather than for the nearest: a wider
-        robust scale, a stiffer template, more points, shared pairs. Tuned on bodies with noise of 1 % of the diagonal.
+        robust scale, a stiffer template, more points, shared pairs. Tuned on 14 hard pairs of SCAPE with noise of 1 % of
+        the diagonal.
         """
         return replace(
             self,

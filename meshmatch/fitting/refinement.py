@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.fitting.candidates import CandidateScorer, averaged, choose
+from meshmatch.fitting.candidates import CandidateScorer, Interpretation, averaged, choose
 from meshmatch.fitting.choices import Refine
 from meshmatch.fitting.completion import completed
 from meshmatch.fitting.latent import refine_code
@@ -43,11 +43,7 @@ class Refinement:
     tries_parts: bool = True
 
 
-def _first(task: FitTask, candidates: list[Candidate]) -> Candidate:
-    return candidates[0]
-
-
-def _first_part(task: FitTask, candidates: list[PartCandidate]) -> PartCandidate:
+def _first(task: FitTask, candidates: list[Interpretation]) -> Interpretation:
     return candidates[0]
 
 
@@ -55,8 +51,7 @@ def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
     """The best candidate, refined by the paper's search over codes."""
     best = candidates[0]
     local = task.samples.to_local(best.pose)
-    surface = task.system.surface(best.vectors)
-    facing = local.facing(surface.points, surface.normals)
+    facing = local.facing(task.system.surface(best.vectors))
     progress = task.progress.stage("refinement")
     vectors = refine_code(task.model, facing, task.config.latent, task.predictor.rng, progress)
     return Candidate(best.pose, vectors, two_way_residual(task.system, local, vectors))
@@ -100,8 +95,7 @@ class _WholeComparison:
         if self._landmarks is not None:
             fixed = self._landmarks[0], candidate.pose.to_local(self._landmarks[1])
         local = task.samples.to_local(candidate.pose)
-        surface = task.system.surface(candidate.vectors)
-        facing = local.facing(surface.points, surface.normals)
+        facing = local.facing(task.system.surface(candidate.vectors))
         vectors = refine_nodes(task.system, facing, candidate.vectors, config, fixed)
         return Candidate(candidate.pose, vectors, two_way_residual(task.system, local, vectors))
 
@@ -144,7 +138,7 @@ class _PartComparison:
 
 
 REFINEMENTS: dict[Refine, Refinement] = {
-    "none": Refinement(_first, _first_part),
-    "latent": Refinement(_search_code, _first_part, tries_parts=False),
+    "none": Refinement(_first, _first),
+    "latent": Refinement(_search_code, _first, tries_parts=False),
     "nodes": Refinement(_fit_nodes, _fit_nodes_to_part),
 }

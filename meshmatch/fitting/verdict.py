@@ -16,7 +16,7 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
 # Mean two-way residuals (units of sqrt(area)) up to which a fit is called good, and fair; that of a part is one way, for
-# what is not visible adds nothing to it. Set by hand, from fits of bodies.
+# what is not visible adds nothing to it. Set by hand.
 GOOD_RESIDUAL, FAIR_RESIDUAL, PART_RESIDUAL = 0.0285, 0.031, 0.027
 # Further from the other surface than this (units of sqrt(area)), a point of shape or template is without counterpart.
 _REACH = 0.06

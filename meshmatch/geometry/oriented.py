@@ -71,13 +71,14 @@ class OrientedPoints:
         """About P of the samples, evenly taken from their order, which must be random."""
         return self.rows(slice(None, None, max(1, len(self.points) // P)))
 
-    def facing(self, points: Float[Floats, "N 3"], normals: Float[Floats, "N 3"]) -> OrientedPoints:
-        """The same samples; normals without a sure sign are turned to agree with those of the nearest points given."""
+    def facing(self, reference: OrientedPoints) -> OrientedPoints:
+        """The same samples; normals without a sure sign are turned to agree with those of the nearest reference points."""
         if self.signed:
             return self
-        tree = cKDTree(with_normals(points, normals))
         out, back = (
-            tree.query(with_normals(self.points, sign * self.normals), distance_upper_bound=_REACH)[0]
+            reference.tree.query(with_normals(self.points, sign * self.normals), distance_upper_bound=_REACH)[
+                0
+            ]
             for sign in (1, -1)
         )
         turned = np.where((back < out)[:, None], -self.normals, self.normals)

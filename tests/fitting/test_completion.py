@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from meshmatch.api.inputs import as_model
 from meshmatch.experiments.partial import part_of
 from meshmatch.experiments.protocols import load_set
 from meshmatch.fitting.completion import area_share, completed, visible_vertices
@@ -15,7 +16,6 @@ from meshmatch.fitting.part import PartCandidate
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.pipeline import read_model
 from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import egg_model, scan_of
 
@@ -152,7 +152,7 @@ def test_half_of_a_body_is_read_as_what_it_is(bench: Path) -> None:
     known = load_set("scape", bench)
     body = known.shape(known.shapes[0])
     half, used = part_of(body, "cut", 0)
-    model = read_model("human")
+    model = as_model("human")
     whole, part = Fitter(model).fit(body), Fitter(model).fit(half)
     assert part.partial and part.verdict == "fair"
     told = float(part.reasons[-1].split(": ")[1].split(" %")[0]) / 100

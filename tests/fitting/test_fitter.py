@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch import pipeline
 from meshmatch.cli import main
 from meshmatch.errors import OptionError
 from meshmatch.fitting.choices import REFINE_NAMES, Refine
@@ -220,7 +219,10 @@ def test_every_refinement_makes_a_map_from_the_command_line(
     capsys: pytest.CaptureFixture[str],
     refine: Refine,
 ) -> None:
-    monkeypatch.setattr(pipeline, "FitConfig", lambda **choices: replace(QUICK, **choices))
+    for_model = FitConfig.for_model
+    monkeypatch.setattr(
+        FitConfig, "for_model", lambda asked, model: for_model(replace(QUICK, refine=asked.refine), model)
+    )
     folder = write_model(model, tmp_path / "egg")
     files = tmp_path / "a.ply", tmp_path / "b.ply"
     save_shape(files[0], egg)

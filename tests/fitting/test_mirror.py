@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from meshmatch.api.inputs import as_model
 from meshmatch.fields.field import Field
 from meshmatch.fitting.mirror import Mirror, mirror_of
 from meshmatch.fitting.network_fit import Predictor
 from meshmatch.fitting.system import node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.models.trained import TrainedModel
-from meshmatch.pipeline import read_model
 from meshmatch.shapes.shape import Shape
 from tests.fitting.eggs import egg_model, gentle_vectors, scan_of
 
@@ -22,7 +22,7 @@ FLIP = np.array([-1.0, 1, 1])
 
 @pytest.fixture(scope="module")
 def human() -> TrainedModel:
-    return read_model("human")
+    return as_model("human")
 
 
 @pytest.fixture(scope="module")

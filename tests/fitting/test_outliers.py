@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from meshmatch.api.inputs import validated
+from meshmatch.api.matching import register
 from meshmatch.errors import InputError
 from meshmatch.fitting.candidates import CandidateScorer
 from meshmatch.fitting.fit_config import FitConfig
@@ -12,7 +14,6 @@ from meshmatch.fitting.samples import take_samples, without_outliers
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.pipeline import register, usable
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -89,11 +90,11 @@ def test_normals_take_the_side_of_the_template(system: NodeSystem) -> None:
     scan = scan_of(Shape(system.verts, system.faces), 700)
     wrong = np.random.default_rng(0).random(700) < 0.5
     mixed = OrientedPoints(scan.points, np.where(wrong[:, None], -scan.normals, scan.normals), signed=False)
-    moved = system.moved(np.zeros((system.K, 3)))
-    faced = mixed.facing(moved, system.normals(moved))
+    surface = system.surface(np.zeros((system.K, 3)))
+    faced = mixed.facing(surface)
     assert faced.signed
     assert ((faced.normals * scan.normals).sum(1) > 0.99).mean() > 0.97
-    assert scan.facing(moved, system.normals(moved)) is scan
+    assert scan.facing(surface) is scan
 
 
 def test_residuals_and_tears_ignore_a_side_that_is_not_known(system: NodeSystem) -> None:
@@ -141,16 +142,18 @@ def test_a_tenth_of_strays_changes_little_and_nine_tenths_are_told() -> None:
     assert rough.verdict != "poor" and not rough.partial
     apart = np.linalg.norm(rough.points_in_file - clean.points_in_file, axis=1)
     assert apart.mean() < 4  # centimetres
-    assert len(rough.vertex_distance) == usable(Shape(with_strays, NO_FACES)).shape.V > 950
-    lost = register(Shape(np.concatenate([points[:100], around(points, 900)]), NO_FACES))
+    assert len(rough.vertex_distance) == validated(Shape(with_strays, NO_FACES)).shape.V > 950
+    lost = register(
+        Shape(np.concatenate([points[:100], around(points, 900)]), NO_FACES), config=FitConfig(partial="no")
+    )
     assert lost.verdict == "poor" and lost.reasons
 
 
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        (np.ones((500, 3)), "has points in only 1 place"),
-        (np.eye(3), "has points in only 3 places"),
+        (np.ones((500, 3)), "has only 1 distinct point position"),
+        (np.eye(3), "has only 3 distinct point positions"),
         (np.outer(np.linspace(0, 1, 500), [1.0, 2.0, 3.0]), "all its points lie on a line"),
         (np.full((500, 3), np.nan), "not finite"),
     ],
@@ -165,6 +168,8 @@ def test_what_is_no_cloud_is_refused_in_one_line(points: np.ndarray, message: st
 def test_a_point_at_the_end_of_the_world_is_a_stray() -> None:
     points = body(600)
     far = np.concatenate([points, [[1e30, 0.0, 0.0], [0.0, -1e15, 0.0]]])
-    here, there = (register(Shape(cloud, NO_FACES), refine="none") for cloud in (points, far))
+    here, there = (
+        register(Shape(cloud, NO_FACES), config=FitConfig(refine="none")) for cloud in (points, far)
+    )
     assert there.verdict == here.verdict != "poor"
     assert np.linalg.norm(here.points_in_file - there.points_in_file, axis=1).mean() < 4  # centimetres

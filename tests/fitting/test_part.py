@@ -6,11 +6,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from meshmatch.api.inputs import as_model
+from meshmatch.api.matching import Matcher
 from meshmatch.errors import OptionError
 from meshmatch.fitting import part
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import Fitter, boundary_length
+from meshmatch.fitting.fitter import boundary_length
 from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
 from meshmatch.fitting.network_fit import one_way_residual
 from meshmatch.fitting.part import SHARES, cost
@@ -22,13 +24,13 @@ from meshmatch.fitting.verdict import empty_share, judge
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
-from meshmatch.pipeline import map_between, read_model
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from tests.fitting.eggs import egg_model
 
+MATCHER = Matcher("human")
 SQUARE = Shape(np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
@@ -81,28 +83,27 @@ def dancer() -> Shape:
 @pytest.fixture(scope="module")
 def whole(dancer: Shape) -> Fit:
     """The fit of all of the dancer."""
-    return Fitter(read_model("human")).fit(dancer)
+    return MATCHER.fit(dancer)
 
 
 def test_one_side_of_a_body_is_found_to_be_a_part_and_matches_the_whole(dancer: Shape, whole: Fit) -> None:
     side, used = side_of(dancer, np.array([0.3, 0.1, 1.0]))
-    model = read_model("human")
-    found_part = Fitter(model).fit(side)
+    found_part = MATCHER.fit(side)
     assert (whole.partial, found_part.partial) == (False, True)
     assert found_part.verdict != "good"
     assert "part" in {reason.code for reason in found_part.reasons}
-    found = map_between(side, found_part, dancer, whole, model="human").index
+    found = MATCHER.map(found_part, whole).index
     apart = np.linalg.norm(dancer.verts[found] - dancer.verts[used], axis=1)  # centimetres
     assert apart.mean() < 5
-    never = Fitter(model, FitConfig(partial="no")).fit(side)
+    never = MATCHER.fit(side, FitConfig(partial="no"))
     assert not never.partial
-    alone = map_between(side, never, dancer, whole).index
+    alone = MATCHER.map(never, whole, agree=False).index
     assert apart.mean() < np.linalg.norm(dancer.verts[alone] - dancer.verts[used], axis=1).mean()
 
 
 def test_a_whole_stays_a_whole_where_parts_are_tried() -> None:
     climber = load_shape(bundled_folder() / "samples" / "climber.ply")
-    assert not Fitter(read_model("human"), FitConfig(partial="yes")).fit(climber).partial
+    assert not MATCHER.fit(climber, FitConfig(partial="yes")).partial
 
 
 @pytest.mark.parametrize("wide_is_better", [True, False])
@@ -134,7 +135,7 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
 
 
 def test_frames_of_a_part_are_tried_along_the_body(dancer: Shape) -> None:
-    model = read_model("human")
+    model = as_model("human")
     scan = take_samples(dancer, 2048, np.random.default_rng(0))[1]
     plain = FitConfig(copies=4, hypotheses=1)
     few = frames_of_part(model, scan, plain, wide=False)
@@ -162,8 +163,7 @@ def test_a_bust_is_found_where_its_up_is_given(dancer: Shape, whole: Fit) -> Non
     faces = dancer.faces[height > np.median(height)]
     used = np.unique(faces)
     bust = Shape(dancer.verts[used], np.searchsorted(used, faces), "bust")
-    model = read_model("human")
-    upper = Fitter(model, FitConfig(up="y", front="z")).fit(bust)
+    upper = MATCHER.fit(bust, FitConfig(up="y", front="z"))
     assert upper.partial and upper.verdict == "fair"
-    found = map_between(bust, upper, dancer, whole, model="human").index
+    found = MATCHER.map(upper, whole).index
     assert np.linalg.norm(dancer.verts[found] - dancer.verts[used], axis=1).mean() < 4  # centimetres

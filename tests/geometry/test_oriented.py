@@ -44,10 +44,10 @@ def test_normals_back_to_back_are_apart() -> None:
 
 def test_unsigned_normals_face_as_their_surroundings_do() -> None:
     wrong = OrientedPoints(ball().points, -ball().normals, signed=False)
-    turned = wrong.facing(ball().points, ball().normals)
+    turned = wrong.facing(ball())
     assert turned.signed and np.allclose(turned.normals, ball().normals)
     sure = OrientedPoints(ball().points, -ball().normals)
-    assert sure.facing(ball().points, ball().normals) is sure
+    assert sure.facing(ball()) is sure
 
 
 def test_images_far_apart_of_near_neighbours_are_discontinuous() -> None:
