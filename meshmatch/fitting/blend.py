@@ -44,9 +44,9 @@ class Blend:
     """A curve through several fits of one template.
 
     Each quantity is blended with the same weights of the fits: linear between two fits, a natural cubic spline
-    through more; straight on beyond the ends. The fits are met exactly: what the path leaves over at them is blended
-    and added. Codes leave much over, so that there it is blended as seen from the parts that it moves, and turns with
-    them.
+    through more; straight on beyond the ends. The fits are met exactly: what the path lacks at them is
+    blended and added. A path of codes lacks much, which is therefore blended in the frames of the parts that it moves,
+    and turns with them.
 
     Parameters
     ----------
@@ -103,12 +103,12 @@ class Blend:
         else:
             raise OptionError(f"unknown way to blend {way!r}", f"choose one of {', '.join(WAYS)}")
         met = [self._path(row) for row in np.eye(len(fits))]
-        self._left = self._keys - np.stack(met)
-        self._near: PointField | None = None
+        self._correction = self._keys - np.stack(met)
+        self._node_field: PointField | None = None
         if way == "codes" and model.has_nodes:
-            self._near = model.field(_beside_nodes(model))
-            turns = np.stack([_turns(self._near, vectors) for vectors in met])
-            self._left = np.einsum("nkij,nki->nkj", turns, self._left)
+            self._node_field = model.field(_beside_nodes(model))
+            turns = np.stack([_turns(self._node_field, vectors) for vectors in met])
+            self._correction = np.einsum("nkij,nki->nkj", turns, self._correction)
         self._turns = RotationBlend([fit.frame.rotation[None] for fit in fits])
         self._scales = np.array([fit.frame.scale for fit in fits])
         self._centers = np.stack([fit.frame.center for fit in fits])
@@ -127,10 +127,10 @@ class Blend:
         weights = self.weights(time)
         if weights.max() == 1.0:  # a fit itself
             return self._keys[weights.argmax()]
-        there, left = self._path(weights), np.tensordot(weights, self._left, 1)
-        return there + (
-            left if self._near is None else np.einsum("kij,kj->ki", _turns(self._near, there), left)
-        )
+        there, correction = self._path(weights), np.tensordot(weights, self._correction, 1)
+        if self._node_field is not None:
+            correction = np.einsum("kij,kj->ki", _turns(self._node_field, there), correction)
+        return there + correction
 
     def points(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
         """Template vertices of a pose, core frame."""
