@@ -63,7 +63,7 @@ DISTRIBUTIONS = {
     "robust_laplacian": "robust-laplacian",
 }
 EXTRAS = ("meshlab", "bodies", "bench", "plots")  # what the package imports only where it is installed
-HEAVY = {"torch", "trimesh", "pymeshlab", "scipy", "safetensors", "matplotlib"}
+HEAVY = {"torch", "trimesh", "pymeshlab", "scipy", "safetensors", "matplotlib", "jaxtyping"}
 NO_TORCH = ("geometry", "shapes", "templates", "maps", "transfer", "render")
 FORBIDDEN_NAMES = {"utils", "util", "common", "helpers", "helper", "base", "misc"}
 

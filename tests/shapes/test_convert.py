@@ -1,5 +1,7 @@
 """Shapes from arrays and from the meshes of other libraries, and back."""
 
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -75,3 +77,16 @@ def test_a_trimesh_there_and_back(cube: Shape) -> None:
     assert np.allclose(back.colors, colors, atol=0.5 / 255)
     assert as_shape(cube.to_trimesh()).colors is None
     assert as_shape(as_shape(cube.verts).to_trimesh()).is_cloud
+
+
+def test_only_stl_loads_trimesh(tmp_path: Path, cube: Shape) -> None:
+    """It takes 0.7 s, which nobody who matches plies should wait for; reading them needs no scipy either."""
+    for suffix in (".ply", ".stl"):
+        save_shape(tmp_path / f"a{suffix}", cube)
+    code = (
+        "import sys; from meshmatch.shapes.files import load_shape; load_shape(sys.argv[1])\n"
+        "print([name for name in ('trimesh', 'scipy', 'PIL') if name in sys.modules])"
+    )
+    for suffix, loaded in ((".ply", "[]"), (".stl", "trimesh")):
+        words = [sys.executable, "-c", code, str(tmp_path / f"a{suffix}")]
+        assert loaded in subprocess.run(words, capture_output=True, text=True, check=True).stdout
