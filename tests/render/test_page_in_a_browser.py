@@ -311,7 +311,7 @@ def test_a_coarser_mesh_keeps_the_numbers_of_the_file(
     running: Any, make_sphere: Callable[[int], Shape], tmp_path: Path
 ) -> None:
     fine = stirred(bump(make_sphere(4)), "fine.ply")
-    write_page(tmp_path / "page.html", fine.source, fine.target, fine.there, fine.back, most=500)
+    write_page(tmp_path / "page.html", fine.source, fine.target, fine.there, fine.back, max_vertices=500)
     with opened(running, tmp_path / "page.html") as view:
         assert "of 2,562 vertices" in view.page.locator("#target .count").inner_text()
         view.page.mouse.move(330, 400)
