@@ -1,4 +1,4 @@
-"""What occurs twice in a mesh, or is nothing: vertices of seams, faces, slivers."""
+"""Duplicate vertices and faces of a mesh, and faces without area."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def load_shape(path: str | Path) -> Shape:
     Raises
     ------
     InputError
-        The file is missing, empty, cut short, of an unknown kind, or holds no usable vertex.
+        The file is missing, empty, cut short, of an unsupported format, or holds no usable vertex.
     """
     path = existing(Path(path), suffixes=SUFFIXES)
     suffix = path.suffix.lower()
