@@ -46,6 +46,7 @@ class PartCandidate:
 
     @property
     def cost(self) -> float:
+        """See `cost`."""
         return cost(self.fit.residual, self.share)
 
 

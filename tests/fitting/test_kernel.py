@@ -11,10 +11,12 @@ import torch
 
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.fields.mls import KERNELS, Kernel, build_field
+from meshmatch.fitting.choices import Refine
 from meshmatch.fitting.dense import dense_shape
-from meshmatch.fitting.fit_config import REFINEMENTS, FitConfig, Refine
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy
+from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.system import node_system
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.registry import built_in_folder

@@ -134,6 +134,7 @@ def test_a_cloud_is_tried_as_a_part_only_where_it_leaves_the_template_bare(
         Fitter(egg_model(), FEW).fit(Shape(half, NO_FACES))
 
 
+@pytest.mark.slow
 def test_a_tenth_of_strays_changes_little_and_nine_tenths_are_told() -> None:
     points = body(1000)
     with_strays = np.concatenate([points[:900], around(points, 100)])
@@ -165,6 +166,7 @@ def test_what_is_no_cloud_is_refused_in_one_line(points: np.ndarray, message: st
     assert "\n" not in str(caught.value) and caught.value.hint
 
 
+@pytest.mark.slow
 def test_a_point_at_the_end_of_the_world_is_a_stray() -> None:
     points = body(600)
     far = np.concatenate([points, [[1e30, 0.0, 0.0], [0.0, -1e15, 0.0]]])

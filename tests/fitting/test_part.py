@@ -86,6 +86,7 @@ def whole(dancer: Shape) -> Fit:
     return MATCHER.fit(dancer)
 
 
+@pytest.mark.slow
 def test_one_side_of_a_body_is_found_to_be_a_part_and_matches_the_whole(dancer: Shape, whole: Fit) -> None:
     side, used = side_of(dancer, np.array([0.3, 0.1, 1.0]))
     found_part = MATCHER.fit(side)
@@ -101,6 +102,7 @@ def test_one_side_of_a_body_is_found_to_be_a_part_and_matches_the_whole(dancer: 
     assert apart.mean() < np.linalg.norm(dancer.verts[alone] - dancer.verts[used], axis=1).mean()
 
 
+@pytest.mark.slow
 def test_a_whole_stays_a_whole_where_parts_are_tried() -> None:
     climber = load_shape(bundled_folder() / "samples" / "climber.ply")
     assert not MATCHER.fit(climber, FitConfig(partial="yes")).partial
@@ -157,6 +159,7 @@ def test_frames_of_a_part_are_tried_along_the_body(dancer: Shape) -> None:
     assert len(frames_of_part(placed, scan, plain, wide=True)) == 1
 
 
+@pytest.mark.slow
 def test_a_bust_is_found_where_its_up_is_given(dancer: Shape, whole: Fit) -> None:
     """Of a third of a body the network alone does not know which way is up."""
     height = dancer.verts[dancer.faces].mean(1)[:, 1]
