@@ -11,7 +11,7 @@ import torch
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes import array_files
-from meshmatch.training import pose_files, run
+from meshmatch.training import bodies, pose_files
 from meshmatch.training.bodies import sample_bodies
 from meshmatch.training.pose_files import POSE_SUFFIXES, GivenPoses, load_poses
 from meshmatch.training.rig import Rig
@@ -125,9 +125,9 @@ def test_a_joint_that_the_body_lacks_is_told_with_its_neighbours(
     with pytest.raises(InputError, match="no joint 'Hips'") as caught:
         GivenPoses(("Hips",), np.zeros((1, 1, 3))).columns(rig)
     assert "docs/formats.md" in caught.value.hint
-    monkeypatch.setattr(run, "cached_rig", lambda *_: rig)
+    monkeypatch.setattr(bodies, "cached_rig", lambda *_: rig)
     with pytest.raises(InputError, match=r"no joint 'lowerarm1\.L'"):
-        run.human_source(egg_template(), poses=poses)
+        bodies.human_source(egg_template(), poses=poses)
 
 
 @pytest.mark.parametrize(
