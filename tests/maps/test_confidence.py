@@ -72,7 +72,7 @@ def test_a_map_by_a_poor_fit_is_believed_half() -> None:
 @pytest.mark.parametrize("side", ["source", "target"])
 def test_distance_from_the_template_costs_confidence_on_both_sides(side: str) -> None:
     """The fit of one side is a little too large all over; the other one is exact."""
-    ball = bumpy_sphere()
+    ball = bumpy_sphere(12, 20)
     unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
     part, fit = repair(unit), lying_on(unit)
     large = replace(fit, points=1.05 * unit.verts)

@@ -10,7 +10,7 @@ from tests.transfer.known import brute_force
 
 
 def test_closest_points_of_a_fine_mesh_are_exact() -> None:
-    ball = icosphere(3)
+    ball = icosphere(2)
     points = 1.02 * np.random.default_rng(0).permutation(icosphere(2).verts)
     found = Surface(ball.verts, ball.faces, ball.vertex_normals).query(points, points / 1.02)
     distance, feet = brute_force(points, ball.verts, ball.faces)
