@@ -383,7 +383,7 @@ def unfit_map(pair: Path) -> dict[str, str]:
         "target.npz": "target.npz was made for another target: c.ply of 162 vertices, but b.ply has 642",
         "short.npy": "short.npy was made for another source",
         "high.npy": "high.npy: the map a.ply -> b.ply: vertex 161",
-        "broken.npz": "broken.npz: does not hold arrays",
+        "broken.npz": "broken.npz does not hold arrays",
         "gone.npz": "there is no file gone.npz",
         "map.xyz": "'.xyz' is not a format for maps",
     }
