@@ -17,6 +17,7 @@ def prepare(
     nodes: given.Nodes = 320,
     radius: given.Radius = 0.13,
     faces: given.Faces = 10_000,
+    decimate: given.Decimate = "fast",
     seed: options.Seed = 0,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -37,7 +38,8 @@ def prepare(
     console = Console(quiet)
     parts = None if labels is None else load_points(labels)
     config = PrepareConfig(
-        NodeConfig(strategy, nodes, radius, seed=seed), faces, template, align, scale, landmarks, parts
+        NodeConfig(strategy, nodes, radius, seed=seed),
+        *(faces, decimate, template, align, scale, landmarks, parts),
     )
     with console.progress() as progress:
         made = prepare_shapes(shapes, output, config, progress)

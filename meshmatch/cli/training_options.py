@@ -58,6 +58,12 @@ Radius = Annotated[
     float, typer.Option(min=1e-6, help="Support radius of a node, in units of sqrt(surface area).")
 ]
 Faces = Annotated[int, typer.Option(min=100, help="Triangles of the low resolution.")]
+Decimate = Annotated[
+    Literal["fast", "meshlab"],
+    typer.Option(
+        help="How the low resolution is made: fast, or slowly with better triangles by MeshLab (extra `meshlab`)."
+    ),
+]
 
 ModelFolder = Annotated[
     Path,

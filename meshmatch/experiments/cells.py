@@ -15,7 +15,7 @@ import torch
 
 from meshmatch.errors import TemplateError
 from meshmatch.fields.choice import FieldName
-from meshmatch.fields.mls import Kernel
+from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.deformer import NetworkConfig
 from meshmatch.templates.nodes import NodeConfig, Strategy, choose_nodes
 from meshmatch.templates.registered import read_registered

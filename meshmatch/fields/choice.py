@@ -7,10 +7,12 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.fields.field import PointField
-from meshmatch.fields.mls import Kernel, build_field
+from meshmatch.fields.mls import build_field
 from meshmatch.fields.pointwise import Motion, PointwiseField
 from meshmatch.fields.rbf import build_rbf
+from meshmatch.geometry.kernels import Kernel
 
 FieldName = Literal["mls", "rbf", "pointwise"]
 FIELDS: tuple[FieldName, ...] = get_args(FieldName)
@@ -21,18 +23,18 @@ def has_nodes(name: FieldName) -> bool:
     return name != "pointwise"
 
 
-def lay_field(
+def field_at(
     name: FieldName,
-    points: np.ndarray,
-    nodes: np.ndarray,
+    points: Float[Floats, "P 3"],
+    nodes: Float[Floats, "K 3"],
     radius: float,
     kernel: Kernel,
     motion: Motion | None = None,
     D: int = 0,
 ) -> PointField:
-    """A representation on fixed points (P, 3) of the template's frame.
+    """A representation on fixed points of the template's frame.
 
-    ``nodes`` (K, 3), ``radius`` and ``kernel`` are for those that have them; ``motion``, with codes of ``D`` numbers, for
+    ``nodes``, ``radius`` and ``kernel`` are for those that have them; ``motion``, with codes of ``D`` numbers, for
     the pointwise one.
 
     Raises

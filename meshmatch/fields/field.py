@@ -13,6 +13,8 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from meshmatch.arrays import Float, Floats, Int, Ints
+
 
 class PointField(Protocol):
     """A representation on P fixed points.
@@ -23,20 +25,20 @@ class PointField(Protocol):
     @property
     def linear(self) -> bool: ...
 
-    def displacement(self, rows: torch.Tensor) -> torch.Tensor:
-        """Rows (B, R, 3) -> displacements (B, P, 3)."""
+    def displacement(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B P 3"]:
+        """Where the points go, relative to where they are."""
         ...
 
-    def deformation_gradient(self, rows: torch.Tensor) -> torch.Tensor:
-        """Rows (B, R, 3) -> F (B, G, 3, 3) on the first G points, all but after `for_training`."""
+    def deformation_gradient(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B G 3 3"]:
+        """F[..., a, k] = dx'_a / dx_k on the first G points: all of them, except after `for_training`."""
         ...
 
-    def displaced(self, rows: np.ndarray) -> np.ndarray:
-        """The displacement of one answer (R, 3) in float64: (P, 3)."""
+    def displaced(self, rows: Float[Floats, "R 3"]) -> Float[Floats, "P 3"]:
+        """The displacement of one answer, in float64."""
         ...
 
-    def strain(self, rows: np.ndarray, at: np.ndarray) -> np.ndarray:
-        """F (N, 3, 3) of one answer (R, 3) at some of the points (N,), float64."""
+    def strain(self, rows: Float[Floats, "R 3"], at: Int[Ints, " N"]) -> Float[Floats, "N 3 3"]:
+        """F of one answer at some of the points."""
         ...
 
     def for_training(self, strained: int | None = None) -> PointField:
@@ -60,14 +62,14 @@ class Field:
 
     Attributes
     ----------
-    phi : tensor (P, K), sparse CSR or dense
+    phi : sparse CSR or dense
         Shape functions; with moving least squares each row sums to one.
-    gradient : tensor (3 P, K), likewise
+    gradient : likewise
         Row 3 p + k holds the derivative of the shape functions at point p along axis k (1 / length).
     """
 
-    phi: torch.Tensor
-    gradient: torch.Tensor
+    phi: Float[torch.Tensor, "P K"]
+    gradient: Float[torch.Tensor, "3*P K"]
 
     @property
     def P(self) -> int:
@@ -81,21 +83,21 @@ class Field:
     def linear(self) -> bool:
         return True
 
-    def displacement(self, rows: torch.Tensor) -> torch.Tensor:
-        """Displacement of the points: node vectors (B, K, 3) -> (B, P, 3)."""
+    def displacement(self, rows: Float[torch.Tensor, "B K 3"]) -> Float[torch.Tensor, "B P 3"]:
+        """Displacement of the points by node vectors."""
         return self._apply(self.phi, rows)
 
-    def deformation_gradient(self, rows: torch.Tensor) -> torch.Tensor:
-        """F = I + sum_i u_i (grad Phi_i)^T: node vectors (B, K, 3) -> (B, P, 3, 3), F[..., a, k] = dx'_a/dx_k."""
+    def deformation_gradient(self, rows: Float[torch.Tensor, "B K 3"]) -> Float[torch.Tensor, "B P 3 3"]:
+        """F = I + sum_i u_i (grad Phi_i)^T of node vectors, F[..., a, k] = dx'_a / dx_k."""
         columns = self._apply(self.gradient, rows).unflatten(1, (-1, 3))  # B P k a
         # At least float32: in bfloat16 the small difference from the identity would be lost.
         kind = torch.promote_types(rows.dtype, torch.float32)
         return columns.transpose(-1, -2) + torch.eye(3, dtype=kind, device=rows.device)
 
-    def displaced(self, rows: np.ndarray) -> np.ndarray:
+    def displaced(self, rows: Float[Floats, "K 3"]) -> Float[Floats, "P 3"]:
         return (self.phi.double() @ torch.from_numpy(np.array(rows))).numpy()
 
-    def strain(self, rows: np.ndarray, at: np.ndarray) -> np.ndarray:
+    def strain(self, rows: Float[Floats, "K 3"], at: Int[Ints, " N"]) -> Float[Floats, "N 3 3"]:
         slopes = (self.gradient.double() @ torch.from_numpy(np.array(rows))).unflatten(0, (-1, 3))
         return slopes.transpose(1, 2).numpy()[at] + np.eye(3)
 
@@ -145,8 +147,10 @@ class _Product(torch.autograd.Function):
         return ctx.transpose @ gradient, None, None
 
 
-def apply_shape_functions(matrix: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """One matrix (R, K), sparse or dense, on a batch of node vectors (B, K, 3) -> (B, R, 3).
+def apply_shape_functions(
+    matrix: Float[torch.Tensor, "R K"], vectors: Float[torch.Tensor, "B K 3"]
+) -> Float[torch.Tensor, "B R 3"]:
+    """One matrix, sparse or dense, on a batch of node vectors.
 
     As a single product: a batched one with three columns is twenty times slower on a CPU.
     """

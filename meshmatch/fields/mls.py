@@ -13,48 +13,33 @@ basis), and the 4 x 4 moment matrices stay well conditioned.
 from __future__ import annotations
 
 import warnings
-from typing import Literal, get_args
 
 import numpy as np
 import torch
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import TemplateError
 from meshmatch.fields.field import Field
+from meshmatch.geometry.kernels import KERNELS, Kernel
 from meshmatch.templates.support import MINIMUM_EIGENVALUE, support_pairs
 
-Kernel = Literal["cubic", "smooth"]
-KERNELS: tuple[Kernel, ...] = get_args(Kernel)
 
-
-def kernel_weights(
-    distance: torch.Tensor, radius: torch.Tensor, kernel: Kernel
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Weight w(d) and (dw/dd) / d for distances inside the support.
-
-    ``cubic`` is the paper's (1 - d/r)^3, whose gradient is set to 0 at the node by symmetry;
-    ``smooth`` is (1 - d^2/r^2)^3, which is C1 there.
-    """
-    ratio = distance / radius
-    if kernel == "cubic":
-        inside = (1 - ratio).clamp_min(0)
-        slope = -3 * inside**2 / (radius * distance.clamp_min(1e-30))
-        return inside**3, torch.where(distance > 0, slope, torch.zeros_like(slope))
-    inside = (1 - ratio**2).clamp_min(0)
-    return inside**3, -6 * inside**2 / radius**2
-
-
-def build_field(points: np.ndarray, nodes: np.ndarray, radius: float | np.ndarray, kernel: Kernel) -> Field:
+def build_field(
+    points: Float[Floats, "P 3"],
+    nodes: Float[Floats, "K 3"],
+    radius: float | Float[Floats, " K"],
+    kernel: Kernel,
+) -> Field:
     """Evaluate the shape functions and their gradient on fixed points.
 
     Parameters
     ----------
-    points : float array (P, 3)
-    nodes : float array (K, 3)
-        In the unit and frame of ``points``.
-    radius : float or float array (K,)
+    points, nodes
+        In one unit and frame.
+    radius
         Support radius of the nodes, same unit.
-    kernel : {"smooth", "cubic"}
-        That of the model, always: vectors learned with one mean something else with another.
+    kernel
+        The model's: vectors learned with one kernel mean something else with another.
 
     Returns
     -------
@@ -73,7 +58,7 @@ def build_field(points: np.ndarray, nodes: np.ndarray, radius: float | np.ndarra
     x, q, r = (torch.from_numpy(np.array(a)) for a in (points, nodes, radii))
     at, of = torch.from_numpy(row), torch.from_numpy(column)
     offset = x[at] - q[of]
-    weight, slope = kernel_weights(offset.norm(dim=1), r[of], kernel)
+    weight, slope = KERNELS[kernel](offset.norm(dim=1), r[of])
     slope_vector = slope[:, None] * offset  # dw/dx
 
     scale = float(r.mean())

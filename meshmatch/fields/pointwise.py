@@ -17,8 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from meshmatch.arrays import Float, Floats, Int, Ints
+
 # (points (B, P, 3), code (B, D)) -> displacements (B, P, 3); what happens to a point depends on no other point.
-Motion = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+Motion = Callable[[Float[torch.Tensor, "B P 3"], Float[torch.Tensor, "B D"]], Float[torch.Tensor, "B P 3"]]
 TURN_ROWS = 3
 
 
@@ -27,20 +29,22 @@ def code_rows(D: int) -> int:
     return -(-D // 3)
 
 
-def pack(code: torch.Tensor) -> torch.Tensor:
-    """Codes (B, D) -> rows (B, R, 3) without a turn."""
+def pack(code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B R 3"]:
+    """Rows of codes, without a turn."""
     D = code.shape[1]
     fill = 3 * (code_rows(D) + TURN_ROWS) - D
     return torch.nn.functional.pad(code, (0, fill)).unflatten(1, (-1, 3))
 
 
-def unpack(rows: torch.Tensor, D: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rows (B, R, 3) -> codes (B, D) and turns T (B, 3, 3)."""
+def unpack(
+    rows: Float[torch.Tensor, "B R 3"], D: int
+) -> tuple[Float[torch.Tensor, "B D"], Float[torch.Tensor, "B 3 3"]]:
+    """Codes and turns T of rows."""
     return rows[:, :-TURN_ROWS].flatten(1)[:, :D], rows[:, -TURN_ROWS:]
 
 
-def turned_rows(rows: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Rows (R, 3) of the deformation whose moved points are those of ``rows`` times ``turn`` (points are rows)."""
+def turned_rows(rows: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
+    """Rows of the deformation whose moved points are those of ``rows`` times ``turn`` (points are rows)."""
     turned = rows.copy()
     turned[-TURN_ROWS:] = (np.eye(3) + rows[-TURN_ROWS:]) @ turn - np.eye(3)
     return turned
@@ -48,10 +52,10 @@ def turned_rows(rows: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class PointwiseField:
-    """A network's motion on fixed points (P, 3), with gradients on ``strained`` (G, 3); codes have D numbers."""
+    """A network's motion on fixed points, with gradients on ``strained``; codes have D numbers."""
 
-    points: torch.Tensor
-    strained: torch.Tensor
+    points: Float[torch.Tensor, "P 3"]
+    strained: Float[torch.Tensor, "G 3"]
     motion: Motion
     D: int
 
@@ -59,25 +63,22 @@ class PointwiseField:
     def linear(self) -> bool:
         return False
 
-    def displacement(self, rows: torch.Tensor) -> torch.Tensor:
-        """Rows (B, R, 3) -> displacements (B, P, 3)."""
+    def displacement(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B P 3"]:
         code, turn = unpack(rows, self.D)
         u = self.motion(self.points.expand(len(code), -1, -1), code)
         return u + (self.points + u) @ turn
 
-    def deformation_gradient(self, rows: torch.Tensor) -> torch.Tensor:
-        """Rows (B, R, 3) -> F (B, G, 3, 3), F[..., a, k] = dx'_a / dx_k."""
+    def deformation_gradient(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B G 3 3"]:
         code, turn = unpack(rows, self.D)
         F = jacobian(self.motion, self.strained.expand(len(code), -1, -1), code)
         F = F + torch.eye(3, dtype=F.dtype, device=F.device)
         return F + turn.transpose(1, 2)[:, None] @ F
 
-    def displaced(self, rows: np.ndarray) -> np.ndarray:
+    def displaced(self, rows: Float[Floats, "R 3"]) -> Float[Floats, "P 3"]:
         with torch.no_grad():
             return self.displacement(torch.from_numpy(np.array(rows)).float()[None])[0].double().numpy()
 
-    def strain(self, rows: np.ndarray, at: np.ndarray) -> np.ndarray:
-        """F (G, 3, 3) of one answer (R, 3) at some of the points."""
+    def strain(self, rows: Float[Floats, "R 3"], at: Int[Ints, " N"]) -> Float[Floats, "N 3 3"]:
         part = PointwiseField(self.points, self.points[torch.from_numpy(at)], self.motion, self.D)
         with torch.no_grad():
             given = torch.from_numpy(np.array(rows)).float()[None]
@@ -99,8 +100,10 @@ class PointwiseField:
         return PointwiseField(points, strained, self.motion, self.D)
 
 
-def jacobian(motion: Motion, points: torch.Tensor, code: torch.Tensor) -> torch.Tensor:
-    """du_a / dx_k (B, P, 3, 3) of a motion, by automatic differentiation; itself differentiable where gradients are.
+def jacobian(
+    motion: Motion, points: Float[torch.Tensor, "B P 3"], code: Float[torch.Tensor, "B D"]
+) -> Float[torch.Tensor, "B P 3 3"]:
+    """du_a / dx_k of a motion, by automatic differentiation; itself differentiable where gradients are.
 
     Points do not act on one another, so the gradient of a sum over points holds each point's own. Backwards through the
     network once for each coordinate: forward mode costs the same here and more memory for its tangents.

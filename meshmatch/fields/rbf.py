@@ -13,15 +13,16 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import TemplateError
 from meshmatch.fields.field import Field
 
 CONSTANT, STEEPNESS = 1.0, 50.0
-_MOST_CONDITION = 1e13
+_MAX_CONDITION = 1e13
 _BLOCK = 4096
 
 
-def build_rbf(points: np.ndarray, nodes: np.ndarray) -> Field:
+def build_rbf(points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"]) -> Field:
     """Evaluate the shape functions and their gradient on fixed points.
 
     The paper's numbers are for shapes in the unit sphere, so lengths are measured in the largest distance of a node from
@@ -29,9 +30,8 @@ def build_rbf(points: np.ndarray, nodes: np.ndarray) -> Field:
 
     Parameters
     ----------
-    points : float array (P, 3)
-    nodes : float array (K, 3)
-        In the unit and frame of ``points``.
+    points, nodes
+        In one unit and frame.
 
     Returns
     -------
@@ -47,7 +47,7 @@ def build_rbf(points: np.ndarray, nodes: np.ndarray) -> Field:
     unit = float(np.linalg.norm(nodes - nodes.mean(0), axis=1).max())
     q = nodes / unit
     among = multiquadric(q[:, None] - q)
-    if not np.linalg.cond(among) < _MOST_CONDITION:
+    if not np.linalg.cond(among) < _MAX_CONDITION:
         raise TemplateError(
             "nodes lie too close together to interpolate between them",
             "use fewer nodes, or another field than rbf",
@@ -65,6 +65,6 @@ def build_rbf(points: np.ndarray, nodes: np.ndarray) -> Field:
     return Field(torch.from_numpy(phi), torch.from_numpy(gradient.reshape(3 * len(points), len(q))))
 
 
-def multiquadric(offset: np.ndarray) -> np.ndarray:
-    """phi of offsets (..., 3), in units of the nodes' radius."""
+def multiquadric(offset: Float[Floats, "*N 3"]) -> Float[Floats, "*N"]:
+    """phi of offsets, in units of the nodes' radius."""
     return np.sqrt(CONSTANT + STEEPNESS * np.square(offset).sum(-1))

@@ -1,7 +1,10 @@
 """What a model is, in words and numbers: a strict JSON card beside its weights.
 
-Standard library alone, so that models can be listed without loading anything heavy.
+Standard library alone, so that listing models stays cheap: importing this module takes 0.06 s of CPU time, and four times
+that with a pydantic model (measured on a shared 2-core machine, 2026-11-22; `models list` would take 0.43 s, not 0.23 s).
 """
+
+from __future__ import annotations
 
 import json
 import math
@@ -16,21 +19,25 @@ from meshmatch.errors import ModelError
 from meshmatch.outputs import replace_on_success
 
 SCHEMA = 3
-MOST_BYTES = 1_000_000
-"""A larger file is no card."""
-
-_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
-_HASH = re.compile(r"[0-9a-f]{16}")
-_SHA256 = re.compile(r"[0-9a-f]{64}")
+MAX_BYTES = 1_000_000
+"""A larger file is not a card."""
 ORIENTATIONS = ("searched", "none", "near", "rigid")
 """How a fit finds the orientation: asks the network, takes what the file has, improves that, or tries all turns."""
 SCALES = ("area", "sphere")
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 _OLD_FRAME = {"orientation": "searched", "scale": "area"}
 _SINCE: dict[int, dict[str, Any]] = {  # what cards of older schemas lack, and what they meant
     1: {"frame": _OLD_FRAME, "stiffness": 1.0},
     2: {"stiffness": 1.0},
 }
-_FIELD_KEYS = {"kernel": str, "radius": float, "nodes": int}
+_KINDS: dict[str, tuple[type, str]] = {  # by annotation
+    "str": (str, "text"),
+    "int": (int, "a whole number"),
+    "float": (float, "a number"),
+    "dict[str, Any]": (dict, "an object"),
+}
+_FIELD_KEYS = {"kernel": "str", "radius": "float", "nodes": "int"}
 
 
 @dataclass(frozen=True)
@@ -52,7 +59,7 @@ class ModelCard:
     data, licence : str
         What it was trained on, and under which terms the weights may be used.
     recipe : dict
-        All settings of the training run.
+        All settings of the training.
     seed, steps : int
     training_minutes : float
     metrics : dict
@@ -67,7 +74,6 @@ class ModelCard:
         Version of this list.
     frame : dict
         How a shape is brought to the template: ``orientation`` (one of `ORIENTATIONS`), ``scale`` (of `SCALES`).
-
     stiffness : float
         How firmly fits that agree hold a common stretch of the template; 1 suits bodies, less suits what varies more.
 
@@ -99,24 +105,13 @@ class ModelCard:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value = _plain(getattr(self, item.name), item.name)
-            if item.type is float and type(value) is int:
-                value = float(value)
-            kind = dict if item.type not in (str, int, float) else item.type
-            if type(value) is not kind:
-                _refuse(f"{item.name} must be {_KINDS[kind]}, not {_shown(value)}")
+            value = _checked(_json_value(getattr(self, item.name), item.name), item.name, str(item.type))
             object.__setattr__(self, item.name, value)
-        if self.schema != SCHEMA:
-            newer = self.schema > SCHEMA
-            raise ModelError(
-                f"the model card has schema {self.schema}, not {SCHEMA}",
-                "it needs a newer meshmatch: update it" if newer else "train or fetch the model again",
-            )
+        _check_schema(self.schema)
         check_name(self.name)
-        if not _HASH.fullmatch(self.template_hash):
-            _refuse(f"template_hash must be 16 hex digits, not {_shown(self.template_hash)}")
-        if not _SHA256.fullmatch(self.weights_sha256):
-            _refuse(f"weights_sha256 must be 64 hex digits, not {_shown(self.weights_sha256)}")
+        for name, digits in (("template_hash", 16), ("weights_sha256", 64)):
+            if not re.fullmatch(f"[0-9a-f]{{{digits}}}", getattr(self, name)):
+                _refuse(f"{name} must be {digits} hex digits, not {_shown(getattr(self, name))}")
         if self.steps < 0 or self.training_minutes < 0:
             _refuse("steps and training_minutes must be 0 or more")
         if not self.stiffness > 0:
@@ -125,26 +120,21 @@ class ModelCard:
             datetime.fromisoformat(self.created)
         except ValueError:
             _refuse(f"created must be an ISO date such as 2026-01-31, not {_shown(self.created)}")
-        self._check_field()
-        if self.frame.keys() != _OLD_FRAME.keys():
-            _refuse(f"frame must have orientation and scale, not {', '.join(self.frame) or 'nothing'}")
+        for name, keys in (("field", _FIELD_KEYS), ("frame", _OLD_FRAME)):
+            if (found := getattr(self, name)).keys() != keys.keys():
+                _refuse(f"{name} must have {', '.join(keys)}, not {', '.join(found) or 'nothing'}")
+        for key, kind in _FIELD_KEYS.items():
+            self.field[key] = _checked(self.field[key], f"field.{key}", kind)
+        if not self.field["radius"] > 0 or self.field["nodes"] < 4:
+            _refuse("field needs a positive radius and at least 4 nodes")
         for key, values in (("orientation", ORIENTATIONS), ("scale", SCALES)):
             if self.frame[key] not in values:
                 _refuse(f"frame.{key} must be one of {', '.join(values)}, not {_shown(self.frame[key])}")
-        _check_metrics(self.metrics)
-
-    def _check_field(self) -> None:
-        if self.field.keys() != _FIELD_KEYS.keys():
-            _refuse(f"field must have {', '.join(_FIELD_KEYS)}, not {', '.join(self.field) or 'nothing'}")
-        for key, kind in _FIELD_KEYS.items():
-            value = self.field[key]
-            if type(value) is not kind and not (kind is float and type(value) is int):
-                _refuse(f"field.{key} must be {_KINDS[kind]}, not {_shown(value)}")
-        if not self.field["radius"] > 0 or self.field["nodes"] < 4:
-            _refuse("field needs a positive radius and at least 4 nodes")
-
-
-_KINDS: dict[Any, str] = {str: "text", int: "a whole number", float: "a number", dict: "an object"}
+        for name, results in self.metrics.items():
+            for key, value in _checked(results, f"metrics.{name}", "dict[str, Any]").items():
+                numbers = value.values() if isinstance(value, dict) else (value,)
+                if any(type(number) not in (int, float) for number in numbers):
+                    _refuse(f"metrics.{name}.{key} must be a number or an object of numbers")
 
 
 def check_name(name: str) -> str:
@@ -163,24 +153,26 @@ def read_card(path: str | Path) -> ModelCard:
     Raises
     ------
     ModelError
-        The file is missing, too large, no JSON object, of another schema, or has missing, unknown, repeated
+        The file is missing, too large, not a JSON object, of another schema, or has missing, unknown, repeated
         or wrong entries.
     """
     path = Path(path)
     try:
+        if path.exists() and not path.is_file():
+            raise OSError("not a regular file")  # a pipe would wait for ever
         with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
+            data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise ModelError(
             f"{path.parent} holds no model: cannot read {path.name}",
             "a model is a folder with card.json, weights.safetensors and template.safetensors",
         ) from error
-    if len(data) > MOST_BYTES:
-        raise ModelError(f"{path} is larger than {MOST_BYTES // 1000} kB: this is no model card")
+    if len(data) > MAX_BYTES:
+        raise ModelError(f"{path} is not a model card: it is larger than {MAX_BYTES // 1000} kB")
     try:
         return card_from_json(data.decode("utf-8"))
     except UnicodeDecodeError as error:
-        raise ModelError(f"{path} is no model card: it is not text", "is the file damaged?") from error
+        raise ModelError(f"{path} is not a model card: it is not text", "is the file damaged?") from error
     except ModelError as error:
         raise ModelError(f"{path}: {error.message}", error.hint) from error
 
@@ -188,27 +180,23 @@ def read_card(path: str | Path) -> ModelCard:
 def card_from_json(text: str) -> ModelCard:
     """The card that a text holds; `ModelError` if it holds none."""
     try:
-        found = json.loads(text, object_pairs_hook=unique_keys, parse_constant=_no_constant)
+        found = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_not_json)
     except (ValueError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
-        raise ModelError(f"this is no JSON: {reason}", "is the file damaged?") from error
+        raise ModelError(f"this is not JSON: {reason}", "is the file damaged?") from error
     if not isinstance(found, dict):
         _refuse("a card must be a JSON object")
-    if type(found.get("schema")) is int and found["schema"] > SCHEMA:
-        # before its keys are judged, which a newer version is free to change
-        raise ModelError(
-            f"the model card has schema {found['schema']}, not {SCHEMA}",
-            "it needs a newer meshmatch: update it",
-        )
-    old = _SINCE.get(found["schema"]) if type(found.get("schema")) is int else None
-    if old is not None and not old.keys() & found.keys():
-        found = found | old | {"schema": SCHEMA}
+    schema = found.get("schema")
+    if type(schema) is int:
+        if schema > SCHEMA:
+            _check_schema(schema)  # before its keys are judged, which a newer version is free to change
+        old = _SINCE.get(schema, {})
+        if old and not old.keys() & found.keys():
+            found = found | old | {"schema": SCHEMA}
     known = [item.name for item in fields(ModelCard)]
-    unknown = sorted(set(found) - set(known))
-    missing = [name for name in known if name not in found]
-    if unknown:
+    if unknown := sorted(set(found) - set(known)):
         _refuse(f"unknown entries: {', '.join(_shown(name) for name in unknown[:5])}")
-    if missing:
+    if missing := [name for name in known if name not in found]:
         _refuse(f"missing entries: {', '.join(missing)}")
     return ModelCard(**found)
 
@@ -221,7 +209,7 @@ def card_to_json(card: ModelCard) -> str:
 
 
 def write_card(card: ModelCard, path: str | Path) -> None:
-    """Write a card, whole or not at all. Write it last: a folder without one is no model.
+    """Write a card completely or not at all. Write it last: a folder without one is not a model.
 
     Raises
     ------
@@ -232,25 +220,24 @@ def write_card(card: ModelCard, path: str | Path) -> None:
         temporary.write_text(card_to_json(card), encoding="utf-8")
 
 
-def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of a JSON text (`object_pairs_hook`); ValueError if a key occurs twice."""
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        raise ValueError("a key occurs twice")
-    return found
+def _check_schema(schema: int) -> None:
+    if schema != SCHEMA:
+        raise ModelError(
+            f"the model card has schema {schema}, not {SCHEMA}",
+            "it needs a newer meshmatch: update it" if schema > SCHEMA else "train or fetch the model again",
+        )
 
 
-def _check_metrics(metrics: dict[str, Any]) -> None:
-    for name, values in metrics.items():
-        if not isinstance(values, dict):
-            _refuse(f"metrics.{name} must be an object of numbers, not {_shown(values)}")
-        for key, value in values.items():
-            numbers = value.values() if isinstance(value, dict) else (value,)
-            if any(type(number) not in (int, float) for number in numbers):
-                _refuse(f"metrics.{name}.{key} must be a number or an object of numbers")
+def _checked(value: Any, where: str, annotation: str) -> Any:
+    kind, words = _KINDS[annotation]
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind:
+        _refuse(f"{where} must be {words}, not {_shown(value)}")
+    return value
 
 
-def _plain(value: Any, where: str, depth: int = 0) -> Any:
+def _json_value(value: Any, where: str, depth: int = 0) -> Any:
     """The value as JSON has it: tuples become lists; what JSON does not have is refused."""
     if depth > 20:
         _refuse(f"{where} is nested too deeply")
@@ -263,14 +250,21 @@ def _plain(value: Any, where: str, depth: int = 0) -> Any:
     if isinstance(value, dict):
         if not all(isinstance(key, str) for key in value):
             _refuse(f"{where} has a key that is not text")
-        return {key: _plain(inner, f"{where}.{key}", depth + 1) for key, inner in value.items()}
+        return {key: _json_value(inner, f"{where}.{key}", depth + 1) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner, where, depth + 1) for inner in value]
+        return [_json_value(inner, where, depth + 1) for inner in value]
     _refuse(f"{where} cannot hold {_shown(value)}")
 
 
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON number")
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a key occurs twice")
+    return found
+
+
+def _not_json(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a JSON number")
 
 
 def _shown(value: Any) -> str:

@@ -19,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from meshmatch.errors import ModelError, OptionError
-from meshmatch.models.tensor_file import TensorInfo, check_tensor_file
+from meshmatch.models.tensor_file import TensorInfo, read_header
 from meshmatch.outputs import replace_on_success
 
 Storage = Literal["float32", "float16", "int8"]
@@ -46,12 +46,12 @@ def save_weights(state: Mapping[str, torch.Tensor], path: str | Path, *, storage
     ModelError
         A tensor is not finite.
     OptionError
-        There is no such storage.
+        An unknown storage.
     OutputError
         The file cannot be written.
     """
     if storage not in STORAGES:
-        raise OptionError(f"no storage {storage!r}", f"choose one of {', '.join(STORAGES)}")
+        raise OptionError(f"unknown storage {storage!r}", f"choose one of {', '.join(STORAGES)}")
     arrays: dict[str, torch.Tensor] = {}
     for name in sorted(state):
         tensor = state[name].detach().cpu()
@@ -92,7 +92,7 @@ def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> d
         The file is missing or damaged, or its tensors are not those expected.
     """
     path = Path(path)
-    held = check_tensor_file(path)
+    held = read_header(path)
     _check(path, held, expected)
     try:
         with safe_open(str(path), framework="pt") as file:
@@ -110,7 +110,9 @@ def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> d
             tensor = tensor.float()
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise _mismatch(path, f"{name} is not finite")
-        found[name] = tensor
+        found[name] = (
+            tensor.clone() if tensor is arrays[name] else tensor
+        )  # memory of its own, aligned as torch does
     return found
 
 

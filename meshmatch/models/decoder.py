@@ -7,6 +7,7 @@ from itertools import pairwise
 import torch
 from torch import nn
 
+from meshmatch.arrays import Float
 from meshmatch.fields.pointwise import pack
 from meshmatch.models.layers import residual_mlp
 
@@ -18,8 +19,8 @@ class FlatDecoder(nn.Module):
         super().__init__()
         self.network = residual_mlp(code, width, depth, 3 * K)
 
-    def forward(self, code: torch.Tensor) -> torch.Tensor:
-        """code (B, D) -> node vectors (B, K, 3)."""
+    def forward(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B K 3"]:
+        """Node vectors of codes."""
         return self.network(code).unflatten(-1, (-1, 3))
 
 
@@ -30,7 +31,7 @@ class NodeDecoder(nn.Module):
     numbers for a fraction of the cost.
     """
 
-    def __init__(self, code: int, nodes: torch.Tensor, width: int = 1024) -> None:
+    def __init__(self, code: int, nodes: Float[torch.Tensor, "K 3"], width: int = 1024) -> None:
         super().__init__()
         self.nodes: torch.Tensor
         self.register_buffer("nodes", nodes)
@@ -43,8 +44,8 @@ class NodeDecoder(nn.Module):
         layers.append(nn.Linear(sizes[-1], 3))
         self.network = nn.Sequential(*layers)
 
-    def forward(self, code: torch.Tensor) -> torch.Tensor:
-        """code (B, D) -> node vectors (B, K, 3)."""
+    def forward(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B K 3"]:
+        """Node vectors of codes."""
         hidden = self.from_code(code)[:, None] + self.from_node(self.nodes)  # B K width
         return 2 * torch.tanh(self.network(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
 
@@ -70,10 +71,10 @@ class PointDecoder(nn.Module):
         nn.init.zeros_(last.bias)
         self.network = nn.Sequential(*layers, last)
 
-    def forward(self, code: torch.Tensor) -> torch.Tensor:
-        """code (B, D) -> rows (B, R, 3)."""
+    def forward(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B R 3"]:
         return pack(code)
 
-    def displacement(self, points: torch.Tensor, code: torch.Tensor) -> torch.Tensor:
-        """points (B, P, 3), code (B, D) -> displacements (B, P, 3)."""
+    def displacement(
+        self, points: Float[torch.Tensor, "B P 3"], code: Float[torch.Tensor, "B D"]
+    ) -> Float[torch.Tensor, "B P 3"]:
         return 2 * torch.tanh(self.network(self.from_code(code)[:, None] + self.from_point(points)))

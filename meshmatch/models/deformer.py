@@ -9,21 +9,21 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-import numpy as np
 import torch
 from torch import nn
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import ModelError
-from meshmatch.fields.choice import FIELDS, FieldName, has_nodes, lay_field
+from meshmatch.fields.choice import FIELDS, FieldName, field_at, has_nodes
 from meshmatch.fields.field import PointField, apply_shape_functions
-from meshmatch.fields.mls import Kernel
 from meshmatch.fields.pointwise import TURN_ROWS, PointwiseField, code_rows, turned_rows
+from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.decoder import FlatDecoder, NodeDecoder, PointDecoder
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.models.layers import residual_mlp
 from meshmatch.models.neighbours import two_way_offsets
 
-_LARGEST = {
+_MAX = {
     "code": 4096, "width": 8192, "depth": 64, "basis": 8192,
     "align_basis": 8192, "align_width": 8192, "corrections": 64, "correct_width": 8192,
 }  # fmt: skip
@@ -31,7 +31,9 @@ _LARGEST = {
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Sizes and choices of a deformer; saved in the model card (those of before ``field`` have moving least squares).
+    """Sizes and choices of a deformer; saved in the model card (cards without ``field`` have moving least squares).
+
+    The defaults were chosen on generated bodies (docs/results.md, ablations).
 
     A pointwise field has a decoder of its own, whatever ``decoder`` says.
     """
@@ -51,13 +53,15 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         # A card may come from anywhere: bound what building the network allocates.
         if self.encoder not in ("basis", "point") or self.decoder not in ("flat", "node"):
-            raise ModelError(f"no network of {self.encoder!r} and {self.decoder!r}", "update meshmatch")
+            raise ModelError(
+                f"unknown network: encoder {self.encoder!r}, decoder {self.decoder!r}", "update meshmatch"
+            )
         if self.field not in FIELDS:
-            raise ModelError(f"no field {self.field!r}, only {', '.join(FIELDS)}", "update meshmatch")
-        for name, most in _LARGEST.items():
+            raise ModelError(f"unknown field {self.field!r}, only {', '.join(FIELDS)}", "update meshmatch")
+        for name, limit in _MAX.items():
             value = getattr(self, name)
-            if type(value) is not int or not 0 <= value <= most:
-                raise ModelError(f"network option {name} must be an integer from 0 to {most}, not {value!r}")
+            if type(value) is not int or not 0 <= value <= limit:
+                raise ModelError(f"network option {name} must be an integer from 0 to {limit}, not {value!r}")
 
     @staticmethod
     def from_dict(values: dict) -> NetworkConfig:
@@ -74,8 +78,8 @@ class NetworkConfig:
 PAPER = NetworkConfig(encoder="point", decoder="node", width=1024, align_basis=0, corrections=0)
 
 
-def rotation_from_six(six: torch.Tensor) -> torch.Tensor:
-    """Gram-Schmidt on two predicted columns (B, 6) -> rotations (B, 3, 3)."""
+def rotation_from_six(six: Float[torch.Tensor, "B 6"]) -> Float[torch.Tensor, "B 3 3"]:
+    """Rotations by Gram-Schmidt on two predicted columns (Zhou et al., CVPR 2019)."""
     a = nn.functional.normalize(six[:, :3], dim=-1)
     b = six[:, 3:] - (a * six[:, 3:]).sum(-1, keepdim=True) * a
     b = nn.functional.normalize(b, dim=-1)
@@ -87,22 +91,23 @@ class Deformer(nn.Module):
 
     Parameters
     ----------
-    nodes : tensor (K, 3)
+    nodes
         Control nodes in the template frame.
-    anchors : tensor (A, 3), anchor_phi : tensor (A, K), or None where the field has no nodes
-        Points of the template where a correction looks at the scan, and the field's shape functions there.
-    basis, align_basis : tensors (M, 3), (N, 3)
+    anchors, anchor_phi
+        Points of the template where a correction looks at the scan, and the field's shape functions there; None where
+        the field has no nodes.
+    basis, align_basis
         Basis points of encoder and aligner; ignored (may be empty) where the config does not use them.
     """
 
     def __init__(
         self,
         config: NetworkConfig,
-        nodes: torch.Tensor,
-        anchors: torch.Tensor,
-        anchor_phi: torch.Tensor | None,
-        basis: torch.Tensor,
-        align_basis: torch.Tensor,
+        nodes: Float[torch.Tensor, "K 3"],
+        anchors: Float[torch.Tensor, "A 3"],
+        anchor_phi: Float[torch.Tensor, "A K"] | None,
+        basis: Float[torch.Tensor, "M 3"],
+        align_basis: Float[torch.Tensor, "N 3"],
     ) -> None:
         super().__init__()
         self.config = config
@@ -136,33 +141,36 @@ class Deformer(nn.Module):
     def K(self) -> int:
         return len(self.nodes)
 
-    def field(self, points: np.ndarray, nodes: np.ndarray, radius: float, kernel: Kernel) -> PointField:
-        """The field that reads this network's rows, on points (P, 3) of the template's frame.
+    def field(
+        self, points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radius: float, kernel: Kernel
+    ) -> PointField:
+        """The field that reads this network's rows, on points of the template's frame.
 
-        ``nodes`` (K, 3) are the template's, in their own precision.
+        ``nodes`` are the template's, in their own precision.
         """
         motion = self.decoder.displacement if isinstance(self.decoder, PointDecoder) else None
-        return lay_field(self.config.field, points, nodes, radius, kernel, motion, self.config.code)
+        return field_at(self.config.field, points, nodes, radius, kernel, motion, self.config.code)
 
-    def turned(self, vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
-        """Rows (R, 3) of the deformation whose moved points (rows) are those of ``vectors`` times ``turn`` (3, 3)."""
+    def turned(self, vectors: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
+        """Rows of the deformation whose moved points (rows) are those of ``vectors`` times ``turn``."""
         if isinstance(self.decoder, PointDecoder):
             return turned_rows(vectors, turn)
         nodes = self.nodes.double().cpu().numpy()
         # A node at q moves to Q^T (q + u), so its vector in the turned frame is that minus q.
         return (nodes + vectors) @ turn - nodes
 
-    def align(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Aligner features -> rotation R (B, 3, 3) and center t (B, 3) of the core: scan = R core + t."""
+    def align(
+        self, features: Float[torch.Tensor, "B N 3"]
+    ) -> tuple[Float[torch.Tensor, "B 3 3"], Float[torch.Tensor, "B 3"]]:
+        """Rotation R and center t of the core: scan = R core + t."""
         assert self.aligner is not None
         out = self.aligner(features)
         return rotation_from_six(out[:, :6]), out[:, 6:]
 
-    def correct(self, vectors: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        """One learned registration step.
-
-        rows (B, R, 3) and scan points (B, P, 3), both in the core frame -> better rows.
-        """
+    def correct(
+        self, vectors: Float[torch.Tensor, "B R 3"], points: Float[torch.Tensor, "B P 3"]
+    ) -> Float[torch.Tensor, "B R 3"]:
+        """One learned registration step: better rows from rows and scan points, both in the core frame."""
         assert self.corrector is not None
         moved = self._at_anchors(vectors)  # B A 3
         seen = two_way_offsets(self.anchors + moved, points)
@@ -179,8 +187,8 @@ class Deformer(nn.Module):
         assert self.anchor_phi is not None
         return apply_shape_functions(self.anchor_phi, vectors)
 
-    def forward(self, points: torch.Tensor) -> torch.Tensor:
-        """Scan points in the core frame (B, P, 3) -> rows (B, R, 3): with nodes, their vectors (B, K, 3)."""
+    def forward(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B R 3"]:
+        """The rows of scans in the core frame; with nodes, these are their vectors."""
         vectors = self.decoder(self.encoder(self.encoder.features(points)))
         for _ in range(self.config.corrections):
             vectors = self.correct(vectors, points)

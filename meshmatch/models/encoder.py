@@ -8,6 +8,7 @@ from itertools import pairwise
 import torch
 from torch import nn
 
+from meshmatch.arrays import Float
 from meshmatch.models.layers import residual_mlp
 from meshmatch.models.neighbours import nearest
 
@@ -19,18 +20,18 @@ class BasisEncoder(nn.Module):
     query per basis point, about a thousandth of a point MLP of the same quality.
     """
 
-    def __init__(self, basis: torch.Tensor, width: int, depth: int, outputs: int) -> None:
+    def __init__(self, basis: Float[torch.Tensor, "M 3"], width: int, depth: int, outputs: int) -> None:
         super().__init__()
         self.basis: torch.Tensor
         self.register_buffer("basis", basis)
         self.network = residual_mlp(3 * len(basis), width, depth, outputs)
 
-    def features(self, points: torch.Tensor) -> torch.Tensor:
-        """points (B, P, 3) -> offsets (B, M, 3), in units of about one standard deviation."""
+    def features(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B M 3"]:
+        """Offsets from the basis, in units of about one standard deviation."""
         offsets = nearest(self.basis.expand(len(points), -1, -1), points)[1]
         return offsets * 5.0
 
-    def forward(self, features: torch.Tensor) -> torch.Tensor:
+    def forward(self, features: Float[torch.Tensor, "B ..."]) -> Float[torch.Tensor, "B D"]:
         return self.network(features.flatten(1))
 
 
@@ -51,11 +52,11 @@ class PointEncoder(nn.Module):
             nn.Linear(latent, latent), nn.ReLU(), nn.Dropout(dropout), nn.Linear(latent, outputs)
         )
 
-    def features(self, points: torch.Tensor) -> torch.Tensor:
-        """points (B, P, 3) -> encoding (B, P, 6 N) of unit length."""
+    def features(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B P 6*N"]:
+        """Encodings of unit length."""
         angle = 2 * math.pi * points[..., None, :] * self.frequencies[:, None]
         waves = torch.cat([angle.sin(), angle.cos()], -1).flatten(-2)
         return waves / math.sqrt(3 * len(self.frequencies))
 
-    def forward(self, features: torch.Tensor) -> torch.Tensor:
+    def forward(self, features: Float[torch.Tensor, "B ..."]) -> Float[torch.Tensor, "B D"]:
         return self.head(self.points(features.transpose(1, 2)).amax(-1))

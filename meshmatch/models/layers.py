@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+from meshmatch.arrays import Float
+
 
 class ResidualBlock(nn.Module):
     """x + W2 gelu(W1 norm(x)), a pre-norm residual layer of constant width."""
@@ -18,7 +20,7 @@ class ResidualBlock(nn.Module):
         nn.init.zeros_(self.narrow.weight)
         nn.init.zeros_(self.narrow.bias)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x: Float[torch.Tensor, "*B W"]) -> Float[torch.Tensor, "*B W"]:
         return x + self.narrow(self.dropout(nn.functional.gelu(self.widen(self.norm(x)))))
 
 

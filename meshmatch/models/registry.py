@@ -1,7 +1,7 @@
 """Models by name: those that ship with the package, and the user's own.
 
 A model is a folder with ``card.json`` (written last), ``weights.safetensors`` and ``template.safetensors``.
-Nothing here loads a network: listing models is cheap.
+Listing models loads neither NumPy nor torch.
 """
 
 import hashlib
@@ -14,10 +14,11 @@ from pathlib import Path
 
 from meshmatch.errors import MeshmatchError, ModelError, OutputError
 from meshmatch.models.card import ModelCard, check_name, read_card
-from meshmatch.models.tensor_file import check_tensor_file
+from meshmatch.models.tensor_file import read_header
 
 CARD, WEIGHTS, TEMPLATE = "card.json", "weights.safetensors", "template.safetensors"
 HOME_VARIABLE = "MESHMATCH_HOME"
+_REPLACED = ".replaced"  # the end of the hidden name of a model that is being replaced
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def user_folder() -> Path:
     """Where the user's own models are; may not exist yet. The variable MESHMATCH_HOME moves it."""
     home = os.environ.get(HOME_VARIABLE)
     if home:
-        return Path(home).expanduser() / "models"
+        return _expanded(home) / "models"
     from platformdirs import user_data_path
 
     return user_data_path("meshmatch", appauthor=False) / "models"
@@ -61,6 +62,7 @@ def user_folder() -> Path:
 
 def list_models() -> tuple[Entry, ...]:
     """All models, built-in ones first, by name; damaged ones too, with their problem."""
+    _restore_interrupted()
     found: dict[str, Entry] = {}
     for parent, built_in in ((built_in_folder(), True), (user_folder(), False)):
         try:
@@ -82,14 +84,8 @@ def get_entry(name: str) -> Entry:
     ModelError
         There is none; the hint names those that are spelled alike.
     """
-    check_name(name)
-    for parent, built_in in ((built_in_folder(), True), (user_folder(), False)):
-        if (parent / name).is_dir():
-            return _entry(parent / name, built_in)
-    names = [entry.name for entry in list_models()]
-    near = get_close_matches(name, names, n=3, cutoff=0.5)
-    hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {', '.join(names) or 'none'}"
-    raise ModelError(f"there is no model {name!r}", f"{hint} (see `meshmatch models list`)")
+    folder = _registered(name)
+    return _entry(folder, folder.parent == built_in_folder())
 
 
 def locate_model(name: str | Path) -> Path:
@@ -101,18 +97,18 @@ def locate_model(name: str | Path) -> Path:
     ModelError
         Neither a registered name nor a model folder.
     """
-    folder = Path(name).expanduser()
-    text = str(name)
+    text, folder = str(name), _expanded(name)
     if isinstance(name, Path) or os.sep in text or "/" in text or text in (".", ".."):
-        if not folder.is_dir():
+        if not _is_folder(folder):
             raise ModelError(
-                f"there is no model folder {folder}", "give the name of a model, or a folder with a card.json"
+                f"there is no model folder {text[:200]}",
+                "give the name of a model, or a folder with a card.json",
             )
         return folder
     try:
-        return get_entry(text).folder
+        return _registered(text)
     except ModelError:
-        if (folder / CARD).is_file():
+        if _is_folder(folder) and (folder / CARD).is_file():
             return folder
         raise
 
@@ -127,8 +123,8 @@ def find_model(name: str | Path) -> tuple[Path, ModelCard]:
     """
     folder = locate_model(name)
     card = read_card(folder / CARD)
-    check_tensor_file(folder / TEMPLATE)
-    check_tensor_file(folder / WEIGHTS)
+    read_header(folder / TEMPLATE)
+    read_header(folder / WEIGHTS)
     with (folder / WEIGHTS).open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if digest != card.weights_sha256:
@@ -141,26 +137,22 @@ def find_model(name: str | Path) -> tuple[Path, ModelCard]:
 
 
 def verify_model(name: str | Path) -> ModelCard:
-    """`find_model`, and the template is the one of the card. Returns the card.
+    """Load a model to be sure that it can be: `meshmatch.models.trained.load_model`. Returns the card.
 
     Raises
     ------
     ModelError
         No such model, or anything about it is wrong.
     """
-    folder, card = find_model(name)
-    from meshmatch.templates.template import load_template
+    from meshmatch.models.trained import load_model
 
+    folder = locate_model(name)
     try:
-        template = load_template(folder / TEMPLATE)
+        card = load_model(folder).card
+    except ModelError:
+        raise
     except MeshmatchError as error:
-        raise ModelError(f"model {card.name}: {error.message}", "fetch or add the model again") from error
-    if template.hash != card.template_hash or card.field["nodes"] != template.K:
-        raise ModelError(
-            f"model {card.name} was trained with another template "
-            f"({card.template_hash}, {card.field['nodes']} nodes; here {template.hash}, {template.K} nodes)",
-            "fetch or add the model again",
-        )
+        raise ModelError(f"model {folder.name}: {error.message}", "fetch or add the model again") from error
     registered = folder.parent in (built_in_folder(), user_folder()) and not folder.name.startswith(".")
     if registered and folder.name != card.name:
         raise ModelError(
@@ -183,40 +175,49 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
     Raises
     ------
     ModelError
-        It is no model, damaged, or its name is taken.
+        It is not a model, damaged, or its name is taken.
     OutputError
         The registry's folder cannot be written.
     """
-    source = Path(folder).expanduser()
-    if not source.is_dir():
-        raise ModelError(f"there is no folder {source}", "a model is a folder with a card.json")
+    source = _expanded(folder)
+    if not _is_folder(source):
+        raise ModelError(f"there is no folder {str(source)[:200]}", "a model is a folder with a card.json")
     card = read_card(source / CARD)
     for file in (TEMPLATE, WEIGHTS):
-        check_tensor_file(source / file)  # before a huge file is copied
+        read_header(source / file)  # before a huge file is copied
     if (built_in_folder() / card.name).exists():
         raise ModelError(f"a built-in model is called {card.name}", "change the name on its card")
+    _restore_interrupted()
     target = user_folder() / card.name
+    taken = ModelError(
+        f"there is a model called {card.name} already",
+        f"`meshmatch models remove {card.name}`, or --replace",
+    )
     if target.exists() and not replace:
-        raise ModelError(
-            f"there is a model called {card.name} already",
-            f"`meshmatch models remove {card.name}`, or --replace",
-        )
+        raise taken
     temporary = user_folder() / f".{card.name}.{secrets.token_hex(4)}"
+    replaced = user_folder() / f".{card.name}{_REPLACED}"
     try:
         temporary.mkdir(parents=True)
         for file in (TEMPLATE, WEIGHTS, CARD):
             shutil.copyfile(source / file, temporary / file)
         if verify_model(temporary) != card:
             raise ModelError(f"{source} changed while it was copied", "try again")
-        if target.exists():
-            _discard(target)
-        os.rename(temporary, target)
+        if replace and target.exists():
+            os.rename(target, replaced)  # if this is the end, `_restore_interrupted` takes it back
+        try:
+            os.rename(temporary, target)
+        except OSError as error:
+            if target.exists():
+                raise taken from error  # another process was faster
+            raise
     except OSError as error:
         raise OutputError(
             f"cannot write {user_folder()}: {error.strerror}", f"set {HOME_VARIABLE} to a folder of yours"
         ) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        _restore_interrupted()
     return _entry(target, False)
 
 
@@ -230,23 +231,58 @@ def remove_model(name: str) -> None:
     OutputError
         Its folder cannot be removed.
     """
-    entry = get_entry(name)
-    if entry.built_in:
+    folder = _registered(name)
+    if folder.parent == built_in_folder():
         raise ModelError(f"{name} is a built-in model and cannot be removed")
     try:
-        _discard(entry.folder)
+        if folder.is_symlink():
+            folder.unlink()
+            return
+        grave = folder.with_name(f".{name}.{secrets.token_hex(4)}")
+        os.rename(folder, grave)  # it loses its name at once, so that a half-removed model is never found
+        shutil.rmtree(grave)
     except OSError as error:
-        raise OutputError(f"cannot remove {entry.folder}: {error.strerror}") from error
+        raise OutputError(f"cannot remove {folder}: {error.strerror}") from error
 
 
-def _discard(folder: Path) -> None:
-    """Remove a folder; it loses its name at once, so that a half-removed model is never found."""
-    if folder.is_symlink():
-        folder.unlink()
-        return
-    grave = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}")
-    os.rename(folder, grave)
-    shutil.rmtree(grave)
+def _registered(name: str) -> Path:
+    """The folder of a registered model; `ModelError` if there is none."""
+    check_name(name)
+    _restore_interrupted()
+    for parent in (built_in_folder(), user_folder()):
+        if (parent / name).is_dir():
+            return parent / name
+    names = [entry.name for entry in list_models()]
+    near = get_close_matches(name, names, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {', '.join(names) or 'none'}"
+    raise ModelError(f"there is no model {name!r}", f"{hint} (see `meshmatch models list`)")
+
+
+def _restore_interrupted() -> None:
+    """Give a model that was being replaced its name back if nothing took its place; else remove it."""
+    for replaced in user_folder().glob(f".*{_REPLACED}"):
+        target = replaced.with_name(replaced.name[1 : -len(_REPLACED)])
+        try:
+            if target.exists():
+                replaced.unlink() if replaced.is_symlink() else shutil.rmtree(replaced)
+            else:
+                os.rename(replaced, target)
+        except OSError:
+            pass  # another process was faster, or the folder is not ours to write
+
+
+def _expanded(path: str | Path) -> Path:
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise ModelError(f"cannot use {str(path)[:200]}: {error}", "write out the home folder") from error
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:  # such as a name that is too long
+        return False
 
 
 def _entry(folder: Path, built_in: bool) -> Entry:

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Hashable
+from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-import numpy as np
 import torch
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import ModelError
 from meshmatch.fields.choice import has_nodes
 from meshmatch.fields.field import PointField
-from meshmatch.fields.mls import KERNELS
+from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.card import ModelCard
 from meshmatch.models.checkpoint import load_weights
 from meshmatch.models.deformer import Deformer, NetworkConfig
-from meshmatch.models.registry import find_model
+from meshmatch.models.registry import TEMPLATE, WEIGHTS, find_model
 from meshmatch.templates.template import Template, load_template
 
 _DERIVING = threading.RLock()
@@ -29,7 +30,7 @@ Derived = TypeVar("Derived")
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """What fitting needs of a category. ``network`` is in evaluation mode, on the CPU.
+    """What fitting needs of a category. ``network`` is in evaluation mode, on the CPU until `to` moves it.
 
     ``derived`` holds what was computed from the model alone, see `once_per_model`.
     """
@@ -39,8 +40,8 @@ class TrainedModel:
     network: Deformer
     derived: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
 
-    def field(self, points: np.ndarray) -> PointField:
-        """The field on points (P, 3) of the template's frame, with the kernel that the network was trained with.
+    def field(self, points: Float[Floats, "P 3"]) -> PointField:
+        """The field on points of the template's frame, with the kernel that the network was trained with.
 
         Raises
         ------
@@ -49,6 +50,15 @@ class TrainedModel:
         """
         nodes, radius = self.template.nodes, self.template.radius
         return self.network.field(points, nodes, radius, self.card.field["kernel"])
+
+    @property
+    def device(self) -> torch.device:
+        """Where the network computes."""
+        return self.network.nodes.device
+
+    def to(self, device: torch.device | str) -> TrainedModel:
+        """The same model on another device; the network is copied, and nothing derived is taken along."""
+        return TrainedModel(self.card, self.template, deepcopy(self.network).to(device))
 
     @property
     def has_nodes(self) -> bool:
@@ -76,15 +86,30 @@ def once_per_model(
 
 
 def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
-    """A network of the right shape whose weights and buffers are still to be read; K nodes."""
-    return Deformer(
-        config,
-        nodes=torch.zeros(K, 3),
-        anchors=torch.zeros(K, 3),
-        anchor_phi=torch.zeros(K, K) if has_nodes(config.field) else None,
-        basis=torch.zeros(config.basis, 3),
-        align_basis=torch.zeros(max(config.align_basis, 1), 3),
-    )
+    """A network for K nodes whose weights and buffers have shapes but no memory: a card cannot ask for gigabytes."""
+    with torch.device("meta"):
+        return Deformer(
+            config,
+            nodes=torch.zeros(K, 3),
+            anchors=torch.zeros(K, 3),
+            anchor_phi=torch.zeros(K, K) if has_nodes(config.field) else None,
+            basis=torch.zeros(config.basis, 3),
+            align_basis=torch.zeros(max(config.align_basis, 1), 3),
+        )
+
+
+def load_network(path: str | Path, config: NetworkConfig, K: int) -> Deformer:
+    """A network for K nodes with the weights of a file, in evaluation mode.
+
+    Raises
+    ------
+    ModelError
+        The file is damaged, or holds the weights of another network.
+    """
+    network = blank_deformer(config, K)
+    expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
+    network.load_state_dict(load_weights(path, expected), assign=True)
+    return network.eval()
 
 
 def load_model(name: str | Path = "human") -> TrainedModel:
@@ -93,23 +118,23 @@ def load_model(name: str | Path = "human") -> TrainedModel:
     Raises
     ------
     ModelError
-        Unknown name, damaged files, a kernel that is not known here, or a template that is not the one the
-        model was trained with.
+        Unknown name, damaged files, a kernel that is not known here, weights that are not those of the card's network,
+        or a template that is not the one the model was trained with.
+    TemplateError
+        The template's file is damaged.
     """
     folder, card = find_model(name)
-    template = load_template(folder / "template.safetensors")
-    if template.hash != card.template_hash:
+    template = load_template(folder / TEMPLATE)
+    if template.hash != card.template_hash or template.K != card.field["nodes"]:
         raise ModelError(
-            f"model {card.name} was trained with another template ({card.template_hash}, not {template.hash})",
-            "add the model again from its source",
+            f"model {card.name} was trained with another template "
+            f"({card.template_hash}, {card.field['nodes']} nodes; here {template.hash}, {template.K} nodes)",
+            "fetch or add the model again",
         )
     if card.field["kernel"] not in KERNELS:
         raise ModelError(
             f"model {card.name} has the kernel {card.field['kernel']!r}, not {' or '.join(KERNELS)}",
             "it may need a newer meshmatch: update it",
         )
-    network = blank_deformer(NetworkConfig.from_dict(card.network), template.K)
-    expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
-    network.load_state_dict(load_weights(folder / "weights.safetensors", expected))
-    network.eval()
+    network = load_network(folder / WEIGHTS, NetworkConfig.from_dict(card.network), template.K)
     return TrainedModel(card, template, network)

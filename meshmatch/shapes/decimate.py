@@ -10,7 +10,7 @@ from meshmatch.geometry.topology import edges_of, is_watertight
 from meshmatch.shapes.pymeshlab_filters import collapse_edges
 from meshmatch.shapes.shape import Shape
 
-Quality = Literal["fast", "pymeshlab"]
+Quality = Literal["fast", "meshlab"]
 _AGGRESSIVENESS = (3.0, 4.0, 2.5, 5.0)
 """To try in turn. On closed bodies 3 kept the mesh closed with the least error where 7, the library's own choice, did
 not; but it can stop short of the target, which higher ones reach."""
@@ -30,8 +30,8 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
         A mesh.
     faces : int
         How many triangles to aim at, at least 4. Borders and closedness can keep it from getting there.
-    quality : "fast" or "pymeshlab"
-        pymeshlab takes ten times as long, and makes well-shaped triangles where the surface is flat.
+    quality : "fast" or "meshlab"
+        meshlab (by pymeshlab) takes ten times as long, and makes well-shaped triangles where the surface is flat.
 
     Raises
     ------
@@ -40,8 +40,8 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
     OptionError
         Unknown quality, fewer than 4 faces, or pymeshlab is not there or lacks its filters.
     """
-    if quality not in ("fast", "pymeshlab"):
-        raise OptionError(f"unknown decimation quality {quality!r}", "choose fast or pymeshlab")
+    if quality not in ("fast", "meshlab"):
+        raise OptionError(f"unknown decimation quality {quality!r}", "choose fast or meshlab")
     if faces < 4:
         raise OptionError(f"cannot decimate to {faces} faces", "use at least 4")
     if shape.is_cloud:
@@ -50,7 +50,7 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
         return shape
     # centered and of size 1: the library compares with fixed tolerances
     center, size = shape.bounds.mean(axis=0), shape.diagonal or 1.0
-    collapse = collapse_edges if quality == "pymeshlab" else _fast
+    collapse = collapse_edges if quality == "meshlab" else _fast
     small_verts, small_faces = collapse((shape.verts - center) / size, shape.faces, faces)
     return _shape(shape, small_verts * size + center, small_faces)
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import TemplateError
-from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.triangulate import triangulate_cloud
@@ -18,14 +18,16 @@ from meshmatch.templates.template import Template
 LOW_FACES = 10_000
 
 
-def low_resolution(shape: Shape, faces: int = LOW_FACES) -> tuple[np.ndarray, np.ndarray]:
+def low_resolution(
+    shape: Shape, faces: int = LOW_FACES, quality: Quality = "fast"
+) -> tuple[np.ndarray, np.ndarray]:
     """Decimate onto a subset of the shape's own vertices: kept indices (V,), faces (F, 3).
 
     Whatever belongs to a vertex (weights, labels, positions on registered shapes) is then kept by indexing.
     """
     if shape.F <= faces:
         return np.arange(shape.V), np.asarray(shape.faces)
-    small = decimate(shape, faces)
+    small = decimate(shape, faces, quality)
     nearest = cKDTree(shape.verts).query(small.verts)[1]
     keep, renumbered = np.unique(nearest, return_inverse=True)
     corners = renumbered.reshape(-1)[small.faces]
@@ -33,9 +35,11 @@ def low_resolution(shape: Shape, faces: int = LOW_FACES) -> tuple[np.ndarray, np
     return keep, corners[(a != b) & (b != c) & (c != a)]
 
 
-def low_mesh(shape: Shape, faces: int = LOW_FACES) -> tuple[np.ndarray, np.ndarray]:
+def low_mesh(
+    shape: Shape, faces: int = LOW_FACES, quality: Quality = "fast"
+) -> tuple[np.ndarray, np.ndarray]:
     """`low_resolution` of a mesh, or a triangulation of a cloud: kept indices (V,), faces (F, 3)."""
-    return triangulate_cloud(shape, faces) if shape.is_cloud else low_resolution(shape, faces)
+    return triangulate_cloud(shape, faces) if shape.is_cloud else low_resolution(shape, faces, quality)
 
 
 def make_template(

@@ -14,7 +14,7 @@ from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.align import Align
-from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.repair import Repaired, repair
@@ -39,6 +39,8 @@ class PrepareConfig:
     nodes : NodeConfig
     faces : int
         Triangles of the low resolution.
+    decimate : {"fast", "meshlab"}
+        How it is made, see `meshmatch.shapes.decimate.decimate`.
     template : name or path, optional
         A shape of the folder, by its name, or any file. By default the first mesh where all are registered, else the
         medoid: the shape that lies nearest to all others.
@@ -55,6 +57,7 @@ class PrepareConfig:
 
     nodes: NodeConfig = field(default_factory=lambda: NodeConfig(strategy="geodesic"))
     faces: int = LOW_FACES
+    decimate: Quality = "fast"
     template: str | Path | None = None
     align: Align | None = None
     scale: Scale = "area"
@@ -123,7 +126,7 @@ def prepare(
         config.nodes,
         labels=_repaired_labels(config.labels, clean),
         source=shapes.name,
-        low=low_mesh(clean.shape, config.faces),
+        low=low_mesh(clean.shape, config.faces, config.decimate),
     )
     save_template(made, output / "template.safetensors")
     none = np.zeros((0, made.shape.V, 3), np.float32)
@@ -134,7 +137,7 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     notes: list[str] = []
     found, marks = _read_shapes(folder, output, config, notes, progress.between(0.0, 0.5))
     first, own = _template_shape(folder, config, found, notes)
-    low = low_mesh(first.shape, config.faces)
+    low = low_mesh(first.shape, config.faces, config.decimate)
     stack = registered_stack(first, found, first.kept_vertex[low[0]], notes)
     registered = len(stack) > 0
     how: Align = "rigid"
@@ -162,7 +165,9 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     stems = [Path(clean.original.name).stem for clean in found]
     for clean, stem, frame, residual in zip(found, stems, frames, residuals, strict=True):
         label = stem if stems.count(stem) == 1 else clean.original.name
-        small = clean.shape if clean.shape.F <= config.faces else decimate(clean.shape, config.faces)
+        small = clean.shape
+        if small.F > config.faces:
+            small = decimate(small, config.faces, config.decimate)
         normal = Shape(frame.apply(small.verts), small.faces, small.name)
         save_shape(output / "normalised" / f"{label}.ply", normal)
         if residual > MAX_RESIDUAL and not registered:

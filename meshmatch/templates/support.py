@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from meshmatch.geometry.kernels import KERNELS, Kernel
+
 # Smallest accepted eigenvalue of the scaled moment matrix, relative to its trace.
 MINIMUM_EIGENVALUE = 1e-6
 
@@ -19,12 +21,14 @@ def support_pairs(points: np.ndarray, nodes: np.ndarray, radii: np.ndarray) -> t
     return row[order].astype(np.int64), column[order].astype(np.int64)
 
 
-def poorly_supported(points: np.ndarray, nodes: np.ndarray, radius: float | np.ndarray) -> np.ndarray:
+def poorly_supported(
+    points: np.ndarray, nodes: np.ndarray, radius: float | np.ndarray, kernel: Kernel = "smooth"
+) -> np.ndarray:
     """Indices of the points without four non-coplanar nodes in reach (with a safety margin)."""
     radii = np.broadcast_to(np.asarray(radius, np.float64), (len(nodes),))
     row, column = support_pairs(points, nodes, radii)
     offset = points[row] - nodes[column]
-    weight = (1 - np.minimum(np.linalg.norm(offset, axis=1) / radii[column], 1) ** 2) ** 3
+    weight = KERNELS[kernel](np.linalg.norm(offset, axis=1), radii[column])[0]
     basis = np.concatenate([np.ones((len(row), 1)), -offset / radii.mean()], 1)
     moment = np.zeros((len(points), 4, 4))
     np.add.at(moment, row, weight[:, None, None] * basis[:, :, None] * basis[:, None, :])

@@ -133,7 +133,7 @@ def load_template(path: str | Path) -> Template:
             if set(file.keys()) != set(_ARRAYS) or not isinstance(words, dict):
                 raise KeyError("arrays")
             arrays = {name: file.get_tensor(name) for name in _ARRAYS}
-    except (SafetensorError, KeyError, ValueError, OSError) as error:
+    except (SafetensorError, KeyError, ValueError, OSError, RecursionError) as error:
         raise TemplateError(
             f"{path.name} is not a template bundle", "make one with `meshmatch prepare`"
         ) from error

@@ -9,7 +9,7 @@ import numpy as np
 import platformdirs
 import torch
 
-from meshmatch.arrays import Float
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress
@@ -110,8 +110,8 @@ def human_source(
     return body_source(rig.restricted(keep, np.array(template.shape.faces)), poses)
 
 
-def unseen_bodies(template: Template, count: int, trained: int = 0, seed: int = 0) -> np.ndarray:
-    """Generated bodies (count, V, 3) in metres on a human template's vertices, of people that a training never drew.
+def unseen_bodies(template: Template, count: int, trained: int = 0, seed: int = 0) -> Float[Floats, "N V 3"]:
+    """So many generated bodies in metres on a human template's vertices, of people that a training never drew.
 
     ``trained`` is the seed of that training: people are drawn with another one, and few of them.
     """

@@ -89,8 +89,8 @@ def _lattice_field(points: np.ndarray) -> Field:
     return build_field(points, lattice, _REACH * float(ticks[1] - ticks[0]), "smooth")
 
 
-def deformed_source(shapes: torch.Tensor, augmentation: Augmentation | None = None) -> Source:
-    """Registered shapes (N, V, 3), drawn with replacement and smoothly deformed; all stand alike, in any unit.
+def deformed_source(shapes: Float[torch.Tensor, "N V 3"], augmentation: Augmentation | None = None) -> Source:
+    """Registered shapes, drawn with replacement and smoothly deformed; all stand alike, in any unit.
 
     So many that no change is needed (see `build_lattice`) are drawn as they are.
     """

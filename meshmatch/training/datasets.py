@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from meshmatch.arrays import Float, Int
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.training.scans import (
     ScanConfig,
@@ -20,11 +21,11 @@ from meshmatch.training.scans import (
 )
 
 # Draws shapes with the template's connectivity: (count, generator) -> vertices (count, V, 3), any unit.
-Source = Callable[[int, torch.Generator], torch.Tensor]
+Source = Callable[[int, torch.Generator], Float[torch.Tensor, "N V 3"]]
 
 
-def registered_source(shapes: torch.Tensor) -> Source:
-    """A fixed set of registered shapes (N, V, 3), drawn with replacement."""
+def registered_source(shapes: Float[torch.Tensor, "N V 3"]) -> Source:
+    """A fixed set of registered shapes, drawn with replacement."""
     shapes = shapes - shapes.mean(1, keepdim=True)
     return lambda count, generator: shapes[torch.randint(len(shapes), (count,), generator=generator)]
 
@@ -38,18 +39,18 @@ def step_generator(seed: int, step: int) -> torch.Generator:
 class Batch:
     """One training batch; lengths in units of sqrt(surface area).
 
-    points : (B, P, 3) scan in a roughly right core frame
-    targets : (B, M, 3) where the template's loss points belong, same frame
+    points : scan in a roughly right core frame
+    targets : where the template's loss points belong, same frame
     encode_features : what the encoder reads of ``points``
     align_features, align_rotation, align_center : the aligner's input (any turn) and answer
     """
 
-    points: torch.Tensor
-    targets: torch.Tensor
+    points: Float[torch.Tensor, "B P 3"]
+    targets: Float[torch.Tensor, "B M 3"]
     encode_features: torch.Tensor
     align_features: torch.Tensor | None = None
-    align_rotation: torch.Tensor | None = None
-    align_center: torch.Tensor | None = None
+    align_rotation: Float[torch.Tensor, "B 3 3"] | None = None
+    align_center: Float[torch.Tensor, "B 3"] | None = None
 
     def to(self, device: torch.device) -> Batch:
         return replace(self, **{n: v.to(device) for n, v in vars(self).items() if v is not None})
@@ -61,16 +62,16 @@ class BatchDataset(torch.utils.data.Dataset):
 
     Attributes
     ----------
-    template_core : (C, 3) template vertices of the core, template frame; core : (C,) their indices
-    loss_points : (M,) vertex indices that are supervised
+    template_core : template vertices of the core, template frame; core : their indices
+    loss_points : vertex indices that are supervised
     scans_per_shape : each drawn shape is scanned this many times
     """
 
     source: Source
-    faces: torch.Tensor
-    template_core: torch.Tensor
-    core: torch.Tensor
-    loss_points: torch.Tensor
+    faces: Int[torch.Tensor, "F 3"]
+    template_core: Float[torch.Tensor, "C 3"]
+    core: Int[torch.Tensor, " C"]
+    loss_points: Int[torch.Tensor, " M"]
     encoder: BasisEncoder | PointEncoder
     aligner: BasisEncoder | None
     scan: ScanConfig

@@ -132,7 +132,7 @@ class Trainer:
         Raises
         ------
         ModelError
-            The file is no checkpoint, or is of another seed, network or template.
+            The file is not a checkpoint, or of another seed, network or template.
         """
         hint = "train into another folder, or start afresh"
         try:
@@ -142,7 +142,7 @@ class Trainer:
                 seed = int(words.get("seed", self.config.seed))
                 arrays = {n: file.get_tensor(n) for n in file.keys()}  # noqa: SIM118 (it is no dictionary)
         except (SafetensorError, OSError, KeyError, ValueError) as error:
-            raise ModelError(f"{path} is no checkpoint of a training", hint) from error
+            raise ModelError(f"{path} is not a checkpoint of a training", hint) from error
         if seed != self.config.seed:
             raise ModelError(f"{path} is a checkpoint of a training with seed {seed}", hint)
         weights = _part(arrays, "model.")

@@ -25,11 +25,11 @@ from meshmatch.training.rig import Rig
 from meshmatch.training.rotations import rotation_from_vector
 from meshmatch.training.skeleton import forward_kinematics
 
-MOST_BYTES = 60_000_000
+MAX_BYTES = 60_000_000
 """A larger file is refused before it is read."""
-MOST_VECTORS = 5_000_000
+MAX_VECTORS = 5_000_000
 """Poses times joints, of a table."""
-_MOST_LETTERS = 1_000_000  # bytes of an array of names: each becomes a string of its own
+_MAX_NAME_BYTES = 1_000_000  # bytes of an array of names: each becomes a string of its own
 COLUMNS = ("pose", "joint", "x", "y", "z")
 
 _HINT = "see docs/formats.md for what a file of poses holds"
@@ -156,13 +156,13 @@ def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
     if not path.is_file():
         raise InputError(f"there is no file {path}", _HINT)
     try:
-        if path.stat().st_size > MOST_BYTES:
+        if path.stat().st_size > MAX_BYTES:
             raise InputError(
-                f"{path.name}: it is larger than {MOST_BYTES // 10**6} MB", "split it, or keep fewer poses"
+                f"{path.name}: it is larger than {MAX_BYTES // 10**6} MB", "split it, or keep fewer poses"
             )
         joints, vectors = read(path)
     except _DAMAGE as error:
-        raise InputError(f"{path.name} is no file of poses: {error}", _HINT) from error
+        raise InputError(f"{path.name} is not a file of poses: {error}", _HINT) from error
     try:
         return GivenPoses(joints, vectors, share, path.name)
     except InputError as error:
@@ -181,7 +181,7 @@ def _read_npz(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
     joints = found["joints"]
     if joints.dtype.kind not in "US" or joints.ndim != 1:
         raise ValueError(f"joints are {joints.dtype} of {_shown(joints.shape)}, not a list of names")
-    if max(joints.nbytes, len(joints)) > _MOST_LETTERS:
+    if max(joints.nbytes, len(joints)) > _MAX_NAME_BYTES:
         raise ValueError(f"{len(joints)} joints of {joints.dtype} are too many")
     return _names(joints.astype(np.str_).tolist()), found["rotations"]
 
@@ -222,7 +222,7 @@ def _read_csv(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
                 turns[at] = tuple(float(word) for word in row[2:])
             except ValueError:
                 raise ValueError(f"line {rows.line_num} has words where numbers belong") from None
-    if len(poses) * len(joints) > MOST_VECTORS:
+    if len(poses) * len(joints) > MAX_VECTORS:
         raise ValueError(f"{len(poses)} poses of {len(joints)} joints are too many")
     vectors = np.zeros((len(poses), len(joints), 3))
     for at, turn in turns.items():

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import torch
 
+from meshmatch.arrays import Float
 from meshmatch.training.limbs import FOLDED, Draw, Limbs, Still, draw_arms, draw_limbs, mirrored, with_legs
 from meshmatch.training.rig import Rig
 from meshmatch.training.rotations import DEGREE, rotation_between, rotation_from_vector, unit
@@ -17,11 +18,15 @@ from meshmatch.training.skeleton import forward_kinematics, penetration
 
 
 def sample_free_pose(
-    rig: Rig, heads: torch.Tensor, generator: torch.Generator, tries: int = 8, tolerance: float = 0.02
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Of several drawn poses keep the first that is free of self-intersection, else the least bad.
+    rig: Rig,
+    heads: Float[torch.Tensor, "B J 3"],
+    generator: torch.Generator,
+    tries: int = 8,
+    tolerance: float = 0.02,
+) -> tuple[Float[torch.Tensor, "B J 3 3"], Float[torch.Tensor, "B J 3"]]:
+    """Of several drawn poses keep the first that is free of self-intersection, else the best.
 
-    Returns the world rotations (B, J, 3, 3) and offsets (B, J, 3) of :func:`forward_kinematics`.
+    Returns the world rotations and offsets of :func:`forward_kinematics`. ``tolerance`` is in units of the torso length.
     """
     B = heads.shape[0]
     repeated = heads.repeat(tries, 1, 1)
@@ -32,18 +37,12 @@ def sample_free_pose(
     return world[pick], offset[pick]
 
 
-def sample_pose(rig: Rig, heads: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Draw one pose per body.
+def sample_pose(
+    rig: Rig, heads: Float[torch.Tensor, "B J 3"], generator: torch.Generator
+) -> Float[torch.Tensor, "B J 3 3"]:
+    """Draw one pose per body: the rotation of every joint, in rest axes, relative to its parent.
 
-    Parameters
-    ----------
-    heads : float tensor (B, J, 3)
-        Rest joints of the bodies, metres.
-
-    Returns
-    -------
-    float tensor (B, J, 3, 3)
-        Rotation of every joint, in rest axes, relative to its parent.
+    ``heads`` are the rest joints of the bodies, metres. Shares and angles are set by hand.
     """
     B, J = heads.shape[:2]
     draw = Draw(B, generator)
@@ -95,8 +94,10 @@ def _pose_limbs(
     return finish
 
 
-def still_pose(rig: Rig, heads: torch.Tensor, arms: float, legs: float) -> torch.Tensor:
-    """Stand still with straight limbs: arms raised and legs spread by so many degrees; (B, J, 3, 3)."""
+def still_pose(
+    rig: Rig, heads: Float[torch.Tensor, "B J 3"], arms: float, legs: float
+) -> Float[torch.Tensor, "B J 3 3"]:
+    """Stand still with straight limbs: arms raised and legs spread by so many degrees."""
     B, J = heads.shape[:2]
     vectors = torch.zeros(B, J, 3)
     angles = dict.fromkeys(Limbs.__dataclass_fields__, 0.0) | {

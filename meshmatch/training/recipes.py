@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from meshmatch.errors import OptionError
-from meshmatch.fields.mls import Kernel
+from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.checkpoint import Storage
 from meshmatch.models.deformer import PAPER, NetworkConfig
 from meshmatch.templates.registered import frame_of, is_registered

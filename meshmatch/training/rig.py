@@ -17,6 +17,7 @@ import torch
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
+from meshmatch.arrays import Float, Int, Ints
 from meshmatch.errors import OptionError
 from meshmatch.outputs import replace_on_success
 from meshmatch.progress import Progress
@@ -35,25 +36,24 @@ class Rig:
 
     Attributes
     ----------
-    rest : float16 tensor (N, V, 3)
-        Rest vertices of N identities, metres.
-    heads : float32 tensor (N, J, 3)
+    rest
+        Rest vertices of N identities, metres; float16.
+    heads
         Joint positions in the rest pose, metres.
-    weights : float32 tensor (V, J)
+    weights
         Linear blend skinning weights; rows sum to one.
-    parents : tuple of int
+    parents
         Parent of every joint, -1 for the root; parents come first.
-    names : tuple of str
+    names
         Joint names.
-    faces : int64 tensor (F, 3)
     """
 
-    rest: torch.Tensor
-    heads: torch.Tensor
-    weights: torch.Tensor
+    rest: Float[torch.Tensor, "N V 3"]
+    heads: Float[torch.Tensor, "N J 3"]
+    weights: Float[torch.Tensor, "V J"]
     parents: tuple[int, ...]
     names: tuple[str, ...]
-    faces: torch.Tensor
+    faces: Int[torch.Tensor, "F 3"]
 
     @property
     def identities(self) -> int:
@@ -62,8 +62,8 @@ class Rig:
     def joint(self, name: str) -> int:
         return self.names.index(name)
 
-    def restricted(self, keep: np.ndarray, faces: np.ndarray) -> Rig:
-        """The same bodies on some vertices (V',), joined by other triangles (F', 3) of these."""
+    def restricted(self, keep: Int[Ints, " K"], faces: Int[Ints, "F 3"]) -> Rig:
+        """The same bodies on some of the vertices, joined by other triangles of these."""
         chosen = torch.from_numpy(keep)
         return replace(
             self,

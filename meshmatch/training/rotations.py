@@ -6,11 +6,13 @@ import math
 
 import torch
 
+from meshmatch.arrays import Float
+
 DEGREE = math.pi / 180.0
 
 
-def rotation_from_vector(vector: torch.Tensor) -> torch.Tensor:
-    """Rodrigues' formula: rotation vectors (..., 3) in radians to matrices (..., 3, 3)."""
+def rotation_from_vector(vector: Float[torch.Tensor, "*B 3"]) -> Float[torch.Tensor, "*B 3 3"]:
+    """Rodrigues' formula: rotation vectors, in radians, to matrices."""
     angle = vector.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     x, y, z = (vector / angle).unbind(-1)
     zero = torch.zeros_like(x)
@@ -19,8 +21,10 @@ def rotation_from_vector(vector: torch.Tensor) -> torch.Tensor:
     return torch.eye(3).to(vector) + sine * cross + (1 - cosine) * (cross @ cross)
 
 
-def rotation_between(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Smallest rotation that takes unit vectors a (..., 3) to b (..., 3); returns a rotation vector."""
+def rotation_between(
+    a: Float[torch.Tensor, "*B 3"], b: Float[torch.Tensor, "*B 3"]
+) -> Float[torch.Tensor, "*B 3"]:
+    """Smallest rotation that takes unit vectors a to b, as rotation vectors."""
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)
     cosine = (a * b).sum(-1, keepdim=True)
@@ -31,6 +35,6 @@ def rotation_between(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.where(half, across * math.pi, axis / sine.clamp_min(1e-9) * torch.atan2(sine, cosine))
 
 
-def unit(vector: torch.Tensor) -> torch.Tensor:
-    """Vectors (..., 3) of length 1."""
+def unit(vector: Float[torch.Tensor, "*B 3"]) -> Float[torch.Tensor, "*B 3"]:
+    """The same vectors with length 1."""
     return torch.nn.functional.normalize(vector, dim=-1)

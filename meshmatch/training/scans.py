@@ -6,14 +6,15 @@ from dataclasses import dataclass
 
 import torch
 
+from meshmatch.arrays import Float, Int
 from meshmatch.training.rotations import DEGREE, rotation_from_vector
 
 
 @dataclass(frozen=True)
 class ScanConfig:
-    """How rough the simulated scans are. Lengths in units of sqrt(surface area).
+    """How rough the simulated scans are; set by hand. Lengths in units of sqrt(surface area).
 
-    ``holes``, ``outliers``, ``partial`` are shares of the scans: with holes; with up to 10 % stray points; seen
+    ``holes``, ``outliers``, ``partial`` are shares of the scans: with holes; with up to 10 % outliers; seen
     from one side or cut by a plane. ``upright``: scans stand in the category's own axes, centred, turned about
     the vertical only (the paper); otherwise roughly in the core frame, where an aligner puts them.
     """
@@ -34,23 +35,27 @@ class ScanConfig:
         return ScanConfig(points, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, upright)
 
 
-def surface_area(verts: torch.Tensor, faces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Face areas (B, F) and their area-weighted centroid (B, 3)."""
+def surface_area(
+    verts: Float[torch.Tensor, "B V 3"], faces: Int[torch.Tensor, "F 3"]
+) -> tuple[Float[torch.Tensor, "B F"], Float[torch.Tensor, "B 3"]]:
+    """Face areas and their area-weighted centroid."""
     a, b, c = (verts[:, faces[:, k]] for k in range(3))
     area = 0.5 * torch.linalg.cross(b - a, c - a).square().sum(-1).sqrt()
     centroid = (area[..., None] * (a + b + c)).sum(1) / (3 * area.sum(1, keepdim=True))
     return area, centroid
 
 
-def normalise(verts: torch.Tensor, faces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def normalise(
+    verts: Float[torch.Tensor, "B V 3"], faces: Int[torch.Tensor, "F 3"]
+) -> tuple[Float[torch.Tensor, "B V 3"], Float[torch.Tensor, "B F"]]:
     """Scale every shape to area 1 with its centroid at 0; returns vertices and normalised face areas."""
     area, centroid = surface_area(verts, faces)
     total = area.sum(1)
     return (verts - centroid[:, None]) / total.sqrt()[:, None, None], area / total[:, None]
 
 
-def random_rotations(B: int, generator: torch.Generator) -> torch.Tensor:
-    """Uniform rotations (B, 3, 3) from random unit quaternions."""
+def random_rotations(B: int, generator: torch.Generator) -> Float[torch.Tensor, "B 3 3"]:
+    """Uniform rotations from random unit quaternions."""
     q = torch.nn.functional.normalize(torch.randn(B, 4, generator=generator), dim=1)
     w, x, y, z = q.unbind(1)
     rows = [
@@ -61,8 +66,10 @@ def random_rotations(B: int, generator: torch.Generator) -> torch.Tensor:
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
-def rigid_fit(source: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Best rigid motion: target ~ R source + t (Kabsch), batched. source (N, 3), target (B, N, 3)."""
+def rigid_fit(
+    source: Float[torch.Tensor, "N 3"], target: Float[torch.Tensor, "B N 3"]
+) -> tuple[Float[torch.Tensor, "B 3 3"], Float[torch.Tensor, "B 3"]]:
+    """Best rigid motions: target ~ R source + t (Kabsch), batched."""
     center = target.mean(1)
     covariance = (target - center[:, None]).transpose(1, 2) @ (source - source.mean(0))
     U, _, Vh = torch.linalg.svd(covariance)
@@ -72,19 +79,21 @@ def rigid_fit(source: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor,
     return R, center - (R @ source.mean(0)[:, None])[..., 0]
 
 
-def small_rotations(B: int, generator: torch.Generator) -> torch.Tensor:
+def small_rotations(B: int, generator: torch.Generator) -> Float[torch.Tensor, "B 3 3"]:
     """Mostly a few degrees, sometimes tens: what an aligner gets wrong."""
     size = torch.where(torch.rand(B, 1, generator=generator) < 0.75, 6.0, 18.0) * DEGREE
     return rotation_from_vector(size * torch.randn(B, 3, generator=generator))
 
 
-def yaw_rotations(B: int, generator: torch.Generator) -> torch.Tensor:
-    """Rotations (B, 3, 3) about the vertical axis y."""
+def yaw_rotations(B: int, generator: torch.Generator) -> Float[torch.Tensor, "B 3 3"]:
+    """Rotations about the vertical axis y."""
     angle = 2 * torch.pi * torch.rand(B, 1, generator=generator)
     return rotation_from_vector(angle * torch.tensor([0.0, 1.0, 0.0]))
 
 
-def bump(verts: torch.Tensor, amplitude: float, generator: torch.Generator) -> torch.Tensor:
+def bump(
+    verts: Float[torch.Tensor, "B V 3"], amplitude: float, generator: torch.Generator
+) -> Float[torch.Tensor, "B V 3"]:
     """Smooth random displacement (clothes, soft tissue, another modeller's hand), unit: sqrt(area)."""
     B = len(verts)
     size = amplitude * torch.rand(B, 1, 1, generator=generator)
@@ -96,9 +105,12 @@ def bump(verts: torch.Tensor, amplitude: float, generator: torch.Generator) -> t
 
 
 def seen_share(
-    normals: torch.Tensor, centers: torch.Tensor, share: float, generator: torch.Generator
-) -> torch.Tensor:
-    """Factors (B, F) for the chance of each face: nearly 0 where a partial scan does not see it, else 1.
+    normals: Float[torch.Tensor, "B F 3"],
+    centers: Float[torch.Tensor, "B F 3"],
+    share: float,
+    generator: torch.Generator,
+) -> Float[torch.Tensor, "B F"]:
+    """Factors for the chance of each face: nearly 0 where a partial scan does not see it, else 1.
 
     A ``share`` of the scans is partial. Half of those see what faces one direction, the others lose what lies
     beyond a plane, at most half of the centers. Faces that hide each other are not told apart.
@@ -115,13 +127,13 @@ def seen_share(
 
 
 def sample_scan(
-    verts: torch.Tensor,
-    areas: torch.Tensor,
-    faces: torch.Tensor,
+    verts: Float[torch.Tensor, "B V 3"],
+    areas: Float[torch.Tensor, "B F"],
+    faces: Int[torch.Tensor, "F 3"],
     config: ScanConfig,
     generator: torch.Generator,
-) -> torch.Tensor:
-    """Points (B, P, 3) on the surface, with uneven density, holes, noise and outliers."""
+) -> Float[torch.Tensor, "B P 3"]:
+    """Points on the surface, with uneven density, holes, noise and outliers."""
     B, P = len(verts), config.points
     a, b, c = (verts[:, faces[:, k]] for k in range(3))
     centers = (a + b + c) / 3  # B F 3
@@ -149,5 +161,5 @@ def sample_scan(
     sigma = config.noise * torch.rand(B, 1, 1, generator=generator) ** 3
     points = points + sigma * torch.randn(B, P, 3, generator=generator)
     lost = torch.rand(B, 1, generator=generator) < config.outliers
-    stray = torch.rand(B, P, generator=generator) < 0.1 * torch.rand(B, 1, generator=generator) * lost
-    return torch.where(stray[..., None], 0.5 * torch.randn(B, P, 3, generator=generator), points)
+    outlier = torch.rand(B, P, generator=generator) < 0.1 * torch.rand(B, 1, generator=generator) * lost
+    return torch.where(outlier[..., None], 0.5 * torch.randn(B, P, 3, generator=generator), points)

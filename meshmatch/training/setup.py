@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from meshmatch.arrays import Float, Int, Ints
 from meshmatch.errors import TemplateError
-from meshmatch.fields.choice import has_nodes, lay_field
+from meshmatch.fields.choice import field_at, has_nodes
 from meshmatch.fields.field import Field
-from meshmatch.fields.mls import Kernel
+from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.deformer import Deformer, NetworkConfig
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.template import Template
@@ -24,8 +25,10 @@ from meshmatch.training.losses import LossPoints
 from meshmatch.training.scans import ScanConfig
 
 
-def fill_basis(points: torch.Tensor, M: int, generator: torch.Generator) -> torch.Tensor:
-    """Basis points (M, 3) spread where shapes of the category are: farthest points of jittered samples."""
+def fill_basis(
+    points: Float[torch.Tensor, "B P 3"], M: int, generator: torch.Generator
+) -> Float[torch.Tensor, "M 3"]:
+    """Basis points spread where shapes of the category are: farthest points of jittered samples."""
     flat = points.flatten(0, 1)
     flat = flat[torch.randperm(len(flat), generator=generator)[:20_000]]
     jittered = flat + 0.06 * torch.randn(len(flat), 3, generator=generator)
@@ -35,8 +38,8 @@ def fill_basis(points: torch.Tensor, M: int, generator: torch.Generator) -> torc
     return jittered[torch.from_numpy(farthest_points(jittered.double().numpy(), M))]
 
 
-def anchor_vertices(template: Template, A: int) -> np.ndarray:
-    """Template vertices (A,) where corrections look at the scan.
+def anchor_vertices(template: Template, A: int) -> Int[Ints, " A"]:
+    """Template vertices where corrections look at the scan.
 
     Raises
     ------
@@ -53,12 +56,12 @@ def anchor_vertices(template: Template, A: int) -> np.ndarray:
 
 def build_anchors(
     template: Template, network: NetworkConfig, kernel: Kernel
-) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Anchors (A, 3) of the corrections and the shape functions there (A, K), None where the field has none."""
+) -> tuple[Float[torch.Tensor, "A 3"], Float[torch.Tensor, "A K"] | None]:
+    """Anchors of the corrections and the shape functions there, None where the field has none."""
     anchors = template.shape.verts[anchor_vertices(template, template.K)]
     phi = None
     if has_nodes(network.field):
-        field = lay_field(network.field, anchors, template.nodes, template.radius, kernel)
+        field = field_at(network.field, anchors, template.nodes, template.radius, kernel)
         assert isinstance(field, Field)
         phi = field.for_training().phi
     return torch.from_numpy(anchors).float(), phi
@@ -89,7 +92,8 @@ def build_deformer(
     return Deformer(network, nodes, anchors, anchor_phi, basis, align_basis)
 
 
-def loss_vertices(template: Template, M: int) -> np.ndarray:
+def loss_vertices(template: Template, M: int) -> Int[Ints, " M"]:
+    """Evenly spread template vertices that a loss is computed on."""
     return farthest_points(template.shape.verts, min(M, template.shape.V))
 
 
@@ -169,9 +173,9 @@ def build_cloud_deformer(
 
 
 def build_surface_points(
-    template: Template, kernel: Kernel, model: Deformer, landmarks: np.ndarray, count: int = 1200
+    template: Template, kernel: Kernel, model: Deformer, landmarks: Int[Ints, " L"], count: int = 1200
 ) -> SurfacePoints:
-    """Evenly spread template vertices, and the landmark vertices (L,), with what a Chamfer distance needs of them."""
+    """Evenly spread template vertices, and the landmark vertices, with what a Chamfer distance needs of them."""
     chosen = loss_vertices(template, count)
     at = np.concatenate([chosen, landmarks]).astype(np.int64)
     verts = template.shape.verts[at]

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import torch
 
+from meshmatch.arrays import Float
 from meshmatch.training.rig import Rig
 
 
 def forward_kinematics(
-    rig: Rig, heads: torch.Tensor, rotations: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """World rotation and offset of every joint: x -> R x + t for a rest point x.
-
-    Returns R (B, J, 3, 3) and t (B, J, 3).
-    """
+    rig: Rig, heads: Float[torch.Tensor, "B J 3"], rotations: Float[torch.Tensor, "B J 3 3"]
+) -> tuple[Float[torch.Tensor, "B J 3 3"], Float[torch.Tensor, "B J 3"]]:
+    """World rotation R and offset t of every joint: x -> R x + t for a rest point x."""
     world: list[torch.Tensor] = []
     offset: list[torch.Tensor] = []
     for index, parent in enumerate(rig.parents):
@@ -63,8 +61,13 @@ def _capsule_pairs() -> list[tuple[int, int]]:
     return pairs
 
 
-def penetration(rig: Rig, heads: torch.Tensor, world: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
-    """Summed overlap of non-adjacent body capsules, (B,), in units of the torso length."""
+def penetration(
+    rig: Rig,
+    heads: Float[torch.Tensor, "B J 3"],
+    world: Float[torch.Tensor, "B J 3 3"],
+    offset: Float[torch.Tensor, "B J 3"],
+) -> Float[torch.Tensor, " B"]:
+    """Summed overlap of non-adjacent body capsules, in units of the torso length."""
     joints = (world @ heads[..., None])[..., 0] + offset
     torso = (heads[:, rig.joint("neck01")] - heads[:, rig.joint("root")]).norm(dim=-1)
     steps = torch.linspace(0, 1, 5)

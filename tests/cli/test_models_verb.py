@@ -119,5 +119,5 @@ def test_json_of_every_verb(run: Run, mine: Path, home: Path) -> None:
     assert checked["human"]["problem"] == ""
     assert len(checked["human"]["sha256"]) == 64
     assert checked["mine"]["sha256"] is None
-    assert "too short" in checked["mine"]["problem"]
+    assert "is damaged" in checked["mine"]["problem"]
     assert json.loads(run("models", "remove", "mine", "--json").out) == {"removed": "mine"}

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from meshmatch.fields.mls import Kernel
+from meshmatch.geometry.kernels import Kernel
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.card import write_card
 from meshmatch.models.checkpoint import save_weights

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from meshmatch.errors import ModelError, OptionError
-from meshmatch.fields.mls import KERNELS, Kernel, build_field
+from meshmatch.fields.mls import build_field
 from meshmatch.fitting.choices import Refine
 from meshmatch.fitting.dense import dense_shape
 from meshmatch.fitting.fit_config import FitConfig
@@ -18,6 +18,7 @@ from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy
 from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.system import node_system
+from meshmatch.geometry.kernels import KERNELS, Kernel
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.registry import built_in_folder
 from meshmatch.models.trained import TrainedModel, load_model

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from meshmatch.fields.mls import KERNELS
 from meshmatch.fitting.system import NodeSystem, _EveryPair, node_system
+from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.trained import TrainedModel
 from tests.fitting.eggs import egg_model, gentle_vectors
 

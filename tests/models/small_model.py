@@ -1,16 +1,20 @@
-"""A model folder with a few numbers in it: everything of a model but a network that works."""
+"""A model folder with a few numbers in it: a network that loads, and learned nothing."""
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.numpy import save_file
+import torch
 
 from meshmatch.models.card import ModelCard, write_card
+from meshmatch.models.checkpoint import save_weights
+from meshmatch.models.deformer import NetworkConfig
+from meshmatch.models.trained import blank_deformer
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, save_template
+
+NETWORK = NetworkConfig(code=4, width=4, depth=1, basis=4, align_basis=0, corrections=0, align_width=4)
 
 
 def small_card(**changes: Any) -> ModelCard:
@@ -52,9 +56,10 @@ def write_model(folder: Path, **changes: Any) -> ModelCard:
     folder.mkdir(parents=True, exist_ok=True)
     template = small_template()
     save_template(template, folder / "template.safetensors")
-    weights = folder / "weights.safetensors"
-    save_file({"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.ones(4, np.float16)}, weights)
-    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
-    card = small_card(**{"template_hash": template.hash, "weights_sha256": digest} | changes)
+    state = blank_deformer(NETWORK, template.K).state_dict()
+    numbers = {name: torch.ones(value.shape) for name, value in state.items()}
+    digest = save_weights(numbers, folder / "weights.safetensors")
+    true = {"template_hash": template.hash, "weights_sha256": digest, "network": NETWORK.to_dict()}
+    card = small_card(**true | changes)
     write_card(card, folder / "card.json")
     return card

@@ -10,7 +10,7 @@ import pytest
 
 from meshmatch.errors import ModelError
 from meshmatch.models.card import (
-    MOST_BYTES,
+    MAX_BYTES,
     ModelCard,
     card_from_json,
     card_to_json,
@@ -85,7 +85,7 @@ _WRONG: list[tuple[str, Any, str]] = [
     ("steps", -1, "0 or more"),
     ("training_minutes", "3", "training_minutes must be a number"),
     ("training_minutes", float("inf"), "training_minutes must be finite"),
-    ("metrics", {"scape": 3.0}, "metrics.scape must be an object of numbers"),
+    ("metrics", {"scape": 3.0}, "metrics.scape must be an object"),
     ("metrics", {"scape": {"none": "good"}}, "metrics.scape.none must be a number"),
     ("metrics", {"scape": {"none": {"mean": {"x": 1}}}}, "metrics.scape.none must be a number"),
     ("metrics", {"scape": {"none": True}}, "metrics.scape.none must be a number"),
@@ -146,7 +146,7 @@ def test_a_card_of_the_second_schema_is_as_stiff_as_it_was() -> None:
 @pytest.mark.parametrize(
     ("frame", "told"),
     [
-        ({}, "frame must have orientation and scale"),
+        ({}, "frame must have orientation, scale"),
         ({"orientation": "none"}, "frame must have"),
         ({"orientation": "sideways", "scale": "area"}, "frame.orientation must be one of"),
         ({"orientation": "none", "scale": 3}, "frame.scale must be one of"),
@@ -184,7 +184,7 @@ def test_a_repeated_key_is_refused() -> None:
 def test_size_is_bounded(tmp_path: Path) -> None:
     path = tmp_path / "card.json"
     text = card_to_json(small_card())
-    path.write_text(text + " " * (MOST_BYTES - len(text.encode())))
+    path.write_text(text + " " * (MAX_BYTES - len(text.encode())))
     assert read_card(path) == small_card()
     with path.open("a") as file:
         file.write(" ")

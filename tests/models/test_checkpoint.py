@@ -115,7 +115,7 @@ def test_diverged_weights_are_refused(tmp_path: Path) -> None:
 
 
 def test_unknown_storage_and_folder_are_refused(state: State, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="no storage 'int4'"):
+    with pytest.raises(OptionError, match="unknown storage 'int4'"):
         save_weights(state, tmp_path / "w", storage="int4")
     with pytest.raises(OutputError, match="there is no folder"):
         save_weights(state, tmp_path / "none" / "w")

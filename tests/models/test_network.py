@@ -16,7 +16,7 @@ from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.models.layers import ResidualBlock, residual_mlp
 from meshmatch.models.neighbours import nearest, two_way_offsets
 from meshmatch.models.registry import built_in_folder
-from meshmatch.models.trained import TrainedModel, blank_deformer, load_model
+from meshmatch.models.trained import TrainedModel, load_model, load_network
 from meshmatch.training.setup import build_deformer
 from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, bent_eggs, egg_template
 
@@ -224,15 +224,11 @@ def test_what_a_config_leaves_out_is_not_there(networks: dict[str, Deformer]) ->
 
 @CONFIGS
 def test_saved_networks_come_back_bit_for_bit(networks, config, tmp_path: Path) -> None:
-    from meshmatch.models.checkpoint import load_weights
-
     model = networks[config.encoder]
     save_weights(model.state_dict(), tmp_path / "weights.safetensors", storage="float32")
-    found = blank_deformer(config, model.K)
-    expected = {name: tuple(value.shape) for name, value in found.state_dict().items()}
-    found.load_state_dict(load_weights(tmp_path / "weights.safetensors", expected))
+    found = load_network(tmp_path / "weights.safetensors", config, model.K)
     points = clouds()
-    assert torch.equal(found.eval()(points), model(points))
+    assert torch.equal(found(points), model(points))
 
 
 def test_configs_survive_their_card_and_unknown_options_do_not() -> None:

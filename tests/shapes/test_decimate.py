@@ -15,11 +15,11 @@ from meshmatch.shapes.shape import Shape
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1750.0])
-@pytest.mark.parametrize("quality", ["fast", "pymeshlab"])
+@pytest.mark.parametrize("quality", ["fast", "meshlab"])
 def test_closed_mesh_stays_closed_and_near(
     make_sphere: Callable[[int], Shape], scale: float, quality: str
 ) -> None:
-    if quality == "pymeshlab":
+    if quality == "meshlab":
         pytest.importorskip("pymeshlab", exc_type=ImportError)
     ball = make_sphere(4)
     shape = Shape(ball.verts * scale + 5 * scale, ball.faces, "ball")
@@ -98,7 +98,7 @@ def test_target_is_reached_where_the_gentle_way_stops_short(sphere: Shape) -> No
 def test_choices_that_do_not_exist(sphere: Shape) -> None:
     with pytest.raises(OptionError, match="unknown decimation quality 'best'") as caught:
         decimate(sphere, 100, "best")
-    assert "fast or pymeshlab" in caught.value.hint
+    assert "fast or meshlab" in caught.value.hint
     with pytest.raises(OptionError, match="cannot decimate to 3 faces"):
         decimate(sphere, 3)
     with pytest.raises(InputError, match="point cloud"):
@@ -109,7 +109,7 @@ def test_lost_filters_are_named(sphere: Shape, monkeypatch: pytest.MonkeyPatch) 
     pymeshlab = pytest.importorskip("pymeshlab")
     monkeypatch.setattr(pymeshlab, "MeshSet", type("MeshSet", (), {}))
     with pytest.raises(OptionError, match="lacks its filter meshing_decimation") as caught:
-        decimate(sphere, 100, "pymeshlab")
+        decimate(sphere, 100, "meshlab")
     assert "libopengl0" in caught.value.hint
 
 
@@ -132,6 +132,6 @@ def test_missing_pymeshlab_is_explained(
 
     monkeypatch.setattr(builtins, "__import__", refuse)
     with pytest.raises(OptionError) as caught:
-        decimate(sphere, 100, "pymeshlab")
+        decimate(sphere, 100, "meshlab")
     assert hint in caught.value.hint
     assert decimate(sphere, 100).F <= 102  # the default way does not need it

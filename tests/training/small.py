@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from meshmatch.fields.mls import Kernel
+from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.deformer import Deformer, NetworkConfig
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import make_template

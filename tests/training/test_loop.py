@@ -231,10 +231,10 @@ def test_a_checkpoint_that_does_not_fit_is_refused(egg: Template, tmp_path: Path
         run.load(path)
     for content in (b"", b"\x00" * 100):
         path.write_bytes(content)
-        with pytest.raises(ModelError, match="no checkpoint"):
+        with pytest.raises(ModelError, match="not a checkpoint"):
             run.load(path)
     save_file(held, path)  # a safetensors file, but not of a trainer
-    with pytest.raises(ModelError, match="no checkpoint"):
+    with pytest.raises(ModelError, match="not a checkpoint"):
         run.load(path)
     assert run.step == 0
     assert same(before, state(run))  # untouched

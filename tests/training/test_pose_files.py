@@ -188,7 +188,7 @@ BROKEN: dict[str, tuple[str, bytes, str]] = {
     "a long name": (".npz", archive(joints=npy(np.zeros(1, "S1000001")), rotations=npy(VECTORS)), "too many"),
     "text for numbers": (".npz", archive(joints=NAMES, rotations=npy(VECTORS.astype(str))), "not numbers of"),
     "complex": (".npz", archive(joints=NAMES, rotations=npy(VECTORS + 0j)), "not numbers of"),
-    "empty json": (".json", b"", "is no file of poses"),
+    "empty json": (".json", b"", "is not a file of poses"),
     "a list": (".json", b"[1, 2]", "not an object"),
     "no joints": (".json", b'{"rotations": []}', "not an object"),
     "joints no list": (".json", b'{"joints": "head", "rotations": []}', "not a list of names"),
@@ -196,8 +196,8 @@ BROKEN: dict[str, tuple[str, bytes, str]] = {
     "ragged": (".json", b'{"joints": ["head"], "rotations": [[[0, 0, 0]], [[0, 0]]]}', "equally long"),
     "a number without end": (".json", b'{"joints": ["head"], "rotations": [[[0, 0, 1%s]]]}' % (b"0" * 400), "equally long"),
     "an object inside": (".json", b'{"joints": ["head"], "rotations": {"a": 1}}', "equally long"),
-    "deep": (".json", b"[" * 100_000, "is no file of poses"),
-    "bytes": (".json", b"\xff\xfe\x00", "is no file of poses"),
+    "deep": (".json", b"[" * 100_000, "is not a file of poses"),
+    "bytes": (".json", b"\xff\xfe\x00", "is not a file of poses"),
     "empty table": (".csv", b"", "first line is not pose,joint,x,y,z"),
     "another table": (".csv", b"a,b\n1,2\n", "first line is not pose,joint,x,y,z"),
     "a table without rows": (".csv", b"pose,joint,x,y,z\n", "no poses"),
@@ -237,7 +237,7 @@ def test_a_promise_of_terabytes_is_not_believed(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(array_files, "MAX_ARRAY_BYTES", 200_000)
     with pytest.raises(InputError, match=r"rotations\.npy promises 288000 bytes"):
         load_poses(path)
-    monkeypatch.setattr(pose_files, "MOST_BYTES", 2000)
+    monkeypatch.setattr(pose_files, "MAX_BYTES", 2000)
     path.write_bytes(b"\0" * 3000)
     with pytest.raises(InputError, match=r"bad\.npz: it is larger"):
         load_poses(path)
@@ -246,7 +246,7 @@ def test_a_promise_of_terabytes_is_not_believed(tmp_path: Path, monkeypatch: pyt
 def test_a_table_of_strangers_does_not_grow_to_its_square(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_files, "MOST_VECTORS", 100)
+    monkeypatch.setattr(pose_files, "MAX_VECTORS", 100)
     path = tmp_path / "bad.csv"
     path.write_text("pose,joint,x,y,z\n" + "".join(f"{k},joint{k},0,0,0\n" for k in range(11)))
     with pytest.raises(InputError, match="11 poses of 11 joints are too many"):
