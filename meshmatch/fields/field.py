@@ -69,7 +69,7 @@ class Field:
     """
 
     phi: Float[torch.Tensor, "P K"]
-    gradient: Float[torch.Tensor, "3*P K"]
+    gradient: Float[torch.Tensor, "P3 K"]
 
     @property
     def P(self) -> int:

@@ -52,7 +52,7 @@ class PointEncoder(nn.Module):
             nn.Linear(latent, latent), nn.ReLU(), nn.Dropout(dropout), nn.Linear(latent, outputs)
         )
 
-    def features(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B P 6*N"]:
+    def features(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B P E"]:
         """Encodings of unit length."""
         angle = 2 * math.pi * points[..., None, :] * self.frequencies[:, None]
         waves = torch.cat([angle.sin(), angle.cos()], -1).flatten(-2)

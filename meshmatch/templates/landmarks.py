@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.array_files import read_npy
 from meshmatch.shapes.repair import Repaired
 
 
-def read_landmarks(file: Path, clean: Repaired) -> np.ndarray:
-    """Landmarks (L, 3) of a shape, in its file's frame; NaN for a missing one.
+def read_landmarks(file: Path, clean: Repaired) -> Float[Floats, "L 3"]:
+    """Landmarks of a shape, in its file's frame; NaN for a missing one.
 
     The file holds vertices (L,), -1 for a missing one, or positions (L, 3).
 

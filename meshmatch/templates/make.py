@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Int, Ints
 from meshmatch.errors import TemplateError
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -20,8 +21,8 @@ LOW_FACES = 10_000
 
 def low_resolution(
     shape: Shape, faces: int = LOW_FACES, quality: Quality = "fast"
-) -> tuple[np.ndarray, np.ndarray]:
-    """Decimate onto a subset of the shape's own vertices: kept indices (V,), faces (F, 3).
+) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
+    """Decimate onto a subset of the shape's own vertices: kept indices, faces.
 
     Whatever belongs to a vertex (weights, labels, positions on registered shapes) is then kept by indexing.
     """
@@ -37,8 +38,8 @@ def low_resolution(
 
 def low_mesh(
     shape: Shape, faces: int = LOW_FACES, quality: Quality = "fast"
-) -> tuple[np.ndarray, np.ndarray]:
-    """`low_resolution` of a mesh, or a triangulation of a cloud: kept indices (V,), faces (F, 3)."""
+) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
+    """`low_resolution` of a mesh, or a triangulation of a cloud: kept indices, faces."""
     return triangulate_cloud(shape, faces) if shape.is_cloud else low_resolution(shape, faces, quality)
 
 
@@ -47,25 +48,22 @@ def make_template(
     name: str,
     config: NodeConfig,
     *,
-    labels: np.ndarray | None = None,
+    labels: Int[Ints, " V"] | None = None,
     label_names: Sequence[str] = (),
-    core: np.ndarray | None = None,
-    pose: str = "",
-    source: str = "",
-    licence: str = "",
-    low: tuple[np.ndarray, np.ndarray] | None = None,
+    core: Int[Ints, " C"] | None = None,
+    low: tuple[Int[Ints, " V_low"], Int[Ints, "F_low 3"]] | None = None,
 ) -> Template:
     """Template bundle of a mesh.
 
     Parameters
     ----------
-    shape : Shape
+    shape
         Of the resting category, any unit; a mesh becomes the dense mesh, a cloud is triangulated.
-    labels : int array (V,), optional
+    labels
         Part of every vertex of ``shape``; a single part where not given.
-    core : int array, optional
+    core
         Vertices of ``shape`` that fix the category's frame; all where not given.
-    low : (kept vertices, faces), optional
+    low
         A low resolution made before (see :func:`low_resolution`).
 
     Raises
@@ -97,7 +95,4 @@ def make_template(
         labels=parts[keep],
         label_names=names,
         core=np.flatnonzero(in_core[keep]),
-        pose=pose,
-        source=source,
-        licence=licence,
     )

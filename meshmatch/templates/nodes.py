@@ -7,6 +7,7 @@ clusters, ``geodesic`` distance, and ``uniform`` (no rejection).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,15 +18,16 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.errors import OptionError, TemplateError
-from meshmatch.shapes.sampling import farthest_points, sample_surface
+from meshmatch.shapes.sampling import Samples, farthest_points, sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.support import poorly_supported
 
 Strategy = Literal["parts", "spectral", "geodesic", "uniform"]
 STRATEGIES: tuple[Strategy, ...] = ("parts", "spectral", "geodesic", "uniform")
 # Of the diameter along the surface: how far apart what one node moves may be. Where parts lie so close that a vertex
-# is left without nodes, the next share is tried.
+# is left without nodes, the next share is tried. Set by hand.
 _GEODESIC_SHARES = (0.2, 0.3, 0.45, 1.0)
 
 
@@ -51,7 +53,9 @@ class NodeConfig:
 
     def __post_init__(self) -> None:
         if self.strategy not in STRATEGIES:
-            raise OptionError(f"no node strategy {self.strategy!r}", f"choose one of {', '.join(STRATEGIES)}")
+            raise OptionError(
+                f"unknown node strategy {self.strategy!r}", f"choose one of {', '.join(STRATEGIES)}"
+            )
         if self.K < 4:
             raise OptionError(f"{self.K} nodes are too few", "moving least squares needs at least 4")
         if not 0 < self.radius < np.inf:
@@ -63,24 +67,23 @@ class NodeConfig:
 
 
 def choose_nodes(
-    shape: Shape, config: NodeConfig, labels: np.ndarray | None = None, noisy: bool = False
-) -> np.ndarray:
-    """Choose nodes (K', 3) such that every vertex has four non-coplanar ones in reach.
+    shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None, noisy: bool = False
+) -> Float[Floats, "K 3"]:
+    """Choose nodes such that every vertex has four non-coplanar ones in reach.
 
     Parameters
     ----------
-    shape : Shape
+    shape
         Mesh in the template frame.
-    labels : int array (V,), optional
+    labels
         Body parts, needed by strategy ``parts``.
-    noisy : bool
+    noisy
         Candidates are the surface's points plus Gaussian noise of ``config.depth``, as suits the mesh of a cloud,
         whose inside is uncertain; otherwise they lie up to that depth below the surface.
 
     Returns
     -------
-    float64 array (K', 3)
-        At least ``config.K`` nodes: vertices that farthest points leave short are given more.
+    At least ``config.K`` nodes: vertices that farthest points leave short are given more.
 
     Raises
     ------
@@ -97,55 +100,56 @@ def choose_nodes(
         candidates = samples.points + config.depth * rng.standard_normal(samples.points.shape)
     else:
         candidates = samples.points - samples.normals * rng.uniform(0, config.depth, (len(samples.points), 1))
-    if config.strategy == "uniform" or shape.is_cloud:
-        return _spread(shape, config, candidates)
-    own = shape.faces[samples.face, samples.barycentric.argmax(1)]
-    touched = cKDTree(shape.verts).query_ball_point(candidates, config.radius)
-    if config.strategy == "spectral":
-        return _spectral_nodes(shape, config, candidates, own, touched)
-    if config.strategy == "geodesic":
-        return _geodesic_nodes(shape, config, candidates, own, touched)
-    assert labels is not None
-    allowed = _parts_allowed(shape, labels, touched, own)
-    return _spread(shape, config, candidates[allowed] if allowed.any() else candidates)
+    failure: TemplateError | None = None
+    for allowed in _allowed(shape, config, candidates, labels, samples):
+        chosen = candidates[allowed] if allowed.any() else candidates
+        nodes = chosen[farthest_points(chosen, min(config.K, len(chosen)))]
+        try:
+            return _complete(shape, config, nodes, chosen)
+        except TemplateError as error:
+            failure = error
+    assert failure is not None
+    raise failure
 
 
-def _spread(shape: Shape, config: NodeConfig, candidates: np.ndarray) -> np.ndarray:
-    """Farthest points of the candidates, and what some vertices then still lack."""
-    nodes = candidates[farthest_points(candidates, min(config.K, len(candidates)))]
-    return _complete(shape, config, nodes, candidates)
-
-
-def _spectral_nodes(shape: Shape, config: NodeConfig, candidates: np.ndarray, own, touched) -> np.ndarray:
-    """Nodes that respect spectral clusters.
+def _allowed(
+    shape: Shape,
+    config: NodeConfig,
+    candidates: Float[Floats, "N 3"],
+    labels: Int[Ints, " V"] | None,
+    samples: Samples,
+) -> Iterator[Bool[Bools, " N"]]:
+    """Which candidates a strategy keeps; a weaker rule follows, for when one leaves some vertices without nodes.
 
     Clusters narrower than the radius (fingers, ears) leave no candidate near them: then a coarser clustering is tried.
     """
-    clusters = config.clusters
-    while True:
-        parts = spectral_clusters(shape, clusters, np.random.default_rng(config.seed))
-        allowed = _parts_allowed(shape, parts, touched, own)
-        try:
-            return _spread(shape, config, candidates[allowed] if allowed.any() else candidates)
-        except TemplateError:
-            if clusters <= 2:
-                raise
-        clusters = clusters * 4 // 5
+    if config.strategy == "uniform" or shape.is_cloud:
+        yield np.ones(len(candidates), bool)
+        return
+    own = shape.faces[samples.face, samples.barycentric.argmax(1)]
+    touched = cKDTree(shape.verts).query_ball_point(candidates, config.radius)
+    if config.strategy == "parts":
+        assert labels is not None
+        yield _parts_allowed(shape, labels, touched, own)
+    elif config.strategy == "geodesic":
+        for share in _GEODESIC_SHARES:
+            yield _geodesic_allowed(shape, touched, own, share)
+    else:
+        clusters = config.clusters
+        yield _clusters_allowed(shape, config, clusters, touched, own)
+        while clusters > 2:
+            clusters = clusters * 4 // 5
+            yield _clusters_allowed(shape, config, clusters, touched, own)
 
 
-def _geodesic_nodes(shape: Shape, config: NodeConfig, candidates: np.ndarray, own, touched) -> np.ndarray:
-    """Nodes that move no two pieces of surface far apart along it."""
-    for share in _GEODESIC_SHARES:
-        allowed = _geodesic_allowed(shape, touched, own, share)
-        try:
-            return _spread(shape, config, candidates[allowed] if allowed.any() else candidates)
-        except TemplateError:
-            if share == _GEODESIC_SHARES[-1]:
-                raise
-    raise AssertionError("the last share returns or raises")
+def _clusters_allowed(shape: Shape, config: NodeConfig, clusters: int, touched, own) -> Bool[Bools, " N"]:
+    parts = spectral_clusters(shape, clusters, np.random.default_rng(config.seed))
+    return _parts_allowed(shape, parts, touched, own)
 
 
-def _complete(shape: Shape, config: NodeConfig, nodes: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+def _complete(
+    shape: Shape, config: NodeConfig, nodes: Float[Floats, "K 3"], candidates: Float[Floats, "N 3"]
+) -> Float[Floats, "K2 3"]:
     """Add the candidates that poorly supported vertices lack, nearest first, a few rounds."""
     for _ in range(20):
         bad = poorly_supported(shape.verts, nodes, config.radius)
@@ -167,15 +171,17 @@ def _complete(shape: Shape, config: NodeConfig, nodes: np.ndarray, candidates: n
     )
 
 
-def _parts_allowed(shape: Shape, parts: np.ndarray, touched: list, own: np.ndarray) -> np.ndarray:
+def _parts_allowed(
+    shape: Shape, parts: Int[Ints, " V"], touched: list, own: Int[Ints, " N"]
+) -> Bool[Bools, " N"]:
     """Drop candidates that touch a part which does not border on their own."""
     neighbours = _part_neighbours(shape, parts)
     home = parts[own]
     return np.array([neighbours[home[i], np.unique(parts[hits])].all() for i, hits in enumerate(touched)])
 
 
-def _part_neighbours(shape: Shape, parts: np.ndarray) -> np.ndarray:
-    """Boolean (N, N): parts that share an edge (or are the same)."""
+def _part_neighbours(shape: Shape, parts: Int[Ints, " V"]) -> Bool[Bools, "N N"]:
+    """Parts that share an edge (or are the same)."""
     N = int(parts.max()) + 1
     joined = np.eye(N, dtype=bool)
     for a, b in ((0, 1), (1, 2), (2, 0)):
@@ -193,7 +199,7 @@ def edge_graph(shape: Shape) -> coo_matrix:
     ).tocsr()
 
 
-def _geodesic_allowed(shape: Shape, touched: list, own: np.ndarray, share: float) -> np.ndarray:
+def _geodesic_allowed(shape: Shape, touched: list, own: Int[Ints, " N"], share: float) -> Bool[Bools, " N"]:
     """Drop candidates that touch surface further than a share of the diameter along the surface."""
     graph = edge_graph(shape)
     landmarks = farthest_points(shape.verts, 40)
@@ -206,13 +212,10 @@ def _geodesic_allowed(shape: Shape, touched: list, own: np.ndarray, share: float
 
 def spectral_clusters(
     shape: Shape, clusters: int, rng: np.random.Generator, functions: int = 12
-) -> np.ndarray:
+) -> Int[Ints, " V"]:
     """k-means on the global point signature (Rustamov 2007) of Laplace-Beltrami eigenvectors.
 
-    Returns
-    -------
-    int64 array (V,)
-        Labels from 0, at most ``clusters`` of them, none without a vertex.
+    Returns labels from 0, at most ``clusters`` of them, none without a vertex.
     """
     stiffness, mass = robust_laplacian.mesh_laplacian(shape.verts, shape.faces)
     count = min(functions + 1, shape.V - 2)
@@ -228,8 +231,8 @@ def spectral_clusters(
     return np.unique(cKDTree(centers).query(signature)[1], return_inverse=True)[1].astype(np.int64)
 
 
-def farthest_points_any(points: np.ndarray, K: int) -> np.ndarray:
-    """Farthest-point sampling in any dimension: indices (K,), starting from the first point."""
+def farthest_points_any(points: Float[Floats, "N D"], K: int) -> Int[Ints, " K"]:
+    """Farthest-point sampling in any dimension: indices, starting from the first point."""
     chosen = [0]
     distance = np.full(len(points), np.inf)
     for _ in range(min(K, len(points)) - 1):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from safetensors.numpy import save_file
 
+from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.progress import Progress, ProgressCallback
@@ -51,7 +52,7 @@ class PrepareConfig:
         Which size of every shape is made that of the template.
     landmarks : folder or suffix, optional
         Where the landmarks of shapes are, see `meshmatch.templates.landmarks`.
-    labels : int array (V,), optional
+    labels : optional
         The part of every vertex of a single shape's file, from 0; for the strategy "parts".
     """
 
@@ -62,20 +63,20 @@ class PrepareConfig:
     align: Align | None = None
     scale: Scale = "area"
     landmarks: str | Path | None = None
-    labels: np.ndarray | None = None
+    labels: Int[Ints, " V"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """The template, and the shapes that share its connectivity (or none).
 
-    shapes : float32 array (N, V, 3), template vertices on every shape, its own axes and unit, centred;
+    shapes : template vertices on every shape, in its own axes and unit, centered;
     empty if the folder's meshes are not registered. names : their files. notes : what was found and done.
     align : how shapes were turned to the template. landmarks : how many points are known on each.
     """
 
     template: Template
-    shapes: np.ndarray
+    shapes: Float[Floats32, "N V 3"]
     names: tuple[str, ...]
     notes: tuple[str, ...]
     align: Align = "none"
@@ -120,14 +121,10 @@ def prepare(
             raise OptionError(f"{name} goes with a folder of shapes", "one shape is its own template")
     make_folder(output)
     clean = _template_file(shapes)
-    made = make_template(
-        clean.shape,
-        shapes.stem,
-        config.nodes,
-        labels=_repaired_labels(config.labels, clean),
-        source=shapes.name,
-        low=low_mesh(clean.shape, config.faces, config.decimate),
-    )
+    labels = _repaired_labels(config.labels, clean)
+    low = low_mesh(clean.shape, config.faces, config.decimate)
+    made = make_template(clean.shape, shapes.stem, config.nodes, labels=labels, low=low)
+    made = replace(made, source=shapes.name)
     save_template(made, output / "template.safetensors")
     none = np.zeros((0, made.shape.V, 3), np.float32)
     return Prepared(made, none, (shapes.name,), tuple(clean.notes))
@@ -145,8 +142,8 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         how = rotation_range(stack, first.original.verts[first.kept_vertex[low[0]]])
     how = config.align or how
     name = folder.resolve().name
-    source = f"{first.original.name} of {folder.name}"
-    made = make_template(first.shape, name, config.nodes, source=source, low=low)
+    made = make_template(first.shape, name, config.nodes, low=low)
+    made = replace(made, source=f"{first.original.name} of {folder.name}")
     template_marks = None
     if config.landmarks is not None:
         template_marks = _template_landmarks(first, None if own is None else marks[own], marks)
@@ -199,8 +196,8 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
 
 def _read_shapes(
     folder: Path, output: Path, config: PrepareConfig, notes: list[str], progress: Progress
-) -> tuple[list[Repaired], list[np.ndarray | None]]:
-    """The usable shapes of a folder, repaired, and the landmarks (L, 3) of each."""
+) -> tuple[list[Repaired], list[Float[Floats, "L 3"] | None]]:
+    """The usable shapes of a folder, repaired, and the landmarks of each."""
     files = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
     landmark_files = find_landmarks(config.landmarks, folder, files)
     files = [path for path in files if path not in landmark_files]
@@ -209,7 +206,7 @@ def _read_shapes(
         raise InputError(f"no shapes in {folder}", f"files that end in {', '.join(SUFFIXES)} are read")
     make_folder(output / "normalised")
     found: list[Repaired] = []
-    marks: list[np.ndarray | None] = []
+    marks: list[Float[Floats, "L 3"] | None] = []
     for number, (path, file) in enumerate(zip(files, landmark_files, strict=True)):
         try:
             clean = _check_size(repair(load_shape(path)))
@@ -257,9 +254,9 @@ def _template_shape(
 
 
 def _template_landmarks(
-    first: Repaired, own: np.ndarray | None, marks: list[np.ndarray | None]
-) -> np.ndarray:
-    """Landmarks (L, 3) of the template's shape, if all shapes have as many; `InputError` otherwise."""
+    first: Repaired, own: Float[Floats, "L 3"] | None, marks: list[Float[Floats, "L 3"] | None]
+) -> Float[Floats, "L 3"]:
+    """Landmarks of the template's shape, if all shapes have as many; `InputError` otherwise."""
     sizes = {len(each) for each in marks if each is not None}
     if len(sizes) > 1:
         raise InputError(
@@ -274,8 +271,8 @@ def _template_landmarks(
     return own
 
 
-def _repaired_labels(labels: np.ndarray | None, clean: Repaired) -> np.ndarray | None:
-    """Labels of the file's vertices (V_original,) as labels of the repaired ones (V,)."""
+def _repaired_labels(labels: Int[Ints, " N"] | None, clean: Repaired) -> Int[Ints, " V"] | None:
+    """Labels of the file's vertices as labels of the repaired ones."""
     if labels is not None and len(labels) != clean.original.V:
         raise InputError(
             f"there are {len(labels)} labels, but {clean.original.name} has {clean.original.V} vertices",

@@ -8,6 +8,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
+from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.frames import kabsch
 from meshmatch.shapes.align import Align
@@ -30,9 +31,9 @@ def same_faces(like: Repaired, found: list[Repaired]) -> bool:
 
 
 def registered_stack(
-    first: Repaired, found: list[Repaired], vertices: np.ndarray, notes: list[str]
-) -> np.ndarray:
-    """Vertices (N, V, 3) of the shapes that share the first one's connectivity; N = 0 unless all of them do."""
+    first: Repaired, found: list[Repaired], vertices: Int[Ints, " V"], notes: list[str]
+) -> Float[Floats32, "N V 3"]:
+    """Vertices of the shapes that share the first one's connectivity; N = 0 unless all of them do."""
     complete = []
     for clean in found if same_faces(first, found) else ():
         invalid = clean.original.invalid
@@ -47,8 +48,8 @@ def registered_stack(
     return (chosen - chosen.mean(1, keepdims=True)).astype(np.float32)
 
 
-def rotation_range(stack: np.ndarray, like: np.ndarray) -> Align:
-    """How far registered shapes (N, V, 3) are turned to the template's vertices (V, 3); "none" of many, unasked."""
+def rotation_range(stack: Float[Floats32, "N V 3"], like: Float[Floats, "V 3"]) -> Align:
+    """How far registered shapes are turned to the template's vertices; "none" of many, unasked."""
     if len(stack) >= SMALL_DATA:
         return "none"
     cosines = [(np.trace(kabsch(like, verts.astype(np.float64)).rotation) - 1) / 2 for verts in stack]
@@ -75,8 +76,8 @@ def frame_of(folder: str | Path) -> dict[str, str] | None:
         return None  # whoever reads its shapes reports what is wrong with the folder
 
 
-def read_registered(folder: str | Path, template: Template) -> np.ndarray:
-    """Registered shapes (N, V, 3) of a prepared folder.
+def read_registered(folder: str | Path, template: Template) -> Float[Floats32, "N V 3"]:
+    """Registered shapes of a prepared folder.
 
     Raises
     ------

@@ -5,14 +5,17 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.kernels import KERNELS, Kernel
 
-# Smallest accepted eigenvalue of the scaled moment matrix, relative to its trace.
+# Smallest accepted eigenvalue of the scaled moment matrix, relative to its trace. Set by hand, as is the margin below.
 MINIMUM_EIGENVALUE = 1e-6
 
 
-def support_pairs(points: np.ndarray, nodes: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (point, node) with |x - q| <= r, sorted by point then node; two int64 arrays (N,)."""
+def support_pairs(
+    points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radii: Float[Floats, " K"]
+) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
+    """Pairs (point, node) with |x - q| <= r, sorted by point then node."""
     tree = cKDTree(points)
     reach = tree.query_ball_point(nodes, radii)
     column = np.repeat(np.arange(len(nodes)), [len(hits) for hits in reach])
@@ -22,8 +25,11 @@ def support_pairs(points: np.ndarray, nodes: np.ndarray, radii: np.ndarray) -> t
 
 
 def poorly_supported(
-    points: np.ndarray, nodes: np.ndarray, radius: float | np.ndarray, kernel: Kernel = "smooth"
-) -> np.ndarray:
+    points: Float[Floats, "P 3"],
+    nodes: Float[Floats, "K 3"],
+    radius: float | Float[Floats, " K"],
+    kernel: Kernel = "smooth",
+) -> Int[Ints, " N"]:
     """Indices of the points without four non-coplanar nodes in reach (with a safety margin)."""
     radii = np.broadcast_to(np.asarray(radius, np.float64), (len(nodes),))
     row, column = support_pairs(points, nodes, radii)

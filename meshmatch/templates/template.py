@@ -12,6 +12,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, TemplateError
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.shape import Shape
@@ -34,14 +35,14 @@ class Template:
         Low resolution mesh: what fitting moves. V vertices.
     dense : Shape
         High resolution mesh of the same surface, for `register` and pictures.
-    nodes : float64 array (K, 3)
+    nodes
         Control nodes.
     radius : float
         Support radius of every node.
-    labels : int64 array (V,)
+    labels
         Part of each vertex, an index into ``label_names``.
     label_names : tuple of str
-    core : int64 array (C,)
+    core
         Vertices that move together as nearly one rigid piece and fix the category's frame (a torso;
         every vertex where a category has no such part).
     pose, source, licence : str
@@ -50,11 +51,11 @@ class Template:
     name: str
     shape: Shape
     dense: Shape
-    nodes: np.ndarray
+    nodes: Float[Floats, "K 3"]
     radius: float
-    labels: np.ndarray
+    labels: Int[Ints, " V"]
     label_names: tuple[str, ...]
-    core: np.ndarray
+    core: Int[Ints, " C"]
     pose: str = ""
     source: str = ""
     licence: str = ""

@@ -12,6 +12,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
+from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
@@ -40,16 +41,16 @@ _COMPARED = 40  # shapes among which the medoid is looked for
 class ShapeSamples:
     """Samples of N shapes in the template's frame, and the landmarks that are known on them.
 
-    points, normals : float32 (N, P, 3), in random order
-    landmarks : float32 (N, L, 3), NaN where a shape lacks one; L may be 0
-    template_landmarks : int64 (L,) vertices of the template's low resolution
+    points, normals : in random order
+    landmarks : NaN where a shape lacks one; L may be 0
+    template_landmarks : vertices of the template's low resolution
     align, scale : how every shape was brought to the template's frame
     """
 
-    points: np.ndarray
-    normals: np.ndarray
-    landmarks: np.ndarray
-    template_landmarks: np.ndarray
+    points: Float[Floats32, "N P 3"]
+    normals: Float[Floats32, "N P 3"]
+    landmarks: Float[Floats32, "N L 3"]
+    template_landmarks: Int[Ints, " L"]
     align: Align
     scale: Scale
 
@@ -104,8 +105,8 @@ def medoid(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int) -> i
 def collect_samples(
     template: Template,
     shapes: Sequence[Repaired],
-    landmarks: Sequence[np.ndarray | None],
-    template_landmarks: np.ndarray | None,
+    landmarks: Sequence[Float[Floats, "L 3"] | None],
+    template_landmarks: Float[Floats, "L 3"] | None,
     how: Align,
     scale: Scale,
     seed: int,
@@ -115,8 +116,8 @@ def collect_samples(
 
     Parameters
     ----------
-    landmarks : for each shape (L, 3) landmarks in its file's frame, NaN where missing; or None
-    template_landmarks : (L, 3) the same landmarks in the template's frame
+    landmarks : for each shape its landmarks in its file's frame, NaN where missing; or None
+    template_landmarks : the same landmarks in the template's frame
 
     Returns
     -------

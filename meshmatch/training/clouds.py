@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from meshmatch.arrays import Float
+from meshmatch.arrays import Float, Floats
 from meshmatch.fields.field import Field
 from meshmatch.fields.mls import build_field
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
@@ -80,8 +80,8 @@ def build_lattice(samples: ShapeSamples) -> Lattice | None:
     )
 
 
-def _lattice_field(points: np.ndarray) -> Field:
-    """The field of a coarse lattice around all points (N, 3), at them."""
+def _lattice_field(points: Float[Floats, "N 3"]) -> Field:
+    """The field of a coarse lattice around all points, at them."""
     low, high = points.min(0), points.max(0)
     middle, half = 0.5 * (low + high), 0.55 * float((high - low).max())
     ticks = np.linspace(-half, half, _SIDE)
@@ -158,7 +158,7 @@ class CloudDataset(torch.utils.data.Dataset):
 
 
 def deformed_normals(
-    F: Float[torch.Tensor, "*B 3 3"], normals: Float[torch.Tensor, "*B 3"]
+    F: Float[torch.Tensor, "*B 3 3"], normals: Float[torch.Tensor, "*#B 3"]
 ) -> Float[torch.Tensor, "*B 3"]:
     """Unit normals after a deformation with gradient F: its cofactors on the normals."""
     a, b, c = F.unbind(-1)  # columns

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from meshmatch.arrays import Int, Ints
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import make_template
 from meshmatch.templates.nodes import NodeConfig
@@ -34,8 +37,8 @@ _PARTS: tuple[tuple[str, tuple[str, ...]], ...] = (
 _CORE = ("chest", "belly", "hips")
 
 
-def body_parts(rig: Rig) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Part of every rig vertex by its dominant joint: labels (V,) and their names, sides apart."""
+def body_parts(rig: Rig) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
+    """Part of every rig vertex by its dominant joint: labels and their names, sides apart."""
     names: list[str] = []
     of_joint = np.zeros(len(rig.names), np.int64)
     for j, joint in enumerate(rig.names):
@@ -58,19 +61,19 @@ def standing_body(rig: Rig, pose: str) -> Shape:
     return Shape(verts.double().numpy(), rig.faces.numpy(), f"human-{pose}")
 
 
-def human_template(rig: Rig, pose: str, config: NodeConfig, low: tuple[np.ndarray, np.ndarray]) -> Template:
+def human_template(
+    rig: Rig, pose: str, config: NodeConfig, low: tuple[Int[Ints, " V"], Int[Ints, "F 3"]]
+) -> Template:
     """Template of the mean body. ``rig`` carries the full mesh; ``low`` is its low resolution (vertices, faces)."""
     labels, names = body_parts(rig)
     core = np.flatnonzero(np.isin(labels, [names.index(part) for part in _CORE]))
-    return make_template(
+    made = make_template(
         standing_body(rig, pose),
         f"human-{pose}",
         config,
         labels=labels,
         label_names=names,
         core=core,
-        pose=pose,
-        source=SOURCE,
-        licence=LICENCE,
         low=low,
     )
+    return replace(made, pose=pose, source=SOURCE, licence=LICENCE)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from meshmatch.arrays import Float, Floats32
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.array_files import read_npz
 from meshmatch.training.rig import Rig
@@ -43,7 +44,7 @@ class GivenPoses:
     ----------
     joints : tuple of str
         J names of joints of the body rig, each once.
-    vectors : float array (P, J, 3)
+    vectors
         Rotation vectors in radians, none longer than a full turn.
     share : float
         Of the bodies, 0..1, how many stand in a pose of these.
@@ -59,7 +60,7 @@ class GivenPoses:
     """
 
     joints: tuple[str, ...]
-    vectors: np.ndarray
+    vectors: Float[Floats32, "P J 3"]
     share: float = 0.5
     name: str = ""
 
@@ -117,16 +118,12 @@ class GivenPoses:
     def mixed(
         self,
         rig: Rig,
-        heads: torch.Tensor,
-        world: torch.Tensor,
-        offset: torch.Tensor,
+        heads: Float[torch.Tensor, "B J 3"],
+        world: Float[torch.Tensor, "B J 3 3"],
+        offset: Float[torch.Tensor, "B J 3"],
         generator: torch.Generator,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Give a share of B posed bodies a pose of these instead.
-
-        heads (B, J, 3), world (B, J, 3, 3) and offset (B, J, 3) are those of :func:`forward_kinematics`, as is what
-        is returned.
-        """
+    ) -> tuple[Float[torch.Tensor, "B J 3 3"], Float[torch.Tensor, "B J 3"]]:
+        """World rotations and offsets of `forward_kinematics`, where a share of the bodies has a pose of these instead."""
         B, J = heads.shape[:2]
         taken = torch.rand(B, generator=generator) < self.share
         pick = torch.randint(self.P, (B,), generator=generator)
@@ -172,7 +169,7 @@ def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, csv.Error, RecursionError)
 
 
-def _read_npz(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
+def _read_npz(path: Path) -> tuple[tuple[str, ...], Any]:
     """Arrays `joints` (J,) of text and `rotations` (P, J, 3)."""
     found = read_npz(path, ("joints", "rotations"))
     for name in ("joints", "rotations"):
@@ -186,7 +183,7 @@ def _read_npz(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
     return _names(joints.astype(np.str_).tolist()), found["rotations"]
 
 
-def _read_json(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
+def _read_json(path: Path) -> tuple[tuple[str, ...], Any]:
     """An object with `joints`, a list of names, and `rotations`, lists of numbers."""
     found: Any = json.loads(path.read_text(encoding="utf-8-sig"))
     if not isinstance(found, dict) or not {"joints", "rotations"} <= found.keys():
@@ -200,7 +197,7 @@ def _read_json(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
     return _names(found["joints"]), vectors
 
 
-def _read_csv(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
+def _read_csv(path: Path) -> tuple[tuple[str, ...], Any]:
     """A row `pose, joint, x, y, z` for each joint that is turned; rows of one pose have the same first word."""
     with path.open(encoding="utf-8-sig", newline="") as file:
         rows = csv.reader(file)

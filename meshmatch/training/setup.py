@@ -92,7 +92,7 @@ def build_deformer(
     return Deformer(network, nodes, anchors, anchor_phi, basis, align_basis)
 
 
-def loss_vertices(template: Template, M: int) -> Int[Ints, " M"]:
+def loss_vertices(template: Template, M: int = 1000) -> Int[Ints, " M"]:
     """Evenly spread template vertices that a loss is computed on."""
     return farthest_points(template.shape.verts, min(M, template.shape.V))
 
@@ -106,9 +106,8 @@ def build_dataset(
     scans_per_shape: int,
     seed: int,
     length: int = 1,
-    supervised: int = 1000,
 ) -> BatchDataset:
-    """Batches of a source for a model, supervised on ``supervised`` template vertices.
+    """Batches of a source for a model, supervised on evenly spread template vertices.
 
     Batches are drawn on the CPU, by processes of their own, wherever the model goes: so they have its encoders' copies.
     """
@@ -119,7 +118,7 @@ def build_dataset(
         faces=torch.from_numpy(np.array(template.shape.faces)),
         template_core=verts[core],
         core=core,
-        loss_points=torch.from_numpy(loss_vertices(template, supervised)),
+        loss_points=torch.from_numpy(loss_vertices(template)),
         encoder=deepcopy(model.encoder).cpu(),
         aligner=None if model.aligner is None else deepcopy(model.aligner).cpu(),
         scan=scan,
@@ -130,11 +129,9 @@ def build_dataset(
     )
 
 
-def build_loss_points(
-    template: Template, kernel: Kernel, model: Deformer, supervised: int = 1000, strained: int = 400
-) -> LossPoints:
+def build_loss_points(template: Template, kernel: Kernel, model: Deformer, strained: int = 400) -> LossPoints:
     """The model's field at the supervised vertices; its gradient at the first ``strained`` of them."""
-    verts = template.shape.verts[loss_vertices(template, supervised)]
+    verts = template.shape.verts[loss_vertices(template)]
     field = model.field(verts, template.nodes, template.radius, kernel)
     return LossPoints(torch.from_numpy(verts).float(), field.for_training(strained))
 

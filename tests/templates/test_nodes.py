@@ -199,7 +199,7 @@ def test_missing_vertices_are_completed(ring: Shape) -> None:
 @pytest.mark.parametrize(
     ("values", "told"),
     [
-        ({"strategy": "psychic"}, "no node strategy 'psychic'"),
+        ({"strategy": "psychic"}, "unknown node strategy 'psychic'"),
         ({"K": 3}, "3 nodes are too few"),
         ({"radius": 0.0}, "must be positive, not 0"),
         ({"radius": -1.0}, "must be positive"),

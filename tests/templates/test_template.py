@@ -21,18 +21,16 @@ FEW = NodeConfig(strategy="uniform", K=60, radius=0.3)
 def ball(sphere: Shape) -> Template:
     labels = (sphere.verts[:, 1] > 0).astype(int)
     core = np.flatnonzero(sphere.verts[:, 1] < 0)
-    return make_template(
+    made = make_template(
         Shape(sphere.verts * 70 + 9, sphere.faces, "ball.obj"),
         "ball",
         FEW,
         labels=labels,
         label_names=("south", "north"),
         core=core,
-        pose="none",
-        source="arithmetic",
-        licence="CC0-1.0",
         low=low_resolution(sphere, 500),
     )
+    return replace(made, pose="none", source="arithmetic", licence="CC0-1.0")
 
 
 def test_a_template_stands_in_its_own_frame(ball: Template) -> None:
