@@ -43,7 +43,7 @@ _ERROR_UNITS = {
     "x100": (100.0, "error (hundredths of sqrt(area))"),
 }
 PALE = (0.88, 0.88, 0.89)
-"""Color of a shape that only carries points."""
+"""Color of a shape that only shows points."""
 
 
 @dataclass(frozen=True, eq=False)

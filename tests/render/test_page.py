@@ -80,6 +80,19 @@ class Page(HTMLParser):
         }
 
 
+@pytest.mark.parametrize(
+    ("verdict", "confidence", "known"), [("unknown", 1.0, False), ("unknown", 0.5, True), ("good", 1.0, True)]
+)
+def test_unknown_confidence_is_not_certainty(
+    tmp_path: Path, cube: Shape, verdict: str, confidence: float, known: bool
+) -> None:
+    found = VertexMap.between(
+        cube, cube, np.arange(8), confidence=np.full(8, confidence, np.float32), verdict=verdict
+    )
+    words = page_of(tmp_path / "page.html", Pair(cube, cube, found, found)).words
+    assert words["confidence"] == ([confidence, confidence] if known else None)
+
+
 def page_of(path: Path, pair: Pair, **options: Any) -> Page:
     write_page(path, pair.source, pair.target, pair.there, pair.back, **options)
     return Page(path.read_text(encoding="utf-8"))

@@ -19,6 +19,7 @@ from meshmatch.shapes.shape import Shape
 from tests.render.browser import PHONE, Opened, browser, opened
 from tests.render.pairs import Pair, bump, stirred
 
+pytestmark = pytest.mark.slow
 MODES = ["matches", "look", "own", "confidence", "plain"]
 
 
@@ -198,6 +199,23 @@ def saturation(pixels: np.ndarray) -> float:
     return float(np.quantile(spread, 0.95) / 255)
 
 
+def test_a_turned_shape_stays_in_its_panel(
+    running: Any, make_sphere: Callable[[int], Shape], tmp_path: Path
+) -> None:
+    ball = make_sphere(2)
+    wide = stirred(Shape(ball.verts * (2.0, 2.0, 0.3), ball.faces, "wide"))
+    write_page(tmp_path / "page.html", wide.source, wide.target, wide.there, wide.back)
+    with opened(running, tmp_path / "page.html") as view:
+        box = view.page.locator("#source .view").bounding_box()
+        for _ in range(9):
+            for vertex in range(0, ball.V, 5):
+                at = view.place("source", vertex)
+                assert box["x"] < at["x"] < box["x"] + box["width"]
+                assert box["y"] < at["y"] < box["y"] + box["height"]
+            view.page.keyboard.press("ArrowRight")
+            view.settled()
+
+
 def test_a_vertex_can_be_typed(running: Any, file: Path, pair: Pair) -> None:
     with opened(running, file) as view:
         field = view.page.get_by_label("Vertex of the target, stirred.ply")
@@ -303,6 +321,9 @@ def test_points_on_either_side(running: Any, pair: Pair, tmp_path: Path) -> None
                 view.page.mouse.move(at["x"], at["y"])
                 shown = view.settled()["shown"]
                 assert (shown["side"], shown["vertex"], shown["match"]) == (side, vertex, found.index[vertex])
+        # The maps do not say how confident they are.
+        assert view.page.locator("#status").inner_text().startswith("Confidence unknown")
+        assert view.page.get_by_role("radio", name="Confidence").count() == 0
         drawn = panels(view, tmp_path / "points.png")
         assert saturation(drawn[0]) > 0.2
 

@@ -26,8 +26,8 @@ const FRAGMENT = `
   varying vec3 vColor;
   varying float vSure;
   ${LIGHT}
-  vec3 ofConfidence(float sure) { // the legend's scale
-    float at = sure * float(STEPS - 1);
+  vec3 ofConfidence(float confidence) { // the legend's scale
+    float at = confidence * float(STEPS - 1);
     int low = min(int(at), STEPS - 2);
     return mix(ramp[low], ramp[low + 1], at - float(low));
   }
@@ -73,7 +73,7 @@ function usualEdge(position, face) {
 
 class Drawing {
   // arrays of one side: position, normal, color, confidence, place, match, face; vertex, where rows are not the file's;
-  // look.* and own.*, what it wears. ramp: colours of confidence 0..1 in even steps.
+  // look.* and own.*, its textures or colours. ramp: colours of confidence 0..1 in even steps.
   constructor(words, arrays, ramp) {
     this.words = words;
     this.arrays = arrays;

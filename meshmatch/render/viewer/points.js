@@ -78,10 +78,10 @@ function tell(announce) {
   const status = $('status');
   if (found) {
     const [from, to] = [words[found.side].name, words[OTHER[found.side]].name];
-    const sure = words.confidence ? found.confidence.toFixed(2) : 'unknown';
+    const confidence = words.confidence ? found.confidence.toFixed(2) : 'unknown';
     status.replaceChildren(
       'Confidence ',
-      bold(sure),
+      bold(confidence),
       ': vertex ',
       bold(found.vertex),
       ' of ',

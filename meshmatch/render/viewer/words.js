@@ -9,7 +9,7 @@ const LEGENDS = {
   matches: () => ['One colour is one place', ': the source by position, the target through the map.'],
   look: () => [
     `The ${words.look.kind} of ${within(words[words.look.side].name)}`,
-    ', carried by the map to the other.',
+    ', transferred by the map to the other.',
   ],
   own: () => ['Each shape as it is in its file', ''],
   confidence: () => {
@@ -18,7 +18,7 @@ const LEGENDS = {
       '0',
       SCALE,
       '1',
-      'how sure each match is',
+      'confidence of each match',
       `: ${there} on average on the source, ${back} on the target.`,
     ];
   },
