@@ -85,7 +85,6 @@ class Blend:
         self._curve = CubicSpline(self.times, np.eye(len(fits)), bc_type="natural")
         self._keys = np.stack([fit.vectors for fit in fits])
         self._system = node_system(model)
-        self._field = model.field(self._system.verts)
         self._stretches = StretchBlend(
             [polar(self._system.deformation_gradient(key))[1] for key in self._keys]
         )
@@ -138,7 +137,7 @@ class Blend:
 
     def turns(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3 3"]:
         """Rotations by which the field of a pose turns each template vertex."""
-        return _turns(self._field, vectors)
+        return _turns(self._system.field, vectors)
 
     def frame(self, time: float) -> Frame:
         """Between the frames of the fits: it turns, moves and grows from one to the next."""

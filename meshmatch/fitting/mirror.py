@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import TemplateError
 from meshmatch.fields.field import Field
+from meshmatch.fitting.system import node_system
 from meshmatch.models.trained import TrainedModel, once_per_model
 
 # Left and right are exchanged in the template frame, where bodies face along z and stand along y.
@@ -54,9 +55,10 @@ def mirror_of(model: TrainedModel) -> Mirror | None:
     if not model.has_nodes or distance.max() > _SYMMETRIC:
         return None
     try:
-        here, there = model.field(verts), model.field(verts * _FLIP)
+        there = model.field(verts * _FLIP)
     except TemplateError:  # the mirrored side has too few nodes
         return None
+    here = node_system(model).field
     assert isinstance(here, Field) and isinstance(there, Field)
     phi, across = _dense(here.phi), _dense(there.phi)
     square = phi.T @ phi

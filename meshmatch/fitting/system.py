@@ -51,6 +51,7 @@ class NodeSystem:
     ----------
     verts : (V, 3) template vertices, template frame
     faces : (F, 3)
+    field : PointField, on the vertices
     linear : whether there are node vectors, and with them what follows
     phi : (V, K), sparse or dense
     slopes : (3 G, K), gradient of the shape functions at G strain points
@@ -66,7 +67,7 @@ class NodeSystem:
         self.linear = field.linear
         self.strain_points = farthest_points(self.verts, min(strain_points, len(self.verts)))
         self._incidence = _vertex_faces(self.faces, len(self.verts))
-        self._field = field
+        self.field = field
         if isinstance(field, Field):
             self._compile(field)
 
@@ -85,12 +86,12 @@ class NodeSystem:
 
     def moved(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
         """Template vertices under node vectors, or under whatever rows the field reads."""
-        return self.verts + (self.phi @ vectors if self.linear else self._field.displaced(vectors))
+        return self.verts + (self.phi @ vectors if self.linear else self.field.displaced(vectors))
 
     def deformation_gradient(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "G 3 3"]:
         """F at the strain points, F[g, a, k] = d x'_a / d x_k."""
         if not self.linear:
-            return self._field.strain(vectors, self.strain_points)
+            return self.field.strain(vectors, self.strain_points)
         return (self.slopes @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3)
 
     def surface(self, vectors: Float[Floats, "K 3"]) -> OrientedPoints:

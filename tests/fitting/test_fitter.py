@@ -11,6 +11,7 @@ import pytest
 
 from meshmatch.cli import main
 from meshmatch.errors import OptionError
+from meshmatch.fields.field import PointField
 from meshmatch.fitting.choices import REFINE_NAMES, Refine
 from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
@@ -249,11 +250,20 @@ def test_two_threads_share_one_fitter_that_is_still_cold(egg: Shape, monkeypatch
             plain(self, *args)
 
         monkeypatch.setattr(kind, "__init__", counted)
+    fields: list[int] = []
+    plain_field = TrainedModel.field
+
+    def counted_field(model: TrainedModel, points: np.ndarray) -> PointField:
+        fields.append(len(points))
+        return plain_field(model, points)
+
+    monkeypatch.setattr(TrainedModel, "field", counted_field)
     model = egg_model()
     fitter, shapes = Fitter(model, QUICK), [egg, bent_egg(model, 1)]
     with ThreadPoolExecutor(2) as pool:
         together = list(pool.map(fitter.fit, shapes))
     assert built == [NodeSystem, Mirror]
+    assert len(fields) == 2  # of the template and of its mirror image
     for shape, fit in zip(shapes, together, strict=True):
         assert np.array_equal(fit.vectors, Fitter(model, QUICK).fit(shape).vectors)
     assert built == [NodeSystem, Mirror]
