@@ -42,8 +42,8 @@ class DisplayMesh:
     verts: Float[Floats, "N 3"]
     faces: Int[Ints, "M 3"]
     normals: Float[Floats, "N 3"]
-    vertex: Int[Ints, N]
-    file_face: Int[Ints, K]
+    vertex: Int[Ints, " N"]
+    file_face: Int[Ints, " K"]
     note: str = ""
 
     @property
@@ -56,7 +56,7 @@ class DisplayMesh:
         return float(np.median(reach[:, -1])) / 2
 
     @cached_property
-    def used(self) -> Int[Ints, K]:
+    def used(self) -> Int[Ints, " K"]:
         """Rows that can be seen: those of a face, or every point."""
         return _corners(self.faces, len(self.verts)) if len(self.faces) else np.arange(len(self.verts))
 
@@ -85,7 +85,7 @@ def display_mesh(shape: Shape, max_vertices: int = MAX_VERTICES) -> DisplayMesh:
     return DisplayMesh(coarse.verts, coarse.faces, normals, vertex, _NONE, note)
 
 
-def _some_points(shape: Shape, rows: Int[Ints, K], max_vertices: int) -> DisplayMesh:
+def _some_points(shape: Shape, rows: Int[Ints, " K"], max_vertices: int) -> DisplayMesh:
     note = ""
     if len(rows) > max_vertices:
         count = len(rows)
@@ -103,7 +103,7 @@ def _compact(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Shape:
     return Shape(verts[used], new[faces])
 
 
-def _corners(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, K]:
+def _corners(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " K"]:
     """The vertices of any face, in order."""
     seen = np.zeros(V, bool)
     seen[faces] = True
@@ -111,8 +111,8 @@ def _corners(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, K]:
 
 
 def _represented(
-    coarse: Shape, verts: Float[Floats, "V 3"], normals: Float[Floats, "V 3"], used: Int[Ints, K]
-) -> Int[Ints, N]:
+    coarse: Shape, verts: Float[Floats, "V 3"], normals: Float[Floats, "V 3"], used: Int[Ints, " K"]
+) -> Int[Ints, " N"]:
     """For each vertex of the coarse mesh the closest used one of the file that faces the same way."""
     edges = coarse.verts[coarse.faces] - coarse.verts[np.roll(coarse.faces, 1, axis=1)]
     weight = _NORMAL_WEIGHT * float(np.linalg.norm(edges, axis=2).mean()) / 2

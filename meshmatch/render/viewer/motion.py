@@ -106,7 +106,7 @@ def write_motion(
 
 
 def _normals(
-    verts: Float[Floats, "N 3"], faces: Int[Ints, "M 3"], joined: Int[Ints, N]
+    verts: Float[Floats, "N 3"], faces: Int[Ints, "M 3"], joined: Int[Ints, " N"]
 ) -> Float[Floats, "N 3"]:
     """Unit normals, the same on both sides of a seam; zeros for points, which then face the viewer."""
     if not len(faces):

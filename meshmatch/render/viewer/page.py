@@ -56,12 +56,11 @@ def write_page(
     rotations: Rotations = (None, None),
     names: tuple[str, str] | None = None,
     looks: Looks | None = None,
-    max_vertices: int = MAX_VERTICES,
 ) -> PageReport:
     """Write a page that shows two shapes side by side, and for each point of one its match on the other.
 
-    The source is colored by position, the target by its colors transferred by the map. The same input gives the same
-    bytes.
+    The source is colored by position, the target by its colors transferred by the map. A shape of more than
+    `MAX_VERTICES` vertices is drawn coarser, and the page says so. The same input gives the same bytes.
 
     Parameters
     ----------
@@ -74,8 +73,6 @@ def write_page(
         To show; by default the shapes' own.
     looks
         Textures or colors, for the button that shows them.
-    max_vertices
-        Up to which a shape is drawn in full; a larger one is drawn coarser, and the page says so.
 
     Raises
     ------
@@ -90,7 +87,7 @@ def write_page(
     check_page(path)
     there, back = there.for_shapes(source, target), back.for_shapes(target, source, "the map back")
     shapes, maps = (source, target), (there, back)
-    parts = display_mesh(source, max_vertices), display_mesh(target, max_vertices)
+    parts = display_mesh(source, MAX_VERTICES), display_mesh(target, MAX_VERTICES)
     turns = upright(source, target, there, rotations)
     cubes = boxes(shapes, parts, there, turns)
     position = position_colors(source, turns[0])

@@ -33,7 +33,7 @@ class Box:
     """
 
     rotation: Float[Floats, "3 3"]
-    low: Float[Floats, 3]
+    low: Float[Floats, " 3"]
     edge: float
     size: float
 
@@ -64,7 +64,7 @@ def boxes(
     return a, b
 
 
-def _cube(drawn: DisplayMesh, rotation: Float[Floats, "3 3"]) -> tuple[Float[Floats, 3], float]:
+def _cube(drawn: DisplayMesh, rotation: Float[Floats, "3 3"]) -> tuple[Float[Floats, " 3"], float]:
     turned = drawn.verts[drawn.used] @ rotation.T
     low, high = turned.min(axis=0), turned.max(axis=0)
     edge = float((high - low).max())

@@ -24,7 +24,7 @@ _LOSSLESS = 256  # pixels along a side up to which an image is stored without lo
 
 
 def make_skin(
-    look: Appearance, faces: Int[Ints, "M 3"], file_face: Int[Ints, M]
+    look: Appearance, faces: Int[Ints, "M 3"], file_face: Int[Ints, " M"]
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """A textured surface as the page has it: of triangles ``faces``, which are ``file_face`` of the file.
 
