@@ -25,6 +25,7 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.convert import ShapeLike, as_shape
 from meshmatch.shapes.repair import Repaired
+from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 
 LandmarkPairs = tuple[ArrayLike, ArrayLike]
@@ -101,6 +102,13 @@ class Matcher:
         """
         clean = [validated(as_shape(shape)) for shape in shapes]
         return self._fit_all(clean, self._configs(config, len(clean)))
+
+    def dense(self, fit: Fit) -> Shape:
+        """The template in its full resolution on the shape of a fit, in the frame and unit of its file."""
+        from meshmatch.fitting.dense import dense_shape
+
+        with thread_limit(1):
+            return dense_shape(self.model, fit)
 
     def map(self, source: Fit, target: Fit, *, agree: bool = True) -> VertexMap:
         """The map from the shape of one fit to the shape of another.

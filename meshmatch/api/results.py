@@ -1,10 +1,13 @@
-"""What matching gives back, and the map in both directions that transfers follow."""
+"""What matching and transfers give back, and the maps in both directions that transfers follow."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Generic, TypeVar
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
@@ -13,6 +16,7 @@ from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.inverse_map import invert_map
+from meshmatch.transfer.low_confidence import LowConfidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +47,11 @@ class MatchResult:
     before_agreement: tuple[Fit, Fit]
     threads: int = 1
 
+    @property
+    def rotations(self) -> tuple[Floats, Floats]:
+        """(3, 3) of source and target: from their files into the orientation of the template, for pictures."""
+        return self.source_fit.frame.rotation, self.target_fit.frame.rotation
+
     def backward(self) -> VertexMap:
         """The map from target to source, made from the same fits: what pulls values from the source to the target."""
         source, target = self.before_agreement
@@ -70,6 +79,11 @@ class MapPair:
     match: MatchResult | None = None
     threads: int = 1
 
+    @property
+    def rotations(self) -> tuple[Floats | None, Floats | None]:
+        """Those of the match, or nothing."""
+        return (None, None) if self.match is None else self.match.rotations
+
     @cached_property
     def backward(self) -> VertexMap:
         """From target to source."""
@@ -79,7 +93,7 @@ class MapPair:
             return invert_map(self.forward, self.source, self.target, self.threads)
 
 
-def checked_pair(
+def pair_of_map(
     found: VertexMap, source: Shape, target: Shape, threads: int = 1, label: str = "the map"
 ) -> MapPair:
     """A map at hand as a pair; `InputError` where it belongs to other shapes or has the opposite direction."""
@@ -107,3 +121,58 @@ def shape_of(fit: Fit) -> Repaired:
             "this fit does not know its shape", "make it with meshmatch.register or Matcher.fit"
         )
     return fit.repaired
+
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ConfidenceRule:
+    """What to do where the map is not to be trusted.
+
+    Parameters
+    ----------
+    minimum : float
+        Confidence (0..1) from which a value is trusted.
+    fill : bool
+        Replace values that are not trusted by what their neighbours have.
+    blank : optional
+        Or replace them by this: a number, one number for each column, a colour (sRGB, 0..1), or a label. By default
+        they are kept.
+
+    Raises
+    ------
+    OptionError
+        Both `fill` and `blank`, or a minimum outside 0..1.
+    """
+
+    minimum: float = 0.3
+    fill: bool = False
+    blank: float | str | Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.fill and self.blank is not None:
+            raise OptionError("fill and blank contradict each other", "choose one of them")
+        if not 0 <= self.minimum <= 1:
+            raise OptionError(f"a confidence lies in 0..1, not {self.minimum:g}")
+
+
+@dataclass(frozen=True, eq=False)
+class Transferred(Generic[T]):
+    """What arrived on the target.
+
+    Attributes
+    ----------
+    data : array, Labels, SkinWeights or Landmarks
+    confidence : (N,) float64
+        Of each vertex, face or landmark, 0 (a guess) to 1 (sure).
+    low : LowConfidence
+        How many were not trusted, and what became of them.
+    maps : MapPair
+        The maps that were followed.
+    """
+
+    data: T
+    confidence: Float[Floats, N]
+    low: LowConfidence
+    maps: MapPair

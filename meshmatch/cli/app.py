@@ -8,10 +8,11 @@ from meshmatch import __version__
 from meshmatch.cli.evaluate import evaluate
 from meshmatch.cli.info import info
 from meshmatch.cli.interpolate import interpolate
-from meshmatch.cli.match import match, register
+from meshmatch.cli.match import match
 from meshmatch.cli.models import models
 from meshmatch.cli.picture import picture
 from meshmatch.cli.prepare import prepare
+from meshmatch.cli.register import register
 from meshmatch.cli.train import train
 from meshmatch.cli.transfer_color import transfer_color
 from meshmatch.cli.transfer_labels import transfer_labels

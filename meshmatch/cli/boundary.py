@@ -86,7 +86,9 @@ def _run(arguments: Sequence[str] | None) -> int:
     from typer.main import get_command
 
     from meshmatch.cli.app import app
+    from meshmatch.threads import set_threads
 
+    set_threads(1)  # before NumPy reads it: whoever needs more asks for them
     try:
         # not app(...): that would replace sys.excepthook, and a bug keeps Python's own traceback
         get_command(app)(args=arguments, prog_name="meshmatch")

@@ -2,19 +2,23 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import threading
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from meshmatch.errors import OutputError
 from meshmatch.outputs import plain_text
+from meshmatch.progress import ProgressCallback
 
 if TYPE_CHECKING:
     import rich.console
 
-# What is going on, on which shape, and which share (0..1) of it is done.
-Report = Callable[[str, str, float], None]
+Json = dict[str, Any]
+"""One JSON object; paths become strings."""
+_QUIET = 10.0  # seconds without a word, where nobody watches a bar
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,7 @@ class Console:
     """Words on stderr. With ``quiet`` only warnings and errors are heard."""
 
     quiet: bool = False
+    _open: list["tuple[rich.console.Console, ProgressCallback]"] = field(default_factory=list)
 
     def say(self, text: str) -> None:
         """A line about what was done."""
@@ -39,11 +44,17 @@ class Console:
             self._line("hint", hint)
 
     @contextmanager
-    def progress(self) -> Iterator[Report]:
-        """A bar for each shape, drawn while the block runs and gone afterwards; nothing if nobody watches."""
+    def progress(self) -> Iterator[ProgressCallback]:
+        """A bar for each shape, drawn while the block runs and gone afterwards; in a log, a line every ten seconds."""
+        if self._open:  # the bars of a block around this one
+            yield self._open[0][1]
+            return
         console = _terminal()
-        if self.quiet or not console.is_terminal:
-            yield lambda what, name, share: None
+        if self.quiet:
+            yield lambda stage, name, share: None
+            return
+        if not console.is_terminal:
+            yield self._lines()
             return
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -56,19 +67,39 @@ class Console:
         with Progress(*columns, console=console, transient=True) as bars:
             rows: dict[str, Any] = {}
 
-            def report(what: str, name: str, share: float) -> None:
+            def report(stage: str, name: str, share: float) -> None:
                 if name not in rows:
-                    rows[name] = bars.add_task(name, total=1.0, what=what)
-                bars.update(rows[name], completed=share, what=what)
+                    rows[name] = bars.add_task(name, total=1.0, what=stage)
+                bars.update(rows[name], completed=share, what=stage)
 
-            yield report
+            self._open.append((console, report))
+            try:
+                yield report
+            finally:
+                self._open.clear()
+
+    def _lines(self) -> ProgressCallback:
+        began = last = time.monotonic()
+        lock = threading.Lock()
+
+        def report(stage: str, name: str, share: float) -> None:
+            nonlocal last
+            with lock:
+                now = time.monotonic()
+                if now - last < _QUIET:
+                    return
+                last = now
+            self.say(f"{name}: {stage}, {100 * share:.0f} % ({now - began:.0f} s)")
+
+        return report
 
     def _line(self, label: str, text: str) -> None:
         from rich.text import Text
 
         color = {"error": "bold red", "warning": "bold yellow", "hint": "dim"}.get(label, "bold")
         words = Text(f"{label}: ", style=color) if label else Text()
-        _terminal().print(words.append(plain_text(text), style="default"), soft_wrap=True, highlight=False)
+        console = self._open[0][0] if self._open else _terminal()  # above the bars
+        console.print(words.append(plain_text(text), style="default"), soft_wrap=True, highlight=False)
 
 
 def _terminal() -> "rich.console.Console":
@@ -77,13 +108,13 @@ def _terminal() -> "rich.console.Console":
     return Terminal(stderr=True)  # made anew: it then follows a stderr that was redirected since
 
 
-def print_json(record: Mapping[str, Any]) -> None:
+def print_json(record: Json) -> None:
     """One JSON object on one line of stdout."""
-    line = json.dumps(record, ensure_ascii=False)
+    line = json.dumps(record, ensure_ascii=False, default=str)
     try:
         line.encode(_coding())
     except UnicodeEncodeError:  # a terminal without these letters, or a file's name that is not UTF-8
-        line = json.dumps(record)
+        line = json.dumps(record, default=str)
     print_text(line + "\n")
 
 

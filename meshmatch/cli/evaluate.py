@@ -8,7 +8,7 @@ import typer
 from meshmatch.cli import options
 from meshmatch.cli import truth as truths
 from meshmatch.cli.console import Console, print_json, print_rows
-from meshmatch.cli.output_paths import check_apart, check_chart, check_png, claimed
+from meshmatch.cli.output_paths import check_chart, check_distinct, check_png, claimed
 
 if TYPE_CHECKING:
     from meshmatch.maps.evaluate import Evaluation
@@ -46,10 +46,8 @@ def evaluate(
     TARGET, over the square root of its area and times 100; and in centimetres with TARGET scaled to 1.9
     square metres, the skin of a person.
     """
-    import numpy as np
-
+    from meshmatch.api.evaluation import evaluate as evaluated
     from meshmatch.errors import OptionError
-    from meshmatch.maps.evaluate import evaluate_map
     from meshmatch.maps.files import load_map
     from meshmatch.render.charts import draw_curves
     from meshmatch.shapes.files import load_shape
@@ -62,13 +60,13 @@ def evaluate(
     check_chart(curve)
     check_png(picture)
     inputs = [map_file, source, target, truth, *(points or ())]
-    check_apart([curve, picture], inputs)
+    check_distinct([curve, picture], inputs)
     # Pictures that cannot be written are told before the geodesics.
     with claimed(curve) as plot, claimed(picture) as drawing:
         shapes = load_shape(source), load_shape(target)
         found = load_map(map_file, *shapes)
         known = truths.load_truth(truth, points, shapes[0])
-        result = evaluate_map(found, *shapes, *known, rng=np.random.default_rng(seed))
+        result = evaluated(found, *shapes, None if known[0] is None else known, seed=seed)
         if plot is not None and result.errors is not None:
             limit = 20.0 if unit == "cm" else 25.0
             draw_curves({found.source or source.stem: result.errors}, plot, limit, unit=unit)

@@ -19,7 +19,7 @@ def claimed(path: Path | None) -> Iterator[Path | None]:
         yield temporary
 
 
-def check_apart(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
+def check_distinct(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
     """Refuse an output that would replace an input, or another output (`OptionError`)."""
     taken = {os.path.realpath(path): "is an input of this command" for path in inputs if path is not None}
     for path in outputs:

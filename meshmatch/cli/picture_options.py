@@ -2,10 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
 
 from meshmatch.cli.console import Console
-from meshmatch.cli.truth import load_truth
+from meshmatch.cli.options import Axis, Seed, check_axes
+from meshmatch.cli.truth import Points, Truth, check_truth, load_truth
+from meshmatch.cli.words import fit_words
 from meshmatch.errors import OptionError
 
 if TYPE_CHECKING:
@@ -15,37 +19,77 @@ if TYPE_CHECKING:
     from meshmatch.shapes.shape import Shape
     from meshmatch.templates.template import Template
 
+View = Literal["quarter", "front", "left", "right", "back", "above"]
+
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """What the user asked to see."""
+    """What is shown."""
 
-    map: Path | None
-    confidence: bool
-    truth: tuple[Path | None, tuple[Path, Path] | None] | None
-    unit: Literal["cm", "x100"]
-    values: list[Path]
-    title: str | None
-    range: tuple[float, float] | None
-    labels: list[Path]
-    on: Literal["vertices", "faces"] | None
-    fit: str | None
-    image: Path | None
-    plain: bool
-    seed: int
+    map: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MAP", help="Of two shapes, SOURCE TARGET, a map: matched places in one colour."
+        ),
+    ] = None
+    confidence: Annotated[bool, typer.Option("--confidence", help="With --map: how sure it is, as heat.")] = (
+        False
+    )
+    truth: Truth = None
+    points: Points = None
+    unit: Annotated[
+        Literal["cm", "x100"],
+        typer.Option(help="Of errors: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100."),
+    ] = "cm"
+    values: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="A number for each vertex, as heat (.npy .csv); or three, as colour. Once for each shape.",
+        ),
+    ] = None
+    title: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="What the numbers of --values are, with their unit.")
+    ] = None
+    range: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="LOW HIGH", help="Ends of the scale of a heat; chosen if not given."),
+    ] = None
+    labels: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="A label for each vertex or face (.npy .csv .txt .json). Once for each shape.",
+        ),
+    ] = None
+    on: Annotated[
+        Literal["vertices", "faces"] | None,
+        typer.Option(help="What the labels belong to; told by their count if not given."),
+    ] = None
+    fit: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MESH|MODEL",
+            help="Over one shape: the template that `meshmatch register` laid on it, or a model whose template is "
+            "laid on it now. The distance is drawn as heat.",
+        ),
+    ] = None
+    image: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A texture for a shape whose file names none, or another one."),
+    ] = None
+    plain: Annotated[bool, typer.Option("--plain", help="Without textures, colours and nodes.")] = False
+    seed: Seed = 0
 
     @property
     def files(self) -> list[Path | None]:
         """All that is read beside the shapes."""
-        known: list[Path | None] = [self.map, self.image, *self.values, *self.labels]
-        if self.fit is not None:
-            known.append(Path(self.fit))
-        if self.truth is not None:
-            known += [self.truth[0], *(self.truth[1] or ())]
-        return known
+        lists = [*(self.values or []), *(self.labels or []), *(self.points or ())]
+        return [self.map, self.image, self.truth, None if self.fit is None else Path(self.fit), *lists]
 
     def check(self, count: int) -> None:
         """Refuse what does not go together, for so many shapes (`OptionError`)."""
+        known = check_truth(self.truth, self.points)
         modes = {"--map": self.map, "--values": self.values, "--labels": self.labels, "--fit": self.fit}
         chosen = [name for name, given in modes.items() if given]
         if self.image is not None:
@@ -56,12 +100,12 @@ class PictureOptions:
             raise OptionError(f"{' and '.join(chosen)} do not go together", "make a picture for each")
         if self.map is not None and count != 2:
             raise OptionError(f"a map is of two shapes, not of {count}", "name the source, then the target")
-        for name, wanted in (("--confidence", self.confidence), ("--truth and --points", self.truth)):
+        for name, wanted in (("--confidence", self.confidence), ("--truth and --points", known)):
             if wanted and self.map is None:
                 raise OptionError(
                     f"{name} need a map" if "and" in name else f"{name} needs a map", "add --map"
                 )
-        if self.confidence and self.truth:
+        if self.confidence and known:
             raise OptionError("--confidence and the truth both color the shapes", "make a picture for each")
         for name, files in (("--values", self.values), ("--labels", self.labels)):
             if files and len(files) != count:
@@ -73,10 +117,53 @@ class PictureOptions:
             raise OptionError("--on needs --labels", "give the labels, or leave out --on")
         if self.title is not None and not self.values:
             raise OptionError("--title needs --values", "give the values, or leave out --title")
-        if self.range is not None and not (self.values or self.fit or self.truth):
+        if self.range is not None and not (self.values or self.fit or known):
             raise OptionError(
                 "--range needs a color scale", "it goes with --values, --truth, --points and --fit"
             )
+
+
+@dataclass(frozen=True)
+class LookOptions:
+    """How it is shown."""
+
+    view: Annotated[View, typer.Option(help="The side that is shown.")] = "quarter"
+    up: Annotated[Axis | None, typer.Option(help="The files' axis that points up. Guessed if not given.")] = (
+        None
+    )
+    front: Annotated[
+        Axis | None, typer.Option(help="The files' axis that the shapes face. Guessed if not given.")
+    ] = None
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH", help="Width and height in pixels, such as 1200x800. Fitted if not given."
+        ),
+    ] = None
+    background: Annotated[
+        str, typer.Option(metavar="COLOR", help="white, dark, transparent, or a colour such as #e8f0f8.")
+    ] = "white"
+    ground: Annotated[bool, typer.Option("--ground/--no-ground", help="Whether shadows fall.")] = True
+
+    def look(self) -> "Look":
+        """The same for the library."""
+        from meshmatch.render.layout import VIEWS
+        from meshmatch.render.picture import Look
+
+        check_axes(self.up, self.front)
+        return Look(_size(self.size), self.background, self.up, self.front, *VIEWS[self.view], self.ground)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    """Width and height of words such as 1200x800 (`OptionError` if invalid)."""
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isascii() and width.isdigit() and height.isascii() and height.isdigit()):
+        raise OptionError(f"invalid size '{text}'", "give width and height in pixels, such as 1200x800")
+    if max(len(width), len(height)) > 9:
+        raise OptionError(f"a picture of {text} pixels is too large", "give a size such as 1200x800")
+    return int(width), int(height)
 
 
 @dataclass(frozen=True)
@@ -157,12 +244,12 @@ def _compose_map(options: PictureOptions, shapes: "list[Shape]", look: "Look") -
     found = load_map(options.map, source, target)
     if options.confidence:
         return compose_confidence(source, target, found, look)
-    if options.truth is None:
+    if not check_truth(options.truth, options.points):
         return compose_match(source, target, found, look=look)
     from meshmatch.maps.evaluate import map_errors
     from meshmatch.maps.geodesics import GeodesicDistances
 
-    here, there = load_truth(*options.truth, source)
+    here, there = load_truth(options.truth, options.points, source)
     assert here is not None and there is not None
     errors = map_errors(found.index, here, there, GeodesicDistances(target))
     return compose_errors(source, target, found, (here, there), errors, options.unit, options.range, look)
@@ -178,16 +265,15 @@ def _compose_fit(
     file = Path(fit)
     if file.is_file() or file.suffix.lower() in SUFFIXES:
         return compose_fit(shape, load_shape(file), limits=options.range)
-    from meshmatch import pipeline
+    from meshmatch.api.matching import register
+    from meshmatch.fitting.fit_config import FitConfig
     from meshmatch.models.registry import locate_model
     from meshmatch.shapes.shape import Shape
 
     locate_model(fit)
+    config = FitConfig(seed=options.seed, up=look.up, front=look.front)
     with voice.progress() as report:
-        found = pipeline.register(
-            shape, model=fit, seed=options.seed, up=look.up, front=look.front, progress=report
-        )
-    words = f"{found.verdict} fit, up {found.up}, front {found.front}"
-    voice.say(f"laid the template of {fit} on {shape.name}: {words}")
+        found = register(shape, model=fit, config=config, progress=report)
+    voice.say(f"fitted the template of {fit} to {shape.name}: {fit_words(found)}")
     fitted = Shape(found.points_in_file, found.faces, f"{fit} on {shape.name}")
     return compose_fit(shape, fitted, found.frame.rotation, options.range)

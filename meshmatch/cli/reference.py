@@ -1,16 +1,54 @@
-"""Write ``docs/cli.md`` from the verbs' own ``--help``: ``python -m meshmatch.cli.reference [--check] [FILE]``."""
+"""Write ``docs/cli.md`` and ``docs/api.md`` from the program's own help and docstrings.
 
+``python -m meshmatch.cli.reference [--check] [FOLDER]``
+"""
+
+import argparse
 import contextlib
+import inspect
 import io
 import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-HEAD = """# The command line
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+CLI_HEAD = """# The command line
 
 Made by `python -m meshmatch.cli.reference` from the program's own `--help`; a test keeps it fresh.
 """
+API_HEAD = """# The Python library
+
+Made by `python -m meshmatch.cli.reference` from signatures and docstrings; a test keeps it fresh. All names are
+attributes of `meshmatch`, which loads them when they are first used. Whatever a user can get wrong is a
+`MeshmatchError` with a `message` and a `hint`.
+"""
+API = {
+    "Matching": ("match", "register", "Matcher", "MatchResult", "Fit", "FitConfig", "VertexMap", "evaluate"),
+    "Transfers": (
+        *("transfer_texture", "transfer_colors", "transfer_values", "transfer_labels", "transfer_weights"),
+        *(
+            "transfer_landmarks",
+            "find_maps",
+            "ConfidenceRule",
+            "BakeOptions",
+            "Transferred",
+            "TexturedResult",
+        ),
+    ),
+    "Shapes and files": (
+        *("Shape", "Frame", "load_shape", "save_shape", "load_map", "save_map", "load_model"),
+        *("MeshmatchError",),
+    ),
+    "Sequences, pictures and pages": (
+        "interpolate",
+        "InterpolationOptions",
+        "Interpolation",
+        "picture",
+        "view",
+    ),
+    "Own categories": ("prepare", "train"),
+}
 
 
 def pages() -> Iterator[tuple[str, ...]]:
@@ -27,8 +65,8 @@ def pages() -> Iterator[tuple[str, ...]]:
 
 
 def reference() -> str:
-    """The page as markdown. The same on every machine: the width of the terminal plays no part."""
-    parts = [HEAD]
+    """The commands as markdown. The same on every machine: the width of the terminal plays no part."""
+    parts = [CLI_HEAD]
     for words in pages():
         parts.append(f"## meshmatch {' '.join(words)}".rstrip() + f"\n\n```text\n{_help(words)}\n```\n")
     return "\n".join(parts)
@@ -45,19 +83,81 @@ def _help(words: Sequence[str]) -> str:
     return "\n".join(line.rstrip() for line in heard.getvalue().strip().splitlines())
 
 
+def api_reference() -> str:
+    """The library as markdown: every public name with its signature and docstring."""
+    import meshmatch
+
+    parts = [API_HEAD]
+    for title, names in API.items():
+        parts.append(f"## {title}\n")
+        for name in names:
+            parts.append(_entry(name, getattr(meshmatch, name), "###"))
+    return "\n".join(parts)
+
+
+def _entry(name: str, thing: object, level: str) -> str:
+    text = f"{level} {name}\n\n```python\n{name}{_signature(thing)}\n```\n\n```text\n{inspect.getdoc(thing)}\n```\n"
+    if not inspect.isclass(thing):
+        return text
+    members = [
+        (key, value.__func__ if isinstance(value, classmethod | staticmethod) else value)
+        for key, value in vars(thing).items()
+        if not key.startswith("_")
+    ]
+    methods = [(key, value) for key, value in members if inspect.isfunction(value)]
+    return "\n".join([text, *(_entry(f"{name}.{key}", value, "####") for key, value in methods)])
+
+
+def _signature(thing: object) -> str:
+    """As it is written in the source; one parameter a line where it is long."""
+    assert callable(thing)
+    try:
+        signature = inspect.signature(thing)
+    except ValueError:
+        return ""
+    words, starred = [], False
+    for parameter in signature.parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY and not starred:
+            words.append("*")
+            starred = True
+        annotation = parameter.annotation
+        if annotation is inspect.Parameter.empty:
+            words.append(str(parameter))
+            continue
+        default = "" if parameter.default is inspect.Parameter.empty else f" = {_default(parameter.default)}"
+        words.append(f"{parameter.name}: {_written(annotation)}{default}")
+    back = signature.return_annotation
+    end = "" if back in (inspect.Signature.empty, None, "None") else f" -> {_written(back)}"
+    line = f"({', '.join(words)}){end}"
+    return line if len(line) < 90 else "(\n    " + ",\n    ".join(words) + f",\n){end}"
+
+
+def _written(annotation: object) -> str:
+    text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    return text.replace("'", '"') if "[" in text else text.strip("'\"")
+
+
+def _default(value: object) -> str:
+    return f"{type(value).__name__}()" if hasattr(value, "__dataclass_fields__") else repr(value)
+
+
 def main(arguments: Sequence[str]) -> int:
-    """Write the page, or with --check say whether the file is what would be written."""
-    check = "--check" in arguments
-    names = [word for word in arguments if word != "--check"]
-    file = Path(names[0]) if names else Path(__file__).resolve().parents[2] / "docs" / "cli.md"
-    page = reference()
-    if not check:
-        file.write_text(page, encoding="utf-8")
-        return 0
-    if file.is_file() and file.read_text(encoding="utf-8") == page:
-        return 0
-    print(f"{os.path.relpath(file)} is stale: run python -m meshmatch.cli.reference", file=sys.stderr)
-    return 1
+    """Write the pages, or with --check say whether the files are what would be written."""
+    parser = argparse.ArgumentParser(
+        prog="python -m meshmatch.cli.reference", description="Write the references."
+    )
+    parser.add_argument("folder", nargs="?", type=Path, default=DOCS, help="where cli.md and api.md are")
+    parser.add_argument("--check", action="store_true", help="write nothing; status 1 if a page is stale")
+    words = parser.parse_args(arguments)
+    stale = 0
+    for name, page in (("cli.md", reference()), ("api.md", api_reference())):
+        file = words.folder / name
+        if not words.check:
+            file.write_text(page, encoding="utf-8")
+        elif not file.is_file() or file.read_text(encoding="utf-8") != page:
+            print(f"{os.path.relpath(file)} is stale: run python -m meshmatch.cli.reference", file=sys.stderr)
+            stale = 1
+    return stale
 
 
 if __name__ == "__main__":

@@ -5,13 +5,15 @@ from typing import Annotated
 
 import typer
 
-from meshmatch.cli import carrying, options
+from meshmatch.cli import transfers
 from meshmatch.cli.console import Console, print_json
+from meshmatch.cli.options import RuleOptions, RunOptions, grouped
 
 
+@grouped
 def transfer_color(
-    source: carrying.Source,
-    target: carrying.Target,
+    source: transfers.Source,
+    target: transfers.Target,
     output: Annotated[
         Path,
         typer.Option(
@@ -22,43 +24,26 @@ def transfer_color(
             ".csv .ply.",
         ),
     ],
+    maps: transfers.MapOptions,
+    rules: RuleOptions,
+    run: RunOptions,
     values: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Carry these numbers, a row for each vertex of SRC (.npy .csv), instead of its colours.",
+            help="Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colours.",
         ),
     ] = None,
-    map: carrying.MapOption = None,
-    fill: carrying.Fill = False,
-    blank: carrying.Blank = None,
-    min_confidence: carrying.Least = carrying.LEAST,
-    picture: carrying.Picture = None,
-    model: options.Model = "human",
-    refine: options.RefineOption = "nodes",
-    up: options.Up = None,
-    front: options.Front = None,
-    seed: options.Seed = 0,
-    strict: options.Strict = False,
-    json: options.Json = False,
-    threads: options.Threads = 2,
-    quiet: options.Quiet = False,
+    picture: transfers.Picture = None,
 ) -> None:
-    """Carry colours, or other numbers of each vertex, from one shape to another.
+    """Transfer vertex colours, or other numbers per vertex.
 
-    They are interpolated within the faces of SRC. What --blank writes is a number, as many numbers as there
-    are columns (1,0,0), or a colour (#ff0000).
+    They are interpolated within the faces of SRC. The VALUE of --blank is a number, one number for each column
+    (1,0,0), or a colour (#ff0000).
     """
-    from meshmatch.threads import set_threads
-
-    set_threads(1)
-    import numpy as np
-
-    from meshmatch.errors import OptionError
+    from meshmatch.api.transfer import transfer_colors, transfer_values
     from meshmatch.shapes.files import load_shape
     from meshmatch.transfer import colors
-    from meshmatch.transfer.attributes import pull_values
-    from meshmatch.transfer.low_confidence import replace_low_values
     from meshmatch.transfer.value_files import (
         Values,
         check_values_suffix,
@@ -67,48 +52,35 @@ def transfer_color(
         save_values,
     )
 
-    request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
-    carrying.check_request(request, fill, blank)
-    if values is not None:
-        check_values_suffix(output)
-    else:
-        colors.check_suffix(output)
-    carrying.check_picture(request, picture, [output, values])
-    voice = Console(quiet)
-    with carrying.output_file(request, output, [values]) as temporary:
+    transfer = transfers.Transfer(source, target, maps, run, Console(run.quiet))
+    (colors.check_suffix if values is None else check_values_suffix)(output)
+    with transfer.outputs([output], [values], picture) as (temporary,):
         a, b = load_shape(source), load_shape(target)
-        given = colors.of_shape(a) if values is None else load_values(values, a)
-        columns = 1 if given.numbers.ndim == 1 else given.numbers.shape[1]
-        empty = None if blank is None else parse_blank(blank, columns)
-        if empty is not None and values is None and not ((empty >= 0) & (empty <= 1)).all():
-            raise OptionError(f"--blank {blank}: colours lie in 0..1", "such as 0.5,0.5,0.5 or #808080")
-        if empty is not None and values is None:
-            empty = colors.light(empty)
-        result = carrying.find_maps(request, voice, a, b)
-        carried = pull_values(result.back, given.numbers)
-        carried, doubt = replace_low_values(
-            carried, result.back.confidence.astype(np.float64), b, min_confidence, empty, fill
-        )
-        if values is None:
-            colors.save(temporary, b, carried)
+        given = None if values is None else load_values(values, a)
+        here = colors.light_of(a) if given is None else given.numbers
+        columns = 1 if here.ndim == 1 else here.shape[1]
+        rule = rules.rule(None if rules.blank is None else parse_blank(rules.blank, columns).tolist())
+        if given is None:
+            result = transfer_colors(a, b, transfer, rule=rule)
+            colors.save(temporary, b, result.data)
         else:
-            save_values(temporary, Values(carried, given.names), b)
-    carrying.tell_doubt(voice, doubt, min_confidence)
-    what = "colours" if values is None else f"{columns} number{'s' if columns > 1 else ''} each"
-    voice.say(f"wrote {output}: {what} for the {b.V} vertices of {request.names[1]}")
+            result = transfer_values(a, b, given.numbers, transfer, rule=rule)
+            save_values(temporary, Values(result.data, given.names), b)
+    transfers.tell_low(transfer.console, result.low, rule.minimum)
+    what = "colours" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
+    transfer.console.say(f"wrote {output}: {what} for the {b.V} vertices of {transfer.names[1]}")
     if picture is not None:
         from meshmatch.render.compose import compose_light, compose_values
 
-        if values is None:
-            shown = compose_light((a, b), (given.numbers, carried))
+        if given is None:
+            shown = compose_light((a, b), (here, colors.light(result.data)))
         else:
-            title = given.names[0] if given.names else values.stem
+            title = given.names[0] if given.names else str(values and values.stem)
             title += "" if columns == 1 else f" (the first of {columns} numbers)"
-            tables = [table if table.ndim == 1 else table[:, 0] for table in (given.numbers, carried)]
+            tables = [table if table.ndim == 1 else table[:, 0] for table in (here, result.data)]
             shown = compose_values((a, b), tables, title)
-        carrying.draw(request, voice, picture, (a, b), result, shown)
-    if json:
-        drawn = None if picture is None else str(picture)
-        record = carrying.map_record(request, result, result.back)
-        record |= carrying.doubt_record(doubt, min_confidence)
-        print_json({"output": str(output), "picture": drawn, "columns": columns} | record)
+        transfer.draw(picture, result.maps, shown)
+    if run.json:
+        record = transfer.record(result.maps, float(result.confidence.mean()))
+        record |= transfers.low_record(result.low, rule.minimum)
+        print_json({"output": output, "picture": picture, "columns": columns} | record)

@@ -5,109 +5,71 @@ from typing import Annotated, Literal
 
 import typer
 
-from meshmatch.cli import carrying, options
+from meshmatch.cli import transfers
 from meshmatch.cli.console import Console, print_json
+from meshmatch.cli.options import RuleOptions, RunOptions, grouped
 
 On = Literal["vertices", "faces"]
 
 
+@grouped
 def transfer_labels(
-    source: carrying.Source,
-    target: carrying.Target,
+    source: transfers.Source,
+    target: transfers.Target,
     output: Annotated[
         Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE",
-            help="Where the labels go: .npy .csv .txt .json, or TGT as .ply.",
-        ),
+        typer.Option("--output", "-o", metavar="FILE", help="Labels: .npy .csv .txt .json, or TGT as .ply."),
     ],
     labels: Annotated[
         Path,
         typer.Option(
-            metavar="FILE",
-            help="A whole number or a word for each vertex or each face of SRC: .npy .csv .txt .json.",
+            metavar="FILE", help="A whole number or a word per vertex or face of SRC: .npy .csv .txt .json."
         ),
     ],
+    maps: transfers.MapOptions,
+    rules: RuleOptions,
+    run: RunOptions,
     on: Annotated[
-        On | None, typer.Option(help="What FILE has labels of. Told by their count if not given.")
+        On | None, typer.Option(help="What the labels of FILE belong to. Default: told by their number.")
     ] = None,
-    to: Annotated[
-        On | None, typer.Option(help="What of TGT gets labels. The same as in FILE if not given.")
-    ] = None,
-    map: carrying.MapOption = None,
-    fill: carrying.Fill = False,
-    blank: carrying.Blank = None,
-    min_confidence: carrying.Least = carrying.LEAST,
-    picture: carrying.Picture = None,
-    model: options.Model = "human",
-    refine: options.RefineOption = "nodes",
-    up: options.Up = None,
-    front: options.Front = None,
-    seed: options.Seed = 0,
-    strict: options.Strict = False,
-    json: options.Json = False,
-    threads: options.Threads = 2,
-    quiet: options.Quiet = False,
+    to: Annotated[On | None, typer.Option(help="What of TGT gets labels. Default: the same.")] = None,
+    picture: transfers.Picture = None,
 ) -> None:
-    """Carry labels of vertices or faces from one shape to another.
+    """Transfer labels of vertices or faces.
 
-    Labels are voted on and never averaged. --blank names the label to write where the confidence is too low,
-    such as -1 or unknown; where SRC has no label it is also what TGT gets.
+    Labels are voted on and never averaged. The VALUE of --blank is a label, such as -1 or unknown; TGT also gets it
+    where SRC has no label.
     """
-    from meshmatch.threads import set_threads
-
-    set_threads(1)
     import numpy as np
 
-    from meshmatch.errors import OptionError
+    from meshmatch.api.transfer import transfer_labels as transferred
     from meshmatch.shapes.files import load_shape
-    from meshmatch.transfer.attributes import pull_labels
-    from meshmatch.transfer.face_labels import mean_of_corners, pull_face_labels
-    from meshmatch.transfer.label_files import check_labels_suffix, load_labels, named, save_labels
-    from meshmatch.transfer.low_confidence import replace_low_labels
+    from meshmatch.transfer.label_files import check_labels_suffix, load_labels, save_labels
 
-    request = carrying.Request(source, target, map, model, refine, seed, up, front, strict, threads)
-    carrying.check_request(request, fill, blank)
+    transfer = transfers.Transfer(source, target, maps, run, Console(run.quiet))
+    rule = rules.rule(rules.blank)
     check_labels_suffix(output)
-    carrying.check_picture(request, picture, [output, labels])
-    voice = Console(quiet)
-    with carrying.output_file(request, output, [labels]) as temporary:
+    with transfer.outputs([output], [labels], picture) as (temporary,):
         a, b = load_shape(source), load_shape(target)
         given = load_labels(labels, a, on)
-        if blank is not None:
-            given.check_blank(blank)
-        if to == "faces" and b.is_cloud:
-            raise OptionError(f"{b.name} is a point cloud: it has no faces to label", "leave out --to faces")
-        kind: On = "vertices" if b.is_cloud else to or given.on
-        result = carrying.find_maps(request, voice, a, b)
-        confidence = result.back.confidence.astype(np.float64)
-        if kind == "faces":
-            found = pull_face_labels(result.back, a, b, given.codes, given.on == "faces", threads)
-            confidence = mean_of_corners(confidence, b)
-        else:
-            found = pull_labels(result.back, a, given.codes, given.on == "faces")
-        found, doubt = replace_low_labels(
-            found, confidence, b, min_confidence, blank is not None, fill, kind == "faces"
-        )
-        carried = named(found, given, kind, blank)
-        save_labels(temporary, carried, b)
-    carrying.tell_doubt(voice, doubt, min_confidence, kind)
-    used = len(np.unique(carried.codes))
-    voice.say(f"wrote {output}: {used} different labels on the {len(found)} {kind} of {request.names[1]}")
+        result = transferred(a, b, given, transfer, to=to, rule=rule)
+        found = result.data
+        save_labels(temporary, found, b)
+    transfers.tell_low(transfer.console, result.low, rule.minimum, found.on)
+    used = len(np.unique(found.codes))
+    transfer.console.say(
+        f"wrote {output}: {used} different labels on the {len(found.codes)} {found.on} of {transfer.names[1]}"
+    )
     if picture is not None:
         from meshmatch.render.compose import compose_labels
 
-        words = [str(name) for name in given.names]
-        theirs = np.where(carried.codes < len(words), carried.codes, -1)  # a blank comes after the names
-        faces = given.on == "faces", kind == "faces"
-        shown = compose_labels((a, b), (given.codes, theirs), words, faces)
-        carrying.draw(request, voice, picture, (a, b), result, shown)
-    if json:
-        drawn = None if picture is None else str(picture)
-        record = carrying.map_record(request, result, result.back)
-        record |= carrying.doubt_record(doubt, min_confidence)
-        print_json(
-            {"output": str(output), "picture": drawn, "from": given.on, "to": kind, "labels": used} | record
-        )
+        names = [str(name) for name in given.names]
+        theirs = np.where(found.codes < len(names), found.codes, -1)  # a blank comes after the names
+        faces = given.on == "faces", found.on == "faces"
+        shown = compose_labels((a, b), (given.codes, theirs), names, faces)
+        transfer.draw(picture, result.maps, shown)
+    if run.json:
+        record = transfer.record(result.maps, float(result.maps.backward.confidence.mean()))
+        record |= transfers.low_record(result.low, rule.minimum)
+        ends = {"from": given.on, "to": found.on, "labels": used}
+        print_json({"output": output, "picture": picture} | ends | record)

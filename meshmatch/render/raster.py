@@ -60,7 +60,7 @@ def draw(scene: Scene, viewport: Viewport) -> Layer:
     edges = edge_points(scene, part)
     rows = max(1, BAND // part.width)
     for first in range(0, part.height, rows):
-        _draw_band(scene, part, edges, first, min(part.height, first + rows), (left, top), drawn)
+        _band(scene, part, edges, first, min(part.height, first + rows), (left, top), drawn)
     return whole
 
 
@@ -74,21 +74,7 @@ def _extent(scene: Scene, viewport: Viewport) -> tuple[int, int, int, int]:
     return int(left), int(top), int(right), int(bottom)
 
 
-@dataclass(frozen=True, eq=False)
-class _Band:
-    """Rows of a picture with one ray per pixel: hits and visibility, from row ``low`` of the viewport on.
-
-    ``corner`` is the column and row of the viewport in the picture, from where blocks are counted.
-    """
-
-    hits: Hits
-    seen: Float[Floats32, "P 2"]
-    shape: tuple[int, int]
-    low: int
-    corner: tuple[int, int]
-
-
-def _draw_band(
+def _band(
     scene: Scene,
     viewport: Viewport,
     edges: Float[Floats32, "E 3"],
@@ -97,7 +83,7 @@ def _draw_band(
     corner: tuple[int, int],
     whole: Layer,
 ) -> None:
-    """Draw rows of a viewport (see `_Band`) into the whole picture."""
+    """Draw rows of a viewport whose corner is at this column and row of the picture, from where blocks are counted."""
     low, high = max(0, first - _HALO), min(viewport.height, last + _HALO)
     shape = (high - low, viewport.width)
     row, column = np.divmod(np.arange(shape[0] * shape[1]), viewport.width)
@@ -120,7 +106,7 @@ def _draw_band(
         chosen[: first - low] = chosen[last - low :] = False
         found = np.flatnonzero(chosen)
         if len(found):
-            fine = _fine(scene, viewport, _Band(hits, seen, shape, low, corner), found, places)
+            fine = _fine(scene, viewport, hits, seen, shape, low, corner, found, places)
             light.reshape(-1, 3)[found], alpha.reshape(-1)[found] = fine
     own = slice(first - low, last - low)
     whole.light[first:last], whole.alpha[first:last] = light[own], alpha[own]
@@ -129,7 +115,7 @@ def _draw_band(
 
 def _shaded(
     scene: Scene, hits: Hits, seen: Float[Floats32, "N 2"]
-) -> tuple[Float[Floats32, "N 3"], Float[Floats32, " N"]]:
+) -> tuple[Float[Floats32, "N 3"], Float[Floats32, N]]:
     """Light times alpha, and alpha, of all rays."""
     light = np.zeros((len(hits.face), 3), np.float32)
     alpha = np.zeros(len(hits.face), np.float32)
@@ -222,26 +208,30 @@ def _differs(values: Float[Floats32, "H W C"], by: float) -> Bool[Bools, "H W"]:
 def _fine(
     scene: Scene,
     viewport: Viewport,
-    band: _Band,
-    chosen: Int[Ints, " N"],
+    hits: Hits,
+    seen: Float[Floats32, "P 2"],
+    shape: tuple[int, int],
+    low: int,
+    corner: tuple[int, int],
+    chosen: Int[Ints, N],
     places: Float[Floats, "R 2"],
-) -> tuple[Float[Floats32, "N 3"], Float[Floats32, " N"]]:
+) -> tuple[Float[Floats32, "N 3"], Float[Floats32, N]]:
     """Light times alpha, and alpha, of chosen pixels of a band, each the mean over places in it."""
-    row, column = np.divmod(np.repeat(chosen, len(places)), band.shape[1])
+    row, column = np.divmod(np.repeat(chosen, len(places)), shape[1])
     offsets = np.tile(places, (len(chosen), 1))
     finer = scene.look(
-        *viewport.at(column + 0.5 + offsets[:, 0], row + band.low + 0.5 + offsets[:, 1]),
+        *viewport.at(column + 0.5 + offsets[:, 0], row + low + 0.5 + offsets[:, 1]),
         viewport.pixel / np.sqrt(len(places)),
     )
     met = np.flatnonzero(finer.face != -1)
     light_seen = np.ones((len(row), 2), np.float32)
-    light_seen[met], known = _reused(band, finer, met, row[met], column[met], viewport.pixel)
+    light_seen[met], known = _reused(finer, met, row[met], column[met], hits, seen, shape, viewport.pixel)
     missing = met[~known]
     # Each ray of a pixel uses other directions, whichever band it is in.
     number = missing % len(places)
     block = (
-        (row[missing] + band.low + band.corner[1]) * BLOCK + number // BLOCK,
-        (column[missing] + band.corner[0]) * BLOCK + number % BLOCK,
+        (row[missing] + low + corner[1]) * BLOCK + number // BLOCK,
+        (column[missing] + corner[0]) * BLOCK + number % BLOCK,
     )
     light_seen[missing] = visibility(scene, finer, missing, block[0], block[1])
     light, alpha = _shaded(scene, finer, light_seen)
@@ -249,27 +239,28 @@ def _fine(
 
 
 def _reused(
-    band: _Band,
     finer: Hits,
-    met: Int[Ints, " N"],
-    row: Int[Ints, " N"],
-    column: Int[Ints, " N"],
+    met: Int[Ints, N],
+    row: Int[Ints, N],
+    column: Int[Ints, N],
+    hits: Hits,
+    seen: Float[Floats32, "P 2"],
+    shape: tuple[int, int],
     pixel: float,
-) -> tuple[Float[Floats32, "N 2"], Bool[Bools, " N"]]:
+) -> tuple[Float[Floats32, "N 2"], Bool[Bools, N]]:
     """Visibility of fine rays from the pixels around them that lie on the same surface, and where there is one."""
-    hits, (H, W) = band.hits, band.shape
     place, flat, normal = finer.place[met], finer.flat[met], finer.normal[met]
     solid = finer.face[met] >= 0
     total = np.zeros((len(met), 2), np.float32)
     weights = np.zeros(len(met), np.float32)
     for down, right in ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)):
-        there = np.clip(row + down, 0, H - 1) * W + np.clip(column + right, 0, W - 1)
+        there = np.clip(row + down, 0, shape[0] - 1) * shape[1] + np.clip(column + right, 0, shape[1] - 1)
         gap = np.einsum("ni,ni->n", hits.place[there] - place, flat)
         turn = np.einsum("ni,ni->n", hits.normal[there], normal)
         weight = _same_surface(gap, turn, pixel)
         face = hits.face[there]
         weight *= ((face >= 0) == solid) & (face != -1)
-        total += weight[:, None] * band.seen[there]
+        total += weight[:, None] * seen[there]
         weights += weight
     known = weights > 0.05
     total[known] /= weights[known, None]

@@ -19,7 +19,7 @@ from meshmatch.shapes.srgb import to_linear
 
 Wrap = Literal["repeat", "clamp", "mirror"]
 Alpha = Literal["opaque", "mask", "blend"]
-_MAX_UV = 1e6
+_FURTHEST_UV = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +82,8 @@ class Appearance:
 
     def __post_init__(self) -> None:
         pictured = np.array([m.image is not None for m in self.materials])[self.material]
-        if not (np.abs(self.uv[pictured]) < _MAX_UV).all():
-            bad = int(np.count_nonzero(~(np.abs(self.uv[pictured]) < _MAX_UV).all(axis=(1, 2))))
+        if not (np.abs(self.uv[pictured]) < _FURTHEST_UV).all():
+            bad = int(np.count_nonzero(~(np.abs(self.uv[pictured]) < _FURTHEST_UV).all(axis=(1, 2))))
             raise InputError(
                 f"the texture coordinates of {bad} faces are out of range (not a number, or over a million)",
                 "unwrap the source again, or export it again",

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from meshmatch.errors import InputError
 
 # Uncompressed bytes of one array in an npz file; a million vertices with 120 dense weights fit.
-MAX_ARRAY_BYTES = 1 << 30
+LARGEST = 1 << 30
 _LAST_CHARACTER = 0x10FFFF
 
 
@@ -49,7 +49,7 @@ def read_npz(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
     Raises
     ------
     InputError
-        The file is damaged, holds objects, or an array of more than `MAX_ARRAY_BYTES` bytes.
+        The file is damaged, holds objects, or an array of more than `LARGEST` bytes.
     """
     found: dict[str, NDArray[Any]] = {}
     try:
@@ -59,16 +59,14 @@ def read_npz(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
                 member = f"{name}.npy"
                 if member in there:
                     with archive.open(member) as file:
-                        found[name] = _array(
-                            file, member, min(archive.getinfo(member).file_size, MAX_ARRAY_BYTES)
-                        )
+                        found[name] = _array(file, member, min(archive.getinfo(member).file_size, LARGEST))
     except Exception as error:  # as above, and the zip around it
         raise _not_arrays(path, error) from error
     return found
 
 
-def _array(file: IO[bytes], name: str, max_bytes: int) -> NDArray[Any]:
-    """The array of an open npy file, if it promises no more than `max_bytes` bytes."""
+def _array(file: IO[bytes], name: str, most: int) -> NDArray[Any]:
+    """The array of an open npy file, if it promises no more than `most` bytes."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of headers as Python 2 wrote them
         version = npy_format.read_magic(file)
@@ -80,7 +78,7 @@ def _array(file: IO[bytes], name: str, max_bytes: int) -> NDArray[Any]:
             raise ValueError("it holds Python objects")
         # An item counts, also one of no bytes: so many of them would fill a list.
         size = math.prod((max(int(kind.itemsize), 1), *(int(axis) for axis in shape)))
-        if min(shape, default=0) < 0 or size > max_bytes:
+        if min(shape, default=0) < 0 or size > most:
             raise ValueError(f"{name} promises {size} bytes")
         file.seek(0)
         array = np.asarray(npy_format.read_array(file, allow_pickle=False))

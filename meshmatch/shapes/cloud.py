@@ -1,6 +1,6 @@
 """What a point cloud does not say by itself: how much surface a point stands for, and which way that faces.
 
-A cloud of more than `MAX_POINTS` points is judged by a random part of it, so that a million points cost seconds.
+A cloud of more than `LARGEST` points is judged by a random part of it, so that a million points cost seconds.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.shapes.orientation import agreeing_flips
 
-MAX_POINTS = 20_000
+LARGEST = 20_000
 
 
 def local_areas(
@@ -116,9 +116,9 @@ def on_a_line(points: Float[Floats, "V 3"]) -> bool:
 
 
 def _part(points: Floats) -> Floats:
-    if len(points) <= MAX_POINTS:
+    if len(points) <= LARGEST:
         return points
-    return points[np.sort(np.random.default_rng(0).choice(len(points), MAX_POINTS, replace=False))]
+    return points[np.sort(np.random.default_rng(0).choice(len(points), LARGEST, replace=False))]
 
 
 def _neighbourhoods(points: Floats) -> tuple[Floats, Floats, Ints]:
@@ -126,8 +126,8 @@ def _neighbourhoods(points: Floats) -> tuple[Floats, Floats, Ints]:
     from scipy.spatial import cKDTree
 
     part = _part(points)
-    count = min(max(len(part) // 200, 18), len(part) - 1)
-    distance, index = cKDTree(part).query(part, count + 1)
+    most = min(max(len(part) // 200, 18), len(part) - 1)
+    distance, index = cKDTree(part).query(part, most + 1)
     return part, distance, index
 
 

@@ -19,7 +19,7 @@ not; but it can stop short of the target, which higher ones reach."""
 def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
     """The surface with about `faces` triangles, by quadric edge collapse (Garland and Heckbert 1997).
 
-    A mesh with at most that many is returned as it is. A closed mesh comes out closed, if need be with more
+    A mesh that has no more is returned as it is. A closed mesh comes out closed, if need be with more
     triangles than asked for; if no way to do that is found, with as few open and non-manifold edges as
     possible. Non-manifold input is taken as it is. Vertices that no face uses are dropped; colours are those
     of the nearest original vertex.
@@ -63,7 +63,7 @@ def _fast(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
     best: tuple[tuple[int, int], Floats, Ints] | None = None
     for aggressiveness in _AGGRESSIVENESS:
         small = fast_simplification.simplify(verts, corners, target_count=target, agg=aggressiveness)
-        new_faces = _without_degenerate(np.asarray(small[1], np.int64))
+        new_faces = _whole(np.asarray(small[1], np.int64))
         if len(new_faces) == 0:
             continue
         faults = sum(edges_of(new_faces).counts) if closed else 0
@@ -75,7 +75,7 @@ def _fast(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
     return (verts, faces) if best is None else best[1:]
 
 
-def _without_degenerate(faces: Ints) -> Ints:
+def _whole(faces: Ints) -> Ints:
     """Without faces that name a vertex twice."""
     a, b, c = faces.T
     return faces[(a != b) & (b != c) & (c != a)]

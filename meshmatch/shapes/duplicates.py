@@ -1,4 +1,4 @@
-"""Duplicate vertices and faces of a mesh, and faces without area."""
+"""What occurs twice in a mesh, or is nothing: vertices of seams, faces, slivers."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def load_shape(path: str | Path) -> Shape:
     Raises
     ------
     InputError
-        The file is missing, empty, cut short, of an unsupported format, or holds no usable vertex.
+        The file is missing, empty, cut short, of an unknown kind, or holds no usable vertex.
     """
     path = existing(Path(path), suffixes=SUFFIXES)
     suffix = path.suffix.lower()
@@ -63,6 +63,16 @@ def load_shape(path: str | Path) -> Shape:
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
         raw = _READERS[suffix](path, data)
     return Shape.with_invalid(raw.verts, raw.faces, plain_text(path.name), raw.colors)
+
+
+def check_suffix(path: Path) -> str:
+    """The suffix in lower case; `OptionError` if shapes are not written with it."""
+    suffix = path.suffix.lower()
+    if suffix not in _WRITERS:
+        raise OptionError(
+            f"cannot write a shape as {suffix or '(no suffix)'}", f"choose one of {', '.join(_WRITERS)}"
+        )
+    return suffix
 
 
 def save_shape(path: str | Path, shape: Shape) -> None:
@@ -80,11 +90,7 @@ def save_shape(path: str | Path, shape: Shape) -> None:
         The folder is missing or cannot be written.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in _WRITERS:
-        raise OptionError(
-            f"cannot write a shape as {suffix or '(no suffix)'}", f"choose one of {', '.join(_WRITERS)}"
-        )
+    suffix = check_suffix(path)
     if suffix == ".stl" and shape.is_cloud:
         raise OptionError("an stl file cannot hold a point cloud", "choose .ply, .xyz or .npy")
     if suffix in (".xyz", ".npy") and not shape.is_cloud:

@@ -1,4 +1,4 @@
-"""Consistent orientation of neighbours: faces of a mesh and normals of a cloud."""
+"""Making neighbours agree which side is out: one tool for faces of a mesh and for normals of a cloud."""
 
 from __future__ import annotations
 

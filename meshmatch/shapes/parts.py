@@ -1,4 +1,4 @@
-"""Connected parts of a mesh: the object, outliers, and perhaps a second object."""
+"""Which connected parts of a mesh belong to the object, and which are dirt or another object."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Parts:
 
 
 def find_parts(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], cross: Float[Floats, "F 3"]) -> Parts:
-    """Classify the connected parts of a mesh; `cross` (F, 3) is the normal of each face, twice its area long."""
+    """Judge the connected parts of a mesh; `cross` (F, 3) is the normal of each face, twice its area long."""
     part = face_parts(faces, len(verts))
     if part.max() == 0:
         return Parts(np.zeros(len(faces), bool), 0, 1, 0, 0.0)

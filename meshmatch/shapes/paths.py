@@ -7,7 +7,7 @@ from pathlib import Path
 
 from meshmatch.errors import InputError
 
-MAX_FILE_BYTES = 1 << 32
+LARGEST_FILE = 1 << 32
 """Bytes: a hundred million vertices, more than anything here can work on. Larger files are refused unread."""
 
 
@@ -22,7 +22,7 @@ def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path
     Raises
     ------
     InputError
-        Missing, a folder, a pipe or device, empty, or larger than `MAX_FILE_BYTES`.
+        Missing, a folder, a pipe or device, empty, or larger than `LARGEST_FILE`.
     """
     try:
         if path.is_dir():
@@ -46,10 +46,10 @@ def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path
         raise InputError(
             f"{path.name} is empty (0 bytes)", hint or "was the download or the export cut short?"
         )
-    if size > MAX_FILE_BYTES:
+    if size > LARGEST_FILE:
         raise InputError(
             f"{path.name} is too large: {size / 2**30:.1f} GiB",
-            f"the limit is {MAX_FILE_BYTES / 2**30:.0f} GiB",
+            f"the limit is {LARGEST_FILE / 2**30:.0f} GiB",
         )
     return path
 

@@ -1,4 +1,4 @@
-"""Repairing a shape, and knowing what became of each original vertex.
+"""Making a shape fit for work without losing sight of any original vertex.
 
 Only what is safe is done: nothing is moved, no hole is closed, no face is invented.
 """
@@ -21,7 +21,7 @@ from meshmatch.shapes.shape import Shape
 
 @dataclass(frozen=True, eq=False)
 class Repaired:
-    """A repaired shape, and how it relates to the original.
+    """A shape that is fit for work, and how it relates to the one that it came from.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Repaired:
     kept_vertex : (V,) int64
         The original vertex that each repaired one is; increasing.
     notes : tuple of str
-        What was found and done, one line each; empty if nothing was.
+        What was found and done, a line each; empty for a shape that was fine.
     original : Shape
         The shape that this one came from.
     kept_face : (F,) int64
@@ -62,7 +62,7 @@ class Repaired:
 
 
 def repair(shape: Shape) -> Repaired:
-    """Remove what is broken, merge duplicates, and note what was done.
+    """Drop what is broken, merge what is double, and say so.
 
     In this order: vertices without a position and the faces that touch them; vertices at exactly the same
     position are merged if they lie on an open edge (texture seams of obj and glTF files, every corner of an

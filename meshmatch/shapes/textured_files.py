@@ -45,6 +45,16 @@ class TexturedFiles:
         picture.write_bytes(png)
 
 
+def check_textured(path: Path, colored: tuple[str, ...] = ()) -> None:
+    """Refuse a suffix that holds no texture (`OptionError`), nor is one of those `colored` by vertex."""
+    if path.suffix.lower() not in (*TEXTURED_SUFFIXES, *colored):
+        hint = f", or in {' or '.join(colored)} for vertex colours" if colored else ""
+        raise OptionError(
+            f"{path.name}: cannot write a texture as {path.suffix or '(no suffix)'}",
+            f"end the name in {' or '.join(TEXTURED_SUFFIXES)}{hint}",
+        )
+
+
 @contextmanager
 def claim_textured(path: str | Path) -> Iterator[TexturedFiles]:
     """Claim the places of a textured mesh before the work; nothing appears unless the block ends well.
@@ -57,11 +67,7 @@ def claim_textured(path: str | Path) -> Iterator[TexturedFiles]:
         A file cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() not in TEXTURED_SUFFIXES:
-        raise OptionError(
-            f"{path.name}: cannot write a texture as {path.suffix or '(no suffix)'}",
-            f"choose {' or '.join(TEXTURED_SUFFIXES)}",
-        )
+    check_textured(path)
     with ExitStack() as claims:  # the obj, which names the others, is claimed first and so renamed last
         temporary = tuple(claims.enter_context(replace_on_success(file)) for file in files_of(path))
         yield TexturedFiles(path, temporary)

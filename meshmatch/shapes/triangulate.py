@@ -19,12 +19,12 @@ _NEIGHBOURS = 16
 _LONGEST = 3.0  # of an edge, against the usual reach of a point's sixth neighbour
 
 
-def triangulate_cloud(cloud: Shape, max_faces: int) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
+def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
     """A mesh over some points of a cloud.
 
     Parameters
     ----------
-    max_faces : int
+    most : int
         About how many triangles at most; half as many points are taken, evenly spread.
 
     Returns
@@ -40,8 +40,8 @@ def triangulate_cloud(cloud: Shape, max_faces: int) -> tuple[Int[Ints, " V"], In
         Hardly any two stars agree: the points lie on no surface.
     """
     chosen = np.arange(cloud.V)
-    if cloud.V > max_faces // 2:
-        chosen = np.sort(farthest_points(cloud.verts, max_faces // 2))
+    if cloud.V > most // 2:
+        chosen = np.sort(farthest_points(cloud.verts, most // 2))
     points, normals = cloud.verts[chosen], cloud.vertex_normals[chosen]
     k = min(_NEIGHBOURS, len(points) - 1)
     distance, index = cKDTree(points).query(points, k + 1)

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.topology import edges_of, same_rows
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import largest_weights
@@ -73,8 +73,8 @@ def _graph(points: Floats, pairs: Ints) -> csr_array:
     )
 
 
-def nearest_known(graph: csr_array, known: Bool[Bools, " N"]) -> Int[Ints, " N"]:
-    """For each node the nearest known one along the graph; itself if it is known; -1 out of reach."""
+def nearest_known(graph: csr_array, known: Bools) -> Ints:
+    """(N,) for each node the nearest known one along the graph; itself if it is known; -1 out of reach."""
     nearest = np.where(known, np.arange(len(known)), -1)
     # Only the unknown and their neighbours matter, however large the rest is.
     adjacent = np.asarray(graph @ (~known).astype(np.float64)) > 0
@@ -92,9 +92,7 @@ def nearest_known(graph: csr_array, known: Bool[Bools, " N"]) -> Int[Ints, " N"]
     return nearest
 
 
-def diffuse(
-    graph: csr_array, known: Bool[Bools, " N"], values: Float[Floats, "N D"]
-) -> tuple[Float[Floats, "N D"], Bool[Bools, " N"]]:
+def diffuse(graph: csr_array, known: Bools, values: Floats) -> tuple[Floats, Bools]:
     """Values (N, D) with the unknown rows filled in: each is the mean of its neighbours, weighted by 1 / distance.
 
     That is the discrete harmonic function with the known values as its boundary; solved by conjugate gradients.

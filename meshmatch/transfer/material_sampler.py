@@ -8,7 +8,7 @@ from scipy.ndimage import maximum_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Ints32
+from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.triangles import cross_product, squared_lengths
 from meshmatch.shapes.appearance import Alpha, Appearance, Material
 from meshmatch.transfer.pyramid import Pyramid, wrapped
@@ -68,16 +68,11 @@ class MaterialSampler:
             out.append(made[key])
         return out
 
-    def footprint(self, face: NDArray[np.integer], reach: Float[Floats32, " N"]) -> Float[Floats32, " N"]:
+    def footprint(self, face: NDArray[np.integer], reach: Floats32) -> Floats32:
         """How many texels of its image a step of `reach` (N,) covers on faces (N,)."""
         return reach * self._density.take(face)
 
-    def colors(
-        self,
-        face: Int[NDArray[np.integer], " N"],
-        weights: Float[Floats32, "3 N"],
-        footprint: Float[Floats32, " N"],
-    ) -> Float[Floats32, "4 N"]:
+    def colors(self, face: NDArray[np.integer], weights: Floats32, footprint: Floats32) -> Floats32:
         """Linear colours and alpha (4, N) on faces (N,) at weights (3, N), as wide as `footprint` (N,) texels."""
         if len(self.materials) == 1:
             return self._of_one(0, face, weights, footprint)
@@ -126,7 +121,7 @@ def _meaning(used: list[Material], colors: Floats | None) -> tuple[Alpha, float,
     return "opaque", 0.5, False
 
 
-def known_texels(material: Material, uv: Float[Floats, "F 3 2"]) -> Bool[Bools, "H W"] | None:
+def known_texels(material: Material, uv: Floats) -> Bools | None:
     """(H, W) True for the texels of an image that lie on the surface, by the coordinates (F, 3, 2) of its faces.
 
     None where it is not worth asking: an image that is tiled, or laid over itself many times.
@@ -182,7 +177,7 @@ def _densities(
     return density.astype(np.float32)
 
 
-def reach_of(first: Float[Floats, "N 3"], second: Float[Floats, "N 3"]) -> Float[Floats, " N"]:
+def reach_of(first: Floats, second: Floats) -> Floats:
     """(N,) the size of a parallelogram (N, 3), (N, 3): the root of its area, or half its longest extent."""
     a, c = squared_lengths(first), squared_lengths(second)
     b = np.einsum("ni,ni->n", first, second)

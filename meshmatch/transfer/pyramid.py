@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Bools, Float, Floats32, Ints, Ints32, UInts8
+from meshmatch.arrays import Bools, Floats32, Ints, Ints32, UInts8
 from meshmatch.shapes.appearance import Material, Wrap
 from meshmatch.shapes.images import Pixels
 from meshmatch.shapes.srgb import LINEAR_OF_BYTE, bytes_of
@@ -21,7 +21,7 @@ from meshmatch.shapes.srgb import LINEAR_OF_BYTE, bytes_of
 _ROWS = 256  # at a time
 
 
-def fill(pixels: Pixels, weight: Float[Floats32, "H W"]) -> list[Pixels]:
+def fill(pixels: Pixels, weight: Floats32) -> list[Pixels]:
     """Smaller levels of (H, W, 4) pixels, each half as large, down to one texel; unknown texels are filled.
 
     Parameters
@@ -130,9 +130,7 @@ class Pyramid:
             material.nearest,
         )
 
-    def look(
-        self, u: Float[Floats32, " N"], v: Float[Floats32, " N"], footprint: Float[Floats32, " N"]
-    ) -> Float[Floats32, "4 N"]:
+    def look(self, u: Floats32, v: Floats32, footprint: Floats32) -> Floats32:
         """Linear colours and alpha (4, N) at (N,), (N,), as wide as `footprint` (N,) texels of the largest level."""
         level = np.log2(np.maximum(footprint, np.float32(1.0)))
         level = np.minimum(level, np.float32(len(self.starts) - 1))

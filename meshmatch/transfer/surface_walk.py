@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Float, Floats, Floats32, Int, Ints, Ints32
+from meshmatch.arrays import Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.topology import same_rows
 from meshmatch.geometry.triangles import (
     blend,
@@ -54,7 +54,7 @@ class SurfaceWalker:
             self._broken |= shape.invalid[shape.faces].any(axis=1)
         self._tree: cKDTree | None = None
 
-    def face_of_vertex(self, vertex: Int[Ints, " N"]) -> Int[Ints, " N"]:
+    def face_of_vertex(self, vertex: Ints) -> Ints:
         """A face at each vertex; -1 where there is none."""
         return self._around[vertex]
 
@@ -62,9 +62,7 @@ class SurfaceWalker:
         """(N, 3) points of faces (N,) by weights (N, 3)."""
         return interpolate(self.verts, self.faces[face], weights)
 
-    def closest(
-        self, points: Float[Floats32, "3 N"], face: Int[Ints32, " N"]
-    ) -> tuple[Int[Ints32, " N"], Float[Floats32, "3 N"], Float[Floats32, " N"]]:
+    def closest(self, points: Floats32, face: Ints32) -> tuple[Ints32, Floats32, Floats32]:
         """The closest place on the surface that a walk reaches.
 
         Parameters
@@ -185,9 +183,7 @@ def _product(a: list[Floats32], b: list[Floats32]) -> Floats32:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def duals(
-    first: Float[Floats, "F 3"], second: Float[Floats, "F 3"]
-) -> tuple[Float[Floats, "F 3"], Float[Floats, "F 3"]]:
+def duals(first: Floats, second: Floats) -> tuple[Floats, Floats]:
     """Vectors (F, 3) whose products with a point of a triangle, seen from its first corner, are the weights of
     its second and third; zeros for a triangle without area.
     """

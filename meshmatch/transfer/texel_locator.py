@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshmatch.arrays import Bools, Float, Floats, Floats32, Int, Ints, Ints32
+from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.material_sampler import reach_of
@@ -39,9 +39,7 @@ class TexelLocator:
         Size of a texel on the source.
     """
 
-    def __init__(
-        self, walker: SurfaceWalker, target: Shape, back: VertexMap, corners: Float[Floats, "F 3 2"]
-    ) -> None:
+    def __init__(self, walker: SurfaceWalker, target: Shape, back: VertexMap, corners: Floats) -> None:
         self.walker = walker
         self._confidence = back.confidence.astype(np.float32)
         image, start = images_of(walker, back)
@@ -120,7 +118,7 @@ class TexelLocator:
         start = [column.take(face) for column in self._start]
         return np.where(corner == 0, start[0], np.where(corner == 1, start[1], start[2]))
 
-    def confidence(self, face: Int[Ints32, " N"], weights: Float[Floats32, "3 N"]) -> Float[Floats32, " N"]:
+    def confidence(self, face: Ints32, weights: Floats32) -> Floats32:
         """(N,) of the map at points (3, N) of triangles (N,)."""
         total, sure = np.zeros(len(face), np.float32), np.zeros(len(face), np.float32)
         for k in range(3):
@@ -138,7 +136,7 @@ class TexelLocator:
         return np.asarray(points.T, np.float32)
 
 
-def images_of(walker: SurfaceWalker, back: VertexMap) -> tuple[Float[Floats, "V 3"], Int[Ints, " V"]]:
+def images_of(walker: SurfaceWalker, back: VertexMap) -> tuple[Floats, Ints]:
     """(V_target, 3) where each vertex of the target lies on the source, and (V_target,) a face of the source there."""
     image = walker.verts[back.index]
     inside = np.flatnonzero(back.face >= 0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Ints32
+from meshmatch.arrays import Bools, Floats, Ints, Ints32
 
 _AT_ONCE = 1 << 21  # texels
 MOST_ROWS = 40_000_000
@@ -45,13 +45,13 @@ class Spans:
             low, done = high, int(ends[high - 1])
 
 
-def rows_of(corners: Float[Floats, "F 3 2"]) -> Int[Ints, " F"]:
+def rows_of(corners: Floats) -> Ints:
     """(F,) how many rows of texel centers each triangle (F, 3, 2) crosses."""
     y = corners[:, :, 1]
     return np.asarray(np.ceil(y.max(axis=1) - 0.5) - np.ceil(y.min(axis=1) - 0.5), np.int64)
 
 
-def spans(corners: Float[Floats, "F 3 2"]) -> Spans:
+def spans(corners: Floats) -> Spans:
     """The texels of triangles (F, 3, 2), whose coordinates count texels: column, row."""
     order = np.lexsort((corners[:, :, 0], corners[:, :, 1]), axis=1)
     top, middle, low = (np.take_along_axis(corners, order[:, k, None, None], axis=1)[:, 0] for k in range(3))
@@ -78,7 +78,7 @@ def _crossing(begin: Floats, end: Floats, y: Floats) -> Floats:
     return np.asarray(begin[:, 0] + (end[:, 0] - begin[:, 0]) * share)
 
 
-def faces_on(corners: Float[Floats, "F 3 2"], size: int) -> tuple[Ints32, int]:
+def faces_on(corners: Floats, size: int) -> tuple[Ints32, int]:
     """The triangle on each texel of a square image, (size, size) with -1 for none, and how many texels are held
     more than once. Where several hold one, the last stays.
     """
@@ -91,7 +91,7 @@ def faces_on(corners: Float[Floats, "F 3 2"], size: int) -> tuple[Ints32, int]:
     return found.reshape(size, size), total - int((found >= 0).sum())
 
 
-def grown(found: Int[Ints32, "H W"], steps: int) -> Int[Ints32, "H W"]:
+def grown(found: Ints32, steps: int) -> Ints32:
     """The same with each texel that is free, but has a neighbour that is not, taking over from it; `steps` times."""
     for _ in range(steps):
         out = found.copy()
@@ -114,7 +114,7 @@ def _shifted(down: int, right: int) -> tuple[tuple[slice, slice], tuple[slice, s
     return (pick[down][0], pick[right][0]), (pick[down][1], pick[right][1])
 
 
-def beside_another(values: Int[Ints32, "H W"]) -> Bool[Bools, "H W"]:
+def beside_another(values: Ints32) -> Bools:
     """(H, W) True for texels with a value (0 or more) that have a neighbour with another one."""
     out = np.zeros(values.shape, bool)
     for a, b in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):

@@ -52,7 +52,7 @@ def transfer_texture(
     target: Shape,
     back: VertexMap,
     atlas: Atlas,
-    options: BakeOptions = BakeOptions(),  # noqa: B008  # frozen
+    options: BakeOptions = BakeOptions(),  # frozen
     progress: Callable[[float], None] = lambda share: None,
 ) -> BakedMesh:
     """Bake the look of a source for a target mesh.

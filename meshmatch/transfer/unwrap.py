@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import xatlas
 
-from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.texels import MOST_ROWS, faces_on, rows_of
@@ -46,7 +46,7 @@ class Atlas:
         Why the file's own are not used; empty if they are, or if there are none.
     """
 
-    uv: Float[Floats, "F 3 2"]
+    uv: Floats
     own: bool
     note: str = ""
 
@@ -128,7 +128,7 @@ def _problem(uv: Floats, shape: Shape, size: int) -> str:
     return f"they overlap on {100 * share:.1f} % of their texels" if share > _OVERLAP else ""
 
 
-def unwrapped(shape: Shape, size: int, padding: int) -> Float[Floats, "F 3 2"]:
+def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
     """(F, 3, 2) new coordinates.
 
     Raises

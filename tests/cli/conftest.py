@@ -1,20 +1,21 @@
 """The command line as its users meet it: words in, a status, stdout and stderr out."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from meshmatch.api import matching
+from meshmatch.api.results import MatchResult
 from meshmatch.cli import main
+from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.frames import Frame
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-
-
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures whose size is not given are small: rays cost seconds."""
-    monkeypatch.setattr("meshmatch.render.layout.HEIGHT", 160)
 
 
 @dataclass(frozen=True)
@@ -48,3 +49,78 @@ def two(tmp_path: Path, sphere: Shape, torus: Shape) -> tuple[Path, Path]:
     save_shape(files[0], sphere)
     save_shape(files[1], torus)
     return files
+
+
+def fake_fit(shape: Shape, verdict: str = "good", reasons: tuple[str, ...] = (), **other: Any) -> Fit:
+    """A fit that nobody made: of two triangles."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    rest: dict[str, Any] = {
+        "frame": Frame(2.0, np.eye(3), np.array([10.0, 0, 0])),
+        "up": "+y",
+        "front": "-z",
+        "residual": 0.0123,
+    }
+    return Fit(
+        template_hash="0" * 16,
+        points=corners,
+        vectors=np.zeros((4, 3)),
+        resting=corners,
+        faces=np.array([[0, 1, 2], [0, 2, 3]]),
+        vertex_distance=np.zeros(shape.V),
+        verdict=verdict,
+        reasons=reasons,
+        seconds=1.0,
+        seed=0,
+        **(rest | other),
+    )
+
+
+def nearest_map(source: Shape, target: Shape, **about: Any) -> VertexMap:
+    """Some map: vertex i goes to vertex i, round and round."""
+    return VertexMap.between(source, target, np.arange(source.V) % target.V, **about)
+
+
+class FakeMatching:
+    """Stands for the matching: remembers how it was called, and answers at once."""
+
+    def __init__(self) -> None:
+        self.called: dict[str, Any] = {}
+        self.verdict = "good"
+        self.reasons: tuple[str, ...] = ()
+        self.make_map: Callable[..., VertexMap] = nearest_map
+        self.make_fit: Callable[..., Fit] = fake_fit
+
+    def match(self, a: Shape, b: Shape, **options: Any) -> MatchResult:
+        self.called = {"source": a.name, "target": b.name} | options
+        options["progress"]("orientation", "a.ply", 0.5)
+        found = self.make_map(a, b, verdict=self.verdict, reasons=self.reasons)
+        fits = self.make_fit(a, self.verdict), self.make_fit(b, self.verdict)
+        result = MatchResult(found, *fits, 2.5, ("a.ply: 3 faces dropped",), fits)
+        object.__setattr__(result, "backward", lambda: self.make_map(b, a))
+        return result
+
+    def fit_all(self, matcher: matching.Matcher, shapes: Any, config: Any = None) -> list[Fit]:
+        (shape,) = shapes
+        self.called = {"shape": shape, "config": matcher.config, "threads": matcher.threads}
+        if matcher.progress is not None:
+            matcher.progress("orientation", "a.ply", 0.5)
+        notes = tuple(f"{shape.name}: {note}" for note in matching.validated(shape).notes)
+        return [replace(self.make_fit(shape, self.verdict, self.reasons), notes=notes)]
+
+
+@pytest.fixture
+def stub(monkeypatch: pytest.MonkeyPatch) -> FakeMatching:
+    fake = FakeMatching()
+    monkeypatch.setattr(matching, "match", fake.match)
+    monkeypatch.setattr(matching.Matcher, "fit_all", lambda *words: fake.fit_all(*words))
+    return fake
+
+
+@pytest.fixture
+def no_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is wrong is told before anything is fitted."""
+
+    def begun(*_: object, **__: object) -> None:
+        raise AssertionError("a fit began")
+
+    monkeypatch.setattr(matching.Matcher, "_fit_all", begun)

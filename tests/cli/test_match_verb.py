@@ -5,80 +5,30 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from meshmatch import pipeline
+from meshmatch.api import matching
 from meshmatch.errors import InputError, OutputError
 from meshmatch.fields.mls import build_field
-from meshmatch.fitting.fit import Fit
-from meshmatch.geometry.frames import Frame
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.files import load_map
-from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import Template
-from tests.cli.conftest import Run
+from tests.cli.conftest import FakeMatching, Run, fake_fit
 from tests.models.small_model import small_card
 
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 
 
-def fit(shape: Shape, verdict: str = "good", reasons: tuple[str, ...] = ()) -> Fit:
-    return Fit(
-        template_hash="0" * 16,
-        frame=Frame(2.0, np.eye(3), np.array([10.0, 0, 0])),
-        points=CORNERS,
-        vectors=np.zeros((4, 3)),
-        resting=CORNERS,
-        faces=FACES,
-        residual=0.0123,
-        vertex_distance=np.zeros(shape.V),
-        verdict=verdict,
-        reasons=reasons,
-        up="+y",
-        front="-z",
-        seconds=1.25,
-        seed=0,
-    )
-
-
-class Recorder:
-    """Stands for the pipeline: remembers how it was called, and answers at once."""
-
-    def __init__(self) -> None:
-        self.called: dict[str, Any] = {}
-        self.verdict = "good"
-        self.reasons: tuple[str, ...] = ()
-
-    def match(self, a: Shape, b: Shape, **options: Any) -> pipeline.MatchResult:
-        self.called = {"source": a.name, "target": b.name} | options
-        options["progress"]("orientation", "a.ply", 0.5)
-        found = VertexMap.between(a, b, np.arange(a.V) % b.V, verdict=self.verdict, reasons=self.reasons)
-        return pipeline.MatchResult(found, fit(a), fit(b), 2.5, ("a.ply: 3 faces dropped",))
-
-    def register(self, shape: Shape, **options: Any) -> Fit:
-        self.called = {"shape": shape} | options
-        options["progress"]("orientation", "a.ply", 0.5)
-        return fit(shape, self.verdict, self.reasons)
-
-
-@pytest.fixture
-def stub(monkeypatch: pytest.MonkeyPatch) -> Recorder:
-    recorder = Recorder()
-    monkeypatch.setattr(pipeline, "match", recorder.match)
-    monkeypatch.setattr(pipeline, "register", recorder.register)
-    return recorder
-
-
 @pytest.mark.parametrize("suffix", [".npy", ".npz", ".csv", ".txt", ".mat", ".json"])
-def test_match_writes_the_map(run: Run, two: tuple[Path, Path], stub: Recorder, suffix: str) -> None:
+def test_match_writes_the_map(run: Run, two: tuple[Path, Path], stub: FakeMatching, suffix: str) -> None:
     output = two[0].with_name(f"map{suffix}")
     answer = run("match", *two, "-o", output)
     assert answer.status == 0
@@ -88,7 +38,7 @@ def test_match_writes_the_map(run: Run, two: tuple[Path, Path], stub: Recorder, 
     assert sorted(path.name for path in output.parent.iterdir()) == sorted(["a.ply", "b.ply", output.name])
 
 
-def test_match_says_what_it_did(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_match_says_what_it_did(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     said = run("match", *two, "-o", two[0].with_name("map.npy")).err
     for words in (
         "3 faces dropped",
@@ -98,42 +48,12 @@ def test_match_says_what_it_did(run: Run, two: tuple[Path, Path], stub: Recorder
         assert words in said
 
 
-DEFAULTS = {
-    "model": "human",
-    "refine": "nodes",
-    "seed": 0,
-    "up": None,
-    "front": None,
-    "partial": "auto",
-    "landmarks": None,
-    "workers": 2,
-}
-
-
-def test_match_defaults(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_match_defaults(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     run("match", *two, "-o", two[0].with_name("map.npy"))
     called = dict(stub.called)
     del called["progress"]
-    assert called == DEFAULTS | {"source": "a.ply", "target": "b.ply"}
-
-
-OPTIONS = [
-    *[(["--refine", value], "refine", value) for value in ("none", "latent", "nodes")],
-    *[(["--up", value], "up", value) for value in ("x", "y", "z", "-x", "-y", "-z")],
-    *[(["--front", value], "front", value) for value in ("x", "y", "z", "-x", "-y", "-z")],
-    (["--seed", "7"], "seed", 7),
-    (["--partial"], "partial", "yes"),
-    (["--whole"], "partial", "no"),
-]
-
-
-@pytest.mark.parametrize(("words", "name", "value"), [*OPTIONS, (["--threads", "1"], "workers", 1)])
-def test_match_hands_options_on(
-    run: Run, two: tuple[Path, Path], stub: Recorder, words: list[str], name: str, value: object
-) -> None:
-    assert run("match", *two, "-o", two[0].with_name("map.npy"), *words).status == 0
-    called = {key: stub.called[key] for key in DEFAULTS}
-    assert called == DEFAULTS | {name: value}
+    rest = {"model": "human", "landmarks": None, "threads": 2, "config": (FitConfig(), FitConfig())}
+    assert called == rest | {"source": "a.ply", "target": "b.ply"}
 
 
 @pytest.mark.parametrize(
@@ -147,21 +67,21 @@ def test_match_hands_options_on(
     ],
 )
 def test_match_refuses_values_that_do_not_exist(
-    run: Run, two: tuple[Path, Path], stub: Recorder, words: list[str]
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, words: list[str]
 ) -> None:
     output = two[0].with_name("map.npy")
     assert run("match", *two, "-o", output, *words).status == 2
     assert not output.exists()
 
 
-def test_match_reads_landmarks(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_match_reads_landmarks(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     file = two[0].with_name("pairs.txt")
     file.write_text("source target\n0 10\n5 11  # the nose\n")
     run("match", *two, "-o", two[0].with_name("map.npy"), "--landmarks", file)
     assert [list(side) for side in stub.called["landmarks"]] == [[0, 5], [10, 11]]
 
 
-def test_match_json_is_one_line_of_data(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_match_json_is_one_line_of_data(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     stub.verdict, stub.reasons = "fair", ("a hand is far",)
     output = two[0].with_name("map.npy")
     answer = run("match", *two, "-o", output, "--json", "--refine", "latent", "--seed", "3")
@@ -178,12 +98,12 @@ def test_match_json_is_one_line_of_data(run: Run, two: tuple[Path, Path], stub: 
     assert record["fits"][0]["residual"] == 0.0123
 
 
-def test_quiet_is_silent(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_quiet_is_silent(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     answer = run("match", *two, "-o", two[0].with_name("map.npy"), "--quiet")
     assert (answer.status, answer.out, answer.err) == (0, "", "")
 
 
-def test_a_poor_fit_warns_even_when_quiet(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_a_poor_fit_warns_even_when_quiet(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     stub.verdict, stub.reasons = "poor", ("an arm is missing",)
     output = two[0].with_name("map.npy")
     answer = run("match", *two, "-o", output, "-q")
@@ -194,7 +114,7 @@ def test_a_poor_fit_warns_even_when_quiet(run: Run, two: tuple[Path, Path], stub
 
 @pytest.mark.parametrize(("verb", "output"), [("match", "map.npy"), ("register", "fitted.ply")])
 def test_strict_makes_a_poor_fit_an_error(
-    run: Run, two: tuple[Path, Path], stub: Recorder, verb: str, output: str
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, verb: str, output: str
 ) -> None:
     stub.verdict, stub.reasons = "poor", ("an arm is missing",)
     words = [*two][: 2 if verb == "match" else 1]
@@ -207,7 +127,7 @@ def test_strict_makes_a_poor_fit_an_error(
 @pytest.mark.parametrize(("verb", "output"), [("match", "map.npy"), ("register", "fitted.ply")])
 @pytest.mark.parametrize("verdict", ["good", "fair"])
 def test_strict_lets_other_fits_pass(
-    run: Run, two: tuple[Path, Path], stub: Recorder, verb: str, output: str, verdict: str
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, verb: str, output: str, verdict: str
 ) -> None:
     stub.verdict, stub.reasons = verdict, ("so so",)
     words = [*two][: 2 if verb == "match" else 1]
@@ -224,7 +144,7 @@ def test_strict_lets_other_fits_pass(
     ids=["suffix", "missing folder", "a folder"],
 )
 def test_an_output_that_cannot_be_is_told_before_the_work(
-    run: Run, two: tuple[Path, Path], stub: Recorder, verb: str, output: str, words: str
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, verb: str, output: str, words: str
 ) -> None:
     suffix = ".npy" if verb == "match" else ".ply"
     path = two[0].parent / output.format(suffix)
@@ -244,7 +164,7 @@ def test_a_failure_leaves_what_was_there(
     def failing(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(pipeline, "match", failing)
+    monkeypatch.setattr(matching, "match", failing)
     output = two[0].with_name("map.npy")
     output.write_bytes(b"old")
     assert run("match", *two, "-o", output).status == (1 if isinstance(error, InputError) else 130)
@@ -254,12 +174,12 @@ def test_a_failure_leaves_what_was_there(
 
 @pytest.mark.parametrize(("verb", "output"), [("match", "map.npy"), ("register", "fitted.ply")])
 def test_a_model_is_named_or_shown(
-    run: Run, two: tuple[Path, Path], stub: Recorder, verb: str, output: str
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, verb: str, output: str
 ) -> None:
     words = (verb, *[*two][: 2 if verb == "match" else 1], "-o", two[0].with_name(output))
     folder = bundled_folder() / "models" / "human"
     assert run(*words, "--model", folder).status == 0
-    assert stub.called["model"] == str(folder)
+    assert verb == "register" or stub.called["model"] == str(folder)
     stub.called = {}
     answer = run(*words, "--model", "humna")
     assert answer.status == 1
@@ -267,7 +187,7 @@ def test_a_model_is_named_or_shown(
     assert stub.called == {}
 
 
-def test_match_draws_a_picture(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_match_draws_a_picture(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     picture, output = two[0].with_name("both.png"), two[0].with_name("map.npy")
     answer = run("match", *two, "-o", output, "--picture", picture, "--json")
     assert answer.status == 0
@@ -281,7 +201,7 @@ def test_match_draws_a_picture(run: Run, two: tuple[Path, Path], stub: Recorder)
 
 
 def test_a_picture_that_fails_costs_no_map(
-    run: Run, two: tuple[Path, Path], stub: Recorder, monkeypatch: pytest.MonkeyPatch
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def failing(*_: object, **__: object) -> None:
         raise OutputError("the disk is full")
@@ -294,7 +214,7 @@ def test_a_picture_that_fails_costs_no_map(
 
 @pytest.mark.parametrize("name", ["both.jpg", "nowhere/both.png", "map.npy", "a.png"])
 def test_a_picture_that_cannot_be_is_told_before_the_work(
-    run: Run, two: tuple[Path, Path], stub: Recorder, name: str
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, name: str
 ) -> None:
     two[0].with_name("a.png").mkdir()
     words = ("-o", two[0].with_name("map.npy"), "--picture", two[0].parent / name)
@@ -305,7 +225,7 @@ def test_a_picture_that_cannot_be_is_told_before_the_work(
     assert not two[0].with_name("map.npy").exists()
 
 
-def test_an_input_is_never_overwritten(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_an_input_is_never_overwritten(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     cloud = two[0].with_name("cloud.npy")
     np.save(cloud, np.eye(3))
     before = cloud.read_bytes(), two[0].read_bytes()
@@ -318,7 +238,7 @@ def test_an_input_is_never_overwritten(run: Run, two: tuple[Path, Path], stub: R
     assert (cloud.read_bytes(), two[0].read_bytes()) == before
 
 
-def test_files_of_one_name_are_told_apart(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_files_of_one_name_are_told_apart(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     other = two[0].parent / "other" / "a.ply"
     other.parent.mkdir()
     other.write_bytes(two[1].read_bytes())
@@ -335,7 +255,7 @@ def test_a_real_ctrl_c_in_the_long_work(
         signal.raise_signal(signal.SIGINT)
         pytest.fail("the signal was swallowed")
 
-    monkeypatch.setattr(pipeline, "match", slow)
+    monkeypatch.setattr(matching, "match", slow)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     try:
         answer = run("match", *two, "-o", two[0].with_name("map.npy"), "--picture", two[0].with_name("p.png"))
@@ -348,30 +268,20 @@ def test_a_real_ctrl_c_in_the_long_work(
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl", ".glb"])
 def test_register_writes_the_template_in_the_frame_of_the_file(
-    run: Run, two: tuple[Path, Path], stub: Recorder, suffix: str
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, suffix: str
 ) -> None:
     output = two[0].with_name(f"fitted{suffix}")
     answer = run("register", two[0], "-o", output)
     assert answer.status == 0
     assert answer.out == ""
-    fitted = load_shape(output)
-    wanted = 2.0 * CORNERS + [10.0, 0, 0]
-    assert np.allclose(fitted.verts[fitted.faces], wanted[FACES])
+    fitted, made = load_shape(output), fake_fit(load_shape(two[0]))
+    wanted = 2.0 * made.points + [10.0, 0, 0]
+    assert np.allclose(fitted.verts[fitted.faces], wanted[made.faces])
     assert "good fit, up +y, front -z" in answer.err
 
 
-@pytest.mark.parametrize(("words", "name", "value"), OPTIONS)
-def test_register_hands_options_on(
-    run: Run, two: tuple[Path, Path], stub: Recorder, words: list[str], name: str, value: object
-) -> None:
-    assert run("register", two[0], "-o", two[0].with_name("fitted.ply"), *words).status == 0
-    defaults = {key: DEFAULTS[key] for key in ("model", "refine", "seed", "up", "front", "partial")}
-    assert {key: stub.called[key] for key in defaults} == defaults | {name: value}
-    assert stub.called["shape"].V == 642
-
-
 def test_register_draws_the_template_over_the_shape(
-    run: Run, two: tuple[Path, Path], stub: Recorder, monkeypatch: pytest.MonkeyPatch
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     picture = two[0].with_name("p.png")
     answer = run("register", two[0], "-o", two[0].with_name("fitted.ply"), "--picture", picture, "--json")
@@ -392,7 +302,7 @@ def test_register_draws_the_template_over_the_shape(
 
 @pytest.mark.parametrize("name", ["p.jpg", "nowhere/p.png", "fitted.ply", "a.ply"])
 def test_a_picture_that_register_cannot_write_is_told_before_the_work(
-    run: Run, two: tuple[Path, Path], stub: Recorder, name: str
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, name: str
 ) -> None:
     words = ("register", two[0], "-o", two[0].with_name("fitted.ply"), "--picture", two[0].parent / name)
     assert run(*words).status == 1
@@ -400,7 +310,7 @@ def test_a_picture_that_register_cannot_write_is_told_before_the_work(
     assert not two[0].with_name("fitted.ply").exists()
 
 
-def test_register_json(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_register_json(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     answer = run("register", two[0], "-o", two[0].with_name("fitted.ply"), "--json", "--quiet")
     record = json.loads(answer.out)
     assert answer.err == ""
@@ -409,7 +319,7 @@ def test_register_json(run: Run, two: tuple[Path, Path], stub: Recorder) -> None
 
 
 def test_register_says_what_repair_did(
-    run: Run, two: tuple[Path, Path], stub: Recorder, sphere: Shape
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, sphere: Shape
 ) -> None:
     faces = np.concatenate([sphere.faces, sphere.faces[:3]])
     save_shape(two[0], Shape(sphere.verts, faces))
@@ -424,18 +334,18 @@ def test_register_says_what_repair_did(
 
 
 def test_register_in_full_resolution(
-    run: Run, two: tuple[Path, Path], stub: Recorder, sphere: Shape, monkeypatch: pytest.MonkeyPatch
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, sphere: Shape, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A translation of all nodes moves the dense template by as much, then out of the core frame."""
     nodes = sphere.verts[:42]
     template = Template(
         "ball", Shape(CORNERS, FACES), sphere, nodes, 1.2, np.zeros(4, int), ("all",), np.arange(4)
     )
-    moved = replace(fit(sphere), template_hash=template.hash, vectors=np.tile([0.0, 0.0, 5.0], (42, 1)))
-    monkeypatch.setattr(pipeline, "register", lambda *_, **__: moved)
+    moved = replace(fake_fit(sphere), template_hash=template.hash, vectors=np.tile([0.0, 0.0, 5.0], (42, 1)))
+    stub.make_fit = lambda *_, **__: moved
     network = SimpleNamespace(field=build_field, config=SimpleNamespace(field="mls"))
     model = TrainedModel(small_card(), template, network)  # type: ignore[arg-type]
-    monkeypatch.setattr(pipeline, "read_model", lambda name: model)
+    monkeypatch.setattr(matching, "as_model", lambda name: model)
     output = two[0].with_name("fitted.ply")
     answer = run("register", two[0], "-o", output, "--dense", "--json")
     assert (answer.status, json.loads(answer.out)["vertices"]) == (0, 642)
@@ -447,28 +357,9 @@ def test_register_in_full_resolution(
 
 
 def test_full_resolution_needs_the_template_of_the_fit(
-    run: Run, two: tuple[Path, Path], stub: Recorder
+    run: Run, two: tuple[Path, Path], stub: FakeMatching
 ) -> None:
     answer = run("register", two[0], "-o", two[0].with_name("fitted.ply"), "--dense")
     assert answer.status == 1
     assert "another template" in answer.err
     assert not two[0].with_name("fitted.ply").exists()
-
-
-@pytest.mark.parametrize("verb", ["match", "register"])
-def test_threads_are_set(
-    run: Run, two: tuple[Path, Path], stub: Recorder, monkeypatch: pytest.MonkeyPatch, verb: str
-) -> None:
-    asked: list[int] = []
-    monkeypatch.setattr("meshmatch.threads.set_threads", asked.append)
-    words = (
-        (*two, "-o", two[0].with_name("map.npy"))
-        if verb == "match"
-        else (two[0], "-o", two[0].with_name("f.ply"))
-    )
-    run(verb, *words, "--threads", "4")
-    # match runs its two fits side by side, one thread each, and spends the rest on the map
-    assert asked == ([1] if verb == "match" else [4])
-    assert verb == "register" or stub.called["workers"] == 4
-    run(verb, *words)  # sums in another order would differ in their last bits: nobody gets that unasked
-    assert asked[-1] == 1

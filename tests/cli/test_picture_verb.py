@@ -2,16 +2,16 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from meshmatch import pipeline
 from meshmatch.cli.picture_options import PictureOptions
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
@@ -22,7 +22,7 @@ from meshmatch.render.scales import UNKNOWN, Scale, Swatches
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
-from tests.cli.conftest import Answer, Run
+from tests.cli.conftest import Answer, FakeMatching, Run, fake_fit
 from tests.shapes.painted import encoded, quarters, write_square_obj
 
 V = 642
@@ -229,26 +229,19 @@ def test_a_registered_mesh_over_its_shape(run: Run, two: tuple[Path, Path], draw
     assert scale.high == 1
 
 
-def test_a_model_is_laid_on_the_shape_first(
-    run: Run, two: tuple[Path, Path], drawn: Drawn, monkeypatch: pytest.MonkeyPatch
+def test_a_model_is_fitted_to_the_shape_first(
+    run: Run, two: tuple[Path, Path], drawn: Drawn, stub: FakeMatching
 ) -> None:
-    called: dict[str, Any] = {}
-
-    def register(shape: Shape, **options: Any) -> SimpleNamespace:
-        called.update(options)
-        options["progress"]("laying", shape.name, 0.5)
-        frame = Frame(1.0, np.diag([-1.0, 1, -1]), np.zeros(3))
-        return SimpleNamespace(
-            points_in_file=shape.verts, faces=shape.faces, frame=frame, verdict="good", up="+y", front="-z"
-        )
-
-    monkeypatch.setattr(pipeline, "register", register)
+    turn = np.diag([-1.0, 1, -1])
+    stub.make_fit = lambda shape, *_: replace(
+        fake_fit(shape, frame=Frame(1.0, turn, np.zeros(3))), points=shape.verts @ turn, faces=shape.faces
+    )
     words = ("--up", "y", "--front", "-z", "--seed", "3")
     answer = run("picture", two[0], "--fit", "human", "-o", two[0].with_name("o.png"), *words)
     assert answer.status == 0, answer.err
     assert "good fit, up +y, front -z" in answer.err
-    assert (called["model"], called["seed"], called["up"], called["front"]) == ("human", 3, "y", "-z")
-    assert np.array_equal(drawn.panels[0].rotation, np.diag([-1.0, 1, -1]))
+    assert stub.called["config"] == FitConfig(seed=3, up="y", front="-z")
+    assert np.array_equal(drawn.panels[0].rotation, turn)
 
 
 @pytest.mark.parametrize(

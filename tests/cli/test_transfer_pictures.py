@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from meshmatch import pipeline
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.render import compose
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look
 from meshmatch.render.scales import UNKNOWN, Scale, Swatches, label_colors
 from meshmatch.shapes.files import load_shape, save_shape
-from tests.cli.conftest import Run
+from tests.cli.conftest import FakeMatching, Run, fake_fit
 from tests.cli.test_transfer_verbs import call, pair, well  # noqa: F401  (pair is a fixture)
 from tests.shapes.painted import encoded, quarters, write_square_obj
 
@@ -43,7 +42,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> Drawn:
 def test_a_picture_of_both_shapes(run: Run, pair: Path, verb: str) -> None:  # noqa: F811
     answer = well(run(*call(verb, "--picture", "p.png", "--json")))
     assert json.loads(answer.out)["picture"] == "p.png"
-    assert "drew p.png: what was carried, on both shapes" in answer.err
+    assert "drew p.png: both shapes with what was transferred" in answer.err
     with Image.open("p.png") as image:
         pixels = np.asarray(image)
     assert image.size[0] > image.size[1]
@@ -151,7 +150,7 @@ def test_a_picture_that_cannot_be_is_told_before_the_work(
     def begun(*_: object, **__: object) -> None:
         raise AssertionError("the work began")
 
-    monkeypatch.setattr("meshmatch.cli.carrying.find_maps", begun)
+    monkeypatch.setattr("meshmatch.cli.transfers.Transfer.__call__", begun)
     before = sorted(path.name for path in pair.iterdir())
     answer = run(*call(verb, "--picture", picture, map="in.png"))
     assert answer.status == 1
@@ -184,24 +183,16 @@ def test_after_a_match_shapes_are_turned_as_their_fits_say(
     run: Run,
     pair: Path,  # noqa: F811
     drawn: Drawn,
-    monkeypatch: pytest.MonkeyPatch,
+    stub: FakeMatching,
 ) -> None:
-    from types import SimpleNamespace
-
     from meshmatch.geometry.frames import Frame
     from meshmatch.transfer.inverse_map import invert_map
 
-    a, b = load_shape("a.ply"), load_shape("b.ply")
-    forward = load_map("ab.npz", a, b)
-    fits = [
-        SimpleNamespace(
-            frame=Frame(1.0, np.diag([s, 1.0, s]), np.zeros(3)), verdict="good", up="+y", front="z"
-        )
-        for s in (1.0, -1.0)
-    ]
-    match = SimpleNamespace(notes=(), source_fit=fits[0], target_fit=fits[1], seconds=1.0)
-    result = SimpleNamespace(back=invert_map(forward, a, b), forward=forward, match=match)
-    monkeypatch.setattr(pipeline, "carry", lambda *_, **__: result)
+    turns = iter((np.eye(3), np.diag([-1.0, 1.0, -1.0])))
+    forward = load_map("ab.npz", load_shape("a.ply"), load_shape("b.ply"))
+    back = invert_map(forward, load_shape("a.ply"), load_shape("b.ply"))
+    stub.make_map = lambda a, b, **about: forward if a.name == "a.ply" else back
+    stub.make_fit = lambda shape, *_: fake_fit(shape, frame=Frame(1.0, next(turns), np.zeros(3)))
     well(run(*call("transfer-color", "--picture", "p.png", map=None)))
-    for panel, made in zip(drawn.panels, fits, strict=True):
-        assert np.array_equal(panel.rotation, made.frame.rotation)
+    for panel, rotation in zip(drawn.panels, (np.eye(3), np.diag([-1.0, 1.0, -1.0])), strict=True):
+        assert np.array_equal(panel.rotation, rotation)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch import pipeline
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes import textured_files
@@ -258,14 +257,6 @@ def test_the_same_words_give_the_same_bytes(run: Run, pair: Path) -> None:
 # What can be wrong
 
 
-@pytest.fixture
-def no_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    def begun(*_: object, **__: object) -> None:
-        raise AssertionError("a fit began")
-
-    monkeypatch.setattr(pipeline, "lay_template", begun)
-
-
 def refused(answer: Answer, words: str, folder: Path, before: set[str]) -> None:
     """One line, a hint, status 1, and nothing new in the folder."""
     lines = answer.err.strip().splitlines()
@@ -336,7 +327,7 @@ def test_a_missing_image_beside_an_obj(run: Run, pair: Path, no_fit: None) -> No
         (("--samples", "0"), "1 to 8 samples"),
         (("--padding", "33"), "padding of 33 texels"),
         (("--blank", "purple"), "--blank purple"),
-        (("--blank", "2,0,0"), "colours lie in 0..1"),
+        (("--blank", "2,0,0"), "a colour has 3 or 4 numbers within 0..1"),
         (("--blank", "0", "--fill"), "contradict each other"),
         (("--up", "y", "--front", "y"), "lie along one axis"),
         (("--image", "gone.png"), "there is no file gone.png"),

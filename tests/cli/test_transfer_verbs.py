@@ -13,13 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch import pipeline
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
-from tests.cli.conftest import Answer, Run
+from tests.cli.conftest import Answer, FakeMatching, Run
 from tests.conftest import icosphere
 from tests.transfer.known import split
 from tests.transfer.skinned import write_skinned_glb
@@ -163,7 +162,7 @@ def test_filled_values(run: Run, pair: Path, doubtful: np.ndarray) -> None:
 def test_values_in_doubt_are_kept_unless_asked(run: Run, pair: Path, doubtful: np.ndarray) -> None:
     answer = well(run(*call("transfer-color", "--values", "values.npy", out="v.npy")))
     assert np.load("v.npy")[doubtful, 0].min() > 0.55
-    assert "kept as they came" in answer.err
+    assert "kept as they are" in answer.err
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -310,7 +309,7 @@ def test_weights_are_filled(run: Run, pair: Path, doubtful: np.ndarray) -> None:
 def test_a_file_without_a_skin_asks_for_weights(run: Run, pair: Path) -> None:
     before = {path.name for path in pair.iterdir()}
     answer = run("transfer-weights", "a.ply", "b.ply", "-o", "out.npz", "--map", "ab.npz")
-    refused(answer, "a.ply holds no skin weights", pair, before)
+    refused(answer, "a.ply has no skin weights", pair, before)
     assert "--weights" in answer.err
 
 
@@ -343,11 +342,11 @@ def test_unsure_landmarks_are_named(run: Run, pair: Path, doubtful: np.ndarray) 
         f"name,vertex\nleft,{load_shape('a.ply').verts[:, 0].argmin()}\nright,{right}\n"
     )
     answer = well(run(*call("transfer-landmarks", "--quiet")))
-    assert answer.err == "warning: landmark right is unsure: its confidence is 0.01\n"
+    assert answer.err == "warning: landmark right is uncertain: its confidence is 0.01\n"
     Path("marks.csv").write_text("vertex\n" + f"{right}\n" * 15)
     answer = well(run(*call("transfer-landmarks", "--quiet")))
     assert len(answer.err.splitlines()) == 11
-    assert "and so are 5 more" in answer.err
+    assert "so are 5 more" in answer.err
 
 
 def test_landmarks_off_the_surface_are_mentioned(run: Run, pair: Path) -> None:
@@ -457,7 +456,11 @@ WRONG: dict[str, tuple[list[str | Path], Callable[[Path], object], str]] = {
         "9 rows, but a.ply has 162",
     ),
     "blank colours": (call("transfer-color", "--blank", "red"), nothing, "--blank red: 4 numbers are needed"),
-    "colours out of range": (call("transfer-color", "--blank", "2"), nothing, "colours lie in 0..1"),
+    "colours out of range": (
+        call("transfer-color", "--blank", "2"),
+        nothing,
+        "a colour has 3 or 4 numbers within 0..1",
+    ),
     "both": (call("transfer-color", "--blank", "0", "--fill"), nothing, "contradict each other"),
     "short labels": (
         call("transfer-labels"),
@@ -526,32 +529,14 @@ def test_an_output_that_cannot_be_written(run: Run, pair: Path, verb: str) -> No
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_choices_for_matching_reach_the_pipeline(
-    run: Run, pair: Path, verb: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    heard: dict[str, object] = {}
-
-    def carry(source: Shape, target: Shape, **choices: object) -> pipeline.CarryResult:
-        heard.update(choices)
-        forward = VertexMap.between(source, target, np.arange(source.V), verdict="good")
-        back = VertexMap.between(target, source, np.arange(target.V) % source.V)
-        fit = type("Fit", (), {"verdict": "good", "up": "+y", "front": "+z"})
-        found = pipeline.MatchResult(forward, fit, fit, 1.5, ("a.ply: turned 3 faces",))  # type: ignore[arg-type]
-        return pipeline.CarryResult(back, forward, found)
-
-    monkeypatch.setattr(pipeline, "carry", carry)
-    choices = ["--model", "human", "--refine", "latent", "--seed", "7", "--up", "y", "--front", "-z"]
-    answer = well(run(*call(verb, *choices, "--threads", "3", "--json", map=None)))
-    heard.pop("progress")
-    assert heard == {
-        **{"model": "human", "refine": "latent", "seed": 7, "up": "y", "front": "-z"},
-        "workers": 3,
-    }
+def test_a_match_is_told_and_recorded(run: Run, pair: Path, verb: str, stub: FakeMatching) -> None:
+    choices = ["--refine", "latent", "--seed", "7"]
+    answer = well(run(*call(verb, *choices, "--json", map=None)))
     record = json.loads(answer.out)
     assert (record["map"], record["model"], record["refine"], record["seed"]) == (None, "human", "latent", 7)
-    assert record["seconds"] == 1.5
-    assert "matched a.ply to b.ply (1.5 s)" in answer.err
-    assert "a.ply: turned 3 faces" in answer.err
+    assert record["seconds"] == 2.5
+    assert "matched a.ply to b.ply (2.5 s)" in answer.err
+    assert "a.ply: 3 faces dropped" in answer.err
 
 
 def test_without_a_map_the_two_are_matched(run: Run, tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch import pipeline
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
@@ -18,11 +17,7 @@ from tests.cli.conftest import Answer, Run
 
 
 @pytest.fixture(autouse=True)
-def no_fit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def begun(*_: object, **__: object) -> None:
-        raise AssertionError("a fit began")
-
-    monkeypatch.setattr(pipeline, "lay_template", begun)
+def home(no_fit: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("MESHMATCH_HOME", str(tmp_path.parent / f"{tmp_path.name}-home"))
 
 
@@ -93,7 +88,7 @@ BAD_FILES = {
     "a cloud of NaN": ("bad.npy", nan_cloud, "NaN"),
     "one triangle": ("bad.ply", one_triangle, "only 1 usable triangle"),
     "no face with area": ("bad.ply", flat_faces, "no face with any area"),
-    "few points": ("bad.npy", few_points, "points in only 20 places"),
+    "few points": ("bad.npy", few_points, "only 20 distinct point positions"),
     "two components far apart": ("bad.ply", far_apart, "2 large parts far apart"),
     "a folder": ("bad.ply", lambda path: path.mkdir(), "is a folder"),
     "a map for a cloud": ("bad.npy", lambda path: np.save(path, np.arange(9)), "bad.npy"),

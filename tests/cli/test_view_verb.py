@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from meshmatch import pipeline
+from meshmatch.api import matching
 from meshmatch.errors import InputError
-from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps import MAP_SUFFIXES
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from tests.cli.conftest import Run
+from tests.cli.conftest import FakeMatching, Run, fake_fit
 
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 
@@ -44,46 +44,14 @@ def known(two: tuple[Path, Path]) -> tuple[Path, Path, Path]:
     return *two, path
 
 
-class Recorder:
-    """Stands for the matching: remembers how it was called, and answers at once."""
-
-    def __init__(self) -> None:
-        self.called: dict[str, Any] = {}
-        self.verdict = "good"
-
-    def carry(self, a: Shape, b: Shape, **options: Any) -> pipeline.CarryResult:
-        self.called = {"source": a.name, "target": b.name} | options
-        options["progress"]("orientation", "a.ply", 0.5)
-        forward = nearest(a, b, verdict=self.verdict, reasons=("an arm is missing",))
-        fits = self.fit(a), self.fit(b)
-        match = pipeline.MatchResult(forward, *fits, 2.5, ("a.ply: 3 faces dropped",))
-        return pipeline.CarryResult(nearest(b, a), forward, match)
-
-    def fit(self, shape: Shape) -> Fit:
-        corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-        return Fit(
-            template_hash="0" * 16,
-            frame=Frame(2.0, TURN, np.zeros(3)),
-            points=corners,
-            vectors=np.zeros((4, 3)),
-            resting=corners,
-            faces=np.array([[0, 1, 2]]),
-            residual=0.0,
-            vertex_distance=np.zeros(shape.V),
-            verdict=self.verdict,
-            reasons=(),
-            up="+y",
-            front="+z",
-            seconds=1.0,
-            seed=0,
-        )
-
-
-@pytest.fixture
-def stub(monkeypatch: pytest.MonkeyPatch) -> Recorder:
-    recorder = Recorder()
-    monkeypatch.setattr(pipeline, "carry", recorder.carry)
-    return recorder
+@pytest.fixture(autouse=True)
+def maps_and_fits(stub: FakeMatching) -> None:
+    """A fake match maps to the nearest vertices, and its fits are turned."""
+    stub.reasons = ("an arm is missing",)
+    stub.make_map = nearest
+    stub.make_fit = lambda shape, verdict, reasons=(): fake_fit(
+        shape, verdict, frame=Frame(2.0, TURN, np.zeros(3)), front="+z"
+    )
 
 
 @pytest.mark.parametrize("suffix", MAP_SUFFIXES)
@@ -112,16 +80,13 @@ def test_json(run: Run, known: tuple[Path, Path, Path]) -> None:
     assert words_of(page)["verdict"] == "fair"
 
 
-def test_without_a_map_the_two_are_matched(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_without_a_map_the_two_are_matched(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     page = two[0].with_name("page.html")
     words = ("--refine", "latent", "--seed", "7", "--up", "z", "--front", "-y", "--threads", "1")
     answer = run("view", *two, "-o", page, "--json", *words)
     assert answer.status == 0
-    del stub.called["progress"]
-    assert stub.called == {
-        **{"source": "a.ply", "target": "b.ply", "model": "human", "refine": "latent", "seed": 7},
-        **{"up": "z", "front": "-y", "workers": 1},
-    }
+    config = FitConfig(refine="latent", seed=7, up="z", front="-y")
+    assert (stub.called["config"], stub.called["threads"]) == ((config, config), 1)
     assert "3 faces dropped" in answer.err
     record = json.loads(answer.out)
     assert (record["refine"], record["seed"], record["seconds"]) == ("latent", 7, 2.5)
@@ -132,7 +97,7 @@ def test_without_a_map_the_two_are_matched(run: Run, two: tuple[Path, Path], stu
     )
 
 
-def test_a_poor_fit_is_shown_unless_strict(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_a_poor_fit_is_shown_unless_strict(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     stub.verdict = "poor"
     page = two[0].with_name("page.html")
     answer = run("view", *two, "-o", page, "--strict")
@@ -242,7 +207,7 @@ def test_a_map_the_wrong_way_round_or_of_others_is_refused(run: Run, known: tupl
 
 @pytest.mark.parametrize("name", ["page.png", "page", "nowhere/page.html", "a.ply", "folder.html"])
 def test_an_output_that_cannot_be_is_told_before_the_work(
-    run: Run, two: tuple[Path, Path], stub: Recorder, name: str
+    run: Run, two: tuple[Path, Path], stub: FakeMatching, name: str
 ) -> None:
     two[0].with_name("folder.html").mkdir()
     before = sorted(path.name for path in two[0].parent.iterdir())
@@ -262,7 +227,9 @@ def test_an_input_is_never_overwritten(run: Run, known: tuple[Path, Path, Path])
     assert page.read_bytes() == known[2].read_bytes()
 
 
-def test_a_mistyped_model_is_told_before_the_work(run: Run, two: tuple[Path, Path], stub: Recorder) -> None:
+def test_a_mistyped_model_is_told_before_the_work(
+    run: Run, two: tuple[Path, Path], stub: FakeMatching
+) -> None:
     answer = run("view", *two, "-o", two[0].with_name("page.html"), "--model", "humna")
     assert answer.status == 1
     assert "did you mean human?" in answer.err
@@ -276,7 +243,7 @@ def test_a_failure_leaves_what_was_there(
     def failing(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(pipeline, "carry", failing)
+    monkeypatch.setattr(matching, "match", failing)
     page = two[0].with_name("page.html")
     page.write_bytes(b"old")
     assert run("view", *two, "-o", page).status == (1 if isinstance(error, InputError) else 130)

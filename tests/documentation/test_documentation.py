@@ -55,8 +55,9 @@ def test_the_readme_matches_the_two_shapes_that_ship() -> None:
     assert sorted(samples) == sorted((ROOT / "templates" / "samples").glob("*.ply"))
 
 
-def test_the_page_of_the_command_line_is_fresh() -> None:
+def test_the_references_are_fresh() -> None:
     assert (ROOT / "docs" / "cli.md").read_text(encoding="utf-8") == reference.reference()
+    assert (ROOT / "docs" / "api.md").read_text(encoding="utf-8") == reference.api_reference()
 
 
 def test_the_page_does_not_depend_on_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,10 +69,15 @@ def test_the_page_does_not_depend_on_the_terminal(monkeypatch: pytest.MonkeyPatc
 def test_the_check_of_the_page_fails_on_a_stale_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = tmp_path / "cli.md"
-    assert reference.main(["--check", str(file)]) == 1
-    assert reference.main([str(file)]) == 0
-    assert reference.main(["--check", str(file)]) == 0
-    file.write_text(file.read_text() + "old words\n")
-    assert reference.main(["--check", str(file)]) == 1
-    assert "stale" in capsys.readouterr().err
+    assert reference.main(["--check", str(tmp_path)]) == 1
+    assert reference.main([str(tmp_path)]) == 0
+    assert reference.main(["--check", str(tmp_path)]) == 0
+    for name in ("cli.md", "api.md"):
+        page = (tmp_path / name).read_text()
+        (tmp_path / name).write_text(page + "old words\n")
+        assert reference.main(["--check", str(tmp_path)]) == 1
+        (tmp_path / name).write_text(page)
+    assert "api.md is stale" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        reference.main(["--help"])
+    assert not Path("--help").exists()

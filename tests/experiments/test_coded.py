@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from meshmatch.api.inputs import as_model
 from meshmatch.experiments import coded
 from meshmatch.experiments.adapters import CodedMatcher
 from meshmatch.experiments.coded import coded_recipe, main
-from meshmatch.pipeline import read_model
 from tests.training.small import bent_eggs, egg_template
 
 
@@ -49,7 +49,7 @@ def test_the_command(
     assert whole["steps"] == 2 and whole["train"]["seed"] == 3 and whole["train"]["bf16"] is True
     assert whole["network"]["width"] == 16 and whole["train"]["shapes"] == 4 and whole["scan"]["points"] == 96
     assert {"date", "commit", "machine", "minutes", "distance"} <= whole.keys()
-    model = read_model(str(folder))
+    model = as_model(str(folder))
     assert not model.has_nodes and model.network.aligner is None
     egg = egg_template().shape
     fit = CodedMatcher(str(folder), steps=3).fit(egg)

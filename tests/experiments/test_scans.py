@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from meshmatch.api.inputs import as_model
+from meshmatch.api.matching import register
 from meshmatch.experiments import segments
 from meshmatch.experiments.scans import main, scan_panels
-from meshmatch.pipeline import read_model, register
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.render.scales import label_colors
 from meshmatch.shapes.files import load_shape
 
@@ -17,8 +19,8 @@ DANCER = Path(__file__).parents[2] / "templates" / "samples" / "dancer.ply"
 
 def test_a_scan_wears_the_parts_of_the_template() -> None:
     shape = load_shape(DANCER)
-    fit = register(shape, refine="none")
-    labels = np.asarray(read_model("human").template.labels)
+    fit = register(shape, config=FitConfig(refine="none"))
+    labels = np.asarray(as_model("human").template.labels)
     scan, laid = scan_panels("one", shape, fit, labels)
     assert (scan.label, laid.label) == ("one", fit.verdict)
     assert np.array_equal(np.asarray(laid.colors, float), label_colors(labels))

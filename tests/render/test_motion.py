@@ -74,7 +74,7 @@ def test_own_colours_and_a_cloud(tmp_path: Path, make_sphere: Callable[[int], Sh
 def test_a_large_shape_is_drawn_coarser(tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
     ball = make_sphere(3)
     path = tmp_path / "a.html"
-    write_motion(path, grown(ball, 1, 2), (0, 1), rotation=np.eye(3), max_vertices=200)
+    write_motion(path, grown(ball, 1, 2), (0, 1), rotation=np.eye(3), most=200)
     words, arrays = read(path)
     assert len(arrays["position"]) <= 2 * 3 * 200
     assert "of 642 vertices" in words["note"]

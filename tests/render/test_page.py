@@ -18,7 +18,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.colors import position_colors
 from meshmatch.render.scales import UNKNOWN
 from meshmatch.render.viewer import Looks, write_page
-from meshmatch.render.viewer.display_mesh import display_mesh
+from meshmatch.render.viewer.drawn import draw
 from meshmatch.render.viewer.packing import pack, small_integers
 from meshmatch.render.viewer.placement import levelled, relative_size, upright
 from meshmatch.shapes.appearance import Appearance, Material
@@ -255,18 +255,17 @@ def test_a_vertex_without_a_position_is_not_drawn(tmp_path: Path, cube: Shape) -
     assert 3 not in arrays["source.face"]
     assert len(arrays["source.face"]) == 3 * (~(cube.faces == 3).any(axis=1)).sum()
     cloud = Shape(cube.verts, np.empty((0, 3), np.int64), "cloud", None, invalid)
-    assert display_mesh(cloud).vertex.tolist() == [0, 1, 2, 4, 5, 6, 7]
+    assert draw(cloud).vertex.tolist() == [0, 1, 2, 4, 5, 6, 7]
     nothing = Shape(cube.verts, cube.faces, "nothing", None, np.ones(8, bool))
-    assert len(display_mesh(nothing).vertex) == 8
+    assert len(draw(nothing).vertex) == 8
 
 
 def test_a_large_mesh_is_drawn_coarser_and_says_so(
-    tmp_path: Path, make_sphere: Callable[[int], Shape], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, make_sphere: Callable[[int], Shape]
 ) -> None:
     fine = stirred(bump(make_sphere(4)))
     path = tmp_path / "page.html"
-    monkeypatch.setattr("meshmatch.render.viewer.page.MAX_VERTICES", 900)
-    report = write_page(path, fine.source, fine.target, fine.there, fine.back)
+    report = write_page(path, fine.source, fine.target, fine.there, fine.back, most=900)
     assert all(200 < drawn <= 900 for drawn in report.drawn)
     assert report.size == path.stat().st_size
     assert report.notes[0] == f"egg.ply: drawn with {report.drawn[0]:,} of 2,562 vertices"
@@ -284,7 +283,7 @@ def test_a_large_mesh_is_drawn_coarser_and_says_so(
 
 def test_a_large_cloud_is_drawn_with_fewer_points(make_sphere: Callable[[int], Shape]) -> None:
     cloud = Shape(make_sphere(4).verts, np.empty((0, 3), np.int64), "cloud")
-    part = display_mesh(cloud, max_vertices=900)
+    part = draw(cloud, most=900)
     assert len(part.vertex) == 600
     assert np.array_equal(part.verts, cloud.verts[part.vertex])
     assert len(np.unique(part.vertex)) == 600
@@ -294,9 +293,7 @@ def test_a_large_cloud_is_drawn_with_fewer_points(make_sphere: Callable[[int], S
 def test_a_heap_of_single_triangles_is_drawn_as_points() -> None:
     rng = np.random.default_rng(0)
     corners = rng.normal(size=(400, 1, 3)) + 0.01 * rng.normal(size=(400, 3, 3))
-    part = display_mesh(
-        Shape(corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3), "heap"), max_vertices=300
-    )
+    part = draw(Shape(corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3), "heap"), most=300)
     assert len(part.faces) == 0
     assert part.note == "drawn with 200 of 1,200 points"
 
@@ -305,7 +302,7 @@ def test_seams_do_not_show_in_the_light(make_sphere: Callable[[int], Shape]) -> 
     """Every corner of each triangle its own vertex, as in an stl: lit like the sphere that it is."""
     ball = make_sphere(3)
     loose = Shape(ball.verts[ball.faces].reshape(-1, 3), np.arange(3 * ball.F).reshape(-1, 3), "loose")
-    part = display_mesh(loose)
+    part = draw(loose)
     assert np.array_equal(part.verts, loose.verts)
     assert np.einsum("ni,ni->n", part.normals, loose.verts).min() > 0.99
 
@@ -433,7 +430,7 @@ def test_large_images_become_smaller(tmp_path: Path, cube: Shape, monkeypatch: p
     assert page.words["source"]["look"]["images"] == ["image/jpeg"]
     with Image.open(BytesIO(data)) as picture:
         assert (picture.format, picture.size) == ("JPEG", (1024, 2048))
-    monkeypatch.setattr("meshmatch.render.viewer.skins.MAX_PIXELS", 512 * 1024)
+    monkeypatch.setattr("meshmatch.render.viewer.skins.MOST_PIXELS", 512 * 1024)
     page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look)))
     with Image.open(BytesIO(page.arrays["source.look.image0"].tobytes())) as picture:
         assert picture.size == (512, 1024)
@@ -469,17 +466,14 @@ def test_vertex_colours_are_painted(tmp_path: Path, cube: Shape) -> None:
     assert np.abs(linear - light[:, :3]).max() < 0.01
 
 
-def test_a_texture_on_a_coarser_mesh_is_painted(
-    tmp_path: Path, make_sphere: Callable[[int], Shape], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_texture_on_a_coarser_mesh_is_painted(tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
     """The image is read at each vertex: its red grows with x."""
     ball = bump(make_sphere(4))
     low, extent = ball.bounds[0], np.ptp(ball.verts, axis=0)
     uv = ((ball.verts - low) / extent)[:, [0, 2]][ball.faces]
     look = Appearance((Material("image", image(64, 64)),), np.zeros(ball.F, np.int64), uv)
     twice = Pair(ball, ball, VertexMap.identity(ball), VertexMap.identity(ball))
-    monkeypatch.setattr("meshmatch.render.viewer.page.MAX_VERTICES", 900)
-    page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look)))
+    page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look)), most=900)
     rows = page.arrays["source.vertex"].astype(int)
     expected = ((ball.verts[rows] - low) / extent)[:, 0]
     assert np.abs(page.arrays["source.look.paint"].reshape(-1, 3)[:, 0] / 255 - expected).max() < 0.03

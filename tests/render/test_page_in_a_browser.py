@@ -203,8 +203,8 @@ def test_a_turned_shape_stays_in_its_panel(
     running: Any, make_sphere: Callable[[int], Shape], tmp_path: Path
 ) -> None:
     ball = make_sphere(2)
-    board = stirred(Shape(np.clip(2 * ball.verts, -1, 1) * (0.85, 1.0, 0.1), ball.faces, "board"))
-    write_page(tmp_path / "page.html", board.source, board.target, board.there, board.back)
+    wide = stirred(Shape(ball.verts * (2.0, 2.0, 0.3), ball.faces, "wide"))
+    write_page(tmp_path / "page.html", wide.source, wide.target, wide.there, wide.back)
     with opened(running, tmp_path / "page.html") as view:
         box = view.page.locator("#source .view").bounding_box()
         for _ in range(9):
@@ -329,11 +329,10 @@ def test_points_on_either_side(running: Any, pair: Pair, tmp_path: Path) -> None
 
 
 def test_a_coarser_mesh_keeps_the_numbers_of_the_file(
-    running: Any, make_sphere: Callable[[int], Shape], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    running: Any, make_sphere: Callable[[int], Shape], tmp_path: Path
 ) -> None:
     fine = stirred(bump(make_sphere(4)), "fine.ply")
-    monkeypatch.setattr("meshmatch.render.viewer.page.MAX_VERTICES", 500)
-    write_page(tmp_path / "page.html", fine.source, fine.target, fine.there, fine.back)
+    write_page(tmp_path / "page.html", fine.source, fine.target, fine.there, fine.back, most=500)
     with opened(running, tmp_path / "page.html") as view:
         assert "of 2,562 vertices" in view.page.locator("#target .count").inner_text()
         view.page.mouse.move(330, 400)

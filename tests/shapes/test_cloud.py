@@ -102,7 +102,7 @@ def test_invalid_points_count_for_nothing() -> None:
 def test_normals_of_a_torus(torus: Shape, monkeypatch: pytest.MonkeyPatch, large: bool) -> None:
     samples = sample_surface(torus, 6000, np.random.default_rng(0))
     if large:
-        monkeypatch.setattr(cloud, "MAX_POINTS", 2500)
+        monkeypatch.setattr(cloud, "LARGEST", 2500)
     normals = estimate_normals(samples.points)
     cosine = np.einsum("ni,ni->n", normals, samples.normals)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
@@ -122,7 +122,7 @@ def test_normals_of_two_balls_are_outward_on_each() -> None:
 def test_large_cloud_gives_each_point_its_share(monkeypatch: pytest.MonkeyPatch) -> None:
     points = on_sphere(9000, density=1.0)
     small = local_areas(points)
-    monkeypatch.setattr(cloud, "MAX_POINTS", 3000)
+    monkeypatch.setattr(cloud, "LARGEST", 3000)
     part = local_areas(points)
     assert part.sum() == pytest.approx(small.sum(), rel=0.03)
     upper = points[:, 2] > 0
@@ -133,7 +133,7 @@ def test_large_cloud_gives_each_point_its_share(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("largest", [20_000, 700])
 def test_strays(monkeypatch: pytest.MonkeyPatch, largest: int) -> None:
-    monkeypatch.setattr(cloud, "MAX_POINTS", largest)
+    monkeypatch.setattr(cloud, "LARGEST", largest)
     points = np.vstack([on_sphere(2000), [[3, 0, 0], [0, 0, 0]]])
     np.testing.assert_array_equal(np.flatnonzero(outlier_points(points)), [2000, 2001])
     assert not outlier_points(points[:10]).any()

@@ -187,7 +187,7 @@ def test_gltf_of_one_mesh_a_thousand_times(tmp_path: Path, monkeypatch: pytest.M
     copies = [{"mesh": 0}] * 1000
     path = broken(tmp_path, (("nodes",), copies), (("scenes", 0, "nodes"), list(range(1000))))
     assert load_shape(path).V == 4000
-    monkeypatch.setattr(gltf, "MAX_CORNERS", 9_000)
+    monkeypatch.setattr(gltf, "MOST_CORNERS", 9_000)
     with pytest.raises(InputError, match="over 9000 vertices"):
         load_shape(path)
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch import pipeline
 from meshmatch.cli import main
 from meshmatch.fields.mls import build_field
 from meshmatch.fitting.fit_config import FitConfig
@@ -23,7 +22,7 @@ QUICK = FitConfig(samples=1000, coarse_samples=300)
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, "FitConfig", lambda **choices: replace(QUICK, **choices))
+    monkeypatch.setattr("meshmatch.fitting.fit_config.FitConfig", lambda **choices: replace(QUICK, **choices))
 
 
 @pytest.fixture(scope="module")

@@ -128,9 +128,8 @@ def painted() -> Shape:
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".npy", ".csv"])
 def test_colours_are_written_as_they_were(tmp_path: Path, suffix: str) -> None:
     shape = painted()
-    amounts = colors.of_shape(shape).numbers
     path = tmp_path / f"c{suffix}"
-    colors.save(path, shape, amounts)
+    colors.save(path, shape, colors.seen(colors.light_of(shape)))
     assert shape.colors is not None
     table = suffix in (".npy", ".csv")
     found = load_values(path, shape).numbers if table else load_shape(path).colors
@@ -143,13 +142,13 @@ def test_gltf_holds_light_and_the_others_colours(tmp_path: Path) -> None:
     """Middle grey on a screen, 188 of 255, is half the light of white."""
     grey = np.full((SHAPE.V, 4), 0.5)
     grey[:, 3] = 1
-    colors.save(tmp_path / "c.glb", SHAPE, grey)
-    colors.save(tmp_path / "c.ply", SHAPE, grey)
+    colors.save(tmp_path / "c.glb", SHAPE, colors.seen(grey))
+    colors.save(tmp_path / "c.ply", SHAPE, colors.seen(grey))
     for name in ("c.glb", "c.ply"):
         again = load_shape(tmp_path / name)
         assert again.colors is not None
         assert np.abs(again.colors[:, :3] - 188 / 255).max() < 0.003  # read, both are as a screen has them
-        assert np.abs(colors.of_shape(again).numbers - grey).max() < 0.005
+        assert np.abs(colors.light_of(again) - grey).max() < 0.005
     import trimesh
 
     stored: Any = trimesh.load(tmp_path / "c.glb", force="mesh")  # as the file has them
@@ -159,7 +158,7 @@ def test_gltf_holds_light_and_the_others_colours(tmp_path: Path) -> None:
 def test_no_colours_is_told_with_what_to_do(tmp_path: Path) -> None:
     save_shape(tmp_path / "a.ply", SHAPE)
     with pytest.raises(InputError, match=r"a\.ply has no vertex colours") as told:
-        colors.of_shape(load_shape(tmp_path / "a.ply"))
+        colors.light_of(load_shape(tmp_path / "a.ply"))
     assert "--values" in told.value.hint
 
 

@@ -1,4 +1,4 @@
-"""The textures or colors that two shapes have on a page: those of one file, transferred by the map to the other."""
+"""What two shapes wear in a page: the look that one has in its file, and the same carried to the other."""
 
 from __future__ import annotations
 
@@ -8,26 +8,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Float, Floats
-from meshmatch.errors import InputError
-from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.render.viewer.display_mesh import DisplayMesh
+from meshmatch.arrays import Floats
+from meshmatch.render.viewer.drawn import Drawn
 from meshmatch.render.viewer.packing import to_bytes
 from meshmatch.render.viewer.skins import make_skin
-from meshmatch.shapes.appearance import Appearance, Material
+from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import LINEAR_OF_BYTE, to_srgb
-from meshmatch.transfer.bake import BakeOptions
-from meshmatch.transfer.texture import colors_of_vertices, transfer_texture
-from meshmatch.transfer.unwrap import atlas_of
 
 SideName = Literal["source", "target"]
-
-
-TEXTURE_SIZE = 1024
-"""Width and height of a texture that is baked for a page, in pixels."""
-MAX_BAKED_FACES = 40_000
-"""A finer mesh gets vertex colors instead: nearly as detailed, and unwrapping it would take a minute."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,106 +25,50 @@ class Looks:
 
     Parameters
     ----------
-    side
+    side : {"source", "target"}
         Whose look it is.
-    shared
-        Of source and target; one of them was transferred.
-    own
+    worn : (Appearance, Appearance)
+        Of source and target; one of them is carried.
+    own : Appearance, optional
         What the other one has in its own file.
     """
 
     side: SideName
-    shared: tuple[Appearance, Appearance]
+    worn: tuple[Appearance, Appearance]
     own: Appearance | None = None
 
     @property
     def words(self) -> dict[str, Any]:
-        """For the page's buttons and legend."""
-        textured = self.shared[0 if self.side == "source" else 1].textured
+        """What the page's buttons and legend say."""
+        textured = self.worn[0 if self.side == "source" else 1].textured
         kind = "texture" if textured else "colours"
         return {"look": {"kind": kind, "side": self.side}, "own": self.own is not None}
 
     def of(self, k: int) -> list[tuple[str, Appearance]]:
         """The looks of one shape (0 the source, 1 the target), each with its name in the page."""
-        found = [("look", self.shared[k])]
+        found = [("look", self.worn[k])]
         if self.own is not None:
             itself = k == (0 if self.side == "source" else 1)
-            found.append(("own", self.shared[k] if itself else self.own))
+            found.append(("own", self.worn[k] if itself else self.own))
         return found
 
 
-def share_look(
-    shapes: tuple[Shape, Shape],
-    own: tuple[Appearance | None, Appearance | None],
-    there: VertexMap,
-    back: VertexMap,
-    *,
-    coordinates: tuple[Float[Floats, "F 3 2"] | None, Float[Floats, "G 3 2"] | None] = (None, None),
-    workers: int = 1,
-) -> Looks | None:
-    """The source's look on both shapes; the target's if the source has none; None if neither has one.
-
-    Parameters
-    ----------
-    own
-        What source and target have in their files.
-    there, back
-        From source to target, and from target to source.
-    coordinates
-        Texture coordinates of both files, which are baked to where they are valid.
-    workers
-        Threads of the baking.
-    """
-    first, second = own
-    if first is not None:
-        other = _transferred(first, shapes[0], shapes[1], back, coordinates[1], workers)
-        return Looks("source", (first, other), second)
-    if second is not None:
-        other = _transferred(second, shapes[1], shapes[0], there, coordinates[0], workers)
-        return Looks("target", (other, second))
-    return None
-
-
-def _transferred(
-    look: Appearance,
-    owner: Shape,
-    shape: Shape,
-    back: VertexMap,
-    coordinates: Float[Floats, "F 3 2"] | None,
-    workers: int,
-) -> Appearance:
-    """A look of ``owner`` on ``shape``, by a map from ``shape`` to ``owner``: baked, or as vertex colors."""
-    if look.textured and 0 < shape.F <= MAX_BAKED_FACES:
-        choices = BakeOptions(size=TEXTURE_SIZE, padding=4, workers=workers)
-        try:
-            atlas = atlas_of(shape, coordinates, choices.size, choices.padding)
-            baked = transfer_texture(owner, look, shape, back, atlas, choices).baked
-        except InputError:  # no surface to speak of, or none that can be unwrapped
-            pass
-        else:
-            material = Material(
-                "", baked.image, wrap=("clamp", "clamp"), alpha=baked.alpha, cutoff=baked.cutoff
-            )
-            return Appearance((material,), np.zeros(shape.F, np.int64), atlas.uv)
-    colors = colors_of_vertices(owner, look, shape, back)
-    return Appearance((Material(),), np.zeros(shape.F, np.int64), np.zeros((shape.F, 3, 2)), colors)
-
-
-def look_arrays(
-    look: Appearance, shape: Shape, part: DisplayMesh
+def dress(
+    look: Appearance, shape: Shape, part: Drawn
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any] | None]:
-    """Arrays of a look on what is drawn of a shape, and what the page has to know about them.
+    """Arrays and words of a look on what is drawn of a shape.
 
-    A skin where there is an image and the triangles are the file's own; otherwise ``paint`` (N, 3), a color for each
-    drawn vertex, and None.
+    A skin where there is an image and the triangles are the file's own; else ``paint`` (N, 3), a colour for each
+    vertex that is drawn, without words.
     """
     if len(part.file_face) and (look.textured or len(look.materials) > 1):
-        return make_skin(look, part.faces, part.file_face)
+        skin = make_skin(look, part.faces, part.file_face)
+        return skin.arrays, skin.words
     return {"paint": to_bytes(vertex_paint(look, shape)[part.vertex])}, None
 
 
-def vertex_paint(look: Appearance, shape: Shape) -> Float[Floats, "V 3"]:
-    """sRGB color at each vertex: of the last of its faces, at the nearest texel."""
+def vertex_paint(look: Appearance, shape: Shape) -> Floats:
+    """(V, 3) the colour at each vertex as screens show it: of the last of its faces, at the nearest texel."""
     light = np.ones((shape.V, 3)) if look.colors is None else np.array(look.colors[:, :3])
     for k, material in enumerate(look.materials):
         face = np.flatnonzero(look.material == k)

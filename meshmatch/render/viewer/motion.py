@@ -1,4 +1,4 @@
-"""A single HTML file that shows a shape in motion, with a slider, without network access."""
+"""One HTML file that shows a shape in motion, with a slider. It needs no network, and forbids it."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch import __version__
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Floats
 from meshmatch.errors import OptionError
 from meshmatch.outputs import replace_on_success
 from meshmatch.render.colors import CLAY
-from meshmatch.render.viewer.display_mesh import MAX_VERTICES, display_mesh
+from meshmatch.render.viewer.drawn import MOST, draw
 from meshmatch.render.viewer.packing import pack, small_integers, to_bytes, to_shorts, to_signed_bytes
 from meshmatch.render.viewer.page import assemble, check_page, plain_text
 from meshmatch.shapes.duplicates import seams
 from meshmatch.shapes.shape import Shape
 
-MAX_POSITIONS = 4_000_000
-"""Vertices times frames up to which a shape is drawn in full."""
+MOST_PLACES = 4_000_000
+"""Vertices times frames up to which a shape is drawn whole."""
 _SCRIPTS = ("data", "materials", "motion")
 
 
@@ -30,25 +30,25 @@ def write_motion(
     frames: Sequence[Shape],
     times: Sequence[float],
     *,
-    rotation: Float[Floats, "3 3"],
+    rotation: Floats,
     met: Mapping[float, str] | None = None,
     title: str = "",
-    max_vertices: int = MAX_VERTICES,
+    most: int = MOST,
 ) -> int:
-    """Write a page on which a shape moves through frames. The same input gives the same bytes.
+    """Write a page on which a shape goes through frames. The same input gives the same bytes.
 
     Parameters
     ----------
     frames
-        At least two shapes with the same faces, in one frame and unit. The first gives the colors.
+        At least two shapes with the same vertices and faces, in one frame and unit. The first gives the colours.
     times
-        Increasing, one per frame.
+        (N,) increasing, one for each frame.
     rotation
-        From the frame of the shapes into y up, z to the front.
+        (3, 3) from the frame of the shapes into y up, z to the front.
     met
         Names to show at some of the times.
-    max_vertices
-        Up to which the shape is drawn in full; fewer if there are many frames.
+    most
+        Vertices up to which the shape is drawn whole; less where there are many frames.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def write_motion(
     Raises
     ------
     OptionError
-        Unsupported suffix, fewer than two frames, frames of different shapes, or times that do not increase.
+        The suffix is no page's; fewer than two frames; frames of different shapes; times that do not increase.
     OutputError
         The file cannot be written.
     """
@@ -66,19 +66,19 @@ def write_motion(
     check_page(path)
     first = frames[0] if frames else None
     if first is None or len(frames) < 2 or len(times) != len(frames) or not (np.diff(times) > 0).all():
-        raise OptionError("a motion needs at least two frames with increasing times")
+        raise OptionError("a motion needs two frames or more, each later than the one before")
     if any(shape.V != first.V or not np.array_equal(shape.faces, first.faces) for shape in frames):
-        raise OptionError("the frames of a motion need the same vertices and faces")
-    part = display_mesh(first, min(max_vertices, MAX_POSITIONS // len(frames)))
+        raise OptionError("the frames of a motion have the same vertices and faces")
+    part = draw(first, min(most, MOST_PLACES // len(frames)))
     rows, faces = part.vertex, part.faces
-    rotated = [shape.verts[rows] @ rotation.T for shape in frames]
-    used = np.concatenate([verts[part.used] for verts in rotated])
+    turned = [shape.verts[rows] @ rotation.T for shape in frames]
+    used = np.concatenate([verts[part.used] for verts in turned])
     low, extent = used.min(axis=0), np.ptp(used, axis=0)
     edge = float(extent.max()) or 1.0
-    joined = seams(rotated[0], faces) if len(faces) else rows
+    joined = seams(turned[0], faces) if len(faces) else rows
     arrays: dict[str, NDArray[Any]] = {
-        "position": to_shorts((np.stack(rotated) - low) / edge),
-        "normal": to_signed_bytes(np.stack([_normals(verts, faces, joined) for verts in rotated])),
+        "position": to_shorts((np.stack(turned) - low) / edge),
+        "normal": to_signed_bytes(np.stack([_normals(verts, faces, joined) for verts in turned])),
         "color": to_bytes(_colors(first)[rows]),
         "face": small_integers(faces),
     }
@@ -105,14 +105,12 @@ def write_motion(
     return len(text.encode())
 
 
-def _normals(
-    verts: Float[Floats, "N 3"], faces: Int[Ints, "M 3"], joined: Int[Ints, " N"]
-) -> Float[Floats, "N 3"]:
-    """Unit normals, the same on both sides of a seam; zeros for points, which then face the viewer."""
+def _normals(verts: Floats, faces: np.ndarray, joined: np.ndarray) -> Floats:
+    """Unit normals (N, 3), the same on both sides of a seam; zeros for points, which then face the viewer."""
     if not len(faces):
         return np.zeros_like(verts)
     return Shape(verts, joined[faces]).vertex_normals[joined]
 
 
-def _colors(shape: Shape) -> Float[Floats, "V 3"]:
+def _colors(shape: Shape) -> Floats:
     return np.tile(np.array(CLAY), (shape.V, 1)) if shape.colors is None else shape.colors[:, :3]

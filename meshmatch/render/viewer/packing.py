@@ -1,4 +1,4 @@
-"""Arrays on a page: compressed bytes as base64, and a table of what is where in them."""
+"""Arrays in a page: one compressed run of bytes as base64, and a table of what lies where in it."""
 
 from __future__ import annotations
 
@@ -53,5 +53,5 @@ def to_shorts(values: Floats) -> NDArray[np.uint16]:
 
 
 def small_integers(values: NDArray[np.int64]) -> NDArray[Any]:
-    """Integers from 0 in 16 bits if they fit (65535 itself has a meaning in WebGL), else in 32."""
+    """Whole numbers from 0 in 16 bits if they fit (65535 itself means something else to WebGL), else in 32."""
     return values.astype(np.uint16 if len(values) == 0 or values.max() < 65535 else np.uint32)

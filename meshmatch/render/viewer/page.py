@@ -1,4 +1,4 @@
-"""A single HTML file that shows two shapes and the map between them, without network access."""
+"""One HTML file that shows two shapes and the map between them. It needs no network, and forbids it."""
 
 from __future__ import annotations
 
@@ -17,29 +17,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch import __version__
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Floats
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import replace_on_success
 from meshmatch.render.colors import position_colors
 from meshmatch.render.compose import matched_colors
-from meshmatch.render.facing import Rotations
 from meshmatch.render.scales import Scale
-from meshmatch.render.viewer.display_mesh import MAX_VERTICES, DisplayMesh, display_mesh
-from meshmatch.render.viewer.looks import Looks, look_arrays
+from meshmatch.render.viewer.drawn import MOST, Drawn, draw
+from meshmatch.render.viewer.looks import Looks, dress
 from meshmatch.render.viewer.packing import pack, small_integers, to_bytes, to_shorts, to_signed_bytes
 from meshmatch.render.viewer.placement import Box, boxes, upright
 from meshmatch.shapes.shape import Shape
 
 PAGE_SUFFIXES = (".html", ".htm")
-# Control characters, line ends, and marks that change the direction of writing.
-_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+# Control characters, ends of lines, and marks that turn the direction of writing.
+_UNSEEMLY = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 _SCRIPTS = ("data", "picking", "materials", "drawing", "cameras", "points", "words", "viewer")
 
 
 @dataclass(frozen=True)
 class PageReport:
-    """A written page: how many vertices of each shape it draws, what was left out, its size in bytes."""
+    """What went into a page: how many vertices of each shape are drawn, what was left out, its bytes."""
 
     drawn: tuple[int, int]
     notes: tuple[str, ...]
@@ -53,33 +52,36 @@ def write_page(
     there: VertexMap,
     back: VertexMap,
     *,
-    rotations: Rotations = (None, None),
+    rotations: tuple[Floats | None, Floats | None] = (None, None),
     names: tuple[str, str] | None = None,
     looks: Looks | None = None,
+    most: int = MOST,
 ) -> PageReport:
     """Write a page that shows two shapes side by side, and for each point of one its match on the other.
 
-    The source is colored by position, the target by its colors transferred by the map. A shape of more than
-    `MAX_VERTICES` vertices is drawn coarser, and the page says so. The same input gives the same bytes.
+    The source is coloured by position, the target by its colours carried along the map. The same input gives
+    the same bytes.
 
     Parameters
     ----------
-    there, back
+    there, back : VertexMap
         From source to target, and from target to source.
     rotations
-        Of source and target into y up, z front, as `Frame.rotation` of a fit. By default the source's is guessed, and
-        the target's follows from the map.
+        ``(3, 3)`` of source and target into y up, z front, as `Frame.rotation` of a fit. The source's is
+        guessed if not given, and the target's then follows from the map.
     names
-        To show; by default the shapes' own.
+        To show; the shapes' own if not given.
     looks
-        Textures or colors, for the button that shows them.
+        What they wear, for the button that shows it.
+    most
+        Vertices up to which a shape is drawn whole; a larger one is drawn coarser, and the page says so.
 
     Raises
     ------
     OptionError
-        The suffix is not one of `PAGE_SUFFIXES`.
+        The suffix is none of `PAGE_SUFFIXES`.
     InputError
-        A map does not belong to these shapes.
+        A map is not of these shapes.
     OutputError
         The file cannot be written.
     """
@@ -87,12 +89,12 @@ def write_page(
     check_page(path)
     there, back = there.for_shapes(source, target), back.for_shapes(target, source, "the map back")
     shapes, maps = (source, target), (there, back)
-    parts = display_mesh(source, MAX_VERTICES), display_mesh(target, MAX_VERTICES)
+    parts = draw(source, most), draw(target, most)
     turns = upright(source, target, there, rotations)
     cubes = boxes(shapes, parts, there, turns)
     position = position_colors(source, turns[0])
     tints = position, matched_colors(position, there, back, source)
-    labels = names or (source.name or "source", target.name or "target")
+    shown = names or (source.name or "source", target.name or "target")
     arrays: dict[str, NDArray[Any]] = {}
     words: dict[str, Any] = {}
     for k, side in enumerate(("source", "target")):
@@ -100,10 +102,10 @@ def write_page(
         own["place"] = to_shorts(cubes[1 - k].place(maps[k].points(shapes[1 - k])[parts[k].vertex]))
         if not np.array_equal(parts[k].vertex, np.arange(shapes[k].V)):
             own["vertex"] = small_integers(parts[k].vertex)
-        words[side] = _words(shapes[k], labels[k], parts[k], cubes[k])
+        words[side] = _words(shapes[k], shown[k], parts[k], cubes[k])
         for name, look in looks.of(k) if looks is not None else []:
-            shown, words[side][name] = look_arrays(look, shapes[k], parts[k])
-            own |= {f"{name}.{key}": array for key, array in shown.items()}
+            worn, words[side][name] = dress(look, shapes[k], parts[k])
+            own |= {f"{name}.{key}": array for key, array in worn.items()}
         arrays |= {f"{side}.{name}": array for name, array in own.items()}
     table, packed = pack(arrays)
     words |= {"look": None, "own": False} if looks is None else looks.words
@@ -117,10 +119,10 @@ def write_page(
         "version": __version__,
         "arrays": table,
     }
-    text = assemble("viewer", _SCRIPTS, words, packed, f"{labels[0]} → {labels[1]}")
+    text = assemble("viewer", _SCRIPTS, words, packed, f"{shown[0]} → {shown[1]}")
     with replace_on_success(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
-    notes = tuple(f"{name}: {part.note}" for name, part in zip(labels, parts, strict=True) if part.note)
+    notes = tuple(f"{name}: {part.note}" for name, part in zip(shown, parts, strict=True) if part.note)
     return PageReport((len(parts[0].vertex), len(parts[1].vertex)), notes, len(text.encode()))
 
 
@@ -130,27 +132,25 @@ def _is_known(found: VertexMap) -> bool:
 
 
 def check_page(path: str | Path) -> None:
-    """Refuse a suffix that no browser would open (`OptionError`)."""
+    """Refuse a name that no browser would open (`OptionError`). Cheap: ask before work."""
     if Path(path).suffix.lower() not in PAGE_SUFFIXES:
         raise OptionError(f"{Path(path).name}: a page is HTML", "end the name in .html")
 
 
-def _arrays(
-    part: DisplayMesh, box: Box, found: VertexMap, color: Float[Floats, "V 3"]
-) -> dict[str, NDArray[Any]]:
-    """Arrays of one shape, a row for each drawn vertex (see `drawing.js`)."""
+def _arrays(part: Drawn, box: Box, found: VertexMap, tint: Floats) -> dict[str, NDArray[Any]]:
+    """What the page holds of one shape, a row for each vertex that is drawn (see `drawing.js`)."""
     rows = part.vertex
     return {
         "position": to_shorts(box.place(part.verts)),
         "normal": to_signed_bytes(part.normals @ box.rotation.T),
-        "color": to_bytes(color[rows]),
+        "color": to_bytes(tint[rows]),
         "confidence": to_bytes(found.confidence[rows]),
         "match": small_integers(found.index[rows]),
         "face": small_integers(part.faces),
     }
 
 
-def _words(shape: Shape, name: str, part: DisplayMesh, box: Box) -> dict[str, Any]:
+def _words(shape: Shape, name: str, part: Drawn, box: Box) -> dict[str, Any]:
     """Sizes are in units of the page, the same for both shapes."""
     scale = box.size / box.edge
     extent = np.ptp(part.verts[part.used] @ box.rotation.T, axis=0) * scale
@@ -167,14 +167,14 @@ def _words(shape: Shape, name: str, part: DisplayMesh, box: Box) -> dict[str, An
 
 
 def plain_text(value: str) -> str:
-    """A name of any bytes as text that UTF-8 can hold, without characters that would disturb the text around it."""
-    return _CONTROL.sub("\ufffd", value.encode("utf-8", "replace").decode("utf-8"))
+    """A name of any bytes as text that UTF-8 can hold, without what would turn or break the words around it."""
+    return _UNSEEMLY.sub("\ufffd", value.encode("utf-8", "replace").decode("utf-8"))
 
 
 def assemble(name: str, scripts: Sequence[str], words: dict[str, Any], packed: str, title: str) -> str:
-    """The whole file: ``name``.html in page.html, with page.css, ``name``.css and scripts.
+    """The whole file, of ``name``.html, ``name``.css and scripts.
 
-    Every part is inserted once, in one pass: a name cannot pose as a part.
+    Every part is put in once, in one pass: a name cannot pose as a part.
     """
     style = _asset("page.css") + _asset(f"{name}.css")
     library = _asset("three.min.js")

@@ -1,7 +1,8 @@
-"""Textures on a page: triangles with texture coordinates, and images of limited size."""
+"""Textures in a page: triangles that know their texture coordinates, and images within bounds."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from io import BytesIO
 from typing import Any
 
@@ -9,34 +10,39 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from meshmatch.arrays import Int, Ints
+from meshmatch.arrays import Ints
 from meshmatch.geometry.topology import same_rows
 from meshmatch.render.viewer.packing import small_integers, to_bytes
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.images import Pixels, png_bytes
 from meshmatch.shapes.srgb import to_srgb
 
-MAX_SIDE = 2048
-"""Pixels along an image's longer side; a larger one is scaled down."""
-MAX_PIXELS = 3 * MAX_SIDE**2
+LARGEST = 2048
+"""Pixels along an image's longer side; a larger one is made smaller."""
+MOST_PIXELS = 3 * LARGEST**2
 """Of all images of one look together."""
-_LOSSLESS = 256  # pixels along a side up to which an image is stored without loss: it may be drawn by hand
+_DRAWN = 256  # pixels along a side up to which an image is kept without loss: it may be drawn by hand
 
 
-def make_skin(
-    look: Appearance, faces: Int[Ints, "M 3"], file_face: Int[Ints, " M"]
-) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """A textured surface as the page has it: of triangles ``faces``, which are ``file_face`` of the file.
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """A textured surface as the page has it.
 
-    Returns
-    -------
-    dict
-        Arrays: ``vertex`` (S,), the drawn vertex of each corner that differs in position or texture coordinates;
-        ``uv`` (S, 2); ``face`` (M, 3) of these S, by material; ``paint`` (S, 3) if vertex colors are to be multiplied;
-        ``image0``, ``image1``...: bytes of image files.
-    dict
-        ``groups``: which faces have which material; ``images``: the media types of the image files.
+    Parameters
+    ----------
+    arrays : dict
+        ``vertex`` (S,): row of the shape that is drawn, ``uv`` (S, 2), ``face`` (M, 3) of these S, by material;
+        ``paint`` (S, 3) where vertex colours are to be multiplied; ``image0``, ``image1``...: bytes of files.
+    words : dict
+        ``groups``: which faces have which material; ``images``: the kinds of the files.
     """
+
+    arrays: dict[str, NDArray[Any]]
+    words: dict[str, Any]
+
+
+def make_skin(look: Appearance, faces: Ints, file_face: Ints) -> Skin:
+    """The skin of the triangles ``faces`` (M, 3), which are the faces ``file_face`` (M,) of the file."""
     material = look.material[file_face]
     order = np.argsort(material, kind="stable")
     corners = faces[order].reshape(-1)
@@ -66,7 +72,7 @@ def make_skin(
         _group(m, 3 * int(begin), 3 * int(many), None if m.image is None else place[id(m.image)])
         for m, begin, many in zip(materials, start, count, strict=True)
     ]
-    return arrays, {"groups": groups, "images": kinds}
+    return Skin(arrays, {"groups": groups, "images": kinds})
 
 
 def _group(material: Material, start: int, count: int, image: int | None) -> dict[str, Any]:
@@ -83,23 +89,23 @@ def _group(material: Material, start: int, count: int, image: int | None) -> dic
 
 
 def _shrink(images: list[Pixels]) -> float:
-    """The factor by which every image is scaled so that all of them stay within `MAX_PIXELS`."""
+    """By how much every image is made smaller so that all of them stay within `MOST_PIXELS`."""
     sizes = [
-        min(1.0, MAX_SIDE / max(image.shape[:2])) ** 2 * image.shape[0] * image.shape[1] for image in images
+        min(1.0, LARGEST / max(image.shape[:2])) ** 2 * image.shape[0] * image.shape[1] for image in images
     ]
-    return min(1.0, float(np.sqrt(MAX_PIXELS / max(sum(sizes), 1.0))))
+    return min(1.0, float(np.sqrt(MOST_PIXELS / max(sum(sizes), 1.0))))
 
 
 def _encoded(pixels: Pixels, shrink: float, opaque: bool) -> tuple[str, bytes]:
-    """Media type and bytes of an image file: PNG if it is small or has alpha, else JPEG."""
+    """Media type and bytes of an image file: PNG where it is small or has alpha, else JPEG."""
     height, width = pixels.shape[:2]
-    scale = shrink * min(1.0, MAX_SIDE / max(height, width))
+    scale = shrink * min(1.0, LARGEST / max(height, width))
     if opaque:
         pixels = np.concatenate([pixels[..., :3], np.full_like(pixels[..., 3:], 255)], axis=2)
     if scale < 1.0:
         size = max(1, round(width * scale)), max(1, round(height * scale))
         pixels = np.asarray(Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS))
-    if not opaque or max(pixels.shape[:2]) <= _LOSSLESS:
+    if not opaque or max(pixels.shape[:2]) <= _DRAWN:
         return "image/png", png_bytes(pixels)
     out = BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels[..., :3])).save(out, format="JPEG", quality=90)

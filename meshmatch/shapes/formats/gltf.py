@@ -28,7 +28,7 @@ _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
-MAX_CORNERS = 30_000_000
+MOST_CORNERS = 30_000_000
 """Vertices of a scene, and corners of its faces: about 2 GB while it is read. One mesh may stand in a scene a thousand
 times, so that a small file can promise any number.
 """
@@ -95,9 +95,9 @@ class Document:
         for node, primitive in self.primitives():
             total += self.count(primitive["attributes"]["POSITION"])
             total += self.count(primitive["indices"]) if "indices" in primitive else 0
-            if total > MAX_CORNERS:
+            if total > MOST_CORNERS:
                 raise InputError(
-                    f"the scene of {self.name} has over {MAX_CORNERS} vertices and corners of faces",
+                    f"the scene of {self.name} has over {MOST_CORNERS} vertices and corners of faces",
                     "export it with fewer copies of its meshes",
                 )
             own = self._placed(self.nodes[node], node, primitive)

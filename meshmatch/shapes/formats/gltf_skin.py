@@ -97,11 +97,11 @@ def _skin(document: Document) -> Skin:
             f"{document.name} has a skin that moves no vertex", "was it exported with its weights?"
         )
     labels = [document.nodes[node].get("name") or f"joint {node}" for node in nodes]
-    names = _numbered([plain_text(str(label)) for label in labels])
+    names = _apart([plain_text(str(label)) for label in labels])
     return Skin(seen, np.concatenate(vertices), np.concatenate(joints), np.concatenate(weights), names)
 
 
-def _numbered(names: list[str]) -> tuple[str, ...]:
+def _apart(names: list[str]) -> tuple[str, ...]:
     """Names, numbered where one occurs again."""
     taken: dict[str, None] = {}
     for name in names:

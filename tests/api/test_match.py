@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import meshmatch
+from meshmatch.api.matching import match, register
 from meshmatch.errors import InputError, ModelError, OptionError
-from meshmatch.pipeline import match, register
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.shapes.shape import Shape
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
@@ -53,9 +54,8 @@ def test_a_turned_and_scaled_copy_maps_to_itself(dancer: Shape) -> None:
 
 
 def test_a_wrong_axis_is_obeyed_and_judged(dancer: Shape) -> None:
-    upside_down = register(dancer, up="-y")
-    right = register(dancer, up="y")
-    assert upside_down.up != "+y" or upside_down.residual > right.residual
+    upside_down = register(dancer, config=FitConfig(up="-y"))
+    right = register(dancer, config=FitConfig(up="y"))
     assert right.up == "+y"
     assert upside_down.residual > right.residual
 
@@ -70,21 +70,21 @@ def test_landmarks_are_honoured(dancer: Shape, both) -> None:
 
 
 @pytest.mark.parametrize(
-    ("choice", "error"),
+    ("choice", "config", "error"),
     [
-        ({"model": "humann"}, ModelError),
-        ({"refine": "lots"}, OptionError),
-        ({"up": "w"}, OptionError),
-        ({"up": "y", "front": "-y"}, OptionError),
-        ({"landmarks": (np.array([10**6]), np.array([0]))}, OptionError),
-        ({"landmarks": (np.array([0, 1]), np.array([0]))}, OptionError),
-        ({"landmarks": (np.array([0]), np.array([0])), "refine": "none"}, OptionError),
-        ({"landmarks": (np.array([0]), np.array([0])), "refine": "latent"}, OptionError),
+        ({"model": "humann"}, {}, ModelError),
+        ({}, {"refine": "lots"}, OptionError),
+        ({}, {"up": "w"}, OptionError),
+        ({}, {"up": "y", "front": "-y"}, OptionError),
+        ({"landmarks": (np.array([10**6]), np.array([0]))}, {}, OptionError),
+        ({"landmarks": (np.array([0, 1]), np.array([0]))}, {}, OptionError),
+        ({"landmarks": (np.array([0]), np.array([0]))}, {"refine": "none"}, OptionError),
+        ({"landmarks": (np.array([0]), np.array([0]))}, {"refine": "latent"}, OptionError),
     ],
 )
-def test_choices_that_do_not_exist(dancer: Shape, choice: dict, error: type) -> None:
+def test_choices_that_do_not_exist(dancer: Shape, choice: dict, config: dict, error: type) -> None:
     with pytest.raises(error) as caught:
-        match(dancer, dancer, **choice)
+        match(dancer, dancer, config=FitConfig(**config), **choice)
     assert caught.value.hint
 
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.render.viewer import looks as module
-from meshmatch.render.viewer.looks import share_look, vertex_paint
+from meshmatch.render.viewer import sharing
+from meshmatch.render.viewer.looks import vertex_paint
+from meshmatch.render.viewer.sharing import share_look
 from meshmatch.shapes.appearance import Appearance, Material, vertex_colors_alone
 from meshmatch.shapes.shape import Shape
 from tests.render.pairs import Pair, bump, stirred
@@ -48,18 +49,18 @@ def test_a_texture_is_baked_for_the_other_mesh(pair: Pair, textured: Appearance)
     looks = share_look((pair.source, pair.target), (textured, None), pair.there, pair.back)
     assert looks is not None
     assert (looks.side, looks.own) == ("source", None)
-    assert looks.shared[0] is textured
-    (material,) = looks.shared[1].materials
+    assert looks.worn[0] is textured
+    (material,) = looks.worn[1].materials
     assert material.image is not None
-    assert material.image.shape == (module.TEXTURE_SIZE, module.TEXTURE_SIZE, 4)
-    seen = vertex_paint(looks.shared[1], pair.target)[:, 0]
+    assert material.image.shape == (sharing.TEXELS, sharing.TEXELS, 4)
+    seen = vertex_paint(looks.worn[1], pair.target)[:, 0]
     assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.06
 
 
 def test_the_wearers_own_coordinates_are_used(pair: Pair, textured: Appearance) -> None:
     first = share_look((pair.source, pair.target), (textured, None), pair.there, pair.back)
     assert first is not None
-    own = first.shared[1].uv[:, :, ::-1]  # an atlas, but another one
+    own = first.worn[1].uv[:, :, ::-1]  # an atlas, but another one
     again = share_look(
         (pair.source, pair.target),
         (textured, None),
@@ -69,8 +70,8 @@ def test_the_wearers_own_coordinates_are_used(pair: Pair, textured: Appearance) 
         workers=2,
     )
     assert again is not None
-    assert np.allclose(again.shared[1].uv, own)
-    seen = vertex_paint(again.shared[1], pair.target)[:, 0]
+    assert np.allclose(again.worn[1].uv, own)
+    seen = vertex_paint(again.worn[1], pair.target)[:, 0]
     assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.06
 
 
@@ -78,8 +79,8 @@ def test_a_source_without_a_look_wears_the_targets(pair: Pair, textured: Appeara
     looks = share_look((pair.target, pair.source), (None, textured), pair.back, pair.there)
     assert looks is not None
     assert (looks.side, looks.own) == ("target", None)
-    assert looks.shared[1] is textured
-    seen = vertex_paint(looks.shared[0], pair.target)[:, 0]
+    assert looks.worn[1] is textured
+    seen = vertex_paint(looks.worn[0], pair.target)[:, 0]
     assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.06
 
 
@@ -102,8 +103,8 @@ def test_colours_of_vertices_are_carried_as_such(pair: Pair) -> None:
     looks = share_look((pair.source, pair.target), (colored(pair.source), None), pair.there, pair.back)
     assert looks is not None
     assert looks.words["look"] == {"kind": "colours", "side": "source"}
-    assert not looks.shared[1].textured
-    seen = vertex_paint(looks.shared[1], pair.target)[:, 0]
+    assert not looks.worn[1].textured
+    seen = vertex_paint(looks.worn[1], pair.target)[:, 0]
     assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.01
 
 
@@ -111,15 +112,15 @@ def test_colours_of_vertices_are_carried_as_such(pair: Pair) -> None:
 def test_where_nothing_can_be_baked_vertices_have_colours(
     pair: Pair, textured: Appearance, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "MAX_BAKED_FACES", 100 if why == "fine" else 10**6)
+    monkeypatch.setattr(sharing, "MOST_FACES", 100 if why == "fine" else 10**6)
     faces = pair.target.faces if why == "fine" else np.empty((0, 3), np.int64)
     other = Shape(pair.target.verts, faces, "other")
     back = VertexMap.between(other, pair.source, pair.back.index)
     there = VertexMap.between(pair.source, other, pair.there.index)
     looks = share_look((pair.source, other), (textured, None), there, back)
     assert looks is not None
-    assert not looks.shared[1].textured
-    seen = vertex_paint(looks.shared[1], other)[:, 0]
+    assert not looks.worn[1].textured
+    seen = vertex_paint(looks.worn[1], other)[:, 0]
     assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.05
 
 
@@ -129,5 +130,5 @@ def test_the_colours_of_a_cloud_are_carried(pair: Pair) -> None:
     back = VertexMap.between(pair.target, cloud, pair.back.index)
     looks = share_look((cloud, pair.target), (colored(cloud), None), there, back)
     assert looks is not None
-    seen = vertex_paint(looks.shared[1], pair.target)[:, 0]
+    seen = vertex_paint(looks.worn[1], pair.target)[:, 0]
     assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.01

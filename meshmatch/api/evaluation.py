@@ -1,0 +1,66 @@
+"""How good a map is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from meshmatch.api.results import MatchResult
+from meshmatch.errors import InputError
+from meshmatch.maps.evaluate import Evaluation, evaluate_map
+from meshmatch.maps.files import load_map
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.convert import ShapeLike, as_shape
+from meshmatch.threads import thread_limit
+
+
+def evaluate(
+    found: MatchResult | VertexMap | str | Path,
+    source: ShapeLike,
+    target: ShapeLike,
+    truth: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+    *,
+    seed: int = 0,
+) -> Evaluation:
+    """Measure a map: its coverage, its distortion, and its errors where the truth is known.
+
+    Parameters
+    ----------
+    found : MatchResult, VertexMap or path
+    source, target
+        The shapes that it maps, as in `meshmatch.match`.
+    truth : (V_source,) or ((N,), (N,)), optional
+        The true target vertex of every source vertex; or N vertices of the source and those of the target.
+    seed : int
+        Of the random pairs of points between which distortion is measured.
+
+    Returns
+    -------
+    Evaluation
+        Errors are geodesic distances on the target, over the square root of its area; or in centimetres with the
+        target scaled to 1.9 square metres, the skin of a person.
+
+    Raises
+    ------
+    MeshmatchError
+        The map or the truth belongs to other shapes.
+    """
+    source, target = as_shape(source, "source"), as_shape(target, "target")
+    if isinstance(found, str | Path):
+        found = load_map(found, source, target)
+    vertex_map = found.map if isinstance(found, MatchResult) else found
+    here = there = None
+    if isinstance(truth, tuple):
+        here, there = (np.asarray(side, np.int64) for side in truth)
+    elif truth is not None:
+        there = np.asarray(truth, np.int64)
+        here = np.arange(source.V)
+    if here is not None and there is not None and (here.ndim != 1 or here.shape != there.shape):
+        raise InputError(
+            f"the truth has {here.shape} vertices of the source and {there.shape} of the target",
+            "give one target vertex for every source vertex, or a pair of lists of the same length",
+        )
+    with thread_limit(1):
+        return evaluate_map(vertex_map, source, target, here, there, rng=np.random.default_rng(seed))

@@ -1,0 +1,233 @@
+"""Pictures of shapes and of what is known about them, and the page that shows a map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from meshmatch.api.maps import MapLike, find_maps
+from meshmatch.api.results import MapPair
+from meshmatch.arrays import Floats
+from meshmatch.errors import InputError, OptionError
+from meshmatch.fitting.fit import Fit
+from meshmatch.outputs import replace_on_success
+from meshmatch.render.compose import (
+    Composition,
+    compose_fit,
+    compose_labels,
+    compose_match,
+    compose_shapes,
+    compose_values,
+    merge_labels,
+)
+from meshmatch.render.facing import facing
+from meshmatch.render.picture import Look
+from meshmatch.render.viewer import Looks, levelled, share_look, write_page
+from meshmatch.shapes.appearance import Appearance
+from meshmatch.shapes.appearance_files import find_appearance, load_coordinates
+from meshmatch.shapes.convert import ShapeLike, as_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import thread_limit
+from meshmatch.transfer.label_files import Labels, labels_of
+
+
+def picture(
+    shapes: Sequence[ShapeLike] | Composition,
+    path: str | Path,
+    *,
+    match: MapLike = None,
+    values: Sequence[ArrayLike] | None = None,
+    labels: Sequence[Labels | ArrayLike] | None = None,
+    fit: Fit | None = None,
+    look: Look | None = None,
+    names: Sequence[str] | None = None,
+) -> tuple[int, int]:
+    """Draw shapes side by side as a PNG, without a GPU, a display or OpenGL.
+
+    Parameters
+    ----------
+    shapes : sequence of shapes, or Composition
+        Each as in `meshmatch.match`; those given as files have their textures. Or what one of the functions of
+        `meshmatch.render.compose` returned, such as the errors of a map.
+    path : path
+        A .png file.
+    match : MatchResult, VertexMap or path, optional
+        Of two shapes: corresponding points have one colour.
+    values : sequence of arrays, optional
+        For each shape a number per vertex (V,), shown as a color map; or colours (V, 3 or 4) in 0..1.
+    labels : sequence of arrays or Labels, optional
+        For each shape a label per vertex or face.
+    fit : Fit, optional
+        Of the one shape: the fitted template is drawn over it, with its distance as a color map.
+    look : Look, optional
+        Size, background, axes and side.
+    names : sequence of str, optional
+        What is written below the shapes.
+
+    Returns
+    -------
+    (width, height)
+        In pixels.
+
+    Raises
+    ------
+    MeshmatchError
+        More than one of `match`, `values`, `labels` and `fit`; or one that does not belong to the shapes.
+    """
+    look = look or Look()
+    with thread_limit(1):
+        shown = _composed(shapes, look, match, values, labels, fit)
+        if names is not None:
+            if len(names) != len(shown.panels):
+                raise OptionError(f"{len(shown.panels)} shapes need as many names, not {len(names)}")
+            shown = shown.named(names)
+        with replace_on_success(path) as temporary:
+            return shown.render(temporary, look)
+
+
+def _composed(
+    given: Sequence[ShapeLike] | Composition,
+    look: Look,
+    match: MapLike,
+    values: Sequence[ArrayLike] | None,
+    labels: Sequence[Labels | ArrayLike] | None,
+    fit: Fit | None,
+) -> Composition:
+    if isinstance(given, Composition):
+        return given
+    known = {"match": match, "values": values, "labels": labels, "fit": fit}
+    chosen = [name for name, one in known.items() if one is not None]
+    if len(chosen) > 1:
+        raise OptionError(f"{' and '.join(chosen)} do not go together", "make a picture for each")
+    shapes = [as_shape(shape) for shape in given]
+    for name, tables in (("values", values), ("labels", labels)):
+        if tables is not None and len(tables) != len(shapes):
+            raise OptionError(f"{len(shapes)} shapes need as many {name}, not {len(tables)}")
+    if match is not None:
+        if len(shapes) != 2:
+            raise OptionError(
+                f"a map is of two shapes, not of {len(shapes)}", "give the source, then the target"
+            )
+        maps = find_maps(shapes[0], shapes[1], match)
+        turns = None if maps.match is None else maps.match.rotations
+        return compose_match(shapes[0], shapes[1], maps.forward, turns or (None, None), look=look)
+    if values is not None:
+        return compose_values(shapes, [np.asarray(table, np.float64) for table in values], "")
+    if labels is not None:
+        pairs = zip(labels, shapes, strict=True)
+        read = [own if isinstance(own, Labels) else labels_of(own, shape) for own, shape in pairs]
+        return compose_labels(shapes, *merge_labels(read), [own.on == "faces" for own in read])
+    if fit is not None:
+        if len(shapes) != 1:
+            raise OptionError(f"a fit is of one shape, not of {len(shapes)}")
+        return compose_fit(shapes[0], Shape(fit.points_in_file, fit.faces), fit.frame.rotation)
+    looks = [_read_look(source, shape)[0] for source, shape in zip(given, shapes, strict=True)]
+    return compose_shapes(list(zip(shapes, looks, strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """A page that was written.
+
+    Attributes
+    ----------
+    drawn : (int, int)
+        How many vertices of each shape are drawn.
+    size : int
+        Bytes of the file.
+    notes : tuple of str
+        What was left out.
+    maps : MapPair
+        The maps that it shows.
+    """
+
+    drawn: tuple[int, int]
+    size: int
+    notes: tuple[str, ...]
+    maps: MapPair
+
+
+def view(
+    source: ShapeLike,
+    target: ShapeLike,
+    path: str | Path,
+    match: MapLike = None,
+    *,
+    up: str | None = None,
+    front: str | None = None,
+    names: Sequence[str] | None = None,
+    threads: int = 2,
+) -> Page:
+    """Write a page that shows two shapes and the map between them: one .html file for any recent browser.
+
+    Parameters
+    ----------
+    source, target, match
+        As in `meshmatch.transfer_values`; textures are read where the shapes are files.
+    path : path
+        An .html file.
+    up, front : str, optional
+        How the source stands where a map was given, such as "z" and "-y"; guessed by default.
+    names : (str, str), optional
+        To show, instead of the names of the shapes.
+    threads : int
+        For what is searched on the surfaces.
+
+    Raises
+    ------
+    MeshmatchError
+        As `meshmatch.match`; or the map belongs to other shapes.
+    """
+    shapes = as_shape(source, "source"), as_shape(target, "target")
+    maps = find_maps(*shapes, match)
+    with thread_limit(1):
+        (look, uv, note), (other, other_uv, other_note) = (
+            _read_look_and_uv(given, shape) for given, shape in zip((source, target), shapes, strict=True)
+        )
+        looks: Looks | None = share_look(
+            shapes, (look, other), maps.forward, maps.backward, coordinates=(uv, other_uv), workers=threads
+        )
+        report = write_page(
+            path,
+            *shapes,
+            maps.forward,
+            maps.backward,
+            rotations=_rotations(source, maps, up, front),
+            names=None if names is None else (names[0], names[1]),
+            looks=looks,
+        )
+    notes = tuple(each for each in (note, other_note) if each)
+    return Page(report.drawn, report.size, (*notes, *report.notes), maps)
+
+
+def _rotations(
+    source: ShapeLike, maps: MapPair, up: str | None, front: str | None
+) -> tuple[Floats | None, Floats | None]:
+    """How the shapes stand: as they were fitted, if well; else the source as the user or its format says."""
+    if maps.match is not None and maps.forward.verdict != "poor":
+        first, second = maps.match.rotations
+        return levelled(maps.source, first), levelled(maps.target, second)
+    if up is not None or front is not None:
+        return facing(maps.source, up, front), None
+    if isinstance(source, str | Path) and Path(source).suffix.lower() in (".glb", ".gltf"):
+        return np.eye(3), None  # the format says: y up, z to the front
+    return None, None
+
+
+def _read_look(source: ShapeLike, shape: Shape) -> tuple[Appearance | None, str]:
+    look, _, note = _read_look_and_uv(source, shape)
+    return look, note
+
+
+def _read_look_and_uv(source: ShapeLike, shape: Shape) -> tuple[Appearance | None, Floats | None, str]:
+    """Textures and texture coordinates of a file. A look that cannot be read is no reason to show nothing."""
+    if not isinstance(source, str | Path):
+        return None, None, ""
+    try:
+        return find_appearance(source, shape), load_coordinates(source, shape), ""
+    except InputError as error:
+        return None, None, f"shown without its look: {error.message}"

@@ -1,0 +1,132 @@
+"""Textures from one shape to another."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from meshmatch.api.maps import MapLike, find_maps
+from meshmatch.api.results import MapPair
+from meshmatch.errors import OptionError
+from meshmatch.progress import Progress, ProgressCallback
+from meshmatch.shapes.appearance import Appearance, vertex_colors_alone
+from meshmatch.shapes.appearance_files import load_appearance, load_coordinates
+from meshmatch.shapes.convert import ShapeLike, as_shape
+from meshmatch.shapes.formats.textured import Textured
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import save_textured
+from meshmatch.threads import thread_limit
+from meshmatch.transfer import texture as baking
+from meshmatch.transfer.bake import Baked, BakeOptions
+from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedResult:
+    """The target with its new texture.
+
+    Attributes
+    ----------
+    mesh : Textured
+        Vertices, faces and texture coordinates.
+    baked : Baked
+        ``baked.image`` (size, size, 4) uint8, and shares of the surface that are not trusted or discontinuous.
+    atlas : Atlas
+        The texture coordinates, and why the target's own were not used.
+    maps : MapPair
+        The maps that were followed.
+    seconds : float
+        Wall time of unwrapping and baking.
+    """
+
+    mesh: Textured
+    baked: Baked
+    atlas: Atlas
+    maps: MapPair
+    seconds: float
+
+    def save(self, path: str | Path) -> None:
+        """Write a .glb, or an .obj with an .mtl and a .png of the same name.
+
+        Raises
+        ------
+        OptionError
+            The suffix is neither .glb nor .obj.
+        OutputError
+            A file cannot be written.
+        """
+        save_textured(path, self.mesh, self.baked.image)
+
+
+def transfer_texture(
+    source: ShapeLike,
+    target: ShapeLike,
+    match: MapLike = None,
+    *,
+    image: str | Path | None = None,
+    uv: Keep = "auto",
+    options: BakeOptions = BakeOptions(),
+    look: Appearance | None = None,
+    progress: ProgressCallback | None = None,
+) -> TexturedResult:
+    """Bake the texture of the source into one of the target.
+
+    Parameters
+    ----------
+    source, target, match
+        See `meshmatch.api.transfer.find_maps`; textures and texture coordinates are read where these are files.
+    image : path, optional
+        A picture for the source's texture coordinates, instead of those that its file names.
+    uv : {"auto", "keep", "new"}
+        Reuse the target's texture coordinates if they are valid; reuse them or fail; or unwrap the target anew.
+    options : BakeOptions
+    look : Appearance, optional
+        Of the source, where it is not a file; else its vertex colours are baked.
+    progress : callable, optional
+        Called with the stage, the name of the shape and the share of the stage that is done (0..1).
+
+    Returns
+    -------
+    TexturedResult
+        ``result.save("target.glb")`` writes it.
+
+    Raises
+    ------
+    MeshmatchError
+        The source has neither a texture nor colours, the target is a point cloud, its texture coordinates are to be
+        kept and are not valid; or as `meshmatch.match`.
+    """
+    baking.check_bake_options(options)
+    own = None
+    if uv != "new" and isinstance(target, str | Path):
+        own_path = Path(target)
+        target = as_shape(target)
+        own = load_coordinates(own_path, target)
+    mesh = as_shape(target, "target")
+    shape, look = _look_of(source, image, look)
+    began = time.monotonic()
+    with thread_limit(1):
+        atlas = atlas_of(mesh, own, options.size, options.padding, uv)
+    unwrapped = time.monotonic() - began
+    maps = find_maps(shape, mesh, match)
+    began = time.monotonic() - unwrapped
+    report = Progress(progress, mesh.name, "baking")
+    with thread_limit(1):
+        made = baking.transfer_texture(shape, look, mesh, maps.backward, atlas, options, report)
+    return TexturedResult(made.mesh, made.baked, atlas, maps, time.monotonic() - began)
+
+
+def _look_of(
+    source: ShapeLike, image: str | Path | None, look: Appearance | None
+) -> tuple[Shape, Appearance]:
+    shape = as_shape(source, "source")
+    if look is not None:
+        return shape, look
+    if isinstance(source, str | Path):
+        return shape, load_appearance(source, shape, image)
+    if image is not None:
+        raise OptionError(
+            "an image needs the texture coordinates of the source's file", "give the source as a path"
+        )
+    return shape, vertex_colors_alone(shape)

@@ -1,0 +1,299 @@
+"""Attributes from one shape to another: values, colours, labels, skin weights and landmarks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import csr_array
+
+from meshmatch.api.maps import MapLike, find_maps
+from meshmatch.api.results import ConfidenceRule, Transferred
+from meshmatch.arrays import Float, Floats
+from meshmatch.errors import InputError, OptionError
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.convert import ShapeLike, as_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import thread_limit
+from meshmatch.transfer import colors as vertex_colors
+from meshmatch.transfer.attributes import pull_labels, pull_values, pull_weights
+from meshmatch.transfer.directions import pull_directions
+from meshmatch.transfer.face_labels import mean_of_corners, pull_face_labels
+from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, named
+from meshmatch.transfer.landmark_files import load_landmarks
+from meshmatch.transfer.landmarks import Landmarks, at_points, at_vertices, push_landmarks
+from meshmatch.transfer.low_confidence import (
+    LowConfidence,
+    replace_low_labels,
+    replace_low_values,
+    replace_low_weights,
+)
+from meshmatch.transfer.weight_files import SkinWeights, load_weights, weights_of
+
+if TYPE_CHECKING:
+    from meshmatch.shapes.appearance import Appearance
+
+
+def transfer_values(
+    source: ShapeLike,
+    target: ShapeLike,
+    values: ArrayLike,
+    match: MapLike = None,
+    *,
+    directions: bool = False,
+    rule: ConfidenceRule = ConfidenceRule(),
+) -> Transferred[Floats]:
+    """Numbers of the source's vertices on the target's vertices, interpolated within the source's faces.
+
+    Parameters
+    ----------
+    source, target, match
+        See `find_maps`.
+    values : (V_source,) or (V_source, D)
+        Values that are not finite take no part.
+    directions : bool
+        The values are directions (V_source, 3), such as normals: they are turned as the surface turns from source to
+        target, and have unit length.
+    rule : ConfidenceRule
+
+    Returns
+    -------
+    Transferred
+        ``result.data`` is an array (V_target,) or (V_target, D).
+
+    Raises
+    ------
+    MeshmatchError
+        Not a row for each vertex; or as `find_maps`.
+    """
+    source = as_shape(source, "source")
+    numbers = np.asarray(values, np.float64)
+    if numbers.ndim not in (1, 2) or len(numbers) != source.V:
+        raise InputError(
+            f"values must be an array of ({source.V},) or ({source.V}, D), not {numbers.shape}",
+            "one row for each vertex of the source",
+        )
+    maps = find_maps(source, target, match)
+    with thread_limit(1):
+        if directions:
+            found = pull_directions(maps.backward, maps.source, maps.target, numbers)
+        else:
+            found = pull_values(maps.backward, numbers)
+        blank = None if rule.blank is None else np.asarray(rule.blank, np.float64)
+        confidence = _confidence(maps.backward)
+        found, low = replace_low_values(found, confidence, maps.target, rule.minimum, blank, rule.fill)
+    return Transferred(found, confidence, low, maps)
+
+
+def transfer_colors(
+    source: ShapeLike,
+    target: ShapeLike,
+    match: MapLike = None,
+    *,
+    colors: ArrayLike | Appearance | None = None,
+    rule: ConfidenceRule = ConfidenceRule(),
+) -> Transferred[Floats]:
+    """Vertex colours of the source on the target's vertices, mixed as light.
+
+    Parameters
+    ----------
+    source, target, match
+        See `find_maps`.
+    colors : (V_source, 3 or 4) in 0..1 (sRGB) or Appearance, optional
+        Other colours than those of the source's file; an appearance is sampled with its textures.
+    rule : ConfidenceRule
+
+    Returns
+    -------
+    Transferred
+        ``result.data`` is (V_target, 4): red, green, blue (sRGB) and alpha in 0..1.
+
+    Raises
+    ------
+    MeshmatchError
+        The source has no vertex colours; or as `find_maps`.
+    """
+    from meshmatch.shapes.appearance import Appearance
+
+    source = as_shape(source, "source")
+    given = None if isinstance(colors, Appearance) else vertex_colors.light_of(source, colors)
+    blank = None
+    if rule.blank is not None:
+        blank = vertex_colors.light(vertex_colors.checked(np.asarray(rule.blank, np.float64)))
+    maps = find_maps(source, target, match)
+    with thread_limit(1):
+        if given is not None:
+            found = pull_values(maps.backward, given)
+        else:
+            from meshmatch.transfer.texture import colors_of_vertices
+
+            assert isinstance(colors, Appearance)
+            found = colors_of_vertices(maps.source, colors, maps.target, maps.backward)
+        confidence = _confidence(maps.backward)
+        found, low = replace_low_values(found, confidence, maps.target, rule.minimum, blank, rule.fill)
+    return Transferred(vertex_colors.seen(found), confidence, low, maps)
+
+
+def transfer_labels(
+    source: ShapeLike,
+    target: ShapeLike,
+    labels: Labels | ArrayLike | str | Path,
+    match: MapLike = None,
+    *,
+    to: On | None = None,
+    rule: ConfidenceRule = ConfidenceRule(),
+) -> Transferred[Labels]:
+    """Labels of the source's vertices or faces on the target: voted on, never averaged.
+
+    Parameters
+    ----------
+    source, target, match
+        See `find_maps`.
+    labels : Labels, array (V_source,) or (F_source,) of integers or words, or path
+        As `Labels` where their number does not tell what they belong to.
+    to : {"vertices", "faces"}, optional
+        What gets labels; by default what has them on the source, and the points of a cloud.
+    rule : ConfidenceRule
+
+    Returns
+    -------
+    Transferred
+        ``result.data.values`` is the label of each vertex or face of the target.
+
+    Raises
+    ------
+    MeshmatchError
+        Labels that do not belong to the source, faces of a cloud; or as `find_maps`.
+    """
+    source, target = as_shape(source, "source"), as_shape(target, "target")
+    if isinstance(labels, str | Path):
+        given = load_labels(labels, source)
+    else:
+        given = labels if isinstance(labels, Labels) else labels_of(labels, source)
+    blank = None if rule.blank is None else str(rule.blank)
+    if blank is not None:
+        given.check_blank(blank)
+    if to == "faces" and target.is_cloud:
+        raise OptionError(f"{target.name} is a point cloud: it has no faces to label", "label its vertices")
+    kind: On = "vertices" if target.is_cloud else to or given.on
+    maps = find_maps(source, target, match)
+    back, of_face = maps.backward, given.on == "faces"
+    with thread_limit(1):
+        confidence = _confidence(back)
+        if kind == "faces":
+            found = pull_face_labels(back, source, target, given.codes, of_face, maps.threads)
+            confidence = mean_of_corners(confidence, target)
+        else:
+            found = pull_labels(back, source, given.codes, of_face)
+        found, low = replace_low_labels(
+            found, confidence, target, rule.minimum, blank is not None, rule.fill, kind == "faces"
+        )
+    return Transferred(named(found, given, kind, blank), confidence, low, maps)
+
+
+def transfer_weights(
+    source: ShapeLike,
+    target: ShapeLike,
+    weights: SkinWeights | csr_array | ArrayLike | str | Path,
+    match: MapLike = None,
+    *,
+    influences: int = 4,
+    rule: ConfidenceRule = ConfidenceRule(),
+) -> Transferred[SkinWeights]:
+    """Skin weights of the source's vertices on the target's; each row sums to 1.
+
+    Parameters
+    ----------
+    source, target, match
+        See `find_maps`.
+    weights : SkinWeights, (V_source, J) array or sparse array, or path
+    influences : int
+        How many joints may move a vertex; the heaviest are kept.
+    rule : ConfidenceRule
+        Weights are filled in or kept, never left blank.
+
+    Returns
+    -------
+    Transferred
+        ``result.data.matrix`` is sparse, (V_target, J).
+
+    Raises
+    ------
+    MeshmatchError
+        Weights that do not belong to the source; or as `find_maps`.
+    """
+    source = as_shape(source, "source")
+    if rule.blank is not None:
+        raise OptionError("skin weights cannot be left blank", "fill them in, or keep them")
+    if influences < 1:
+        raise OptionError(f"a vertex needs at least 1 joint, not {influences}")
+    if isinstance(weights, str | Path):
+        given = load_weights(weights, source)
+    else:
+        given = weights if isinstance(weights, SkinWeights) else weights_of(weights, source)
+    maps = find_maps(source, target, match)
+    with thread_limit(1):
+        confidence = _confidence(maps.backward)
+        found = pull_weights(maps.backward, given.matrix, influences)
+        found, low = replace_low_weights(found, confidence, maps.target, rule.minimum, rule.fill, influences)
+    return Transferred(SkinWeights(found, given.names), confidence, low, maps)
+
+
+def transfer_landmarks(
+    source: ShapeLike,
+    target: ShapeLike,
+    landmarks: Landmarks | ArrayLike | str | Path,
+    match: MapLike = None,
+    *,
+    rule: ConfidenceRule = ConfidenceRule(),
+) -> Transferred[Landmarks]:
+    """Landmarks of the source at exact points of the target's surface.
+
+    Parameters
+    ----------
+    source, target, match
+        See `find_maps`.
+    landmarks : Landmarks, vertices (N,), positions (N, 3), or path
+        A position stands for the nearest point of the source.
+    rule : ConfidenceRule
+        Its minimum alone: landmarks below it are counted, and kept.
+
+    Returns
+    -------
+    Transferred
+        ``result.data.points`` (N, 3) in the target's frame; also their vertex, or face and barycentric weights.
+
+    Raises
+    ------
+    MeshmatchError
+        Landmarks that are not on the source; or as `find_maps`.
+    """
+    source = as_shape(source, "source")
+    given = _landmarks(landmarks, source)
+    maps = find_maps(source, target, match)
+    with thread_limit(1):
+        found = push_landmarks(maps.forward, maps.source, maps.target, given)
+    low = int((found.confidence < rule.minimum).sum())
+    return Transferred(found, found.confidence, LowConfidence(len(found.names), low), maps)
+
+
+def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape) -> Landmarks:
+    if isinstance(landmarks, Landmarks):
+        return landmarks
+    if isinstance(landmarks, str | Path):
+        return load_landmarks(landmarks, source)[0]
+    places = np.asarray(landmarks)
+    if places.ndim == 1 and places.dtype.kind in "iu":
+        return at_vertices(source, places)
+    if places.ndim == 2 and places.shape[1] == 3 and places.dtype.kind in "iuf":
+        return at_points(source, places.astype(np.float64))[0]
+    raise InputError(
+        f"landmarks cannot be an array of {places.shape} {places.dtype}",
+        "give vertices (N,) as integers, or positions (N, 3)",
+    )
+
+
+def _confidence(back: VertexMap) -> Float[Floats, V]:
+    return back.confidence.astype(np.float64)

@@ -1,0 +1,193 @@
+"""Attributes in Python: from a map at hand, as files and as arrays; nothing is fitted."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import meshmatch
+from meshmatch import ConfidenceRule
+from meshmatch.api import matching
+from meshmatch.api.results import MapPair
+from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.maps.files import save_map
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+from tests.conftest import icosphere
+from tests.transfer.known import split
+
+
+@pytest.fixture(autouse=True)
+def no_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    def begun(*_: object, **__: object) -> None:
+        raise AssertionError("a fit began")
+
+    monkeypatch.setattr(matching.Matcher, "_fit_all", begun)
+
+
+def test_a_map_at_hand_is_turned_round() -> None:
+    coarse = icosphere(1)
+    fine, forward, back = split(coarse)
+    maps = meshmatch.find_maps(coarse, fine, forward)
+    assert maps.match is None
+    assert np.array_equal(maps.forward.index, forward.index)
+    assert np.allclose(maps.backward.points(coarse), back.points(coarse), atol=1e-12)
+    assert meshmatch.find_maps(coarse, fine, maps) is maps
+    assert (
+        meshmatch.find_maps(coarse, fine, lambda source, target: MapPair(source, target, forward)).match
+        is None
+    )
+
+
+def test_shapes_and_map_may_be_files(tmp_path: Path) -> None:
+    save_shape(tmp_path / "a.ply", icosphere(1))
+    a = load_shape(tmp_path / "a.ply")
+    save_shape(tmp_path / "b.ply", split(a)[0])
+    fine, forward, _ = split(a)
+    save_map(tmp_path / "ab.npy", forward)
+    maps = meshmatch.find_maps(tmp_path / "a.ply", tmp_path / "b.ply", tmp_path / "ab.npy")
+    assert (maps.backward.source, maps.backward.target) == ("b.ply", "a.ply")
+    assert maps.backward.source_vertices == fine.V
+    with pytest.raises(InputError, match=r"ab\.npy runs the wrong way: from a\.ply to b\.ply"):
+        meshmatch.find_maps(tmp_path / "b.ply", tmp_path / "a.ply", tmp_path / "ab.npy")
+
+
+@pytest.fixture
+def pair() -> tuple[Shape, Shape, VertexMap]:
+    """A sphere, the same one turned, moved and twice as large, and the true map."""
+    sphere = icosphere(3)
+    other = Shape(2.0 * sphere.verts @ TURN.T + 7.0, sphere.faces, "other")
+    return sphere, other, VertexMap.between(sphere, other, np.arange(sphere.V), verdict="good")
+
+
+TURN = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+
+
+def test_directions_turn_with_the_surface(pair: tuple[Shape, Shape, VertexMap]) -> None:
+    source, target, found = pair
+    result = meshmatch.transfer_values(source, target, source.vertex_normals, found, directions=True)
+    assert np.allclose(result.data, target.vertex_normals, atol=1e-6)
+    field = np.cross(source.vertex_normals, [0.0, 0, 1])  # along the surface, of any length
+    turned = meshmatch.transfer_values(source, target, field, found, directions=True).data
+    length = np.linalg.norm(field, axis=1)
+    long = length > 0.1
+    assert np.allclose(turned[long], (field @ TURN.T)[long] / length[long, None], atol=1e-3)
+    # as plain numbers they stay as they are
+    assert np.allclose(meshmatch.transfer_values(source, target, field, found).data, field)
+
+
+def test_a_mirrored_surface_is_no_rotation(pair: tuple[Shape, Shape, VertexMap]) -> None:
+    source, _, _ = pair
+    mirrored = Shape(source.verts * [-1.0, 1, 1], source.faces[:, ::-1], "mirrored")
+    found = VertexMap.between(source, mirrored, np.arange(source.V))
+    result = meshmatch.transfer_values(source, mirrored, source.vertex_normals, found, directions=True)
+    assert np.einsum("ni,ni->n", result.data, mirrored.vertex_normals).min() > 0.8
+
+
+def test_arrays_of_all_kinds(pair: tuple[Shape, Shape, VertexMap]) -> None:
+    source, target, found = pair
+    V = source.V
+    colors = np.random.default_rng(0).random((V, 3))
+    assert np.allclose(meshmatch.transfer_colors(source, target, found, colors=colors).data[:, :3], colors)
+    words = np.where(source.verts[:, 0] > 0, "left", "right")
+    labels = meshmatch.transfer_labels(source, target, words, found)
+    assert np.array_equal(labels.data.values, words)
+    assert labels.low.low == 0
+    weights = np.eye(3)[np.arange(V) % 3]
+    assert np.allclose(
+        meshmatch.transfer_weights(source, target, weights, found).data.matrix.toarray(), weights
+    )
+    points = meshmatch.transfer_landmarks(source, target, [3, 5], found).data
+    assert np.allclose(points.points, target.verts[[3, 5]])
+    places = meshmatch.transfer_landmarks(source, target, source.verts[[3, 5]], found).data
+    assert np.allclose(places.points, points.points)
+
+
+def test_what_is_not_trusted_is_kept_filled_or_blank(pair: tuple[Shape, Shape, VertexMap]) -> None:
+    source, target, _ = pair
+    confidence = np.ones(source.V, np.float32)
+    confidence[10] = 0.1
+    doubtful = VertexMap.between(source, target, np.arange(source.V), confidence=confidence)
+    values = source.verts[:, 0].copy()
+    values[10] = 99.0
+
+    def at_ten(**rule: object) -> float:
+        result = meshmatch.transfer_values(source, target, values, doubtful, rule=ConfidenceRule(**rule))  # type: ignore[arg-type]
+        assert result.low.low == 1
+        return float(result.data[10])
+
+    assert at_ten() == 99.0
+    assert at_ten(blank=-1.0) == -1.0
+    assert abs(at_ten(fill=True) - source.verts[10, 0]) < 0.05
+    with pytest.raises(OptionError, match="contradict"):
+        ConfidenceRule(fill=True, blank=0.0)
+    with pytest.raises(OptionError, match=r"lies in 0\.\.1"):
+        ConfidenceRule(minimum=2.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "words", "told"),
+    [
+        ("transfer_values", (np.zeros(5),), r"values must be an array of \(642,\)"),
+        ("transfer_values", (np.zeros((642, 2, 2)),), "values must be an array"),
+        ("transfer_labels", (np.zeros(7, int),), "7 labels"),
+        ("transfer_weights", (-np.ones((642, 2)),), "negative"),
+        ("transfer_landmarks", ([642],), "landmark 0 is vertex 642"),
+        ("transfer_landmarks", ([[1.0, 2.0]],), "landmarks cannot be an array"),
+    ],
+)
+def test_what_does_not_belong_to_the_source(
+    pair: tuple[Shape, Shape, VertexMap], call: str, words: tuple[object, ...], told: str
+) -> None:
+    source, target, found = pair
+    with pytest.raises(MeshmatchError, match=told):
+        getattr(meshmatch, call)(source, target, *words, found)
+
+
+def test_colours_that_are_not_there(pair: tuple[Shape, Shape, VertexMap]) -> None:
+    source, target, found = pair
+    with pytest.raises(InputError, match="has no vertex colours"):
+        meshmatch.transfer_colors(source, target, found)
+    with pytest.raises(OptionError, match="3 or 4 numbers within"):
+        meshmatch.transfer_colors(source, target, found, colors=np.full((source.V, 3), 2.0))
+
+
+def test_a_texture_is_baked_and_saved(pair: tuple[Shape, Shape, VertexMap], tmp_path: Path) -> None:
+    source, target, found = pair
+    red = Shape(source.verts, source.faces, "red", np.tile([1.0, 0, 0, 1], (source.V, 1)))
+    options = meshmatch.BakeOptions(size=64)
+    result = meshmatch.transfer_texture(red, target, found, options=options)
+    assert result.baked.image.shape == (64, 64, 4)
+    assert (np.median(result.baked.image.reshape(-1, 4), axis=0)[:3] == [255, 0, 0]).all()
+    result.save(tmp_path / "b.glb")
+    assert load_shape(tmp_path / "b.glb").V >= target.V
+    with pytest.raises(OptionError, match="cannot write a texture"):
+        result.save(tmp_path / "b.ply")
+
+
+def test_evaluate_takes_arrays(pair: tuple[Shape, Shape, VertexMap]) -> None:
+    source, target, found = pair
+    result = meshmatch.evaluate(found, source, target, np.arange(source.V))
+    assert result.errors is not None and result.errors.mean == 0
+    two = meshmatch.evaluate(found, source, target, ([1, 2], [1, 2]))
+    assert two.errors is not None and len(two.errors.values) == 2
+    with pytest.raises(InputError, match="the truth has"):
+        meshmatch.evaluate(found, source, target, ([1, 2], [1]))
+
+
+def test_pictures_and_pages(pair: tuple[Shape, Shape, VertexMap], tmp_path: Path) -> None:
+    source, target, found = pair
+    plain = meshmatch.picture([source, target], tmp_path / "two.png", names=["one", "other"])
+    assert plain[0] > plain[1] > 100
+    for number, given in enumerate(
+        ({"match": found}, {"values": [source.verts[:, 0]] * 2}, {"labels": [[0] * 642] * 2})
+    ):
+        meshmatch.picture([source, target], tmp_path / f"{number}.png", **given)  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match="match and values do not go together"):
+        meshmatch.picture([source, target], tmp_path / "no.png", match=found, values=[[0.0] * 642] * 2)
+    with pytest.raises(OptionError, match="2 shapes need as many values, not 1"):
+        meshmatch.picture([source, target], tmp_path / "no.png", values=[[0.0] * 642])
+    page = meshmatch.view(source, target, tmp_path / "ab.html", found)
+    assert page.size == (tmp_path / "ab.html").stat().st_size
+    assert not (tmp_path / "no.png").exists()
