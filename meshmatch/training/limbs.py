@@ -85,28 +85,14 @@ def draw_limbs(draw: Draw, arm: torch.Tensor, family: torch.Tensor) -> Limbs:
     """Angles of one side; ``arm`` (B,) as `draw_arms` gives it, ``family`` (B,) is 0..5: stand, wide, crouch or
     sit, kneel, bend forward, lunge."""
     at = torch.arange(draw.B)
-    elevation = torch.stack(
-        [
-            draw.normal(14, 12).abs(),
-            draw.normal(80, 20),
-            draw.normal(80, 28),
-            draw.normal(150, 20),
-            draw.uniform(5, 165),
-            draw.normal(35, 18),
-            draw.normal(55, 25),
-        ]
-    )[arm, at].clamp(3, 175)
-    azimuth = torch.stack(
-        [
-            draw.uniform(-50, 110),
-            draw.normal(5, 20),
-            draw.normal(85, 28),
-            draw.uniform(-30, 110),
-            draw.uniform(-50, 130),
-            draw.normal(75, 28),
-            draw.normal(80, 22),
-        ]
-    )[arm, at].clamp(-60, 135)
+    elevation = torch.stack([
+        draw.normal(14, 12).abs(), draw.normal(80, 20), draw.normal(80, 28), draw.normal(150, 20),
+        draw.uniform(5, 165), draw.normal(35, 18), draw.normal(55, 25),
+    ])[arm, at].clamp(3, 175)  # fmt: skip
+    azimuth = torch.stack([
+        draw.uniform(-50, 110), draw.normal(5, 20), draw.normal(85, 28), draw.uniform(-30, 110),
+        draw.uniform(-50, 130), draw.normal(75, 28), draw.normal(80, 22),
+    ])[arm, at].clamp(-60, 135)  # fmt: skip
     any_elbow = draw.choice(
         [0.45, 0.4, 0.15], [draw.normal(10, 14).abs(), draw.uniform(0, 145), draw.normal(90, 25)]
     )
@@ -119,37 +105,19 @@ def draw_limbs(draw: Draw, arm: torch.Tensor, family: torch.Tensor) -> Limbs:
     any_pronation = draw.choice([0.7, 0.3], [draw.normal(10, 38), draw.uniform(-85, 95)])
     pronation = any_pronation - raised * draw.uniform(0, 50)
     # Families of the legs: stand, wide, crouch or sit, kneel, bend forward, lunge (left or right first).
-    flexion = torch.stack(
-        [
-            draw.normal(3, 9),
-            draw.uniform(-35, 125),
-            draw.normal(88, 25),
-            draw.normal(15, 25),
-            draw.normal(65, 28),
-            draw.uniform(-35, 100),
-        ]
-    )[family, at].clamp(-40, 135)
+    flexion = torch.stack([
+        draw.normal(3, 9), draw.uniform(-35, 125), draw.normal(88, 25), draw.normal(15, 25),
+        draw.normal(65, 28), draw.uniform(-35, 100),
+    ])[family, at].clamp(-40, 135)  # fmt: skip
     crouch_knee = (flexion * draw.uniform(0.6, 1.4) + draw.normal(0, 15)).clamp(0, 150)
-    knee = torch.stack(
-        [
-            draw.normal(6, 8).abs(),
-            draw.choice([0.5, 0.5], [draw.uniform(0, 145), crouch_knee]),
-            crouch_knee,
-            draw.normal(110, 25),
-            draw.normal(10, 12).abs(),
-            draw.uniform(0, 110),
-        ]
-    )[family, at].clamp(0, 150)
-    spread = torch.stack(
-        [
-            draw.normal(7, 8),
-            draw.uniform(-15, 55),
-            draw.normal(12, 18),
-            draw.normal(8, 10),
-            draw.normal(10, 12),
-            draw.normal(10, 14),
-        ]
-    )[family, at].clamp(-20, 65)
+    knee = torch.stack([
+        draw.normal(6, 8).abs(), draw.choice([0.5, 0.5], [draw.uniform(0, 145), crouch_knee]),
+        crouch_knee, draw.normal(110, 25), draw.normal(10, 12).abs(), draw.uniform(0, 110),
+    ])[family, at].clamp(0, 150)  # fmt: skip
+    spread = torch.stack([
+        draw.normal(7, 8), draw.uniform(-15, 55), draw.normal(12, 18), draw.normal(8, 10),
+        draw.normal(10, 12), draw.normal(10, 14),
+    ])[family, at].clamp(-20, 65)  # fmt: skip
     return Limbs(
         arm_elevation=elevation,
         arm_azimuth=azimuth,

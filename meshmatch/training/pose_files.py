@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -161,54 +160,50 @@ def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
     except _DAMAGE as error:
         raise InputError(f"{path.name} is not a file of poses: {error}", _HINT) from error
     try:
-        return GivenPoses(joints, vectors, share, path.name)
+        return GivenPoses(tuple(joints), vectors, share, path.name)
     except InputError as error:
         raise InputError(f"{path.name}: {error.message}", error.hint) from error
 
 
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, csv.Error, RecursionError)
+_DAMAGE = (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error, RecursionError)
 
 
-def _read_npz(path: Path) -> tuple[tuple[str, ...], Any]:
+def _read_npz(path: Path) -> tuple[list[Any], Any]:
     """Arrays `joints` (J,) of text and `rotations` (P, J, 3)."""
     found = read_npz(path, ("joints", "rotations"))
-    for name in ("joints", "rotations"):
-        if name not in found:
-            raise ValueError(f"it has no array {name!r}")
-    joints = found["joints"]
+    joints = _entry(found, "joints")
     if joints.dtype.kind not in "US" or joints.ndim != 1:
         raise ValueError(f"joints are {joints.dtype} of {_shown(joints.shape)}, not a list of names")
     if max(joints.nbytes, len(joints)) > _MAX_NAME_BYTES:
         raise ValueError(f"{len(joints)} joints of {joints.dtype} are too many")
-    return _names(joints.astype(np.str_).tolist()), found["rotations"]
+    return joints.astype(np.str_).tolist(), _entry(found, "rotations")
 
 
-def _read_json(path: Path) -> tuple[tuple[str, ...], Any]:
+def _read_json(path: Path) -> tuple[list[Any], Any]:
     """An object with `joints`, a list of names, and `rotations`, lists of numbers."""
     found: Any = json.loads(path.read_text(encoding="utf-8-sig"))
-    if not isinstance(found, dict) or not {"joints", "rotations"} <= found.keys():
+    if not isinstance(found, dict):
         raise ValueError("it is not an object with joints and rotations")
-    if not isinstance(found["joints"], list):
+    joints = _entry(found, "joints")
+    if not isinstance(joints, list) or not all(isinstance(word, str) for word in joints):
         raise ValueError("joints are not a list of names")
+    rotations = _entry(found, "rotations")
     try:
-        vectors = np.array(found["rotations"], np.float64)
+        return joints, np.array(rotations, np.float64)
     except (ValueError, TypeError, OverflowError):
         raise ValueError("rotations are not lists of numbers, equally long") from None
-    return _names(found["joints"]), vectors
 
 
-def _read_csv(path: Path) -> tuple[tuple[str, ...], Any]:
+def _read_csv(path: Path) -> tuple[list[Any], Any]:
     """A row `pose, joint, x, y, z` for each joint that is turned; rows of one pose have the same first word."""
+    poses: dict[str, int] = {}
+    joints: dict[str, int] = {}
+    turns: dict[tuple[int, int], list[float]] = {}
     with path.open(encoding="utf-8-sig", newline="") as file:
         rows = csv.reader(file)
         if tuple(word.strip() for word in next(rows, [])) != COLUMNS:
             raise ValueError(f"its first line is not {','.join(COLUMNS)}")
-        poses: dict[str, int] = {}
-        joints: dict[str, int] = {}
-        turns: dict[tuple[int, int], tuple[float, ...]] = {}
-        for row in rows:
-            if not row:
-                continue
+        for row in filter(None, rows):
             if len(row) != len(COLUMNS):
                 raise ValueError(f"line {rows.line_num} has {len(row)} columns, not {len(COLUMNS)}")
             pose, joint = (word.strip() for word in row[:2])
@@ -216,7 +211,7 @@ def _read_csv(path: Path) -> tuple[tuple[str, ...], Any]:
             if at in turns:
                 raise ValueError(f"line {rows.line_num} turns {joint[:80]!r} of pose {pose[:80]!r} again")
             try:
-                turns[at] = tuple(float(word) for word in row[2:])
+                turns[at] = [float(word) for word in row[2:]]
             except ValueError:
                 raise ValueError(f"line {rows.line_num} has words where numbers belong") from None
     if len(poses) * len(joints) > MAX_VECTORS:
@@ -224,13 +219,13 @@ def _read_csv(path: Path) -> tuple[tuple[str, ...], Any]:
     vectors = np.zeros((len(poses), len(joints), 3))
     for at, turn in turns.items():
         vectors[at] = turn
-    return tuple(joints), vectors
+    return list(joints), vectors
 
 
-def _names(words: Sequence[Any]) -> tuple[str, ...]:
-    if not all(isinstance(word, str) for word in words):
-        raise ValueError("joints are not a list of names")
-    return tuple(words)
+def _entry(found: dict[str, Any], name: str) -> Any:
+    if name not in found:
+        raise ValueError(f"it has no {name}")
+    return found[name]
 
 
 def _shown(shape: tuple[int, ...]) -> str:
@@ -238,4 +233,3 @@ def _shown(shape: tuple[int, ...]) -> str:
 
 
 _READERS = {".npz": _read_npz, ".json": _read_json, ".csv": _read_csv}
-POSE_SUFFIXES = tuple(_READERS)

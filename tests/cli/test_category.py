@@ -20,7 +20,7 @@ FEW = ("--nodes", "60", "--radius", "0.35", "--strategy", "uniform", "-q")
 
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("meshmatch.render.picture.render_shapes", lambda panels, path: None)
+    monkeypatch.setattr("meshmatch.render.compose.render_shapes", lambda *_: None)
 
 
 @pytest.fixture

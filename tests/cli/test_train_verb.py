@@ -68,6 +68,7 @@ def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
     assert called["recipe"] == recipe_for()
     assert "step 2 of 2: total 0.25, validation 0.0321 (8 s)" in answer.err
     assert f"meshmatch models add {tmp_path / 'mine'}" in answer.err
+    assert "unfinished: step 2 of 13,000; the same command goes on" in answer.err
 
 
 @pytest.mark.parametrize("preset", ["default", "paper"])
@@ -147,7 +148,7 @@ def test_poses_of_a_file_are_mixed_in(run: Run, stub: Recorder, tmp_path: Path) 
 def test_a_prepared_folder_brings_template_and_category(
     run: Run, stub: Recorder, tmp_path: Path, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("meshmatch.render.picture.render_shapes", lambda panels, path: None)
+    monkeypatch.setattr("meshmatch.render.compose.render_shapes", lambda *_: None)
     for name in ("eggs/one.ply", "eggs/two.ply"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(two[0].read_bytes())

@@ -13,7 +13,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes import array_files
 from meshmatch.training import bodies, pose_files
 from meshmatch.training.bodies import sample_bodies
-from meshmatch.training.pose_files import POSE_SUFFIXES, GivenPoses, load_poses
+from meshmatch.training.pose_files import GivenPoses, load_poses
 from meshmatch.training.rig import Rig
 from meshmatch.training.skeleton import forward_kinematics
 from tests.training.small import egg_template
@@ -47,7 +47,7 @@ def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-@pytest.mark.parametrize("suffix", POSE_SUFFIXES)
+@pytest.mark.parametrize("suffix", [".npz", ".json", ".csv"])
 def test_every_format_reads_the_same(tmp_path: Path, suffix: str) -> None:
     found = load_poses(write(tmp_path / f"poses{suffix}"), 0.25)
     assert found.joints == JOINTS
@@ -179,7 +179,7 @@ BROKEN: dict[str, tuple[str, bytes, str]] = {
     "empty archive": (".npz", b"", "not a zip file"),
     "text as archive": (".npz", b"head 1 2 3\n", "not a zip file"),
     "cut archive": (".npz", archive(joints=NAMES, rotations=npy(VECTORS))[:-40], "not a zip file"),
-    "no rotations": (".npz", archive(joints=NAMES), "no array 'rotations'"),
+    "no rotations": (".npz", archive(joints=NAMES), "has no rotations"),
     "names are numbers": (".npz", archive(joints=npy(np.arange(3)), rotations=npy(VECTORS)), "not a list of names"),
     "no npy inside": (".npz", archive(joints=b"abc", rotations=npy(VECTORS)), "does not hold arrays"),
     "short array": (".npz", archive(joints=NAMES, rotations=npy(VECTORS)[:-8]), "does not hold arrays"),
@@ -190,7 +190,7 @@ BROKEN: dict[str, tuple[str, bytes, str]] = {
     "complex": (".npz", archive(joints=NAMES, rotations=npy(VECTORS + 0j)), "not numbers of"),
     "empty json": (".json", b"", "is not a file of poses"),
     "a list": (".json", b"[1, 2]", "not an object"),
-    "no joints": (".json", b'{"rotations": []}', "not an object"),
+    "no joints": (".json", b'{"rotations": []}', "it has no joints"),
     "joints no list": (".json", b'{"joints": "head", "rotations": []}', "not a list of names"),
     "joints no names": (".json", b'{"joints": [1], "rotations": [[[0, 0, 0]]]}', "not a list of names"),
     "ragged": (".json", b'{"joints": ["head"], "rotations": [[[0, 0, 0]], [[0, 0]]]}', "equally long"),
