@@ -112,8 +112,8 @@ def compose_match(
     turns = _same_side(source, target, vertex_map, look, rotations)
     here = position_colors(source, turns[0])
     there = matched_colors(here, vertex_map, invert_map(vertex_map, source, target), source)
-    shown = _pair(source, target, (here, there), caption="matched places in one colour")
-    return shown.rotated(turns)
+    panels = Panel(source, here, source.name), Panel(target, there, target.name)
+    return Composition(panels, caption="matched places in one colour").rotated(turns)
 
 
 def matched_colors(
@@ -130,9 +130,12 @@ def compose_confidence(
     """Source and target colored by the confidence of the map: low is dark."""
     back = invert_map(vertex_map, source, target)
     scale = Scale(0.0, 1.0, "confidence of the map", reverse=True)
-    colors = scale.colors(vertex_map.confidence), scale.colors(back.confidence)
+    panels = (
+        Panel(source, scale.colors(vertex_map.confidence), source.name),
+        Panel(target, scale.colors(back.confidence), target.name),
+    )
     record = {"confidence_mean": float(vertex_map.confidence.mean())}
-    shown = _pair(source, target, colors, scale, "the confidence of the map", record)
+    shown = Composition(panels, scale, "the confidence of the map", record)
     return shown.rotated(_same_side(source, target, vertex_map, look))
 
 
@@ -295,18 +298,6 @@ def _with_points(
 ) -> Panel:
     plain = np.tile(PALE, (shape.V, 1))
     return Panel(shape, plain, shape.name, points=points, point_colors=colors, point_radius=radius)
-
-
-def _pair(
-    source: Shape,
-    target: Shape,
-    colors: tuple[Float[Floats, "V 3"], Float[Floats, "W 3"]],
-    legend: Legend | None = None,
-    caption: str = "",
-    record: dict[str, Any] | None = None,
-) -> Composition:
-    panels = Panel(source, colors[0], source.name), Panel(target, colors[1], target.name)
-    return Composition(panels, legend, caption, record or {})
 
 
 def _same_side(
