@@ -64,7 +64,7 @@ OWNERS = {
     "threadpoolctl": {"threads"},
     "torch": {"arrays", "fields", "models", "training", "fitting", "experiments"},
     "trimesh": {"shapes", "fitting", "experiments"},
-    "typer": {"cli"},
+    "typer": {"cli", "experiments"},
     "xatlas": {"transfer"},
 }
 DISTRIBUTIONS = {

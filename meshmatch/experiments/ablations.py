@@ -1,199 +1,279 @@
-"""The paper's ablations: ``python -m meshmatch.experiments.ablations --output FOLDER --minutes 2``.
+"""The paper's ablations.
 
 Tables 4 (representations and constraints: errors and cost), 5 (regularisers), 6 (nodes and radius, kernel), 7 (how nodes
 are chosen); figures 6 (refinement), 8 (template pose), 9 (training shapes), 10 (supervised points). All are views of one
-set of cells. Each cell is trained once, from the beginning, and measured on shapes that it has not seen and on pairs of
-the benchmark's sets. Representations and constraints, which cost differently, have the same minutes (of the processor;
-with a GPU on the clock); all other cells take as many steps as the base does in them.
+set of runs. Each run is trained once, from the beginning, and measured on shapes that it has not seen and on pairs of the
+benchmark's sets. Representations and constraints, which cost differently, have the same minutes (of the processor; with a
+GPU on the clock); all other runs take as many steps as the base does in them.
 
-What is measured lies in the output folder and is not measured again, so that a run that was stopped goes on with what is
-missing; ``--show`` measures nothing and shows what is there. The tables say the budget. Errors are in cm at 1.9 m2 of
-skin: *held out*, the mean distance of the template's points from where they belong, by the network alone; on a set, the
-geodesic error after the search over codes with the cell's own regularisers, on all ordered pairs of some shapes. The
-paper's numbers beside them are of long trainings on an A100 and of its own pairs.
+What is measured lies in the output folder and is not measured again, so that a stopped command goes on with what is
+missing; --show measures nothing and shows what is there. The tables say the budget. Errors are in cm at 1.9 m2 of skin:
+held out, the mean distance of the template's points from where they belong, by the network alone; on a set, the geodesic
+error after the search over codes with the run's own regularisers, on all ordered pairs of some shapes. The paper's numbers
+beside them are of long trainings on an A100 and of its own pairs.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from rich.console import Console
-from rich.table import Table
+from typer import Option
 
-from meshmatch.experiments.ablation_cells import Known
-from meshmatch.experiments.ablation_figures import draw_views
-from meshmatch.experiments.ablation_run import Run, by_time
-from meshmatch.experiments.ablation_tables import TABLES
-from meshmatch.experiments.cells import BASE, PRESETS
-from meshmatch.experiments.orderings import Claim, claims
-from meshmatch.experiments.protocols import CLOUD_SET
-from meshmatch.experiments.report import circumstances, status_of, wide_console
+from meshmatch.api.inputs import as_model
+from meshmatch.errors import OptionError, TemplateError
+from meshmatch.experiments import runner
+from meshmatch.experiments.ablation_errors import (
+    LINES,
+    METHODS,
+    Measure,
+    Subject,
+    chosen_names,
+    descend,
+    errors_of,
+    oriented,
+    subject,
+)
+from meshmatch.experiments.ablation_results import Claim, claims, draw_views, tables
+from meshmatch.experiments.ablation_setting import Preset, Setting
+from meshmatch.experiments.ablation_training import is_trained, memory, timed, train_run
+from meshmatch.experiments.ablation_views import (
+    BASE,
+    CODED,
+    VIEWS,
+    Known,
+    Run,
+    all_runs,
+    by_time,
+    methods_of,
+)
+from meshmatch.experiments.sets import ALL_SETS, CLOUD_SET, BenchSet, load_set
+from meshmatch.geometry.frames import Frame
+from meshmatch.models.registry import find_model
 from meshmatch.outputs import replace_on_success
 
-
-def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
-    """Measure what is missing, print tables and orderings, draw figures, and a JSON line; its record is returned too."""
-    here = Run(options, console)
-    if options.minutes and not options.show:
-        for cell in here.now():
-            here.measure_errors(cell, here.train(cell))
-    known = here.known()
-    words = budget(here, known)
-    out = wide_console()
-    shown = [view for view in here.views if view in TABLES]
-    tables = [table for view in shown for table in TABLES[view](known, here.sets, words)]
-    for table in tables:
-        out.print(table)
-    found = claims(known, here.sets)
-    told = [said(claim) for claim in found]
-    for sentence in [*told, f"Budget: {words}"]:
-        out.print(sentence, soft_wrap=True)
-    if options.markdown is not None:
-        with replace_on_success(options.markdown) as temporary:
-            temporary.write_text(as_markdown(tables, found), encoding="utf-8")
-    missing = [cell.name for cell in here.cells if cell not in known.trained]
-    if missing and options.minutes:
-        out.print(f"Not measured: {', '.join(missing)}", soft_wrap=True)
-    drawn = draw_views(known, here.views, here.sets, options.pictures or options.output)
-    for path in drawn:
-        console.print(f"wrote {path}", highlight=False)
-    record = {
-        "benchmark": "ablations",
-        **circumstances(options.threads, 1),
-        "setting": asdict(here.setting),
-        "measure": asdict(here.measure),
-        "minutes": options.minutes,
-        "cells": {cell.name: record for cell, record in known.trained.items()},
-        "errors": {
-            f"{cell.name} {name} {how}": r["mean_cm"] for (cell, name, how), r in known.errors.items()
-        },
-        "times": known.times,
-        "memory": known.memory,
-        "claims": [asdict(claim) for claim in found],
-        "figure6": known.descent,
-    }
-    print(json.dumps(record), flush=True)
-    return record
+BODIES = 5
+"""How many bodies figure 6 is measured on."""
 
 
-def as_markdown(tables: Sequence[Table], found: Sequence[Claim]) -> str:
-    """The tables, each under its title, and the claims as two more: lines for docs/results.md."""
-    grids = {
-        str(table.title): [[str(c.header), *map(str, c.cells)] for c in table.columns] for table in tables
-    }
-    places = list(dict.fromkeys(claim.where for claim in found if claim.where))
-    by_words: dict[str, dict[str, str]] = {}
+@dataclass(frozen=True)
+class Kept:
+    """The output folder and what is asked of it; each method measures what is not there yet."""
+
+    folder: Path
+    setting: Setting
+    measure: Measure
+    minutes: float
+    model: str
+    benches: Sequence[BenchSet]
+    cache: Path | None
+    show: bool
+
+    def asked(self, run: Run, **more: Any) -> dict[str, Any]:
+        """The choices that a run's file belongs to."""
+        return {"run": asdict(run), "setting": asdict(self.setting), **more}
+
+    def here(self) -> dict[str, Any]:
+        """The circumstances of a measurement."""
+        return runner.circumstances(self.setting.threads)
+
+    @cached_property
+    def reference(self) -> str:
+        """What tells the weights of the model that says the orientation from others."""
+        return find_model(self.model)[1].weights_sha256
+
+    def answer(
+        self, path: Path, asked: dict[str, Any], measured: Callable[[], dict[str, Any]]
+    ) -> dict[str, Any] | None:
+        """A kept result, measured if it must be and may be."""
+        return runner.recall(path, asked) if self.show else runner.once(path, asked, measured)
+
+    def train(self, run: Run) -> dict[str, Any] | None:
+        """How its training went; {"skipped": why} where nodes cannot be laid."""
+        budget: dict[str, Any] = {"minutes": self.minutes}
+        if not by_time(run):
+            base = self.train(BASE)
+            budget = {"steps": 0 if base is None else int(base["steps"])}
+
+        def measured() -> dict[str, Any]:
+            runner.tell(
+                f"training {run.name}: {', '.join(f'{value:g} {name}' for name, value in budget.items())}"
+            )
+            try:
+                found = train_run(run, self.setting, self.folder / run.name / "model", **budget)
+            except TemplateError as error:
+                found = {"skipped": error.message}
+            return {**self.here(), **found}
+
+        return self.answer(self.folder / run.name / "trained.json", self.asked(run, **budget), measured)
+
+    def _error(self, run: Run, where: str, how: str, trained: dict[str, Any]) -> tuple[Path, dict[str, Any]]:
+        asked = {"model": trained.get("model"), "measure": asdict(self.measure), "set": where, "method": how}
+        return self.folder / run.name / f"error-{where}-{how}.json", asked | {"reference": self.reference}
+
+    def errors(self, run: Run, trained: dict[str, Any]) -> dict[tuple[Run, str, str], dict[str, Any]]:
+        """Errors on every set after every refinement that belongs to the run.
+
+        Raises
+        ------
+        OptionError
+            Something is missing, and the model that it would be measured with.
+        """
+        found: dict[tuple[Run, str, str], dict[str, Any]] = {}
+        for bench in self.benches if "skipped" not in trained else ():
+            kept = {how: runner.recall(*self._error(run, bench.name, how, trained)) for how in METHODS}
+            missing = [how for how in methods_of(run) if kept[how] is None]
+            if missing and not self.show:
+                folder = self.folder / run.name
+                if not is_trained(folder / "model", trained):
+                    raise OptionError(f"{folder} has lost its model", "remove that folder to train it again")
+                runner.tell(f"measuring {run.name} on {bench.name}")
+                loaded = as_model(folder / "model")
+                new = errors_of(loaded, run, self.subjects(bench), self.model, missing, self.measure)
+                for how, record in new.items():
+                    kept[how] = runner.keep(
+                        *self._error(run, bench.name, how, trained), {**self.here(), **record}
+                    )
+            found |= {(run, bench.name, how): record for how, record in kept.items() if record is not None}
+        return found
+
+    @cached_property
+    def _subjects(self) -> dict[str, list[Subject]]:
+        return {}
+
+    def subjects(self, bench: BenchSet) -> list[Subject]:
+        """The shapes on which a set's errors are measured, in the orientation that the reference model finds."""
+        if bench.name not in self._subjects:
+            names = chosen_names(bench, self.measure)
+
+            def measured() -> dict[str, Any]:
+                runner.tell(f"orienting {len(names)} shapes of {bench.name}")
+                frames = {name: oriented(bench.seen(name), self.model, self.measure) for name in names}
+                return {"frames": {name: asdict(frame) for name, frame in frames.items()}}
+
+            asked = {"shapes": names, "seed": self.measure.seed, "reference": self.reference}
+            frames = runner.once(self.folder / f"frames-{bench.name}.json", asked, measured)["frames"]
+            self._subjects[bench.name] = [
+                subject(bench, name, Frame(**frames[name]), self.measure, self.cache) for name in names
+            ]
+        return self._subjects[bench.name]
+
+    def cost(self, rounds: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Times and memory of the iterations of table 4's runs."""
+        runs = VIEWS["table4"].runs
+
+        def taking_turns() -> dict[str, Any]:
+            runner.tell(f"timing {len(runs)} runs side by side")
+            return {**self.here(), "times": timed(self.setting, runs, rounds)}
+
+        asked = {"runs": [asdict(run) for run in runs], "setting": asdict(self.setting), "rounds": rounds}
+        times = self.answer(self.folder / "times.json", asked, taking_turns)
+        grown = {}
+        for run in runs:
+            path = self.folder / run.name / "memory.json"
+            found = self.answer(path, self.asked(run), partial(memory, self.setting, run))
+            if found is not None:
+                grown[run.name] = found
+        return {} if times is None else times["times"], grown
+
+    def descent(self, trained: dict[Run, dict[str, Any]]) -> dict[str, Any] | None:
+        """Figure 6, if its runs are there."""
+        if not {BASE, CODED} <= trained.keys():
+            return None
+        digests = [trained[run].get("model") for run in (BASE, CODED)]
+        asked: dict[str, Any] = {"models": digests, "measure": asdict(self.measure), "bodies": BODIES}
+        asked["steps"] = [counts for _, _, counts in LINES.values()]
+
+        def measured() -> dict[str, Any]:
+            runner.tell("measuring figure 6")
+            models = {run: as_model(self.folder / run.name / "model") for run in (BASE, CODED)}
+            return {**self.here(), "lines": descend(models, self.setting, self.measure, BODIES)}
+
+        return self.answer(self.folder / "figure6.json", asked, measured)
+
+    def known(self, runs: Sequence[Run], views: Sequence[str], rounds: int) -> Known:
+        """What is there, after measuring what is missing; no runs are trained in 0 minutes."""
+        trained: dict[Run, dict[str, Any]] = {}
+        errors: dict[tuple[Run, str, str], dict[str, Any]] = {}
+        for run in runs if self.minutes else ():
+            if (found := self.train(run)) is not None:
+                trained[run] = found
+                errors |= self.errors(run, found)
+        times, grown = self.cost(rounds) if "table4" in views and rounds else ({}, {})
+        return Known(trained, errors, times, grown, self.descent(trained) if "figure6" in views else None)
+
+    def budget(self, known: Known) -> str:
+        """What the numbers cost, in words."""
+        clocks = {record["clock"] for record in known.trained.values() if "clock" in record}
+        words = [f"{self.minutes:g} {'CPU ' if clocks == {'processor'} else ''}min of training a run"]
+        steps = known.trained.get(BASE, {}).get("steps")
+        if steps and not all(by_time(run) for run in known.trained):
+            words[0] += f" or the base's {steps} steps"
+        words += [f"preset {self.setting.preset}", f"{self.measure.code_steps} steps on the code"]
+        words += [f"the pairs of {self.measure.shapes} shapes of a set", f"{self.setting.threads} threads"]
+        return ", ".join(words)
+
+
+def claims_table(found: Sequence[Claim]) -> Any:
+    """Each claim in a row, its verdicts on the held-out shapes and each set (what is about costs: under "")."""
+    rows: dict[str, dict[str, str]] = {}
     for claim in found:
-        by_words.setdefault(claim.words, {})[claim.where] = _verdict(claim)
-    costs = {words: held[""] for words, held in by_words.items() if "" in held}
-    grids["What constraints cost"] = [["claim", *costs], ["here", *costs.values()]]
-    errors = {words: held for words, held in by_words.items() if "" not in held}
-    columns = [[place, *(held.get(place, "") for held in errors.values())] for place in places]
-    grids["Orderings of errors"] = [["claim", *errors], *columns]
-    lines = []
-    for title, grid in grids.items():
-        rows = [f"| {' | '.join(row)} |" for row in zip(*grid, strict=True)]
-        lines += [title, "", rows[0], "|---" * len(grid) + "|", *rows[1:], ""]
-    return "\n".join(lines)
+        rows.setdefault(claim.words, {"claim": claim.words})[claim.where or "costs"] = claim.verdict
+    columns = {"claim": "claim", **{(claim.where or "costs"): (claim.where or "costs") for claim in found}}
+    return runner.table("What the paper claims, here", list(rows.values()), columns)
 
 
-def said(claim: Claim) -> str:
-    """A line about a claim."""
-    where = f"{claim.where}: " if claim.where else ""
-    return f"{where}{claim.words}: {_verdict(claim)}"
-
-
-def _verdict(claim: Claim) -> str:
-    if claim.holds is None:
-        return "not measured"
-    numbers = ", ".join(f"{value:.2f}" for value in claim.numbers)
-    return f"{'holds' if claim.holds else 'DOES NOT HOLD'} ({numbers})"
-
-
-def budget(here: Run, known: Known) -> str:
-    """What the numbers cost, in words."""
-    clocks = {record["clock"] for record in known.trained.values() if "clock" in record}
-    clock = "CPU " if clocks == {"processor"} else ""
-    words = [f"{here.options.minutes:g} {clock}min of training a cell"]
-    steps = known.trained.get(BASE, {}).get("steps")
-    if steps and not all(by_time(cell) for cell in known.trained):
-        words[0] += f" or the base's {steps} steps"
-    words.append(f"preset {here.setting.preset}")
-    words += [
-        f"{here.measure.code_steps} steps on the code",
-        f"the pairs of {here.measure.shapes} shapes of a set",
-    ]
-    words.append(f"{here.setting.threads} thread" + "s" * (here.setting.threads > 1))
-    return ", ".join(words)
-
-
-def options_of(words: Sequence[str] | None) -> argparse.Namespace:
-    """What was asked for."""
-    parser = argparse.ArgumentParser("python -m meshmatch.experiments.ablations", description=__doc__)
-    add = parser.add_argument
-    add("--output", type=Path, required=True, metavar="FOLDER", help="of what is measured")
-    add("--tables", default="4,5,6,7", help="of %(default)s; may be empty")
-    add("--figures", default="6,8,9,10", help="of %(default)s; may be empty")
-    add(
-        "--minutes",
-        type=float,
-        default=2.0,
-        help="of training a cell; 0 trains none, table 4 then has its cost alone",
-    )
-    add("--seeds", type=int, default=1, help="trainings of each cell of the views that are repeated")
-    add(
-        "--repeated",
-        default="table4",
-        metavar="VIEWS",
-        help="which these are, such as table4,figure9: %(default)s; may be empty",
-    )
-    add(
-        "--cells",
-        default="",
-        metavar="NAMES",
-        help="measure these alone, and show what is there of the others",
-    )
-    add("--rounds", type=int, default=5, help="iterations of table 4's cells under the clock; 0 for none")
-    add("--sets", default=f"shrec19,{CLOUD_SET}", help="on which errors are measured; may be empty")
-    add(
-        "--shapes",
-        type=int,
-        default=6,
-        metavar="N",
-        help="of each set, whose pairs are measured: %(default)s",
-    )
-    add("--code-steps", type=int, default=100, help="of the search over codes: %(default)s")
-    add("--preset", default="small", choices=PRESETS, help="of the training: %(default)s")
-    add("--folder", metavar="FOLDER", help="prepared shapes to learn from, in place of generated bodies")
-    add("--identities", type=int, default=1024, help="of generated bodies: %(default)s")
-    add("--batch", type=int, help="shapes in a batch, in place of the preset's")
-    add("--code", type=int, help="numbers in a code, in place of the preset's")
-    add("--width", type=int, help="of the network's layers, in place of the preset's")
-    add("--threads", type=int, default=1)
-    add("--model", default="human", help="which says the orientation of a set's shapes: %(default)s")
-    add("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
-    add("--cache", type=Path, help="folder of kept geodesic distances")
-    add("--markdown", type=Path, metavar="FILE", help="the tables and orderings again, for docs/results.md")
-    add("--pictures", type=Path, metavar="FOLDER", help="of the figures; by default the output folder")
-    add("--show", action="store_true", help="measure nothing, show what is there")
-    options = parser.parse_args(words)
-    if min(options.minutes, options.rounds) < 0 or min(options.seeds, options.threads) < 1:
-        parser.error("minutes and rounds of 0 or more and seeds and threads of 1 or more are needed")
-    if options.code_steps < 1 or options.shapes < 2:
-        parser.error("at least one step on the code and two shapes are needed")
-    return options
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the benchmark; 0 when it ran, 1 when the data or the choice stopped it."""
-    options = options_of(words)
-    return status_of(lambda: run(options, Console(stderr=True)))
+@runner.command
+def main(
+    output: Annotated[Path, Option(help="folder of what is measured")],
+    views: Annotated[str, Option(help=f"of {', '.join(VIEWS)}")] = ",".join(VIEWS),
+    minutes: Annotated[float, Option(min=0, help="of training a run; 0: table 4's cost alone")] = 2.0,
+    seeds: Annotated[int, Option(min=1, help="trainings of each run of the views that are repeated")] = 1,
+    repeated: Annotated[str, Option(help="which views these are; may be empty")] = "table4",
+    rounds: Annotated[int, Option(min=0, help="iterations of table 4's runs under the clock")] = 5,
+    sets: Annotated[str, Option(help="on which errors are measured; may be empty")] = f"shrec19,{CLOUD_SET}",
+    shapes: Annotated[int, Option(min=2, help="of each set, whose pairs are measured")] = 6,
+    code_steps: Annotated[int, Option(min=1, help="of the search over codes")] = 100,
+    preset: Annotated[Preset, Option(help="of the training")] = "small",
+    folder: Annotated[str | None, Option(help="prepared shapes to learn from, not generated bodies")] = None,
+    identities: Annotated[int, Option(min=1, help="of generated bodies")] = 1024,
+    threads: runner.Threads = 1,
+    model: runner.Model = "human",
+    data: runner.Data = runner.DATA,
+    cache: runner.Cache = None,
+    markdown: Annotated[Path | None, Option(help="write the tables again, for docs/results.md")] = None,
+    pictures: Annotated[Path | None, Option(help="folder of the figures; by default the output")] = None,
+    show: Annotated[bool, Option("--show", help="measure nothing, show what is there")] = False,
+) -> runner.Report:
+    names = [name for name in VIEWS if name in runner.names_of(views, VIEWS, "view")]
+    runs = all_runs(names, seeds, runner.names_of(repeated, VIEWS, "view"))
+    benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
+    setting = Setting(preset, folder, identities, threads)
+    measure = Measure(shapes=shapes, code_steps=code_steps)
+    kept = Kept(output, setting, measure, minutes, model, benches, cache, show)
+    known = kept.known(runs, names, rounds)
+    budget, where = kept.budget(known), [bench.name for bench in benches]
+    found = claims(known, where)
+    drawn = [*tables(known, names, where, budget), claims_table(found)]
+    if markdown is not None:
+        with replace_on_success(markdown) as temporary:
+            temporary.write_text("\n".join(runner.as_markdown(each) for each in drawn), encoding="utf-8")
+    notes = [f"Budget: {budget}"]
+    if minutes and (missing := [run.name for run in runs if run not in known.trained]):
+        notes.append(f"Not measured: {', '.join(missing)}")
+    notes += [f"wrote {path}" for path in draw_views(known, names, where, pictures or output)]
+    record = {
+        **{"setting": asdict(setting), "measure": asdict(measure)},
+        "runs": {run.name: each for run, each in known.trained.items()},
+        "errors": {f"{run.name} {name} {how}": r["mean_cm"] for (run, name, how), r in known.errors.items()},
+        **{"times": known.times, "memory": known.memory, "figure6": known.descent},
+        "claims": [asdict(claim) for claim in found],
+    }
+    return runner.Report(record, drawn, notes)
 
 
 if __name__ == "__main__":

@@ -1,34 +1,34 @@
-"""The development benchmark, whole: ``python -m meshmatch.experiments.bench --data ../shared/bench``.
+"""The development benchmark, whole: every shape fitted once, every pair mapped and measured.
 
-Fits every shape once, builds the map of every pair from two fits, measures every pair and prints a table and,
-last, one JSON line. ``--limit-pairs`` measures a stated part and says so. A pair that cannot be matched is
-not left out: it counts as the map that sends every vertex to vertex 0.
+A pair that cannot be matched is not left out: it counts as the map that sends every vertex to vertex 0. --limit-pairs
+measures a stated part and says so.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import multiprocessing
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
-from rich.console import Console
+from rich.table import Table
+from typer import Option
 
+from meshmatch.api.matching import Matcher
+from meshmatch.arrays import Int, Ints
 from meshmatch.errors import MeshmatchError
-from meshmatch.experiments.distances import default_folder
-from meshmatch.experiments.protocols import CLOUD_SET, SET_NAMES, BenchSet, Pair, load_set
-from meshmatch.experiments.report import circumstances, print_table, status_of
+from meshmatch.experiments import runner
 from meshmatch.experiments.scores import SetScores, evaluate_set
-from meshmatch.fitting.choices import Refine
+from meshmatch.experiments.sets import ALL_SETS, SET_NAMES, BenchSet, Pair, load_set
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig, Partial, Refine
+from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.maps.vertex_map import VertexMap
@@ -37,11 +37,11 @@ from meshmatch.render.charts import draw_curves
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import set_threads
 
+Maps = Mapping[Pair, Int[Ints, " V_src"]]
 
-class Matcher(Protocol):
-    """What is measured: something that fits one shape, and makes a map of two fits. It must survive a
-    pickle.
-    """
+
+class Method(Protocol):
+    """What is measured: something that fits one shape, and makes a map of two fits. It must survive a pickle."""
 
     def fit(self, shape: Shape) -> Any:
         """Whatever is worth knowing about one shape."""
@@ -51,25 +51,26 @@ class Matcher(Protocol):
 
 
 @dataclass(frozen=True)
-class PipelineMatcher:
-    """This project's own pipeline with its options."""
+class OurMethod:
+    """This project with its options."""
 
     model: str = "human"
     refine: Refine = "nodes"
     seed: int = 0
+    partial: Partial = "auto"
+    threads: int = 1
 
-    def fit(self, shape: Shape) -> Any:
-        """Move the model's template onto the shape."""
-        from meshmatch.pipeline import fit_shape
+    def _matcher(self) -> Matcher:
+        config = FitConfig(refine=self.refine, seed=self.seed, partial=self.partial)
+        return Matcher(self.model, config, self.threads)
 
-        return fit_shape(shape, model=self.model, refine=self.refine, seed=self.seed)
+    def fit(self, shape: Shape) -> Fit:
+        """Fit the model's template to the shape."""
+        return self._matcher().fit(shape)
 
-    def map(self, source: Shape, source_fit: Any, target: Shape, target_fit: Any) -> VertexMap:
+    def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:
         """Build the map from two fits."""
-        from meshmatch.pipeline import map_between
-
-        agreeing = self.model if self.refine == "nodes" else None
-        return map_between(source, source_fit, target, target_fit, model=agreeing)
+        return self._matcher().map(source_fit, target_fit, agree=self.refine == "nodes")
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class _Work:
     """What a worker needs: it is sent once, not with every task."""
 
     bench: BenchSet
-    matcher: Matcher
+    method: Method
     threads: int
     fits: dict[str, Any]
 
@@ -101,13 +102,13 @@ def _fit_one(name: str) -> tuple[str, Any, float]:
     shape = _seen(_work.bench, name)
     started = time.perf_counter()
     try:
-        fit = _work.matcher.fit(shape)
+        fit = _work.method.fit(shape)
     except MeshmatchError as error:
         fit = error
     return name, fit, time.perf_counter() - started
 
 
-def _map_one(pair: Pair) -> tuple[Pair, NDArray[np.int64] | MeshmatchError, float]:
+def _map_one(pair: Pair) -> tuple[Pair, Ints | MeshmatchError, float]:
     assert _work is not None
     fits = [_work.fits[name] for name in pair]
     for fit in fits:
@@ -116,7 +117,7 @@ def _map_one(pair: Pair) -> tuple[Pair, NDArray[np.int64] | MeshmatchError, floa
     source, target = (_seen(_work.bench, name) for name in pair)
     started = time.perf_counter()
     try:
-        index = _work.matcher.map(source, fits[0], target, fits[1]).index
+        index = _work.method.map(source, fits[0], target, fits[1]).index
     except MeshmatchError as error:
         return pair, error, time.perf_counter() - started
     return pair, index, time.perf_counter() - started
@@ -163,62 +164,50 @@ def _judgement(fit: Any) -> Any:
     return [getattr(fit, "verdict", None), None if residual is None else round(float(residual), 5)]
 
 
-def chosen_pairs(bench: BenchSet, limit: int | None) -> list[Pair]:
-    """All pairs, or `limit` of them spread evenly over the list, always the same ones."""
-    if limit is None or limit >= len(bench.pairs):
-        return list(bench.pairs)
-    return [bench.pairs[k] for k in np.linspace(0, len(bench.pairs) - 1, max(1, limit)).round().astype(int)]
-
-
 def run_set(
     bench: BenchSet,
-    matcher: Matcher,
-    *,
+    method: Method,
     pairs: Sequence[Pair],
-    cache: Path,
+    *,
+    cache: Path | None = None,
     jobs: int = 1,
     threads: int = 1,
     save: Path | None = None,
-    console: Console | None = None,
 ) -> SetRun:
-    """Fit every shape of `pairs` once, map every pair, measure all of them."""
-    console = console or Console(stderr=True, quiet=True)
+    """Fit every shape of ``pairs`` once, map every pair, measure all of them."""
     names = sorted({name for pair in pairs for name in pair}, key=bench.shapes.index)
     fits: dict[str, Any] = {}
     fit_seconds: dict[str, float] = {}
-    with console.status(f"{bench.name}: fitting") as status:
-        for name, fit, seconds in _each(_fit_one, names, _Work(bench, matcher, threads, {}), jobs):
-            fits[name], fit_seconds[name] = fit, seconds
-            status.update(f"{bench.name}: fitted {len(fits)} of {len(names)} shapes")
-        maps: dict[Pair, NDArray[np.int64]] = {}
-        map_seconds: dict[Pair, float] = {}
-        failed: dict[Pair, str] = {}
-        for pair, index, seconds in _each(_map_one, pairs, _Work(bench, matcher, threads, fits), jobs):
-            if isinstance(index, MeshmatchError):
-                failed[pair] = index.message
-                maps[pair] = np.zeros(bench.shape(pair[0]).V, dtype=np.int64)
-            else:
-                maps[pair], map_seconds[pair] = index, seconds
-            status.update(f"{bench.name}: mapped {len(maps)} of {len(pairs)} pairs")
-        if save is not None:
-            save_maps(save, bench, maps)
-        status.update(f"{bench.name}: measuring {len(pairs)} pairs (the first time this takes minutes)")
-        scores = evaluate_set(bench, maps, cache=cache, pairs=pairs)
-    return SetRun(scores, fit_seconds, map_seconds, failed, fits)
+    work = _each(_fit_one, names, _Work(bench, method, threads, {}), jobs)
+    for name, fit, seconds in runner.track(work, f"{bench.name}: fitting", len(names)):
+        fits[name], fit_seconds[name] = fit, seconds
+    maps: dict[Pair, Ints] = {}
+    map_seconds: dict[Pair, float] = {}
+    failed: dict[Pair, str] = {}
+    work = _each(_map_one, pairs, _Work(bench, method, threads, fits), jobs)
+    for pair, index, seconds in runner.track(work, f"{bench.name}: mapping", len(pairs)):
+        if isinstance(index, MeshmatchError):
+            failed[pair] = index.message
+            maps[pair] = np.zeros(bench.shape(pair[0]).V, dtype=np.int64)
+        else:
+            maps[pair], map_seconds[pair] = index, seconds
+    if save is not None:
+        save_maps(save, bench, maps)
+    return SetRun(evaluate_set(bench, maps, pairs=pairs, cache=cache), fit_seconds, map_seconds, failed, fits)
 
 
 def _map_path(folder: Path, bench: BenchSet, pair: Pair) -> Path:
     return folder / bench.name / f"{pair[0]}-{pair[1]}.npy"
 
 
-def save_maps(folder: Path, bench: BenchSet, maps: dict[Pair, NDArray[np.int64]]) -> None:
+def save_maps(folder: Path, bench: BenchSet, maps: Maps) -> None:
     """Keep maps as ``folder/set/source-target.npy``, where `load_maps` finds them."""
     make_folder(folder / bench.name)
     for pair, index in maps.items():
         save_map(_map_path(folder, bench, pair), VertexMap(*pair, index))
 
 
-def load_maps(folder: Path, bench: BenchSet, pairs: Iterable[Pair]) -> dict[Pair, NDArray[np.int64]]:
+def load_maps(folder: Path, bench: BenchSet, pairs: Iterable[Pair]) -> dict[Pair, Ints]:
     """Maps that were made elsewhere, checked against their shapes."""
     shapes = {name: bench.shape(name) for name in sorted({name for pair in pairs for name in pair})}
     return {
@@ -227,71 +216,62 @@ def load_maps(folder: Path, bench: BenchSet, pairs: Iterable[Pair]) -> dict[Pair
     }
 
 
-def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser("python -m meshmatch.experiments.bench", description=__doc__)
-    parser.add_argument("--data", type=Path, default=Path("../shared/bench"), help="the benchmark's data")
-    parser.add_argument("--sets", default=",".join(SET_NAMES), help=f"some of %(default)s, {CLOUD_SET}")
-    parser.add_argument("--model", default="human")
-    parser.add_argument("--refine", default="nodes", choices=("none", "latent", "nodes"))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--limit-pairs", type=int, metavar="N", help="N pairs of each set, evenly spread")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--threads", type=int, default=1, help="threads in each process")
-    parser.add_argument("--cache", type=Path, help="folder of kept geodesic distances (10 GB for all sets)")
-    parser.add_argument("--maps", type=Path, metavar="DIR", help="measure DIR/set/source-target.npy instead")
-    parser.add_argument("--save-maps", type=Path, metavar="DIR", help="keep the maps there")
-    parser.add_argument("--curve", type=Path, metavar="FILE", help="draw the cumulative curves")
-    return parser.parse_args(words)
+def scores_table(sets: Sequence[SetScores]) -> Table:
+    """A row for each set, and one for each kind of pair in it."""
+    rows = []
+    for whole in sets:
+        for scores in (whole, *whole.groups()):
+            row = scores.as_dict()
+            part = "" if row["complete"] else f" of {scores.expected}"
+            name = f"  {scores.group}" if scores.group else scores.bench.name
+            rows.append(row | {"set": name, "pairs": f"{row['pairs']}{part}", "worst": row["worst"][0][2]})
+    columns = {"set": "set", "pairs": "pairs:>", "mean": "mean_cm:.2f", "median": "median_cm:.2f"}
+    columns |= {"median pair": "median_pair_cm:.2f", f"over {LOST_CM:g} cm": "share_over_15cm:.2%"}
+    columns |= {"flips": "flips:.1%", "worst pair": "worst:.2f"}
+    return runner.table(f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})", rows, columns)
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the benchmark; 0 when it ran, 1 when the data or the choice stopped it."""
-    options = _arguments(words)
-    console = Console(stderr=True)
-    return status_of(lambda: run(options, console))
+INCOMPLETE = "Not all pairs were measured: these means are not the benchmark's."
 
 
-def run(options: argparse.Namespace, console: Console) -> dict[str, Any]:
-    """Everything that `main` does, errors as exceptions; the record that the JSON line holds is returned
-    too.
-    """
-    set_threads(options.threads)
-    started = time.perf_counter()
-    cache = options.cache or default_folder()
-    benches = [load_set(name, options.data) for name in options.sets.split(",")]
-    matcher = PipelineMatcher(options.model, options.refine, options.seed)
+@runner.command
+def main(
+    data: runner.Data = runner.DATA,
+    sets: Annotated[str, Option(help=f"of {', '.join(ALL_SETS)}")] = ",".join(SET_NAMES),
+    model: runner.Model = "human",
+    refine: Refine = "nodes",
+    seed: runner.Seed = 0,
+    limit_pairs: runner.LimitPairs = None,
+    jobs: runner.Jobs = 1,
+    threads: runner.Threads = 1,
+    cache: runner.Cache = None,
+    maps: Annotated[Path | None, Option(help="measure DIR/set/source-target.npy instead")] = None,
+    save_maps: Annotated[Path | None, Option(help="keep the maps in this folder")] = None,
+    curve: Annotated[Path | None, Option(help="draw the cumulative curves into this file")] = None,
+) -> runner.Report:
+    benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
+    method = OurMethod(model, refine, seed, threads=threads)
     runs: list[SetRun] = []
     for bench in benches:
-        pairs = chosen_pairs(bench, options.limit_pairs)
-        if options.maps is not None:
-            maps = load_maps(options.maps, bench, pairs)
-            runs.append(SetRun(evaluate_set(bench, maps, cache=cache, pairs=pairs), {}, {}, {}, {}))
+        pairs = runner.spread(bench.pairs, limit_pairs)
+        if maps is not None:
+            given = evaluate_set(bench, load_maps(maps, bench, pairs), pairs=pairs, cache=cache)
+            runs.append(SetRun(given, {}, {}, {}, {}))
         else:
             runs.append(
-                run_set(
-                    bench,
-                    matcher,
-                    pairs=pairs,
-                    cache=cache,
-                    jobs=options.jobs,
-                    threads=options.threads,
-                    save=options.save_maps,
-                    console=console,
-                )
+                run_set(bench, method, pairs, cache=cache, jobs=jobs, threads=threads, save=save_maps)
             )
-    if options.curve is not None:
-        draw_curves({each.scores.bench.name: each.scores.joined for each in runs}, options.curve)
-    print_table([each.scores for each in runs])
-    record = {
-        "benchmark": "development half",
-        **circumstances(options.threads, options.jobs),
-        "geodesic": GEODESIC,
-        "maps": str(options.maps) if options.maps else vars(matcher),
-        "seconds": round(time.perf_counter() - started, 1),
-        "sets": {each.scores.bench.name: each.as_dict() for each in runs},
-    }
-    print(json.dumps(record), flush=True)
-    return record
+    scores = [each.scores for each in runs]
+    if curve is not None:
+        draw_curves({each.bench.name: each.joined for each in scores}, curve)
+    notes = []
+    for each in scores:
+        worst = ", ".join(f"{a} -> {b} {mean:.1f}" for (a, b), mean in list(each.means_cm.items())[:5])
+        notes.append(f"{each.bench.name}, worst pairs (mean, cm): {worst}")
+    if any(len(each.errors) < each.expected for each in scores):
+        notes.append(INCOMPLETE)
+    record = {"geodesic": GEODESIC, "sets": {each.scores.bench.name: each.as_dict() for each in runs}}
+    return runner.Report(record, [scores_table(scores)], notes)
 
 
 if __name__ == "__main__":

@@ -1,79 +1,137 @@
-"""Ten hearts: ``python -m meshmatch.experiments.hearts``.
+"""Ten hearts.
 
 The four-chamber hearts of the benchmark were decimated independently. Models are trained on them as anybody would train
-one on a folder (`meshmatch prepare`, `meshmatch train`), and then all ordered pairs are matched. Where two hearts kept
-a vertex of the same original mesh the truth is known exactly; only these vertices count, about a fifth of each. The
-error is the Euclidean distance on the target between the matched and the true vertex (walls are thin, and the surface's
-own distance between two points of a wall may be long), in units of sqrt(area), times 100; beside it the share of points
-in the right chamber.
+one on a folder (`meshmatch prepare`, `meshmatch train`), and then all ordered pairs are matched. Where two hearts kept a
+vertex of the same original mesh the truth is known exactly; only these vertices count, about a fifth of each. The error
+is the Euclidean distance on the target between the matched and the true vertex (walls are thin, and the surface's own
+distance between two points of a wall may be long), in units of sqrt(area), times 100; beside it the share of points in
+the right chamber.
 
-``registered``: six hearts get the vertices and triangles of one of them, through the vertices that the truth knows, and
-are learned as registered meshes. The other four (``--unseen``), the last by name, are seen by no training; pairs of
-these alone have a column of their own. Here training has seen the truth of six. ``--measure unseen`` fits and matches
-these four alone, which is quicker.
-
-``unregistered``: all ten as they are, without correspondence. Trained and measured on the same ten: a registration of a
-collection, not a test of what a model knows of hearts it never saw. It has seen no truth.
-
-``meshmonk``: a rival's way (Apache-2.0, `pip install meshmonk`): its viscoelastic registration of the same template,
-from the same alignment, with its defaults. Beside them all: rigid alignment and the nearest vertex.
+- registered: six hearts get the vertices and triangles of one of them, through the vertices that the truth knows, and
+  are learned as registered meshes. The other four (--unseen), the last by name, are seen by no training; pairs of these
+  alone have a column of their own. Here training has seen the truth of six. --measure unseen fits and matches these four
+  alone, which is quicker.
+- unregistered: all ten as they are, without correspondence. Trained and measured on the same ten: a registration of a
+  collection, not a test of what a model knows of hearts it never saw. It has seen no truth.
+- meshmonk: a baseline (Apache-2.0, pip install meshmonk): its viscoelastic registration of the same template, from the
+  same alignment, with its defaults. Beside them all: rigid alignment and the nearest vertex.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from rich.console import Console
+from scipy.interpolate import RBFInterpolator
+from scipy.spatial import cKDTree
+from typer import Option
 
-from meshmatch.errors import OptionError
-from meshmatch.experiments.adapters import viscoelastic
-from meshmatch.experiments.category import (
-    Pair,
-    Tell,
-    Training,
-    fit_all,
-    load_category,
-    map_all,
-    nearest_all,
-    options_of_training,
-    trained,
-    training_of,
-)
-from meshmatch.experiments.heart_truth import chamber_picture, heart_errors, save_registered, through
-from meshmatch.experiments.report import columns, publish, status_of
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.api.inputs import validated
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.experiments import category, runner
+from meshmatch.experiments.baseline_methods import viscoelastic
+from meshmatch.experiments.category import Maps, Shapes
+from meshmatch.experiments.sets import Pair, load_folder
 from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.triangles import vertex_normals
+from meshmatch.maps.surface import Surface
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import make_folder
-from meshmatch.pipeline import usable
+from meshmatch.render.picture import Look
+from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.template import Template
 from meshmatch.templates.unregistered import medoid
-from meshmatch.threads import set_threads
 
 TRUTH = ".truth.npy"
 WAYS = ("meshmonk", "unregistered", "registered")
+_NEAR = 40  # known vertices that say where another one goes
+Truth = Mapping[str, Int[Ints, "V 2"]]
+"""For each shape and vertex: the vertex of the original mesh, and the chamber."""
 
 
-def meshmonk_maps(
-    template: Template, shapes: Mapping[str, Shape], frames: Mapping[str, Frame], kept: Path, tell: Tell
-) -> dict[Pair, np.ndarray]:
-    """Maps through meshmonk's registrations of the template, a minute each, kept as files."""
+def heart_errors(shapes: Shapes, truth: Truth, maps: Maps, unseen: Collection[str] = ()) -> dict[str, Any]:
+    """Errors at the vertices whose partner is known: over pairs, and the share of right chambers.
+
+    ``unseen_x100`` is the mean over pairs of ``unseen`` shapes alone, None without such pairs; ``across_x100`` the part
+    of the errors along the target's normals: the rest is sliding along the surface.
+    """
+    means, chambers, across = {}, [], []
+    for (source, target), found in maps.items():
+        _, ours, theirs = np.intersect1d(truth[source][:, 0], truth[target][:, 0], return_indices=True)
+        got, shape = found.index[ours], shapes[target]
+        off = 100 * (shape.verts[got] - shape.verts[theirs]) / np.sqrt(shape.area)
+        means[source, target] = float(np.linalg.norm(off, axis=1).mean())
+        across.append(float(np.abs((off * shape.vertex_normals[theirs]).sum(1)).mean()))
+        chambers.append(float((truth[target][got, 1] == truth[source][ours, 1]).mean()))
+    worst = max(means, key=lambda pair: means[pair])
+    strange = [mean for pair, mean in means.items() if set(pair) <= set(unseen)]
+    return {
+        **{"pairs": len(means), "mean_x100": round(float(np.mean(list(means.values()))), 4)},
+        **{"worst_pair_x100": round(means[worst], 4), "worst_pair": list(worst)},
+        "across_x100": round(float(np.mean(across)), 4),
+        "right_chamber": round(float(np.mean(chambers)), 4),
+        "unseen_pairs": len(strange),
+        "unseen_x100": round(float(np.mean(strange)), 4) if strange else None,
+    }
+
+
+def registered(
+    template: Shape, ids: Int[Ints, " V"], target: Shape, target_ids: Int[Ints, " V_tgt"]
+) -> Float[Floats, "V 3"]:
+    """Where the vertices of one heart lie on another, by the vertices of the original mesh (ids) that both kept.
+
+    Between these the displacement is a thin plate spline's, and then the nearest place of the target's surface that
+    faces the same way is taken.
+    """
+    _, ours, theirs = np.intersect1d(ids, target_ids, return_indices=True)
+    small, large = float(np.sqrt(template.area)), float(np.sqrt(target.area))
+    verts, there = template.verts / small, target.verts / large
+    spline = RBFInterpolator(verts[ours], there[theirs] - verts[ours], neighbors=min(_NEAR, len(ours)))
+    moved = verts + spline(verts)
+    surface = Surface(there, target.faces, vertex_normals(there, target.faces))
+    foot = surface.query(moved, vertex_normals(moved, template.faces))
+    return np.asarray(large * foot.values(target.faces, there))
+
+
+def save_registered(folder: Path, shapes: Shapes, truth: Truth, template: str, names: Sequence[str]) -> None:
+    """Some hearts as meshes with the vertices and triangles of one of them, a file for each."""
+    make_folder(folder)
+    first, ids = shapes[template], truth[template][:, 0]
+    for name in names:
+        verts = first.verts if name == template else registered(first, ids, shapes[name], truth[name][:, 0])
+        save_shape(folder / f"{name}.ply", Shape(verts, first.faces, name))
+
+
+def through(places: Mapping[str, Float[Floats, "V 3"]], shapes: Shapes) -> dict[Pair, VertexMap]:
+    """Maps through registered vertices: nearest of the source's, the same one on the target, nearest target vertex."""
+    to = {name: cKDTree(places[name]).query(shape.verts)[1] for name, shape in shapes.items()}
+    back = {name: cKDTree(shape.verts).query(places[name])[1] for name, shape in shapes.items()}
+    return {
+        (a, b): VertexMap.between(shapes[a], shapes[b], back[b][to[a]])
+        for a, b in category.ordered_pairs(shapes)
+    }
+
+
+def meshmonk_places(
+    template: Template, shapes: Shapes, frames: Mapping[str, Frame], kept: Path
+) -> dict[str, Float[Floats, "V 3"]]:
+    """Where meshmonk registers the template's vertices on each shape, a minute each, kept as files."""
     ours = template.shape
     make_folder(kept)
     places = {}
     for name, shape in shapes.items():
-        tell(f"meshmonk: {name}")
         file = kept / f"{name}-{template.hash}.npy"
         if not file.is_file():
+            runner.tell(f"meshmonk: {name}")
             turned = shape.vertex_normals @ frames[name].rotation.T
             found = viscoelastic(
                 (ours.verts, ours.vertex_normals, ours.faces),
@@ -81,130 +139,86 @@ def meshmonk_maps(
             )
             np.save(file, frames[name].undo(found))
         places[name] = np.load(file, allow_pickle=False)
-    return through(places, shapes)
+    return places
 
 
-def prepared_frames(prepared: Path) -> dict[str, Frame]:
-    """The way from each file of a prepared folder to its template's frame."""
-    words = json.loads((prepared / "prepared.json").read_text(encoding="utf-8"))
-    return {
+def by_meshmonk(
+    folder: Path, training: category.Training, nodes: NodeConfig, template: str, shapes: Shapes
+) -> Maps:
+    """Maps through meshmonk's registrations of the template, prepared as for a training."""
+    made = prepare(folder, training.work, PrepareConfig(nodes, template=template, align="near"))
+    words = json.loads((training.work / "prepared.json").read_text(encoding="utf-8"))
+    frames = {
         Path(name).stem: Frame(each["scale"], np.array(each["rotation"]), np.array(each["center"]))
         for name, each in zip(words["names"], words["frames"], strict=True)
     }
+    return through(meshmonk_places(made.template, shapes, frames, training.work / "fits"), shapes)
 
 
-def run(
-    ways: Sequence[str],
-    training: Training,
-    *,
-    data: Path,
-    unseen: int,
-    stiffness: float,
-    measure: str,
-    picture: Path | None,
-) -> dict[str, Any]:
-    """Train, match, measure, print a table and a JSON line; the line's record is returned too."""
-    if strangers := [way for way in ways if way not in WAYS]:
-        raise OptionError(f"there is no way {strangers[0]!r}", f"choose from {', '.join(WAYS)}")
-    set_threads(training.threads)
-    shapes, truth = load_category(data / "heart", TRUTH)
-    console = Console(stderr=True)
-    results: dict[str, dict[str, Any]] = {}
-    trainings: dict[str, Any] = {}
-    maps: dict[Pair, np.ndarray] = {}
-    with console.status("hearts") as status:
-
-        def tell(what: str) -> None:
-            status.update(what)
-
-        clean = [usable(shape) for shape in shapes.values()]
-        template = list(shapes)[medoid(clean, "near", "area", training.seed)]
-        others = [name for name in shapes if name != template]
-        strange = others[len(others) - unseen :]
-        measured = {name: shapes[name] for name in (strange if measure == "unseen" else shapes)}
-        nearest = {pair: index for pair, (index, _) in nearest_all(measured, "near", "area", tell).items()}
-        results["rigid alignment, nearest vertex"] = heart_errors(shapes, truth, nearest, strange)
-        for way in ways:
+@runner.command
+def main(
+    data: runner.Data = runner.DATA,
+    ways: Annotated[str, Option(help=f"of {', '.join(WAYS)}")] = ",".join(WAYS),
+    unseen: Annotated[int, Option(min=0, help="hearts kept from `registered`")] = 4,
+    measure: Annotated[Literal["all", "unseen"], Option(help="which hearts are fitted")] = "all",
+    stiffness: Annotated[float, Option(min=1e-9, help="as in meshmatch train")] = 0.05,
+    picture: Annotated[Path | None, Option(help="draw one heart's chambers on the others")] = None,
+    minutes: category.Minutes = 25,
+    steps: category.Steps = 3000,
+    nodes: category.Nodes = 600,
+    radius: category.Radius = 0.1,
+    work: category.Work = None,
+    threads: runner.Threads = 2,
+    seed: runner.Seed = 0,
+) -> runner.Report:
+    asked = runner.names_of(ways, WAYS, "way")
+    folder = data / "heart"
+    shapes, truth = load_folder(folder, TRUTH)
+    template = list(shapes)[medoid([validated(shape) for shape in shapes.values()], "near", "area", seed)]
+    others = [name for name in shapes if name != template]
+    strange = others[len(others) - unseen :]
+    measured = {name: shapes[name] for name in (strange if measure == "unseen" else shapes)}
+    pairs = category.ordered_pairs(measured)
+    errors = partial(heart_errors, shapes, truth, unseen=strange)
+    # walls that touch move together; less than the radius that suits a body
+    config = NodeConfig("uniform", nodes, radius, 0.01, seed=seed)
+    rows = [{"method": category.RIGID, **errors(category.nearest_maps(measured, "near", "area", pairs))}]
+    went, notes = {}, []
+    maps: Maps = {}
+    how = {"minutes": minutes, "steps": steps, "threads": threads, "seed": seed}
+    with category.training_in(work, nodes=nodes, radius=radius, **how) as training:
+        for way in asked:
+            here = training.inside(way)
             if way == "meshmonk":
                 if find_spec("meshmonk") is None:
-                    console.print("meshmonk is not installed: its row is left out")
+                    notes.append("meshmonk is not installed: its row is left out")
                     continue
-                nodes = NodeConfig("uniform", training.nodes, training.radius, 0.01, seed=training.seed)
-                place = training.work / "meshmonk"
-                made = prepare(data / "heart", place, PrepareConfig(nodes, template=template, align="near"))
-                maps = meshmonk_maps(made.template, measured, prepared_frames(place), place / "fits", tell)
-                results["meshmonk"] = heart_errors(shapes, truth, maps, strange)
+                maps = by_meshmonk(folder, here, config, template, measured)
+                rows.append({"method": way, **errors(maps)})
                 continue
-            folder, here = data / "heart", training.inside(way)
+            source = folder
             if way == "registered":
-                folder = here.work / "shapes"
-                seen = [name for name in shapes if name not in strange]
-                save_registered(folder, shapes, truth, template, seen)
-            # walls that touch move together; less than the radius that suits a body
-            model, how = trained(
-                folder,
-                here,
-                how="near",
-                scale="area",
-                tell=tell,
-                depth=0.01,
-                template=template,
-                stiffness=stiffness,
+                source = here.work / "shapes"
+                save_registered(source, shapes, truth, template, [n for n in shapes if n not in strange])
+            model, went[way] = category.trained(
+                source, here, config, how="near", scale="area", template=template, stiffness=stiffness
             )
-            trainings[way] = how
-            for refine in ("none", "nodes"):
-                began = time.monotonic()
-                config = FitConfig(seed=training.seed, refine=refine, partial="no")
-                fits = fit_all(model, measured, config, tell)
-                found = map_all(model, measured, fits, config, tell)
-                maps = {pair: each.index for pair, each in found.items()}
-                label = f"{way}, {'network alone' if refine == 'none' else 'nodes refined'}"
-                results[label] = heart_errors(shapes, truth, maps, strange)
-                results[label]["seconds"] = round(time.monotonic() - began, 1)
-                results[label]["verdicts"] = sorted(fit.verdict for fit in fits.values())
-    numbers = ["pairs", "mean", "worst pair", "right chamber", f"pairs of {len(strange)} unseen"]
-    table = columns("Hearts: Euclidean error x 100 / sqrt(area)", ["method"], numbers)
-    for label, each in results.items():
-        alone = "-" if each["unseen_x100"] is None else f"{each['unseen_x100']:.2f}"
-        shares = f"{each['worst_pair_x100']:.2f}", f"{100 * each['right_chamber']:.1f} %", alone
-        table.add_row(label, str(each["pairs"]), f"{each['mean_x100']:.2f}", *shares)
+            found, maps = category.compared(
+                model, measured, category.network_and_nodes(seed, f"{way}, "), pairs, errors
+            )
+            rows += found
+    columns = {"method": "method", "pairs": "pairs:d", "mean": "mean_x100:.2f"}
+    columns |= {"worst pair": "worst_pair_x100:.2f", "right chamber": "right_chamber:.1%"}
+    columns |= {f"pairs of {len(strange)} unseen": "unseen_x100:.2f"}
     if picture is not None and maps:
-        chamber_picture(measured, truth, maps, next(iter(measured)), picture)
-        console.print(f"wrote {picture}")
-    record = {
-        "seed": training.seed,
-        "template": template,
-        "unseen": strange,
-        "stiffness": stiffness,
-        "training": trainings,
-        "results": results,
-    }
-    return publish("hearts", table, record, threads=training.threads)
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the benchmark; 0 when it ran, 1 when the data or the choice stopped it."""
-    parser = options_of_training("hearts", __doc__, minutes=25, steps=3000, nodes=600, radius=0.1)
-    parser.add_argument("--ways", default=",".join(WAYS), help="%(default)s")
-    parser.add_argument("--unseen", type=int, default=4, help="hearts kept from `registered`; %(default)s")
-    parser.add_argument("--measure", choices=("all", "unseen"), default="all", help="%(default)s")
-    parser.add_argument("--stiffness", type=float, default=0.05, help="as in meshmatch train; %(default)s")
-    parser.add_argument("--picture", type=Path, help="draw one heart's chambers on the others")
-    options = parser.parse_args(words)
-    if options.unseen < (2 if options.measure == "unseen" else 0) or not options.stiffness > 0:
-        parser.error("unseen hearts of 0 or more (2 to measure them) and a stiffness above 0 are needed")
-    with training_of(parser, options) as training:
-        return status_of(
-            lambda: run(
-                options.ways.split(","),
-                training,
-                data=options.data,
-                unseen=options.unseen,
-                stiffness=options.stiffness,
-                measure=options.measure,
-                picture=options.picture,
-            )
-        )
+        first, *rest = measured
+        sure = {n: VertexMap.between(shapes[n], shapes[first], maps[n, first].index) for n in rest[:5]}
+        category.carried_picture(picture, Look(up="z", front="-y"), shapes, truth[first][:, 1], sure, first)
+        notes.append(f"wrote {picture}")
+    record = {"template": template, "unseen": strange, "training": went, "rows": rows}
+    return runner.Report(
+        record, [runner.table("Hearts: Euclidean error x 100 / sqrt(area)", rows, columns)], notes
+    )
 
 
 if __name__ == "__main__":

@@ -1,59 +1,48 @@
-"""Tables, planes and chairs without correspondence: ``python -m meshmatch.experiments.segments``.
+"""Tables, planes and chairs without correspondence.
 
-For each class a model is trained on its ten shapes without correspondence, every shape is fitted with 200 steps on
-the code (the paper's test-time weights), and all ordered pairs are matched. What is asked is what a label transfer
-needs: where a keypoint of one shape lies on another. The error is the distance between the matched and the true
-keypoint over the diagonal of the target's bounding box; a label arrives where that is below a tenth. Structure
-differs within a class (four legs, one leg, none), so no map can be right everywhere: whether the confidence knows is
-the area under its ROC curve, and its mean where the keypoint is right and where it is wrong.
+For each class a model is trained on its ten shapes without correspondence, every shape is fitted with 200 steps on the
+code (the paper's test-time weights), and all ordered pairs are matched. What is asked is what a label transfer needs:
+where a keypoint of one shape lies on another. The error is the distance between the matched and the true keypoint over
+the diagonal of the target's bounding box; a label arrives where that is below a tenth. Structure differs within a class
+(four legs, one leg, none), so no map can be right everywhere: whether the confidence knows is the area under its ROC
+curve, and its mean where the keypoint is right and where it is wrong.
 
-Files are turned every way. `--turns given` (the default) brings each shape to the axes of the first one with the turn
-of a cube that suits its keypoints best, so upright and facing the same way, as the benchmark's protocol gives it;
-`--turns searched` lets `meshmatch prepare --align rigid` find the orientation. The same shapes, in the same
-orientation, are matched by rigid alignment and the nearest vertex. Trained and measured on the same ten. A table looks
-the same from several sides, and keypoints begin at any leg and run round either way: so the ends of legs are measured
-once more, for every method, in the numbering that suits a pair best.
+Files are turned every way. --turns given (the default) brings each shape to the axes of the first one with the turn of a
+cube that suits its keypoints best, so upright and facing the same way, as the benchmark's protocol gives it; --turns
+searched lets `meshmatch prepare --align rigid` find the orientation. The same shapes, in the same orientation, are
+matched by rigid alignment and the nearest vertex. Trained and measured on the same ten. A table looks the same from
+several sides, and keypoints begin at any leg and run round either way: so the ends of legs are measured once more, for
+every method, in the numbering that suits a pair best.
+
 Parts are drawn from keypoints: a vertex belongs to the nearest one. Labels of the target, fetched along the map, are
-compared with the source's own: intersection over union (IoU), by area, the mean over parts and pairs. Of tables the
-legs are counted (three, four or eight): a leg can have no counterpart where the other table has another number of
-them, and the confidence of legs is compared between such pairs and the others.
+compared with the source's own: intersection over union (IoU), by area, the mean over parts and pairs. Of tables the legs
+are counted (three, four or eight): a leg can have no counterpart where the other table has another number of them, and
+the confidence of legs is compared between such pairs and the others.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from rich.console import Console
-from rich.status import Status
 from scipy.spatial.transform import Rotation
+from typer import Option
 
-from meshmatch.errors import OptionError
-from meshmatch.experiments.category import (
-    Pair,
-    Training,
-    area_under_curve,
-    fit_all,
-    load_category,
-    map_all,
-    nearest_all,
-    options_of_training,
-    trained,
-    training_of,
-)
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.experiments import category, runner
+from meshmatch.experiments.category import Maps, Shapes
 from meshmatch.experiments.keypoint_parts import (
-    carried_picture,
     keypoint_parts,
     leg_confidence,
     leg_errors,
     mean_overlap,
-    rounded,
     table_legs,
 )
-from meshmatch.experiments.report import columns, publish, status_of
+from meshmatch.experiments.scores import area_under_curve
+from meshmatch.experiments.sets import load_folder
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.outputs import make_folder
@@ -61,81 +50,74 @@ from meshmatch.render.picture import Look
 from meshmatch.shapes.align import Align
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.threads import set_threads
+from meshmatch.templates.nodes import NodeConfig
 
-CLASSES = ("table", "plane", "chair")
 KEYPOINTS = ".keypoints.npy"
 RIGHT = 0.1
 """Share of the target's diagonal within which a keypoint has arrived."""
-
-Turns = Literal["given", "searched"]
-
-_LOOKS = {
+CLASSES = {
     "table": Look(up="-z", front="-y", turn=25, tilt=-20),
     "plane": Look(up="z", front="-x", turn=-40, tilt=40),
     "chair": Look(up="y", front="-x", turn=35, tilt=15),
 }
+COLUMNS = {
+    **{"class": "class", "method": "method", "mean": "mean:.3f", "median": "median:.3f"},
+    **{f"within {RIGHT:g}": "arrived:.1%", "IoU": "iou:.2f", "AUC": "confidence_auc:.2f"},
+    **{"sure if right": "confidence_right:.2f", "if wrong": "confidence_wrong:.2f"},
+}
+LEGS = {
+    **{"legs": "legs_mean:.3f", "legs arrived": "legs_arrived:.0%", "AUC of legs": "legs_auc:.2f"},
+    **{"sure if as many": "legs_alike:.2f", "if not": "legs_unlike:.2f"},
+}
 
 
-def stood_alike(shapes: Mapping[str, Shape], keypoints: Mapping[str, np.ndarray]) -> dict[str, Shape]:
+def stood_alike(shapes: Shapes, keypoints: Mapping[str, Int[Ints, " N"]]) -> dict[str, Shape]:
     """Every shape by the turn of a cube that brings its keypoints nearest to those of the first shape."""
     turns = Rotation.create_group("O").as_matrix()
-    first, like = next(iter(shapes)), _unit(next(iter(shapes.values())), next(iter(keypoints.values())))
+    first = next(iter(shapes))
+    like = _unit(shapes[first], keypoints[first])
     stood = {first: shapes[first]}
-    for name, shape in shapes.items():
-        if name == first:
-            continue
+    for name, shape in list(shapes.items())[1:]:
         own = _unit(shape, keypoints[name])
         best = min(turns, key=lambda turn: float(np.square(own @ turn.T - like).sum()))
         stood[name] = Shape(shape.verts @ best.T, shape.faces, shape.name)
     return stood
 
 
-def _unit(shape: Shape, keypoints: np.ndarray) -> np.ndarray:
+def _unit(shape: Shape, keypoints: Int[Ints, " N"]) -> Float[Floats, "N 3"]:
     return (shape.verts[keypoints] - shape.bounds.mean(axis=0)) / shape.diagonal
 
 
-def keypoint_errors(
-    shapes: Mapping[str, Shape],
-    keypoints: Mapping[str, np.ndarray],
-    maps: Mapping[Pair, tuple[np.ndarray, np.ndarray]],
-) -> dict[str, Any]:
-    """Errors of (index, confidence) maps at the keypoints, and what their confidence tells."""
+def keypoint_errors(shapes: Shapes, keypoints: Mapping[str, Int[Ints, " N"]], maps: Maps) -> dict[str, Any]:
+    """Errors of maps at the keypoints, and what their confidence tells (None where there is nothing to tell apart)."""
     errors, sure, means, overlaps = [], [], {}, []
     parts = {name: keypoint_parts(shape, keypoints[name]) for name, shape in shapes.items()}
-    for (source, target), (index, confidence) in maps.items():
-        overlaps.append(mean_overlap(parts[target][index], parts[source], shapes[source].vertex_areas))
+    for (source, target), found in maps.items():
+        labels = parts[target][found.index]
+        overlaps.append(mean_overlap(labels, parts[source], shapes[source].vertex_areas))
         shape, at = shapes[target], keypoints[source]
-        apart = shape.verts[index[at]] - shape.verts[keypoints[target]]
-        found = np.linalg.norm(apart, axis=1) / shape.diagonal
-        errors.append(found)
-        sure.append(confidence[at])
-        means[source, target] = float(found.mean())
+        off = shape.verts[found.index[at]] - shape.verts[keypoints[target]]
+        errors.append(np.linalg.norm(off, axis=1) / shape.diagonal)
+        sure.append(found.confidence[at])
+        means[source, target] = float(errors[-1].mean())
     error, confidence = np.concatenate(errors), np.concatenate(sure).astype(float)
     right = error < RIGHT
     worst = max(means, key=lambda pair: means[pair])
     return {
-        "pairs": len(maps),
-        "mean": round(float(error.mean()), 4),
-        "median": round(float(np.median(error)), 4),
-        "arrived": round(float(right.mean()), 4),
-        "iou": round(float(np.mean(overlaps)), 4),
-        "worst_pair": [*worst, round(means[worst], 4)],
-        "confidence_auc": rounded(area_under_curve(confidence, right)),
-        "confidence_right": rounded(float(confidence[right].mean()) if right.any() else np.nan),
-        "confidence_wrong": rounded(float(confidence[~right].mean()) if (~right).any() else np.nan),
+        **{"pairs": len(maps), "mean": float(error.mean()), "median": float(np.median(error))},
+        **{"arrived": float(right.mean()), "iou": float(np.mean(overlaps))},
+        "worst_pair": [*worst, means[worst]],
+        "confidence_auc": area_under_curve(confidence, right) if 0 < right.mean() < 1 else None,
+        "confidence_right": float(confidence[right].mean()) if right.any() else None,
+        "confidence_wrong": float(confidence[~right].mean()) if (~right).any() else None,
     }
 
 
 def measure(
-    name: str, data: Path, training: Training, turns: Turns, pictures: Path | None, status: Status
-) -> dict[str, Any]:
+    name: str, data: Path, training: category.Training, turns: str, pictures: Path | None
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Train on one class, match all its pairs, and the same by rigid alignment; draw labels as they are carried."""
-
-    def tell(what: str) -> None:
-        status.update(f"{name}: {what}")
-
-    shapes, keypoints = load_category(data / name, KEYPOINTS)
+    shapes, keypoints = load_folder(data / name, KEYPOINTS)
     how: Align = "rigid"
     if turns == "given":
         shapes, how = stood_alike(shapes, keypoints), "none"
@@ -146,86 +128,59 @@ def measure(
     legs = {}
     if name == "table":
         legs = {key: table_legs(shape, keypoints[key]) for key, shape in shapes.items()}
-    answers = nearest_all(shapes, how, "sphere", tell)
-    rigid = keypoint_errors(shapes, keypoints, answers)
-    if legs:
-        rigid |= leg_errors(shapes, keypoints, answers, RIGHT)
-    results: dict[str, Any] = {"rigid alignment, nearest vertex": rigid}
-    model, went = trained(folder, training, how=how, scale="sphere", tell=tell)
-    for label, config in (
-        ("network alone", FitConfig(seed=training.seed, refine="none", partial="no")),
-        (
-            "200 steps on the code",
-            FitConfig(seed=training.seed, refine="latent", latent=LatentRefineConfig(steps=200)),
-        ),
-        ("nodes refined", FitConfig(seed=training.seed, partial="no")),
-    ):
-        fits = fit_all(model, shapes, config, tell)
-        maps = map_all(model, shapes, fits, config, tell)
-        answers = {pair: (found.index, found.confidence) for pair, found in maps.items()}
-        results[label] = keypoint_errors(shapes, keypoints, answers)
-        results[label]["verdicts"] = sorted(fit.verdict for fit in fits.values())
-        if legs:
-            results[label] |= leg_confidence(legs, answers) | leg_errors(shapes, keypoints, answers, RIGHT)
+
+    def errors(maps: Maps) -> dict[str, Any]:
+        found = keypoint_errors(shapes, keypoints, maps)
+        return found | (leg_errors(shapes, keypoints, maps, RIGHT) if legs else {})
+
+    def with_confidence(maps: Maps) -> dict[str, Any]:
+        return errors(maps) | (leg_confidence(legs, maps) if legs else {})
+
+    pairs = category.ordered_pairs(shapes)
+    rows = [{"method": category.RIGID, **errors(category.nearest_maps(shapes, how, "sphere", pairs))}]
+    config = NodeConfig("uniform", training.nodes, training.radius, 0.03, seed=training.seed)
+    model, went = category.trained(folder, training, config, how=how, scale="sphere")
+    latent = LatentRefineConfig(steps=200)
+    network, nodes = category.network_and_nodes(training.seed).items()
+    code = ("200 steps on the code", FitConfig(seed=training.seed, refine="latent", latent=latent))
+    found, maps = category.compared(model, shapes, dict([network, code, nodes]), pairs, with_confidence)
     if pictures is not None:
         first = Path(went["template"]).stem
+        others = [key for key in shapes if key != first]
+        picked = np.unique(np.linspace(0, len(others) - 1, min(5, len(others))).astype(int))
+        onto = {others[k]: maps[others[k], first] for k in picked}
         parts = keypoint_parts(shapes[first], keypoints[first])
-        carried_picture(shapes, parts, answers, first, pictures / f"segments-{name}.png", _LOOKS[name])
-    return {"training": went, "results": results}
+        category.carried_picture(pictures / f"segments-{name}.png", CLASSES[name], shapes, parts, onto, first)
+    return went, [{"class": name, **row} for row in rows + found]
 
 
-def run(
-    classes: Sequence[str], training: Training, *, data: Path, turns: Turns, pictures: Path | None
-) -> dict[str, Any]:
-    """Measure the classes, print a table and a JSON line; the line's record is returned too."""
-    if strangers := [name for name in classes if name not in CLASSES]:
-        raise OptionError(f"there is no class '{strangers[0]}'", f"choose from {', '.join(CLASSES)}")
-    set_threads(training.threads)
+@runner.command
+def main(
+    data: runner.Data = runner.DATA,
+    classes: Annotated[str, Option(help=f"of {', '.join(CLASSES)}")] = ",".join(CLASSES),
+    turns: Annotated[Literal["given", "searched"], Option(help="how shapes are turned")] = "given",
+    pictures: Annotated[Path | None, Option(help="draw labels as they are carried into this folder")] = None,
+    minutes: category.Minutes = 10,
+    steps: category.Steps = 2000,
+    nodes: category.Nodes = 320,
+    radius: category.Radius = 0.2,
+    work: category.Work = None,
+    threads: runner.Threads = 2,
+    seed: runner.Seed = 0,
+) -> runner.Report:
+    names = runner.names_of(classes, CLASSES, "class")
     if pictures is not None:
         make_folder(pictures)
-    numbers = ["mean", "median", f"within {RIGHT:g}", "IoU", "AUC", "sure if right", "if wrong"]
-    told = [*numbers, "legs", f"within {RIGHT:g}", "AUC of legs", "sure if as many", "if not"]
+    went, rows = {}, []
+    how = {"minutes": minutes, "steps": steps, "threads": threads, "seed": seed}
+    with category.training_in(work, nodes=nodes, radius=radius, **how) as training:
+        for name in names:
+            runner.tell(name)
+            went[name], found = measure(name, data, training.inside(name), turns, pictures)
+            rows += found
+    columns = COLUMNS | (LEGS if "table" in names else {})
     title = f"Keypoints, orientation {turns}: error / diagonal, all pairs"
-    table = columns(title, ["class", "method"], told if "table" in classes else numbers)
-    records = {}
-    for name in classes:
-        with Console(stderr=True).status(name) as status:
-            records[name] = measure(name, data, training.inside(name), turns, pictures, status)
-        for number, (label, each) in enumerate(records[name]["results"].items()):
-            sure = [each[f"confidence_{key}"] for key in ("auc", "right", "wrong")]
-            if "table" in classes:
-                sure += [each.get("legs_mean"), each.get("legs_arrived")]
-                sure += [each.get(f"legs_{key}") for key in ("auc", "alike", "unlike")]
-            table.add_row(
-                name if number == 0 else "",
-                label,
-                f"{each['mean']:.3f}",
-                f"{each['median']:.3f}",
-                f"{100 * each['arrived']:.1f} %",
-                f"{each['iou']:.2f}",
-                *("-" if value is None else f"{value:.2f}" for value in sure),
-            )
-    record = {"seed": training.seed, "turns": turns, "classes": records}
-    return publish("segments", table, record, threads=training.threads)
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the benchmark; 0 when it ran, 1 when the data or the choice stopped it."""
-    parser = options_of_training("segments", __doc__, minutes=10, steps=2000, nodes=320, radius=0.2)
-    parser.add_argument("--classes", default=",".join(CLASSES), help="%(default)s")
-    parser.add_argument("--turns", choices=("given", "searched"), default="given")
-    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw labels as they are carried")
-    options = parser.parse_args(words)
-    with training_of(parser, options) as training:
-        return status_of(
-            lambda: run(
-                options.classes.split(","),
-                training,
-                data=options.data,
-                turns=options.turns,
-                pictures=options.pictures,
-            )
-        )
+    return runner.Report({"training": went, "rows": rows}, [runner.table(title, rows, columns)])
 
 
 if __name__ == "__main__":

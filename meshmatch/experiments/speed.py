@@ -1,16 +1,14 @@
-"""Time and memory of whole processes: ``python -m meshmatch.experiments.speed``.
+"""Time and memory of whole processes.
 
-Each case is a command as a user types it, in a process of its own, from the interpreter's start to its end: nothing
-is warm but the disk's cache. Shown is the median of several runs after one that does not count: seconds on the
-clock, seconds of CPU (both cores together), and the largest memory that a run ever held. Bars are for two cores,
-and all processes are kept on two where the system allows that. The shapes are the two samples, split and decimated
-to the sizes that the cases ask for.
+Each case is a command as a user types it, in a process of its own, from the interpreter's start to its end: nothing is
+warm but the disk's cache. Shown is the median of several runs after one that does not count: seconds on the clock,
+seconds of CPU (both cores together), and the largest memory that a run ever held. Bars are for two cores, and all
+processes are kept on two where the system allows that. The shapes are the two samples, split and decimated to the sizes
+that the cases ask for.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import multiprocessing
 import os
 import statistics
@@ -21,12 +19,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
-from rich.table import Table
+from typer import Option
 
 from meshmatch.errors import MeshmatchError
-from meshmatch.experiments.report import circumstances, status_of, wide_console
+from meshmatch.experiments import runner
 from meshmatch.geometry.topology import edge_keys
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape, save_shape
@@ -146,58 +145,42 @@ def keep_to_cores(count: int) -> int:
     return len(os.sched_getaffinity(0))
 
 
-def _record(case: Case, costs: list[Cost]) -> dict[str, object]:
+def record_of(name: str, case: Case, costs: list[Cost]) -> dict[str, Any]:
+    """A case's row: medians, bars, whether they are met, every run."""
     middle = Cost(
         *(statistics.median(values) for values in zip(*(asdict(c).values() for c in costs), strict=True))
     )
-    met = middle.wall <= case.seconds and (not case.gigabytes or middle.gigabytes <= case.gigabytes)
     return {
-        **{name: round(value, 3) for name, value in asdict(middle).items()},
+        "case": name,
+        **{key: round(value, 3) for key, value in asdict(middle).items()},
         "bar_seconds": case.seconds,
         "bar_gigabytes": case.gigabytes or None,
-        "met": met,
+        "met": middle.wall <= case.seconds and (not case.gigabytes or middle.gigabytes <= case.gigabytes),
         "runs": [[round(value, 3) for value in asdict(cost).values()] for cost in costs],
     }
 
 
-def run(cases: Sequence[str], runs: int, cores: int) -> dict[str, object]:
-    """Measure cases by name; prints a table and a JSON line, whose record is returned too."""
+COLUMNS = {
+    **{"case": "case", "seconds": "wall:.2f", "bar, s": "bar_seconds:g", "CPU s": "cpu:.2f"},
+    **{"GB": "gigabytes:.2f", "bar, GB": "bar_gigabytes:g", "met": "met"},
+}
+
+
+@runner.command
+def main(
+    cases: Annotated[str, Option(help=f"of {', '.join(CASES)}")] = ",".join(CASES),
+    runs: Annotated[int, Option(min=1, help="counted runs of each case")] = 5,
+    cores: Annotated[int, Option(min=1, help="cores that all processes share")] = 2,
+) -> runner.Report:
+    names = runner.names_of(cases, CASES, "case")
     kept = keep_to_cores(cores)
-    table = Table(title=f"Whole processes on {kept} cores, median of {runs} runs", title_justify="left")
-    for name in ("case", "seconds", "bar", "CPU s", "GB", "bar", "met"):
-        table.add_column(name, justify="left" if name == "case" else "right")
-    records: dict[str, object] = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name in cases:
-            case = CASES[name]
-            record = records[name] = _record(case, measure(case, runs, Path(folder)))
-            bar = f"{case.gigabytes:g}" if case.gigabytes else ""
-            numbers = (
-                f"{record['wall']:.2f}",
-                f"{case.seconds:g}",
-                f"{record['cpu']:.2f}",
-                f"{record['gigabytes']:.2f}",
-            )
-            table.add_row(name, *numbers, bar, "yes" if record["met"] else "NO")
-    wide_console().print(table)
-    whole = {"benchmark": "speed", **circumstances(threads=kept, jobs=1), "cases": records}
-    print(json.dumps(whole), flush=True)
-    return whole
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the benchmark; 0 when it ran, whatever it measured."""
-    parser = argparse.ArgumentParser("python -m meshmatch.experiments.speed", description=__doc__)
-    parser.add_argument("--cases", default=",".join(CASES), help="some of %(default)s")
-    parser.add_argument("--runs", type=int, default=5, help="counted runs of each case")
-    parser.add_argument("--cores", type=int, default=2, help="cores that all processes share")
-    options = parser.parse_args(words)
-    cases = options.cases.split(",")
-    if unknown := sorted(set(cases) - set(CASES)):
-        parser.error(f"no case {unknown[0]!r}; there are {', '.join(CASES)}")
-    if options.runs < 1 or options.cores < 1:
-        parser.error("--runs and --cores begin at 1")
-    return status_of(lambda: run(cases, options.runs, options.cores))
+        rows = [
+            record_of(name, CASES[name], measure(CASES[name], runs, Path(folder)))
+            for name in runner.track(names, "running")
+        ]
+    title = f"Whole processes on {kept} cores, median of {runs} runs"
+    return runner.Report({"kept_to_cores": kept, "cases": rows}, [runner.table(title, rows, COLUMNS)])
 
 
 if __name__ == "__main__":

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from meshmatch.errors import InputError
-from meshmatch.experiments import animals, heart_truth, hearts, keypoint_parts, segments
-from meshmatch.experiments.category import area_under_curve, load_category, nearest_all, spread_pairs
+from meshmatch.experiments import animals, category, hearts, keypoint_parts, segments
+from meshmatch.experiments.category import RIGID, nearest_maps, ordered_pairs
+from meshmatch.experiments.sets import load_folder
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
@@ -18,15 +19,9 @@ from meshmatch.templates.nodes import NodeConfig
 from tests.conftest import icosphere
 
 
-def test_the_area_under_the_curve() -> None:
-    assert area_under_curve([1, 2, 3, 4], [False, False, True, True]) == 1.0
-    assert area_under_curve([4, 3, 2, 1], [False, False, True, True]) == 0.0
-    assert area_under_curve([1, 1, 1, 1], [False, True, False, True]) == 0.5
-    assert np.isnan(area_under_curve([1, 2], [True, True]))
-    rng = np.random.default_rng(0)
-    score, right = rng.integers(0, 9, 60), rng.random(60) < 0.4
-    pairs = [(a > b) + 0.5 * (a == b) for a in score[right] for b in score[~right]]
-    assert area_under_curve(score, right) == pytest.approx(np.mean(pairs))
+def mapped(maps: dict[tuple[str, str], np.ndarray]) -> dict[tuple[str, str], VertexMap]:
+    """Indices as maps of full confidence."""
+    return {pair: VertexMap(*pair, index) for pair, index in maps.items()}
 
 
 def test_errors_of_hearts_by_hand(cube: Shape) -> None:
@@ -39,15 +34,15 @@ def test_errors_of_hearts_by_hand(cube: Shape) -> None:
     truth["b"][0, 0] = 99  # vertex 7 of a has no partner
     shapes = {"a": cube, "b": other}
     right = np.arange(8)[::-1]
-    found = heart_truth.heart_errors(shapes, truth, {("a", "b"): right})
+    found = hearts.heart_errors(shapes, truth, mapped({("a", "b"): right}))
     assert (found["mean_x100"], found["right_chamber"], found["unseen_x100"]) == (0.0, 1.0, None)
     wrong = right.copy()
     wrong[0] = right[4]  # from x = 0 to x = 1: one edge, and the other chamber
     wrong[7] = 0  # does not count
     assert found["across_x100"] == 0.0
-    found = heart_truth.heart_errors(shapes, truth, {("a", "b"): wrong, ("b", "a"): right}, ["a"])
+    found = hearts.heart_errors(shapes, truth, mapped({("a", "b"): wrong, ("b", "a"): right}), ["a"])
     assert found["unseen_pairs"] == 0  # of two shapes that are both unseen
-    found = heart_truth.heart_errors(shapes, truth, {("a", "b"): wrong}, ["b", "a"])
+    found = hearts.heart_errors(shapes, truth, mapped({("a", "b"): wrong}), ["b", "a"])
     assert found["unseen_x100"] == found["mean_x100"]
     assert found["mean_x100"] == pytest.approx(100 / 7 / np.sqrt(6), abs=1e-3)
     assert found["right_chamber"] == pytest.approx(6 / 7, abs=1e-3)
@@ -58,8 +53,8 @@ def test_errors_of_hearts_by_hand(cube: Shape) -> None:
 
 def test_maps_through_registered_vertices(cube: Shape) -> None:
     other = Shape(cube.verts[::-1] + 5, 7 - cube.faces)
-    maps = heart_truth.through({"a": cube.verts, "b": cube.verts + 5}, {"a": cube, "b": other})
-    assert np.array_equal(maps["a", "b"], np.arange(8)[::-1])
+    maps = hearts.through({"a": cube.verts, "b": cube.verts + 5}, {"a": cube, "b": other})
+    assert np.array_equal(maps["a", "b"].index, np.arange(8)[::-1])
 
 
 def test_hearts_are_registered_by_what_both_kept() -> None:
@@ -73,7 +68,7 @@ def test_hearts_are_registered_by_what_both_kept() -> None:
     theirs = 1000 + np.arange(other.V)
     theirs[: ball.V : 2] = ids[::2]  # subdivision keeps the vertices and adds others behind them
     assert np.allclose(other.verts[: ball.V], ball.verts)
-    found = heart_truth.registered(ball, ids, Shape(bent(other.verts), other.faces), theirs)
+    found = hearts.registered(ball, ids, Shape(bent(other.verts), other.faces), theirs)
     apart = np.linalg.norm(found - bent(ball.verts), axis=1)
     assert apart[::2].max() < 1e-6
     assert apart.max() < 1.0  # of a ball of diameter 100
@@ -81,8 +76,8 @@ def test_hearts_are_registered_by_what_both_kept() -> None:
 
 def test_pairs_are_spread_evenly(cube: Shape) -> None:
     shapes = dict.fromkeys("abcd", cube)
-    assert len(spread_pairs(shapes)) == len(spread_pairs(shapes, 99)) == 12
-    some = spread_pairs(shapes, 4)
+    assert len(ordered_pairs(shapes)) == len(ordered_pairs(shapes, 99)) == 12
+    some = ordered_pairs(shapes, 4)
     assert [pair[0] for pair in some] == list("abcd")
     assert all(a != b for a, b in some)
 
@@ -92,11 +87,13 @@ def test_errors_of_keypoints_by_hand(cube: Shape) -> None:
     index = np.arange(8)
     index[3] = 2  # an edge away: 1 / sqrt(3) of the diagonal
     sure = np.array([0.9, 0.8, 0.7, 0.1, 0, 0, 0, 0])
-    found = segments.keypoint_errors(shapes, points, {("a", "b"): (index, sure)})
+    found = segments.keypoint_errors(
+        shapes, points, {("a", "b"): VertexMap("a", "b", index, confidence=sure)}
+    )
     assert found["mean"] == pytest.approx(1 / np.sqrt(3) / 4, abs=1e-3)
     assert (found["median"], found["arrived"], found["confidence_auc"]) == (0.0, 0.75, 1.0)
-    assert (found["confidence_right"], found["confidence_wrong"]) == (0.8, 0.1)
-    perfect = segments.keypoint_errors(shapes, points, {("a", "b"): (np.arange(8), sure)})
+    assert (found["confidence_right"], found["confidence_wrong"]) == pytest.approx((0.8, 0.1))
+    perfect = segments.keypoint_errors(shapes, points, mapped({("a", "b"): np.arange(8)}))
     assert perfect["confidence_auc"] is None and perfect["confidence_wrong"] is None
 
 
@@ -137,9 +134,9 @@ def test_legs_are_counted_and_their_confidence_compared(monkeypatch: pytest.Monk
     maps = {}
     for source, target in (("a", "b"), ("b", "a"), ("a", "c")):
         sure = np.full(len(legs[source]), 0.9 if target != "c" else 0.2)
-        maps[source, target] = (np.zeros(len(sure), int), sure)
+        maps[source, target] = VertexMap(source, target, np.zeros(len(sure), int), confidence=sure)
     found = keypoint_parts.leg_confidence(legs, maps)
-    assert found == {"legs_auc": 1.0, "legs_alike": 0.9, "legs_unlike": 0.2}
+    assert found == pytest.approx({"legs_auc": 1.0, "legs_alike": 0.9, "legs_unlike": 0.2})
     alone = keypoint_parts.leg_confidence(legs, {("a", "b"): maps["a", "b"]})
     assert alone["legs_auc"] is None and alone["legs_unlike"] is None
 
@@ -152,7 +149,7 @@ def test_the_ends_of_legs_are_measured_in_the_best_of_a_squares_numberings() -> 
 
     def measured(order: list[int]) -> dict[str, float]:
         index = np.array([*order, *(4 + k for k in order)])
-        maps = {("a", "b"): (index, np.ones(8))}
+        maps = mapped({("a", "b"): index})
         return keypoint_parts.leg_errors(
             {"a": table, "b": table}, {"a": keypoints, "b": keypoints}, maps, 0.1
         )
@@ -182,17 +179,9 @@ def test_nearest_after_alignment() -> None:
         "a": Shape(ball.verts * [1, 2, 3], ball.faces),
         "b": Shape(7 * ball.verts[::-1] * [1, 2, 3] + 4, len(ball.verts) - 1 - ball.faces[:, ::-1]),
     }
-    index, sure = nearest_all(shapes, "none", "area", lambda what: None)["a", "b"]
-    assert np.array_equal(index, np.arange(ball.V)[::-1])
-    assert sure.min() > 0.99
-
-
-def test_a_missing_folder_or_truth_is_told(tmp_path: Path, cube: Shape) -> None:
-    with pytest.raises(InputError, match="no shapes in"):
-        load_category(tmp_path, ".truth.npy")
-    save_shape(tmp_path / "a.ply", cube)
-    with pytest.raises(InputError, match=r"has no \.truth\.npy"):
-        load_category(tmp_path, ".truth.npy")
+    found = nearest_maps(shapes, "none", "area", [("a", "b")])["a", "b"]
+    assert np.array_equal(found.index, np.arange(ball.V)[::-1])
+    assert found.confidence.min() > 0.99
 
 
 @pytest.mark.parametrize(
@@ -221,49 +210,43 @@ def balls(folder: Path, ending: str, count: int = 2) -> None:
         np.save(folder / f"{n}{ending}", truth)
 
 
+def rows_of(text: str) -> tuple[dict, dict[str, dict]]:
+    """The record and its rows by method."""
+    record = json.loads(text.splitlines()[-1])
+    return record, {row["method"]: row for row in record["rows"]}
+
+
+QUICK = ["--steps", "2", "--threads", "1", "--nodes", "60", "--radius", "0.35", "--minutes", "1"]
+
+
 def test_hearts_from_end_to_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     balls(tmp_path / "heart", ".truth.npy", 3)
     monkeypatch.setattr(hearts, "find_spec", lambda name: None)
     drawn = []
-    monkeypatch.setattr(heart_truth, "render_shapes", lambda panels, path, look: drawn.append(len(panels)))
-    words = ["--data", tmp_path, "--steps", "2", "--threads", "1", "--work", tmp_path / "work"]
-    words += ["--nodes", "60", "--radius", "0.35", "--minutes", "1", "--seed", "0", "--unseen", "1"]
-    assert hearts.main([*map(str, words), "--picture", str(tmp_path / "hearts.png")]) == 0
-    record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    monkeypatch.setattr(category, "render_shapes", lambda panels, path, look: drawn.append(len(panels)))
+    words = ["--data", str(tmp_path), *QUICK, "--work", str(tmp_path / "work")]
+    assert hearts.main([*words, "--unseen", "1", "--picture", str(tmp_path / "hearts.png")]) == 0
+    record, rows = rows_of(capsys.readouterr().out)
     assert record["training"]["registered"]["steps"] == record["training"]["unregistered"]["steps"] == 2
-    assert record["results"]["rigid alignment, nearest vertex"]["mean_x100"] < 10
-    assert record["results"]["unregistered, nodes refined"]["pairs"] == 6
-    assert record["results"]["registered, nodes refined"]["unseen_x100"] is None
-    assert "meshmonk" not in record["results"]  # where it is not installed
+    assert rows[RIGID]["mean_x100"] < 10
+    assert rows["unregistered, nodes refined"]["pairs"] == 6
+    assert rows["registered, nodes refined"]["unseen_x100"] is None
+    assert "meshmonk" not in rows  # where it is not installed
     assert len(record["unseen"]) == 1 and record["template"] not in record["unseen"]
     learned = json.loads((tmp_path / "work" / "registered" / "prepared" / "prepared.json").read_text())
     assert learned["registered"] and len(learned["names"]) == 2
     assert drawn == [3]
-    assert {"date", "commit", "machine"} <= record.keys()
-    alone = [
-        *map(str, words[:-1]),
-        "2",
-        "--measure",
-        "unseen",
-        "--ways",
-        "unregistered",
-        "--stiffness",
-        "0.5",
-    ]
-    assert hearts.main(alone) == 0
-    record = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert record["results"]["unregistered, nodes refined"]["unseen_pairs"] == 2
-    assert record["results"]["unregistered, nodes refined"]["pairs"] == 2
-    assert record["stiffness"] == 0.5
-    assert hearts.main(["--data", str(tmp_path), "--ways", "guessed"]) == 1
-    assert "no way 'guessed'" in capsys.readouterr().err
+    alone = ["--unseen", "2", "--measure", "unseen", "--ways", "unregistered"]
+    assert hearts.main([*words, *alone]) == 0
+    row = rows_of(capsys.readouterr().out)[1]["unregistered, nodes refined"]
+    assert (row["unseen_pairs"], row["pairs"]) == (2, 2)
 
 
-def test_registrations_of_a_rival_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_registrations_of_meshmonk_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     balls(tmp_path, ".truth.npy")
-    shapes, _ = load_category(tmp_path, ".truth.npy")
+    shapes, _ = load_folder(tmp_path, ".truth.npy")
     template = make_template(shapes["0"], "ball", NodeConfig("uniform", 60, 0.35))
     frames = {name: sqrt_area_frame(shape) for name, shape in shapes.items()}
     asked = []
@@ -274,8 +257,8 @@ def test_registrations_of_a_rival_are_kept(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(hearts, "viscoelastic", register)
     for _ in range(2):
-        maps = hearts.meshmonk_maps(template, shapes, frames, tmp_path / "kept", lambda what: None)
-        assert np.array_equal(maps["0", "1"], np.arange(162))
+        places = hearts.meshmonk_places(template, shapes, frames, tmp_path / "kept")
+        assert np.array_equal(hearts.through(places, shapes)["0", "1"].index, np.arange(162))
     assert asked == [162, 162]
 
 
@@ -283,19 +266,15 @@ def test_segments_from_end_to_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn = []
-    monkeypatch.setattr(
-        keypoint_parts, "render_shapes", lambda panels, path, look: drawn.append((panels, path))
-    )
+    monkeypatch.setattr(category, "render_shapes", lambda panels, path, look: drawn.append((panels, path)))
     balls(tmp_path / "plane", ".keypoints.npy")
-    words = ["--data", tmp_path, "--classes", "plane", "--steps", "2", "--threads", "1", "--minutes", "1"]
-    words += ["--nodes", "60", "--radius", "0.35", "--pictures", tmp_path]
-    assert segments.main([*map(str, words), "--work", str(tmp_path / "work"), "--turns", "given"]) == 0
-    record = json.loads(capsys.readouterr().out.splitlines()[-1])
-    results = record["classes"]["plane"]["results"]
-    assert results["rigid alignment, nearest vertex"]["arrived"] == 1.0
-    assert 0.9 < results["rigid alignment, nearest vertex"]["iou"] <= 1.0
-    assert results["200 steps on the code"]["pairs"] == 2
-    assert "legs_auc" not in results["200 steps on the code"]
+    words = ["--data", str(tmp_path), "--classes", "plane", *QUICK, "--pictures", str(tmp_path)]
+    assert segments.main([*words, "--work", str(tmp_path / "work")]) == 0
+    _, rows = rows_of(capsys.readouterr().out)
+    assert rows[RIGID]["arrived"] == 1.0
+    assert 0.9 < rows[RIGID]["iou"] <= 1.0
+    assert rows["200 steps on the code"]["pairs"] == 2
+    assert "legs_auc" not in rows["200 steps on the code"]
     [(panels, path)] = drawn
     assert len(panels) == 2 and path == tmp_path / "segments-plane.png"
 
@@ -311,8 +290,9 @@ def test_kinds_of_animals_and_their_errors_by_hand(cube: Shape) -> None:
     right, wrong = np.arange(8), np.arange(8)
     wrong[0] = 4  # an edge away, of 1; the area is 6
     maps = {("wolf", "dog"): wrong, ("dog", "x"): right, ("x", "dog"): right}
-    found = animals.animal_errors(shapes, truth, maps)
-    assert found["kinds"] == {"across": 0.0, "dog to dog": pytest.approx(100 / 8 / np.sqrt(6), abs=1e-3)}
+    found = animals.animal_errors(shapes, truth, mapped(maps))
+    assert found["across"] == 0.0
+    assert found["dog to dog"] == pytest.approx(100 / 8 / np.sqrt(6), abs=1e-3)
     assert found["lost"] == pytest.approx(1 / 24, abs=1e-3)
     assert (found["pairs"], found["median_pair_x100"]) == (3, 0.0)
 
@@ -322,31 +302,13 @@ def test_animals_from_end_to_end(points: int, tmp_path: Path, capsys: pytest.Cap
     balls(tmp_path / "animal", ".landmarks.npy", 3)
     for file in (tmp_path / "animal").glob("*.npy"):
         np.save(file, np.arange(162))
-    words = ["--data", tmp_path, "--template", "1", "--points", points, "--steps", "2", "--threads", "1"]
-    words += [
-        "--work",
-        tmp_path / "work",
-        "--minutes",
-        "1",
-        "--seed",
-        "0",
-        "--nodes",
-        "60",
-        "--radius",
-        "0.35",
-        "--limit-pairs",
-        "1",
-        "--limit-shapes",
-        "2",
-    ]
-    assert animals.main([str(word) for word in words]) == 0
-    record = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert (record["training"]["template"], record["points"]) == ("1", points)
-    assert record["results"]["rigid alignment, nearest vertex"]["mean_x100"] < 12
-    assert record["results"]["nodes refined"]["pairs"] == 1
-    assert list(record["results"]["nodes refined"]["verdicts"]) == [
-        "0",
-        "2",
-    ]  # evenly spread; all are learned
+    words = ["--data", str(tmp_path), "--template", "1", "--points", str(points), *QUICK]
+    words += ["--limit-pairs", "1", "--limit-shapes", "2"]
+    assert animals.main(words) == 0
+    record, rows = rows_of(capsys.readouterr().out)
+    assert record["training"]["template"] == "1"
+    assert rows[RIGID]["mean_x100"] < 12
+    assert rows["nodes refined"]["pairs"] == 1
+    assert list(rows["nodes refined"]["verdicts"]) == ["0", "2"]  # evenly spread; all are learned
     assert animals.main(["--data", str(tmp_path), "--template", "9"]) == 1
     assert "no animal" in capsys.readouterr().err

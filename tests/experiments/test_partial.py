@@ -1,16 +1,16 @@
 """Parts of shapes and the measure of confidence, by hand; the command on a small set."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from meshmatch.experiments import partial
 from meshmatch.experiments.partial import main, part_of, seen_faces
-from meshmatch.experiments.protocols import load_set
-from meshmatch.fitting.fit import Fit
-from meshmatch.geometry.frames import Frame
+from meshmatch.experiments.sets import load_set
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
@@ -44,20 +44,18 @@ def test_parts_keep_their_vertices(kind: partial.Kind) -> None:
         assert part_of(ball, kind, seed)[0].hash == part.hash
 
 
+@dataclass
 class Known:
-    """Stands for the pipeline: right maps, made wrong at some vertices with little confidence."""
+    """Stands for our method: right maps, made wrong at some vertices with little confidence."""
 
-    def register(self, shape: Shape, **how: object) -> Fit:
-        none = np.zeros(shape.V)
-        still = np.zeros((1, 3))
-        return Fit(
-            "", Frame.identity(), still, still, still, still, 0.0, none, "good", (), "+y", "+z", 0.0, 0,
-            partial=how.get("partial") == "yes",
-        )  # fmt: skip
+    used: dict[str, np.ndarray]
+    seed: int = 0
 
-    def map_between(self, source: Shape, _: Fit, target: Shape, __: Fit, **how: object) -> VertexMap:
-        _, used = self.parts[source.hash]
-        index = truth(Path(source.name).stem, Path(target.name).stem)[used]
+    def fit(self, shape: Shape) -> SimpleNamespace:
+        return SimpleNamespace(partial=shape.hash in self.used)
+
+    def map(self, source: Shape, _: object, target: Shape, __: object) -> VertexMap:
+        index = truth(Path(source.name).stem, Path(target.name).stem)[self.used[source.hash]]
         wrong = np.arange(len(index)) % 5 == 0
         index = np.where(wrong, (index + target.V // 2) % target.V, index)
         return VertexMap.between(source, target, index, confidence=np.where(wrong, 0.1, 0.9))
@@ -66,21 +64,19 @@ class Known:
 def test_the_command_counts_what_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data, known = build(tmp_path / "data"), Known()
+    data, known = build(tmp_path / "data"), Known({})
     bench = load_set("shrec19", data)
-    known.parts = {}
     for name in bench.shapes:
         for kind in partial.KINDS:
             part, used = part_of(bench.shape(name), kind, bench.shapes.index(name))
-            known.parts[part.hash] = part, used
-    monkeypatch.setattr(partial, "register", known.register)
-    monkeypatch.setattr(partial, "map_between", known.map_between)
+            known.used[part.hash] = used
+    monkeypatch.setattr(partial, "OurMethod", lambda *_, **__: known)
     words = ["--sets", "shrec19", "--data", str(data), "--cache", str(tmp_path / "kept"), "--partial", "yes"]
     assert main(words) == 0
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
-    for kind in partial.KINDS:
-        found = record["sets"]["shrec19"][kind]
-        assert (found["pairs"], found["of"]) == (3, 3)
+    assert [row["part"] for row in record["rows"]] == list(partial.KINDS)
+    for found in record["rows"]:
+        assert (found["set"], found["pairs"]) == ("shrec19", "3 of 3")
         assert found["median_cm"] == 0.0
         assert 0.05 < found["share_over_15cm"] <= 0.25
         assert found["auc"] > 0.9
@@ -89,4 +85,4 @@ def test_the_command_counts_what_is_left(
 
 def test_a_missing_set_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--sets", "tosca", "--data", str(tmp_path)]) == 1
-    assert "no set" in capsys.readouterr().err
+    assert "unknown set" in capsys.readouterr().err

@@ -7,13 +7,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError, OptionError, OutputError
-from meshmatch.experiments import distances
-from meshmatch.experiments.distances import TruthDistances
-from meshmatch.experiments.protocols import SET_NAMES, BenchSet, load_set
-from meshmatch.experiments.report import commit, print_table
-from meshmatch.experiments.scores import SetScores, evaluate_set
-from meshmatch.maps.evaluate import CM_PER_UNIT, map_errors
+from meshmatch.experiments import scores as room
+from meshmatch.experiments.scores import TruthDistances, area_under_curve, evaluate_set, summary
+from meshmatch.experiments.sets import SET_NAMES, BenchSet, load_folder, load_set
+from meshmatch.maps.evaluate import CM_PER_UNIT, Errors, map_errors
 from meshmatch.maps.geodesics import GeodesicDistances
+from meshmatch.shapes import save_shape
 from tests.experiments.small_bench import BODY, build, truth
 
 
@@ -41,7 +40,7 @@ def test_pairs_and_groups(small: Path) -> None:
 
 
 def test_sets_that_are_not_there(small: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="no set 'tosca'"):
+    with pytest.raises(OptionError, match="unknown set 'tosca'"):
         load_set("tosca", small)
     with pytest.raises(InputError, match="no shapes"):
         load_set("scape", tmp_path)
@@ -71,7 +70,7 @@ def test_errors_are_those_of_the_plain_way(small: Path, kept: Path, name: str) -
     bench = load_set(name, small)
     rng = np.random.default_rng(0)
     maps = {pair: rng.integers(0, BODY.V, BODY.V) for pair in bench.pairs}
-    scores = evaluate_set(name, maps, data=small, cache=kept)
+    scores = evaluate_set(bench, maps, cache=kept)
     total = []
     for source, target in bench.pairs:
         expected = map_errors(
@@ -128,8 +127,6 @@ def test_nothing_is_left_out_in_silence(small: Path, kept: Path) -> None:
     for bad in (np.zeros(3, int), np.full(BODY.V, BODY.V), np.full(BODY.V, -1), np.zeros(BODY.V)):
         with pytest.raises(InputError, match="shrec19 1 -> 2"):
             evaluate_set(bench, {("1", "2"): bad}, cache=kept, pairs=[("1", "2")])
-    with pytest.raises(InputError, match="where is"):
-        evaluate_set("shrec19", maps)
 
 
 def test_distances_are_computed_once(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,8 +138,8 @@ def test_distances_are_computed_once(small: Path, tmp_path: Path, monkeypatch: p
     assert errors[0] == errors[3] == 0
     assert (errors[1:3] > 0).all()
     assert np.load(first.path).shape == (3, shape.V)
-    monkeypatch.setattr(distances, "GeodesicDistances", None)  # would fail if it were asked again
-    monkeypatch.setattr(distances, "READ_BYTES", 1)  # one row at a time
+    monkeypatch.setattr(room, "GeodesicDistances", None)  # would fail if it were asked again
+    monkeypatch.setattr(room, "READ_BYTES", 1)  # one row at a time
     again = TruthDistances(bench.shape("mesh000"), landmarks, tmp_path)
     assert np.array_equal(again.errors([index])[0], errors)
     one, other = again.errors([index, index[::-1]])
@@ -166,27 +163,37 @@ def test_a_folder_that_cannot_be_made(small: Path, tmp_path: Path) -> None:
 
 
 def test_the_default_folder_can_be_moved(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv(distances.CACHE_VARIABLE, str(tmp_path))
-    assert distances.default_folder() == tmp_path
-    monkeypatch.delenv(distances.CACHE_VARIABLE)
-    assert distances.default_folder().name == "geodesics"
+    monkeypatch.setenv(room.CACHE_VARIABLE, str(tmp_path))
+    assert room.default_folder() == tmp_path
+    monkeypatch.delenv(room.CACHE_VARIABLE)
+    assert room.default_folder().name == "geodesics"
 
 
-def test_the_table(small: Path, kept: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bench = load_set("faust", small)
-    pairs = bench.pairs[:3]
-    scores: SetScores = evaluate_set(bench, {p: truth(*p) for p in pairs}, cache=kept, pairs=pairs)
-    print_table([scores])
-    text = capsys.readouterr().out
-    assert "3 of 6" in text
-    assert "same subject" in text
-    assert "1 of 4" in text
-    assert "Not all pairs were measured" in text
-    assert "Dijkstra" in text
+def test_the_area_under_the_curve() -> None:
+    assert area_under_curve([1, 2, 3, 4], [False, False, True, True]) == 1.0
+    assert area_under_curve([4, 3, 2, 1], [False, False, True, True]) == 0.0
+    assert np.isnan(area_under_curve([1, 2], [True, True]))
+    rng = np.random.default_rng(0)
+    score, right = rng.integers(0, 9, 60), rng.random(60) < 0.4
+    pairs = [(a > b) + 0.5 * (a == b) for a in score[right] for b in score[~right]]
+    assert area_under_curve(score, right) == pytest.approx(np.mean(pairs))
 
 
-def test_commit_without_git(tmp_path: Path) -> None:
-    assert commit(tmp_path) == "unknown"
+def test_a_summary_by_hand() -> None:
+    pairs = [Errors(np.array(cm) / CM_PER_UNIT) for cm in ([0, 2], [10, 20], [30, 40])]
+    found = summary(pairs)
+    assert found["mean_cm"] == pytest.approx(17)
+    assert (found["median_cm"], found["median_pair_cm"]) == pytest.approx((15, 15))
+    assert found["share_over_15cm"] == pytest.approx(0.5)
+    assert found["flips"] == pytest.approx(1 / 3)
+
+
+def test_a_missing_folder_or_truth_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no shapes in"):
+        load_folder(tmp_path, ".truth.npy")
+    save_shape(tmp_path / "a.ply", BODY)
+    with pytest.raises(InputError, match=r"has no \.truth\.npy"):
+        load_folder(tmp_path, ".truth.npy")
 
 
 def test_the_real_sets_have_the_protocols_pairs(bench: Path) -> None:

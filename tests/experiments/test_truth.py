@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.experiments.protocols import load_set
+from meshmatch.experiments.sets import load_set
 from meshmatch.experiments.truth import groups, main, same_order
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.shapes.shape import Shape

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.api.inputs import as_model
 from meshmatch.experiments.partial import part_of
-from meshmatch.experiments.protocols import load_set
+from meshmatch.experiments.sets import load_set
 from meshmatch.fitting.completion import area_share, completed, visible_vertices
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import Candidate

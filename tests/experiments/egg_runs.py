@@ -1,4 +1,4 @@
-"""Cells of eggs: a prepared folder, and a recipe that costs nothing."""
+"""Runs of eggs: a prepared folder, and a recipe that costs nothing."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from meshmatch.cli import main as meshmatch
-from meshmatch.experiments import cells, pool
+from meshmatch.experiments import ablation_setting
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import make_template
@@ -16,10 +16,10 @@ from tests.conftest import icosphere
 from tests.training.small import NETWORK, bent_eggs
 
 TINY = replace(
-    cells.SMALL,
+    ablation_setting.SMALL,
     network=replace(NETWORK, align_basis=0, corrections=0),
-    train=replace(cells.SMALL.train, shapes=4),
-    scan=replace(cells.SMALL.scan, points=64),
+    train=replace(ablation_setting.SMALL.train, shapes=4),
+    scan=replace(ablation_setting.SMALL.scan, points=64),
 )
 
 
@@ -39,6 +39,6 @@ def prepare_eggs(root: Path) -> Path:
 
 def make_small(monkeypatch: pytest.MonkeyPatch) -> None:
     """The preset "small" becomes tiny."""
-    monkeypatch.setattr(cells, "SMALL", TINY)
-    monkeypatch.setattr(pool, "HELD_OUT", 5)
-    monkeypatch.setattr(pool, "_drawn", pool._drawn.__wrapped__)
+    monkeypatch.setattr(ablation_setting, "SMALL", TINY)
+    monkeypatch.setattr(ablation_setting, "HELD_OUT_SHAPES", 5)
+    monkeypatch.setattr(ablation_setting, "pool_of", ablation_setting.pool_of.__wrapped__)

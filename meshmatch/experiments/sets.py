@@ -1,29 +1,30 @@
-"""The development benchmark's sets: which shapes, which pairs, and what is true.
+"""The sets of the benchmark: which shapes, which pairs, and what is true.
 
-The data are described in ``bench/README.md`` beside them. In short, *landmark k is the same body point on
-every shape of a set*, and a set differs from another in how a landmark names its vertex:
+The data are described in ``README.md`` beside them. In short, *landmark k is the same body point on every shape of a
+set*, and a set differs from another in how a landmark names its vertex:
 
 - ``shrec19``: ``N.landmarks.npy`` (6890,) vertex ids; the pairs of ``pairs.txt``.
 - ``scape``: vertex i is landmark i on every shape (the triangulations differ); all ordered pairs.
 - ``faust``: ``tr_reg_NNN.landmarks.npy`` (5000,) vertex ids; all ordered pairs, of one subject or of two. Ten
   consecutive numbers are one subject.
 
-``scape-pcn`` is ``scape`` as the paper's *PC+N*: the matcher gets the vertices alone, with Gaussian noise of 1 % of
-the bounding box's diagonal; errors are measured on the mesh that they come from.
+``scape-pcn`` is ``scape`` as the paper's *PC+N*: the method gets the vertices alone, with Gaussian noise of 1 % of the
+bounding box's diagonal; errors are measured on the mesh that they come from.
 
 Several landmarks may share a vertex where a mesh is coarser than the landmarks. All of them count.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
@@ -31,6 +32,7 @@ from meshmatch.shapes.shape import Shape
 Pair = tuple[str, str]
 SET_NAMES = ("shrec19", "scape", "faust")
 CLOUD_SET = "scape-pcn"
+ALL_SETS = (*SET_NAMES, CLOUD_SET)
 NOISE = 0.01  # of the bounding box's diagonal, along each axis
 
 
@@ -52,15 +54,15 @@ class BenchSet:
         return load_shape(self.path(shape))
 
     def seen(self, shape: str) -> Shape:
-        """What the matcher gets of it: the same, or for ``scape-pcn`` its vertices with noise, seeded by its place."""
+        """What a method gets of it: the same, or for ``scape-pcn`` its vertices with noise, seeded by its place."""
         whole = self.shape(shape)
         if self.name != CLOUD_SET:
             return whole
         noise = np.random.default_rng(self.shapes.index(shape)).standard_normal(whole.verts.shape)
         return Shape(whole.verts + NOISE * whole.diagonal * noise, np.empty((0, 3), np.int64), whole.name)
 
-    def landmarks(self, shape: str) -> NDArray[np.int64]:
-        """Vertex id of every landmark ``(N,)``; N is the same for every shape of a set."""
+    def landmarks(self, shape: str) -> Int[Ints, " N"]:
+        """Vertex id of every landmark; N is the same for every shape of a set."""
         return _landmarks(self.path(shape), self.folder.name == "scape")
 
     def group(self, pair: Pair) -> str:
@@ -80,14 +82,13 @@ def load_set(name: str, data: Path) -> BenchSet:
     InputError
         The folder lacks the set, or a file that the pairs name.
     """
-    known = (*SET_NAMES, CLOUD_SET)
-    if name not in known:
-        raise OptionError(f"there is no set '{name}'", f"choose from {', '.join(known)}")
+    if name not in ALL_SETS:
+        raise OptionError(f"unknown set '{name}'", f"choose from {', '.join(ALL_SETS)}")
     folder = Path(data) / ("scape" if name == CLOUD_SET else name)
     shapes = tuple(sorted((path.stem for path in folder.glob("*.ply")), key=_by_number))
     if not shapes:
         raise InputError(
-            f"no shapes in {folder}", "--data names the folder that holds shrec19, scape and faust"
+            f"no shapes in {folder}", f"--data names the folder that holds {', '.join(SET_NAMES)}"
         )
     if name == "shrec19":
         lines = (folder / "pairs.txt").read_text(encoding="ascii").split("\n")
@@ -109,7 +110,7 @@ def _faust_subject(name: str) -> int:
 
 
 @cache
-def _landmarks(path: Path, every_vertex: bool) -> NDArray[np.int64]:
+def _landmarks(path: Path, every_vertex: bool) -> Int[Ints, " N"]:
     shape = load_shape(path)
     if every_vertex:
         ids = np.arange(shape.V)
@@ -119,3 +120,21 @@ def _landmarks(path: Path, every_vertex: bool) -> NDArray[np.int64]:
         raise InputError(f"the landmarks of {path} do not name its vertices")
     ids.setflags(write=False)
     return ids
+
+
+def load_folder(folder: Path, suffix: str) -> tuple[dict[str, Shape], Mapping[str, Ints]]:
+    """All shapes of a folder and what is true of each (``NAME`` + suffix), by name.
+
+    Raises
+    ------
+    InputError
+        The folder is not there, or a shape lacks its truth.
+    """
+    files = sorted(folder.glob("*.ply"))
+    if not files:
+        raise InputError(f"no shapes in {folder}", "--data names the folder that holds the benchmark")
+    paths = {file.stem: file.with_name(file.stem + suffix) for file in files}
+    if missing := [name for name, path in paths.items() if not path.is_file()]:
+        raise InputError(f"{missing[0]} has no {suffix}")
+    truth = {name: np.load(path, allow_pickle=False) for name, path in paths.items()}
+    return {file.stem: load_shape(file) for file in files}, truth

@@ -1,0 +1,210 @@
+"""What all ablation runs share: the recipe, templates, and shapes to learn from, drawn once for all runs.
+
+Simulating a scan costs several times what learning from it does in a small network. So a fixed number of shapes is
+scanned a few times each beforehand, and a run that has fewer shapes has the first ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from meshmatch.arrays import Float
+from meshmatch.errors import TemplateError
+from meshmatch.experiments.ablation_views import BASE, Run
+from meshmatch.models.deformer import NetworkConfig
+from meshmatch.models.encoder import BasisEncoder, PointEncoder
+from meshmatch.templates.nodes import NodeConfig, Strategy, choose_nodes
+from meshmatch.templates.registered import read_registered
+from meshmatch.templates.template import Template, read_template
+from meshmatch.training.bodies import human_source
+from meshmatch.training.datasets import Batch, Source, registered_source
+from meshmatch.training.loop import TrainConfig
+from meshmatch.training.losses import CorrespondenceLoss
+from meshmatch.training.recipes import Recipe, recipe_for
+from meshmatch.training.scans import ScanConfig
+from meshmatch.training.setup import build_dataset, build_deformer
+
+Preset = Literal["small", "default", "paper"]
+SPHERE = 0.65
+"""The paper's unit, the radius of a sphere around the body, in units of sqrt(area)."""
+SCANS = 4
+"""How often each shape is scanned."""
+HELD_OUT_SHAPES = 64
+_BLOCK = 50
+_SEED, _UNSEEN = 17, 999_983
+
+SMALL = Recipe(
+    NetworkConfig(code=256, width=384, depth=2, basis=512, align_basis=0, corrections=0),
+    TrainConfig(
+        shapes=32,
+        scans_per_shape=1,
+        warm_up=20,
+        decay=0.6,
+        average=0.99,
+        workers=0,
+        loss=CorrespondenceLoss(volume=2e-3, arap=2e-3, blend=1e-3, robust=True),
+    ),
+    ScanConfig(points=1024, holes=0.0, outliers=0.0, partial=0.0),
+    "smooth",
+)
+"""The recipe of the preset "small", for minutes of one core."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all runs share; plain values, so that a process of its own can be told.
+
+    Parameters
+    ----------
+    preset : {"small", "default", "paper"}
+        The recipe: network, losses, scans.
+    folder : str, optional
+        Shapes that `meshmatch prepare` made ready; None for generated bodies.
+    identities : int
+        Of generated bodies.
+    """
+
+    preset: Preset = "small"
+    folder: str | None = None
+    identities: int = 1024
+    threads: int = 1
+
+    def recipe(self, run: Run) -> Recipe:
+        """The preset's recipe with the run's choices; constraints that it does not have weigh nothing.
+
+        No network has an aligner or learned corrections: the orientation is given, the same to all runs, and what is
+        compared is the deformation.
+        """
+        chosen = SMALL if self.preset == "small" else recipe_for(preset=self.preset)
+        given = chosen.train.loss
+        loss = replace(
+            given,
+            volume=given.volume if "vol" in run.constraint else 0.0,
+            arap=given.arap if "arap" in run.constraint else 0.0,
+            blend=given.blend if "Z" in run.constraint else 0.0,
+        )
+        network = replace(chosen.network, field=run.field, align_basis=0, corrections=0)
+        train = replace(
+            chosen.train,
+            loss=loss,
+            shapes=chosen.train.shapes * chosen.train.scans_per_shape,
+            scans_per_shape=1,
+            workers=0,
+            threads=self.threads,
+            seed=run.seed,
+        )
+        return Recipe(network, train, replace(chosen.scan, upright=False), run.kernel)
+
+    @property
+    def strained(self) -> int:
+        """At how many of the loss points the energies of the regularisers are taken."""
+        return 200 if self.preset == "small" else 400
+
+    def template(self, run: Run) -> Template:
+        """The template with the run's nodes, chosen by its `rule`.
+
+        Raises
+        ------
+        TemplateError
+            Nodes of this number and radius do not carry it.
+        """
+        return _with_nodes(self.resting(run.pose), run.nodes, run.radius * SPHERE, run.strategy)[0]
+
+    def rule(self, run: Run) -> Strategy:
+        """By which rule its nodes are chosen: its own, or none ("uniform") where that one leaves too few."""
+        return _with_nodes(self.resting(run.pose), run.nodes, run.radius * SPHERE, run.strategy)[1]
+
+    def resting(self, pose: str) -> Template:
+        """The template in a pose, with the nodes that it came with; a folder has one pose."""
+        return _resting(self.folder, pose)
+
+    def sources(self, pose: str) -> tuple[Source, Source]:
+        """What draws shapes to learn from, and shapes that nobody learned from: other people, or a folder's last ones."""
+        template = self.resting(pose)
+        if self.folder is None:
+            return human_source(template, self.identities, 0), human_source(template, 64, 1)
+        shapes = torch.from_numpy(read_registered(self.folder, template))
+        kept = max(1, len(shapes) - max(1, len(shapes) // 5))
+        return registered_source(shapes[:kept]), registered_source(shapes[kept:])
+
+
+@lru_cache(maxsize=4)
+def _resting(folder: str | None, pose: str) -> Template:
+    return read_template(f"human-{pose}" if folder is None else Path(folder) / "template.safetensors")
+
+
+@lru_cache(maxsize=8)
+def _with_nodes(template: Template, K: int, radius: float, strategy: Strategy) -> tuple[Template, Strategy]:
+    for rule in dict.fromkeys((strategy, "uniform")):
+        try:
+            nodes = choose_nodes(template.shape, NodeConfig(rule, K, radius), template.labels)
+            return replace(template, nodes=nodes, radius=radius), rule
+        except TemplateError:
+            if rule == "uniform":
+                raise
+    raise AssertionError
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Scans of N shapes, `SCANS` each, one after the other.
+
+    Parameters
+    ----------
+    points : without points (P = 0) where all that is read of them is in the features
+    features : of a network that reads the points themselves (N, 0, 3)
+    targets : where the template's loss points belong
+    basis : basis points of every run's encoder, whose features these are
+    held_out : a batch of shapes that no run learns from
+    source : draws such shapes as there are in the pool
+    """
+
+    points: Float[Tensor, "N P 3"]
+    features: Float[Tensor, "N M 3"]
+    targets: Float[Tensor, "N 1000 3"]
+    basis: Float[Tensor, "M 3"]
+    held_out: Batch
+    source: Source
+
+    def batch(
+        self, step: int, count: int, shapes: int, seed: int, encoder: BasisEncoder | PointEncoder
+    ) -> Batch:
+        """The batch of a step, of the scans of the first ``shapes``: a function of its arguments."""
+        generator = torch.Generator().manual_seed((seed * 2_654_435_761 + step) % (2**63))
+        chosen = torch.randint(min(shapes * SCANS, len(self.targets)), (count,), generator=generator)
+        points = self.points[chosen]
+        features = self.features[chosen] if self.features.shape[1] else encoder.features(points)
+        return Batch(points, self.targets[chosen], features)
+
+
+@lru_cache(maxsize=3)
+def pool_of(setting: Setting, pose: str, shapes: int = BASE.shapes) -> Pool:
+    """The pool of a template pose, drawn once in a process."""
+    template, recipe = setting.resting(pose), setting.recipe(Run(pose=pose))
+    source, unseen = setting.sources(pose)
+    generator = torch.Generator().manual_seed(_SEED)
+    drawn = torch.cat([source(min(_BLOCK, shapes - at), generator) for at in range(0, shapes, _BLOCK)])
+
+    def some(count: int, generator: torch.Generator) -> Tensor:
+        return drawn[torch.randint(len(drawn), (count,), generator=generator)]
+
+    model = build_deformer(template, some, recipe.network, recipe.scan, recipe.kernel, _SEED)
+    data = build_dataset(template, some, model, recipe.scan, _BLOCK, SCANS, _SEED)
+    reads = recipe.network.encoder == "point"
+    blocks = []
+    for number, block in enumerate(drawn.split(_BLOCK)):
+        batch = replace(data, source=lambda *_, block=block: block, shapes=len(block))[number]
+        none = torch.zeros(len(batch.points), 0, 3)
+        features = none if reads else batch.encode_features
+        blocks.append((batch.points if reads else none, features, batch.targets))
+    points, features, targets = (torch.cat(part) for part in zip(*blocks, strict=True))
+    held_out = replace(data, source=unseen, shapes=HELD_OUT_SHAPES, scans_per_shape=1, seed=_UNSEEN)[0]
+    encoder = model.encoder
+    basis = encoder.basis.clone() if isinstance(encoder, BasisEncoder) else torch.zeros(1, 3)
+    return Pool(points, features, targets, basis, held_out, some)

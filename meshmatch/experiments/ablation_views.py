@@ -1,0 +1,269 @@
+"""The paper's tables and figures as data: which runs each looks at, and what the paper printed or claims.
+
+A run is one training: a choice in everything that the paper varies. All tables and figures are views of the same runs,
+most of which differ from `BASE` in one thing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from meshmatch.fields.choice import FIELDS, FieldName
+from meshmatch.geometry.kernels import Kernel
+from meshmatch.templates.nodes import STRATEGIES, Strategy
+
+CONSTRAINTS = ("none", "arap", "vol", "vol+arap", "vol+arap+Z")
+PAPER_SETS = ("shrec19", "scape-pcn")
+HELD_OUT = "held out"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training.
+
+    Parameters
+    ----------
+    field, kernel : of the deformation
+    constraint : one of `CONSTRAINTS`
+    nodes, radius : K, and r in the paper's unit
+    strategy : how nodes are chosen
+    pose : of the template
+    shapes : how many there are to learn from
+    supervised : on how many template points the right place is told
+    """
+
+    field: FieldName = "mls"
+    constraint: str = "vol+arap+Z"
+    nodes: int = 300
+    radius: float = 0.2
+    strategy: Strategy = "parts"
+    pose: str = "T"
+    shapes: int = 2000
+    supervised: int = 1000
+    kernel: Kernel = "smooth"
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """Of its folder: in what it differs from the base."""
+        parts = [
+            f"{each.name}-{getattr(self, each.name)}".replace("+", "-").lower()
+            for each in fields(self)
+            if getattr(self, each.name) != each.default
+        ]
+        return ".".join(parts) or "base"
+
+
+BASE = Run()
+CODED = replace(BASE, field="pointwise", constraint="none")
+"""3D-CODED as a run."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row: words ("{rule}" stands for how nodes were chosen in the end), the run, the paper's errors in cm on
+    `PAPER_SETS`, and the refinement."""
+
+    words: tuple[str, ...]
+    run: Run
+    paper: tuple[float, float] | None = None
+    method: str = "code"
+
+
+@dataclass(frozen=True)
+class View:
+    """A table or figure: its title, the headings of its rows' words, rows, and whether nodes are refined too.
+
+    ``across`` is set where the first word is a number against which errors are drawn as lines.
+    """
+
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[Row, ...]
+    nodes: bool = False
+    across: bool = False
+
+    @property
+    def runs(self) -> list[Run]:
+        """Each run once, the base first."""
+        return sorted(dict.fromkeys(row.run for row in self.rows), key=lambda run: run != BASE)
+
+
+_PAPER4 = {
+    "none": {"pointwise": (7.4, 13.7), "rbf": (8.5, 9.9), "mls": (7.7, 9.8)},
+    "vol+arap": {"pointwise": (7.1, 12.6), "rbf": (8.0, 9.1), "mls": (5.2, 7.0)},
+    "vol+arap+Z": {"pointwise": (9.1, 14.8), "rbf": (8.1, 9.3), "mls": (4.8, 6.6)},
+}
+_PAPER5 = {
+    **{"none": (7.7, 9.8), "arap": (6.9, 10.2), "vol": (7.3, 8.7), "vol+arap": (5.2, 7.0)},
+    "vol+arap+Z": (4.8, 6.6),
+}
+_PAPER5_TEST = (
+    ("none", "no refinement", (7.9, 12.5)),
+    ("chamfer", "Chamfer alone", (5.0, 6.7)),
+    ("code", "Chamfer, volume, arap", (4.8, 6.6)),
+)
+_PAPER6 = {
+    (100, 0.5): (6.8, 8.2),
+    (300, 0.2): (4.8, 6.6), (300, 0.5): (5.4, 7.6),
+    (900, 0.1): (5.4, 7.0), (900, 0.2): (6.4, 8.7), (900, 0.5): (6.5, 8.8),
+    (2700, 0.07): (6.2, 9.8), (2700, 0.2): (6.5, 9.6), (2700, 0.5): (6.5, 10.1),
+}  # fmt: skip
+_PAPER7 = {
+    ("parts", "T"): (4.8, 6.6), ("parts", "A"): (5.1, 7.4),
+    ("spectral", "T"): (4.8, 6.6), ("spectral", "A"): (5.1, 7.3),
+    ("geodesic", "T"): (5.0, 6.9), ("geodesic", "A"): (5.2, 7.4),
+    ("uniform", "T"): (5.1, 6.9), ("uniform", "A"): (5.9, 9.5),
+}  # fmt: skip
+PAPER_MS = {
+    "pointwise": {"none": 32.0, "vol+arap": 250.4, "vol+arap+Z": 4098.3},
+    "rbf": {"none": 8.0, "vol+arap": 8.2, "vol+arap+Z": 12.6},
+    "mls": {"none": 7.8, "vol+arap": 8.0, "vol+arap+Z": 12.1},
+}
+"""Milliseconds of an iteration in the paper's table 4, on an A100."""
+TABLE4 = tuple(_PAPER4)
+GRID = tuple(replace(BASE, nodes=K, radius=r) for K, r in _PAPER6)
+
+
+def _numbers(name: str, counts: Sequence[int]) -> tuple[Row, ...]:
+    return tuple(Row((str(count),), replace(BASE, **{name: count})) for count in counts)  # type: ignore[arg-type]
+
+
+VIEWS = {
+    "table4": View(
+        "Table 4",
+        ("constraint", "field"),
+        tuple(
+            Row((each, field), replace(BASE, field=field, constraint=each), _PAPER4[each][field])
+            for each in TABLE4
+            for field in FIELDS
+        ),
+        nodes=True,
+    ),
+    "table5": View(
+        "Table 5",
+        ("when", "regularisers"),
+        (
+            *(
+                Row(("training", each), replace(BASE, constraint=each), paper)
+                for each, paper in _PAPER5.items()
+            ),
+            *(Row(("test time", words), BASE, paper, how) for how, words, paper in _PAPER5_TEST),
+        ),
+    ),
+    "figure9": View(
+        "Figure 9", ("training shapes",), _numbers("shapes", (250, 500, 1000, 2000)), across=True
+    ),
+    "figure10": View(
+        "Figure 10", ("supervised points",), _numbers("supervised", (50, 100, 1000)), across=True
+    ),
+    "figure8": View(
+        "Figure 8", ("template",), tuple(Row((pose,), replace(BASE, pose=pose)) for pose in "TAI")
+    ),
+    "table7": View(
+        "Table 7",
+        ("nodes by", "template"),
+        tuple(
+            Row((how, pose), replace(BASE, strategy=how, pose=pose), _PAPER7[how, pose])
+            for how in STRATEGIES
+            for pose in "TA"
+        ),
+    ),
+    "table6": View(
+        "Table 6",
+        ("K", "r", "nodes by", "kernel"),
+        (
+            *(
+                Row((str(run.nodes), f"{run.radius:g}", "{rule}", "smooth"), run, paper)
+                for run, paper in zip(GRID, _PAPER6.values(), strict=True)
+            ),
+            Row(("300", "0.2", "{rule}", "cubic"), replace(BASE, kernel="cubic")),
+        ),
+    ),
+    "figure6": View("Figure 6", (), (Row((), BASE), Row((), CODED))),
+}
+"""In the order in which their runs are trained."""
+
+CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
+    (
+        "with vol+arap+Z: mls < rbf < pointwise",
+        tuple(replace(BASE, field=each) for each in ("mls", "rbf", "pointwise")),
+    ),
+    (
+        "mls: vol+arap+Z < vol+arap < none",
+        tuple(replace(BASE, constraint=each) for each in reversed(TABLE4)),
+    ),
+    (
+        "mls: both regularisers < none",
+        (replace(BASE, constraint="vol+arap"), replace(BASE, constraint="none")),
+    ),
+    (
+        "pointwise: vol+arap < vol+arap+Z (Z does not pay)",
+        tuple(replace(BASE, field="pointwise", constraint=each) for each in TABLE4[1:]),
+    ),
+    ("nodes by parts < uniform nodes (T)", (BASE, replace(BASE, strategy="uniform"))),
+    ("template pose T < I", (BASE, replace(BASE, pose="I"))),
+    (
+        "more shapes are better: 2000 < 1000 < 500 < 250",
+        tuple(replace(BASE, shapes=count) for count in (2000, 1000, 500, 250)),
+    ),
+    ("1000 supervised points < 50", (BASE, replace(BASE, supervised=50))),
+)
+"""What the paper says of errors: the runs in the order from the least error to the largest."""
+
+
+def all_runs(views: Sequence[str], seeds: int = 1, repeated: Sequence[str] = ()) -> list[Run]:
+    """Every run of some views once; last, those of the ``repeated`` views with other seeds."""
+    runs = list(dict.fromkeys(run for view in VIEWS if view in views for run in VIEWS[view].runs))
+    alike = dict.fromkeys(run for view in VIEWS if view in repeated for run in VIEWS[view].runs)
+    again = [replace(run, seed=seed) for seed in range(1, seeds) for run in alike if run in runs]
+    return [*runs, *again]
+
+
+def by_time(run: Run) -> bool:
+    """Whether its budget is time: where representations and constraints, which differ in cost, are compared.
+
+    All others, which are compared for what they learn, take as many steps as the base does in that time.
+    """
+    return replace(run, field=BASE.field, constraint=BASE.constraint, seed=BASE.seed) == BASE
+
+
+def methods_of(run: Run) -> tuple[str, ...]:
+    """With which refinements a run is measured, whatever its seed: the paper's; those of tables 4 and 5 where they look."""
+    alike = replace(run, seed=BASE.seed)
+    if alike == BASE:
+        return ("code", "none", "chamfer", "nodes")
+    return ("code", "nodes") if alike in VIEWS["table4"].runs and run.field != "pointwise" else ("code",)
+
+
+@dataclass(frozen=True)
+class Known:
+    """What was measured: ``trained`` as `train_run` tells it or {"skipped": why}; ``errors`` by set and method.
+
+    Parameters
+    ----------
+    trained : {run: record}
+    errors : {(run, set, method): record}
+    times, memory : {name of a run: record}
+    descent : what `meshmatch.experiments.ablation_errors.descend` found, if it was measured
+    """
+
+    trained: Mapping[Run, Mapping[str, Any]]
+    errors: Mapping[tuple[Run, str, str], Mapping[str, Any]]
+    times: Mapping[str, Mapping[str, Any]]
+    memory: Mapping[str, Mapping[str, Any]]
+    descent: Mapping[str, Any] | None = None
+
+    def error(self, run: Run, where: str, method: str = "code", what: str = "mean_cm") -> list[float]:
+        """Errors in cm of a run and its repetitions with other seeds; ``where`` is a set, or `HELD_OUT`.
+
+        ``what`` is "mean_cm", or on a set "median_cm".
+        """
+        alike = sorted((each for each in self.trained if replace(each, seed=0) == run), key=lambda r: r.seed)
+        if where == HELD_OUT:
+            records = [self.trained[each].get("held_out_cm") for each in alike]
+        else:
+            records = [self.errors.get((each, where, method), {}).get(what) for each in alike]
+        return [record for record in records if record is not None]

@@ -1,0 +1,261 @@
+"""The runner that all experiments share: options, circumstances, finished work kept in a folder, tables, one JSON line.
+
+An experiment is a function with typer annotations that returns a `Report`; `command` makes its `main`. Shared options
+(`Data`, `Seed`, `Threads`, ...) are declared here once. Rows of a table are the dictionaries of the record:
+
+    @command
+    def main(data: Data = DATA, seed: Seed = 0) -> Report:
+        rows = [{"set": "scape", "mean_cm": 1.63}]
+        return Report({"sets": rows}, [table("Errors", rows, {"set": "set", "mean": "mean_cm:.2f"})])
+"""
+
+from __future__ import annotations
+
+import datetime
+import functools
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+import typer
+from rich import progress
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.outputs import make_folder, replace_on_success
+from meshmatch.threads import set_threads
+
+T = TypeVar("T")
+
+DATA = Path("../shared/bench")
+Data = Annotated[Path, typer.Option(help="folder of the evaluation data")]
+Model = Annotated[str, typer.Option(help="name or folder of a model")]
+Seed = Annotated[int, typer.Option(min=0)]
+Threads = Annotated[int, typer.Option(min=1, help="threads of each process")]
+Jobs = Annotated[int, typer.Option(min=1, help="processes")]
+LimitPairs = Annotated[int | None, typer.Option(min=1, help="pairs of each set, evenly spread")]
+Cache = Annotated[Path | None, typer.Option(help="folder of kept geodesic distances (10 GB for all sets)")]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What an experiment found: the record for the JSON line, tables, and lines to print below them."""
+
+    record: Mapping[str, Any]
+    tables: Sequence[Table] = ()
+    notes: Sequence[str] = ()
+
+
+def command(run: Callable[..., Report]) -> Callable[..., int]:
+    """The ``main`` of an experiment: parse words, run, print, and return the exit status.
+
+    0: it ran; 1: the data or a choice stopped it (one line on stderr); 2: usage. The module's docstring is its help. The
+    JSON line begins with the circumstances and the options.
+    """
+    module = sys.modules[run.__module__]
+    name = Path(str(module.__file__)).stem
+
+    @functools.wraps(run)
+    def body(**options: Any) -> None:
+        threads, jobs = options.get("threads", 1), options.get("jobs", 1)
+        set_threads(threads)
+        began = time.perf_counter()
+        try:
+            report = run(**options)
+        except MeshmatchError as error:
+            explain(error)
+            raise SystemExit(1) from None
+        out = Console(width=None if os.isatty(1) else 140, highlight=False)  # a pipe has no width of its own
+        for each in report.tables:
+            out.print(each)
+        for line in report.notes:
+            out.print(line, soft_wrap=True, markup=False)
+        head = {"experiment": name, **circumstances(threads, jobs), "options": plain(options)}
+        seconds = round(time.perf_counter() - began, 1)
+        print(json.dumps(plain({**head, "seconds": seconds, **report.record})), flush=True)
+
+    def main(words: Sequence[str] | None = None) -> int:
+        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+        app.command(help=module.__doc__)(body)
+        try:
+            program = f"python -m meshmatch.experiments.{name}"
+            typer.main.get_command(app)(args=words if words is None else list(words), prog_name=program)
+        except SystemExit as stop:
+            return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+        return 0
+
+    return main
+
+
+def explain(error: MeshmatchError) -> None:
+    """Print on stderr what stopped an experiment."""
+    console = Console(stderr=True, highlight=False)
+    console.print(f"[red]error:[/] {escape(error.message)}", soft_wrap=True)
+    if error.hint:
+        console.print(f"[dim]hint:[/] {escape(error.hint)}", soft_wrap=True)
+
+
+def tell(line: str) -> None:
+    """Print on stderr what is going on."""
+    Console(stderr=True, highlight=False).print(line, markup=False, soft_wrap=True)
+
+
+def track(items: Iterable[T], what: str, total: int | None = None) -> Iterable[T]:
+    """The same items, with a progress bar on stderr."""
+    console = Console(stderr=True)
+    return progress.track(items, what, total=total, console=console, disable=not console.is_terminal)
+
+
+def plain(value: Any) -> Any:
+    """What JSON can say: paths as words, tuples as lists, numbers that are not finite as null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(each) for each in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def names_of(words: str, known: Iterable[str], what: str) -> list[str]:
+    """Names separated by commas, each once and in the order given.
+
+    Raises
+    ------
+    OptionError
+        A name that is not known.
+    """
+    allowed = list(known)
+    names = list(dict.fromkeys(name for name in words.split(",") if name))
+    for name in names:
+        if name not in allowed:
+            raise OptionError(f"unknown {what} '{name}'", f"choose from {', '.join(allowed)}")
+    return names
+
+
+def spread(items: Sequence[T], count: int | None) -> list[T]:
+    """``count`` items, evenly spread over a sequence and always the same ones; all of them for None or a large count."""
+    if count is None or count >= len(items):
+        return list(items)
+    return [items[k] for k in np.linspace(0, len(items) - 1, max(1, count)).round().astype(int)]
+
+
+def table(title: str, rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
+    """Rows as a table.
+
+    Parameters
+    ----------
+    columns
+        Heading: key of the row, or "key:format" for numbers, which stand to the right (format ">" for words that do).
+        What a row lacks, None and nan leave the cell empty.
+    """
+    drawn = Table(title=title, title_justify="left")
+    for heading, column in columns.items():
+        drawn.add_column(heading, justify="right" if ":" in column else "left", no_wrap=":" not in column)
+    for row in rows:
+        drawn.add_row(*(_cell(row, *column.partition(":")[::2]) for column in columns.values()))
+    return drawn
+
+
+def _cell(row: Mapping[str, Any], key: str, form: str) -> str:
+    value = row.get(key)
+    if value is None or value != value:
+        return ""
+    return format(value, form).replace("%", " %") if form != ">" else str(value)
+
+
+def as_markdown(drawn: Table) -> str:
+    """A table as lines for docs/results.md."""
+    grid = [[str(column.header), *map(str, column.cells)] for column in drawn.columns]
+    rows = [f"| {' | '.join(row)} |" for row in zip(*grid, strict=True)]
+    return "\n".join([str(drawn.title), "", rows[0], "|---" * len(grid) + "|", *rows[1:], ""])
+
+
+def circumstances(threads: int, jobs: int = 1) -> dict[str, Any]:
+    """Date, commit, machine and threads, as every published number needs them."""
+    return {
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "commit": commit(),
+        "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
+        "python": platform.python_version(),
+        "threads": threads,
+        "jobs": jobs,
+    }
+
+
+def commit(folder: Path = Path(__file__).parent) -> str:
+    """Short hash of the checked-out commit, with "+" if tracked files were changed; "unknown" without git."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    try:
+        changed = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "--short=10", "HEAD") + ("+" if changed else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def recall(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
+    """A kept result; None where there is no file.
+
+    Raises
+    ------
+    InputError
+        The file is damaged.
+    OptionError
+        It was measured with other choices than ``asked``.
+    """
+    if not path.is_file():
+        return None
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        before = dict(found["asked"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(
+            f"{path} is not a result of this experiment", "remove it to measure again"
+        ) from error
+    now = plain(asked)
+    if differences := sorted(key for key in {*before, *now} if before.get(key) != now.get(key)):
+        raise OptionError(
+            f"{path} was measured with other choices ({', '.join(differences)})",
+            "choose another output folder, or remove the file",
+        )
+    return dict(found)
+
+
+def keep(path: Path, asked: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
+    """Write a result with the choices that it belongs to, and return both."""
+    record: dict[str, Any] = plain({"asked": asked, **found})
+    make_folder(path.parent)
+    with replace_on_success(path) as temporary:
+        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return record
+
+
+def once(path: Path, asked: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
+    """A kept result, measured and written where there is none: a run that was stopped goes on with what is missing."""
+    found = recall(path, asked)
+    return keep(path, asked, measure()) if found is None else found

@@ -1,0 +1,118 @@
+"""The runner: options, tables, finished work that is kept, the JSON line and the exit status."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.errors import InputError, OptionError
+from meshmatch.experiments import runner
+from meshmatch.experiments.runner import (
+    Report,
+    Seed,
+    as_markdown,
+    command,
+    commit,
+    keep,
+    names_of,
+    once,
+    plain,
+    recall,
+    spread,
+    table,
+)
+
+ROWS = [{"set": "scape", "mean": 1.234, "share": 0.25}, {"set": "faust", "mean": float("nan")}]
+
+
+@command
+def main(count: int, seed: Seed = 0) -> Report:
+    if count == 13:
+        raise InputError("thirteen [shapes]", "take another number")
+    record = {"rows": ROWS, "path": Path("x"), "array": np.arange(count)}
+    return Report(
+        record, [table("A table", ROWS, {"set": "set", "mean": "mean:.2f", "part": "share:.0%"})], ["done"]
+    )
+
+
+def test_a_command_prints_tables_notes_and_one_line_last(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["2", "--seed", "3"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    record = json.loads(lines[-1])
+    assert lines[-2] == "done"
+    assert any("scape" in line and "1.23" in line and "25 %" in line for line in lines)
+    assert (record["experiment"], record["options"]) == ("test_runner", {"count": 2, "seed": 3})
+    assert {"date", "commit", "machine", "python", "threads", "jobs", "seconds"} < record.keys()
+    assert record["rows"][1]["mean"] is None  # JSON has no nan
+    assert (record["path"], record["array"]) == ("x", [0, 1])
+
+
+def test_what_stops_a_command_is_one_line_and_a_status(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["13"]) == 1
+    assert capsys.readouterr().err.splitlines() == ["error: thirteen [shapes]", "hint: take another number"]
+    assert main(["2", "--seed", "-1"]) == 2
+    assert main(["many"]) == 2
+    assert main(["--help"]) == 0
+    assert "The runner: options" in capsys.readouterr().out
+
+
+def test_a_bug_keeps_its_traceback() -> None:
+    with pytest.raises(ZeroDivisionError):
+        command(lambda: 1 // 0)([])  # type: ignore[arg-type,return-value]
+
+
+def test_names_are_checked_and_items_are_spread() -> None:
+    assert names_of("b,a,b", "abc", "letter") == ["b", "a"]
+    assert names_of("", "abc", "letter") == []
+    with pytest.raises(OptionError, match="unknown letter 'd'"):
+        names_of("a,d", "abc", "letter")
+    items = list(range(10))
+    assert spread(items, None) == spread(items, 99) == items
+    assert spread(items, 2) == [0, 9]
+    assert len(set(spread(items, 4))) == 4
+    assert spread(items, 0) == [0]
+
+
+def test_a_table_as_markdown() -> None:
+    lines = as_markdown(table("T", ROWS, {"set": "set", "mean": "mean:.1f"})).splitlines()
+    assert lines == ["T", "", "| set | mean |", "|---|---|", "| scape | 1.2 |", "| faust |  |"]
+
+
+def test_plain_values() -> None:
+    found = plain({"a": (1, Path("b")), 2: np.float32(0.5), "c": np.int64(3), "d": True, "e": np.inf})
+    assert found == {"a": [1, "b"], "2": 0.5, "c": 3, "d": True, "e": None}
+
+
+def test_a_result_is_measured_once(tmp_path: Path) -> None:
+    calls: list[int] = []
+
+    def measure() -> dict[str, float]:
+        calls.append(1)
+        return {"cm": 2.5}
+
+    path = tmp_path / "new" / "run.json"
+    asked = {"pairs": (("a", "b"),), "seed": 0}
+    assert recall(path, asked) is None
+    assert once(path, asked, measure) == once(path, asked, measure) == recall(path, asked)
+    assert len(calls) == 1
+
+
+def test_a_result_of_other_choices_is_refused(tmp_path: Path) -> None:
+    keep(tmp_path / "run.json", {"seed": 0, "steps": 5}, {"cm": 1})
+    with pytest.raises(OptionError, match=r"other choices \(seed, steps\)"):
+        recall(tmp_path / "run.json", {"seed": 1, "steps": 6})
+    with pytest.raises(OptionError, match=r"\(minutes\)"):
+        recall(tmp_path / "run.json", {"seed": 0, "steps": 5, "minutes": 2})
+
+
+@pytest.mark.parametrize("words", ["{", "[]", "{}", "3", "[" * 5000, '"asked"'])
+def test_a_damaged_result_is_told(words: str, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text(words)
+    with pytest.raises(InputError, match=r"run\.json is not a result"):
+        recall(tmp_path / "run.json", {})
+
+
+def test_commit_without_git(tmp_path: Path) -> None:
+    assert commit(tmp_path) == "unknown"
+    assert runner.circumstances(2)["threads"] == 2
