@@ -120,12 +120,13 @@ def draw_lines(charts: Sequence[Chart], path: str | Path, ylabel: str) -> None:
     pens = {name: _pen(k) for k, name in enumerate(dict.fromkeys(n for c in charts for n in c.lines))}
     if not 1 <= len(pens) <= len(COLORS):
         raise OptionError(f"a chart needs 1 to {len(COLORS)} lines, not {len(pens)}")
-    for line in (line for chart in charts for line in chart.lines.values()):
+    for chart, line in ((chart, line) for chart in charts for line in chart.lines.values()):
         numbers = np.array([*line.x, *line.y, *line.spread], float)
         if not len(line.x) or len(line.x) != len(line.y) or len(line.spread) not in (0, len(line.x)):
             raise OptionError("a line needs as many values as places, and at least one")
-        if not np.isfinite(numbers).all() or numbers.min() < 0:
-            raise OptionError("a line needs numbers of 0 or more")
+        lowest = min([*line.y, *line.spread, *(line.x if chart.log else ())])
+        if not np.isfinite(numbers).all() or lowest < 0:
+            raise OptionError("a line needs values of 0 or more, and on a logarithmic axis places too")
     with _saved(path, 6.4, 3.6) as figure:
         row = figure.subplots(1, len(charts), sharey=True, squeeze=False)[0]
         for axes, chart in zip(row, charts, strict=True):

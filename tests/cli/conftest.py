@@ -18,6 +18,12 @@ from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 
 
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures whose size is not given are small: rays cost seconds."""
+    monkeypatch.setattr("meshmatch.render.layout.HEIGHT", 240)
+
+
 @dataclass(frozen=True)
 class Answer:
     status: int

@@ -14,6 +14,8 @@ from meshmatch.templates.location import bundled_folder
 from tests.cli.conftest import Run
 from tests.fitting.eggs import bent_egg, egg_model, write_model
 
+pytestmark = pytest.mark.usefixtures("remembered_fits")
+
 
 @pytest.fixture(scope="module")
 def eggs(tmp_path_factory: pytest.TempPathFactory) -> Path:
