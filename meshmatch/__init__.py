@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from meshmatch.maps.files import load_map as load_map
     from meshmatch.maps.files import save_map as save_map
     from meshmatch.maps.vertex_map import VertexMap as VertexMap
-    from meshmatch.models.trained import load_model as load_model
+    from meshmatch.models.registry import load_model as load_model
     from meshmatch.shapes.files import load_shape as load_shape
     from meshmatch.shapes.files import save_shape as save_shape
     from meshmatch.shapes.shape import Shape as Shape
@@ -65,7 +65,7 @@ _HOMES = {
     "find_maps": "meshmatch.api.maps",
     "interpolate": "meshmatch.api.interpolation",
     "load_map": "meshmatch.maps.files",
-    "load_model": "meshmatch.models.trained",
+    "load_model": "meshmatch.models.registry",
     "load_shape": "meshmatch.shapes.files",
     "match": "meshmatch.api.matching",
     "picture": "meshmatch.api.pictures",

@@ -174,12 +174,14 @@ def verbs(program: typer.Typer) -> Iterator[Callable[..., object]]:
 
 
 def long_lists(modules: dict[str, ast.Module], verbs: Container[str], limit: int = 8) -> list[str]:
-    """Functions with too many parameters; the options of a verb are its interface and do not count."""
+    """Functions with too many parameters; the options of a verb are its interface and do not count, nor a program's."""
     return [
         f"{name}: {parameters(function)} parameters"
         for module, tree in modules.items()
         for function in functions(tree)
-        if parameters(function) > limit and (name := f"{module}.{function.name}") not in verbs
+        if parameters(function) > limit
+        and (name := f"{module}.{function.name}") not in verbs
+        and not (function.name == "main" and room_of(module) == "experiments")
     ]
 
 
@@ -231,7 +233,6 @@ def test_the_rule_sees_an_import_that_points_down() -> None:
     assert asked("maps", "from meshmatch.fitting.fit import Fit") == []
 
 
-@pytest.mark.xfail(strict=False, reason="not all of it holds yet")
 def test_no_module_imports_in_a_circle() -> None:
     none(circles(trees()))
 

@@ -45,7 +45,7 @@ def as_model(model: TrainedModel | str | Path) -> TrainedModel:
 
 @lru_cache(maxsize=2)
 def _loaded(folder: Path, changed: int) -> TrainedModel:
-    from meshmatch.models.trained import load_model
+    from meshmatch.models.registry import load_model
 
     return load_model(folder)
 

@@ -4,6 +4,8 @@ A model is a folder with ``card.json`` (written last), ``weights.safetensors`` a
 Listing models loads neither NumPy nor torch.
 """
 
+from __future__ import annotations
+
 import hashlib
 import os
 import secrets
@@ -11,10 +13,14 @@ import shutil
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from meshmatch.errors import MeshmatchError, ModelError, OutputError
 from meshmatch.models.card import ModelCard, check_name, read_card
 from meshmatch.models.tensor_file import read_header
+
+if TYPE_CHECKING:
+    from meshmatch.models.trained import TrainedModel
 
 CARD, WEIGHTS, TEMPLATE = "card.json", "weights.safetensors", "template.safetensors"
 HOME_VARIABLE = "MESHMATCH_HOME"
@@ -136,16 +142,31 @@ def find_model(name: str | Path) -> tuple[Path, ModelCard]:
     return folder, card
 
 
+def load_model(name: str | Path = "human") -> TrainedModel:
+    """Load a model by its registry name or folder.
+
+    Raises
+    ------
+    ModelError
+        Unknown name, damaged files, a kernel that is not known here, weights that are not those of the card's network,
+        or a template that is not the one the model was trained with.
+    TemplateError
+        The template's file is damaged.
+    """
+    from meshmatch.models.trained import trained_model  # torch
+
+    folder, card = find_model(name)
+    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS)
+
+
 def verify_model(name: str | Path) -> ModelCard:
-    """Load a model to be sure that it can be: `meshmatch.models.trained.load_model`. Returns the card.
+    """Load a model to be sure that it can be loaded. Returns the card.
 
     Raises
     ------
     ModelError
         No such model, or anything about it is wrong.
     """
-    from meshmatch.models.trained import load_model
-
     folder = locate_model(name)
     try:
         card = load_model(folder).card

@@ -20,7 +20,6 @@ from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.card import ModelCard
 from meshmatch.models.checkpoint import load_weights
 from meshmatch.models.deformer import Deformer, NetworkConfig
-from meshmatch.models.registry import TEMPLATE, WEIGHTS, find_model
 from meshmatch.templates.template import Template, load_template
 
 _DERIVING = threading.RLock()
@@ -112,19 +111,18 @@ def load_network(path: str | Path, config: NetworkConfig, K: int) -> Deformer:
     return network.eval()
 
 
-def load_model(name: str | Path = "human") -> TrainedModel:
-    """Load a model by its registry name or folder.
+def trained_model(card: ModelCard, template_file: Path, weights_file: Path) -> TrainedModel:
+    """The model of a card, from files that are safe to read; `meshmatch.models.registry.load_model` finds them.
 
     Raises
     ------
     ModelError
-        Unknown name, damaged files, a kernel that is not known here, weights that are not those of the card's network,
-        or a template that is not the one the model was trained with.
+        A kernel that is not known here, weights that are not those of the card's network, or a template that is not the
+        one the model was trained with.
     TemplateError
         The template's file is damaged.
     """
-    folder, card = find_model(name)
-    template = load_template(folder / TEMPLATE)
+    template = load_template(template_file)
     if template.hash != card.template_hash or template.K != card.field["nodes"]:
         raise ModelError(
             f"model {card.name} was trained with another template "
@@ -136,5 +134,5 @@ def load_model(name: str | Path = "human") -> TrainedModel:
             f"model {card.name} has the kernel {card.field['kernel']!r}, not {' or '.join(KERNELS)}",
             "it may need a newer meshmatch: update it",
         )
-    network = load_network(folder / WEIGHTS, NetworkConfig.from_dict(card.network), template.K)
+    network = load_network(weights_file, NetworkConfig.from_dict(card.network), template.K)
     return TrainedModel(card, template, network)

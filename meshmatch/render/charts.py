@@ -120,11 +120,11 @@ def draw_lines(charts: Sequence[Chart], path: str | Path, ylabel: str) -> None:
     pens = {name: _pen(k) for k, name in enumerate(dict.fromkeys(n for c in charts for n in c.lines))}
     if not 1 <= len(pens) <= len(COLORS):
         raise OptionError(f"a chart needs 1 to {len(COLORS)} lines, not {len(pens)}")
-    for chart, line in ((chart, line) for chart in charts for line in chart.lines.values()):
+    for log, line in ((chart.log, line) for chart in charts for line in chart.lines.values()):
         numbers = np.array([*line.x, *line.y, *line.spread], float)
         if not len(line.x) or len(line.x) != len(line.y) or len(line.spread) not in (0, len(line.x)):
             raise OptionError("a line needs as many values as places, and at least one")
-        lowest = min([*line.y, *line.spread, *(line.x if chart.log else ())])
+        lowest = min([*line.y, *line.spread, *(line.x if log else ())])
         if not np.isfinite(numbers).all() or lowest < 0:
             raise OptionError("a line needs values of 0 or more, and on a logarithmic axis places too")
     with _saved(path, 6.4, 3.6) as figure:

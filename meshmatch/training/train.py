@@ -18,8 +18,8 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.models.card import ModelCard, check_name, write_card
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import Deformer
-from meshmatch.models.registry import CARD, TEMPLATE, WEIGHTS
-from meshmatch.models.trained import TrainedModel, load_model
+from meshmatch.models.registry import CARD, TEMPLATE, WEIGHTS, load_model
+from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.templates.registered import frame_of, read_registered

@@ -31,7 +31,7 @@ from meshmatch.experiments.ablation_views import (
     methods_of,
 )
 from meshmatch.fields.choice import FIELDS, FieldName
-from meshmatch.models.trained import load_model
+from meshmatch.models.registry import load_model
 from meshmatch.training.setup import build_loss_points
 from tests.experiments.egg_runs import make_small, prepare_eggs
 

@@ -20,8 +20,8 @@ from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.system import node_system
 from meshmatch.geometry.kernels import KERNELS, Kernel
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.models.registry import built_in_folder
-from meshmatch.models.trained import TrainedModel, load_model
+from meshmatch.models.registry import built_in_folder, load_model
+from meshmatch.models.trained import TrainedModel
 from tests.fitting.eggs import egg_model
 
 OTHER: dict[Kernel, Kernel] = {"cubic": "smooth", "smooth": "cubic"}

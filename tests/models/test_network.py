@@ -15,8 +15,8 @@ from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig, rotation_f
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.models.layers import ResidualBlock, residual_mlp
 from meshmatch.models.neighbours import nearest, two_way_offsets
-from meshmatch.models.registry import built_in_folder
-from meshmatch.models.trained import TrainedModel, load_model, load_network
+from meshmatch.models.registry import built_in_folder, load_model
+from meshmatch.models.trained import TrainedModel, load_network
 from meshmatch.training.setup import build_deformer
 from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, bent_eggs, egg_template
 

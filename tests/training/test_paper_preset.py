@@ -11,7 +11,8 @@ from meshmatch.cli import main
 from meshmatch.fields.mls import build_field
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.models.trained import TrainedModel, load_model
+from meshmatch.models.registry import load_model
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.training import recipes

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from meshmatch.errors import InputError, OptionError, OutputError, TemplateError
-from meshmatch.models.registry import verify_model
-from meshmatch.models.trained import TrainedModel, load_model
+from meshmatch.models.registry import load_model, verify_model
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.nodes import NodeConfig
