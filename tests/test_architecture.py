@@ -302,7 +302,6 @@ def test_the_rule_sees_a_module_that_is_too_long(tmp_path: Path) -> None:
     assert long_modules(tmp_path) == ["long.py: 321 lines"]
 
 
-@pytest.mark.xfail(strict=False, reason="not all of it holds yet")
 def test_no_list_of_parameters_is_too_long() -> None:
     none(long_lists(trees(), {f"{verb.__module__}.{verb.__name__}" for verb in verbs(app)}))
 

@@ -106,7 +106,7 @@ def _band(
         chosen[: first - low] = chosen[last - low :] = False
         found = np.flatnonzero(chosen)
         if len(found):
-            fine = _fine(scene, viewport, hits, seen, shape, low, corner, found, places)
+            fine = _fine(scene, viewport, hits, seen, low, corner, found, places)
             light.reshape(-1, 3)[found], alpha.reshape(-1)[found] = fine
     own = slice(first - low, last - low)
     whole.light[first:last], whole.alpha[first:last] = light[own], alpha[own]
@@ -210,13 +210,13 @@ def _fine(
     viewport: Viewport,
     hits: Hits,
     seen: Float[Floats32, "P 2"],
-    shape: tuple[int, int],
     low: int,
     corner: tuple[int, int],
     chosen: Int[Ints, N],
     places: Float[Floats, "R 2"],
 ) -> tuple[Float[Floats32, "N 3"], Float[Floats32, N]]:
     """Light times alpha, and alpha, of chosen pixels of a band, each the mean over places in it."""
+    shape = (len(hits.face) // viewport.width, viewport.width)
     row, column = np.divmod(np.repeat(chosen, len(places)), shape[1])
     offsets = np.tile(places, (len(chosen), 1))
     finer = scene.look(

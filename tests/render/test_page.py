@@ -261,11 +261,12 @@ def test_a_vertex_without_a_position_is_not_drawn(tmp_path: Path, cube: Shape) -
 
 
 def test_a_large_mesh_is_drawn_coarser_and_says_so(
-    tmp_path: Path, make_sphere: Callable[[int], Shape]
+    tmp_path: Path, make_sphere: Callable[[int], Shape], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("meshmatch.render.viewer.page.MOST", 900)
     fine = stirred(bump(make_sphere(4)))
     path = tmp_path / "page.html"
-    report = write_page(path, fine.source, fine.target, fine.there, fine.back, most=900)
+    report = write_page(path, fine.source, fine.target, fine.there, fine.back)
     assert all(200 < drawn <= 900 for drawn in report.drawn)
     assert report.size == path.stat().st_size
     assert report.notes[0] == f"egg.ply: drawn with {report.drawn[0]:,} of 2,562 vertices"
@@ -466,14 +467,17 @@ def test_vertex_colours_are_painted(tmp_path: Path, cube: Shape) -> None:
     assert np.abs(linear - light[:, :3]).max() < 0.01
 
 
-def test_a_texture_on_a_coarser_mesh_is_painted(tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
+def test_a_texture_on_a_coarser_mesh_is_painted(
+    tmp_path: Path, make_sphere: Callable[[int], Shape], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The image is read at each vertex: its red grows with x."""
+    monkeypatch.setattr("meshmatch.render.viewer.page.MOST", 900)
     ball = bump(make_sphere(4))
     low, extent = ball.bounds[0], np.ptp(ball.verts, axis=0)
     uv = ((ball.verts - low) / extent)[:, [0, 2]][ball.faces]
     look = Appearance((Material("image", image(64, 64)),), np.zeros(ball.F, np.int64), uv)
     twice = Pair(ball, ball, VertexMap.identity(ball), VertexMap.identity(ball))
-    page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look)), most=900)
+    page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look)))
     rows = page.arrays["source.vertex"].astype(int)
     expected = ((ball.verts[rows] - low) / extent)[:, 0]
     assert np.abs(page.arrays["source.look.paint"].reshape(-1, 3)[:, 0] / 255 - expected).max() < 0.03

@@ -55,7 +55,6 @@ def write_page(
     rotations: tuple[Floats | None, Floats | None] = (None, None),
     names: tuple[str, str] | None = None,
     looks: Looks | None = None,
-    most: int = MOST,
 ) -> PageReport:
     """Write a page that shows two shapes side by side, and for each point of one its match on the other.
 
@@ -73,8 +72,6 @@ def write_page(
         To show; the shapes' own if not given.
     looks
         What they wear, for the button that shows it.
-    most
-        Vertices up to which a shape is drawn whole; a larger one is drawn coarser, and the page says so.
 
     Raises
     ------
@@ -89,7 +86,7 @@ def write_page(
     check_page(path)
     there, back = there.for_shapes(source, target), back.for_shapes(target, source, "the map back")
     shapes, maps = (source, target), (there, back)
-    parts = draw(source, most), draw(target, most)
+    parts = draw(source, MOST), draw(target, MOST)
     turns = upright(source, target, there, rotations)
     cubes = boxes(shapes, parts, there, turns)
     position = position_colors(source, turns[0])
