@@ -183,7 +183,7 @@ def test_doubt_is_kept_filled_or_left_blank(run: Run, pair: Path) -> None:
     kept = run(*call("--json", map="doubt.npz"))
     record = json.loads(well(kept).out)
     assert record["low_confidence_share"] == pytest.approx(share, abs=0.08)
-    assert "has less confidence than 0.3: kept as it came" in kept.err
+    assert "has less confidence than 0.3: kept as it is" in kept.err
     top = np.array([[0.0, 0.0, 1.0]])
     was = seen("out.glb", top)
 
@@ -349,8 +349,8 @@ def test_axes_and_a_map_do_not_go_together(run: Run, pair: Path) -> None:
 @pytest.mark.parametrize(
     ("out", "what"),
     [
-        ("out.stl", "a texture cannot be kept as '.stl'"),
-        ("out", "a file without a suffix"),
+        ("out.stl", "cannot write a texture as .stl"),
+        ("out", "cannot write a texture as (no suffix)"),
         ("a.glb", "is an input of this command"),
         ("gone/out.glb", "there is no folder gone"),
     ],
