@@ -431,9 +431,14 @@ def test_a_picture_that_fails_leaves_what_was_there(
 
 def test_all_files_that_are_read_are_guarded() -> None:
     asked = PictureOptions(
-        Path("m"), False, (Path("t"), (Path("p"), Path("q"))), "cm", [Path("v")], None, None, [Path("l")],
-        None, "f", Path("i"), False, 0,
-    )  # fmt: skip
+        map=Path("m"),
+        truth=Path("t"),
+        points=(Path("p"), Path("q")),
+        values=[Path("v")],
+        labels=[Path("l")],
+        fit="f",
+        image=Path("i"),
+    )
     assert {str(path) for path in asked.files} == {"m", "t", "p", "q", "v", "l", "f", "i"}
 
 
