@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import threading
 from functools import lru_cache
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, ModelError, OptionError
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.shapes.cloud import on_a_line
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
@@ -19,6 +22,9 @@ if TYPE_CHECKING:
 MINIMUM_FACES = 50
 MINIMUM_POINTS = 100
 
+THREADS = 2
+"""Unless said otherwise: the two shapes of a match are fitted beside each other, each on one thread."""
+
 _loading = threading.Lock()
 
 
@@ -28,9 +34,16 @@ def as_model(model: TrainedModel | str | Path) -> TrainedModel:
     Raises
     ------
     ModelError
-        There is none of this name, or its files are damaged.
+        There is none of this name, its files are damaged, or it is something else.
     """
     if not isinstance(model, str | Path):
+        from meshmatch.models.trained import TrainedModel
+
+        if not isinstance(model, TrainedModel):
+            raise ModelError(
+                f"a model cannot be made of {type(model).__name__}",
+                "give its name, its folder, or what load_model returned",
+            )
         return model
     from meshmatch.models.registry import WEIGHTS, locate_model
 
@@ -80,3 +93,29 @@ def validated(shape: Shape) -> Repaired:
             "save each object in a file of its own",
         )
     return clean
+
+
+def checked_threads(threads: int | None) -> int:
+    """The number of threads that is meant (`OptionError` if it is below 1 or not an integer)."""
+    if threads is None:
+        return THREADS
+    if not isinstance(threads, Integral) or threads < 1:
+        raise OptionError(f"threads must be 1 or more, not {threads!r}", "leave it out for the default")
+    return int(threads)
+
+
+def check_config(config: object) -> None:
+    """Refuse what is no `FitConfig` (`OptionError`)."""
+    if not isinstance(config, FitConfig):
+        raise OptionError(
+            f"a config is a FitConfig, not {type(config).__name__}", 'such as meshmatch.FitConfig(up="y")'
+        )
+
+
+def check_fit(fit: object) -> None:
+    """Refuse what is no `Fit` (`OptionError`)."""
+    if not isinstance(fit, Fit):
+        raise OptionError(
+            f"a map is made from fits, not from {type(fit).__name__}",
+            "fit each shape with Matcher.fit; or call match with the shapes themselves",
+        )

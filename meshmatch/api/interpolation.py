@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -23,7 +24,7 @@ from meshmatch.maps.template_footpoints import in_core_frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes.convert import ShapeLike
+from meshmatch.shapes.convert import ShapeLike, as_shapes
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Floats, Shape
 from meshmatch.threads import thread_limit
@@ -164,8 +165,9 @@ def interpolate(
     """
     began = time.monotonic()
     options = options or InterpolationOptions()
+    shapes = as_shapes(shapes)
     for count, what in ((len(shapes), "two shapes to go between"), (frames, "two shapes to make")):
-        if count < 2:
+        if not isinstance(count, Integral) or count < 2:
             raise OptionError(f"a sequence needs at least {what}, not {count}")
     matcher = Matcher(model, None, threads, progress)
     fits = matcher.fit_all(shapes, config)

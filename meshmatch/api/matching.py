@@ -12,26 +12,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.inputs import as_model, check_config, check_fit, checked_threads, validated
 from meshmatch.api.results import MatchResult, map_of_fits, shape_of
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig, check_landmarks
 from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.landmarks import fits_with_landmarks
+from meshmatch.fitting.landmarks import fits_with_landmarks, landmark_places
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes.convert import ShapeLike, as_shape
+from meshmatch.shapes.convert import ShapeLike, as_shape, as_shapes
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 
 LandmarkPairs = tuple[ArrayLike, ArrayLike]
 """Corresponding points: vertices of the source (N,), vertices of the target (N,)."""
-THREADS = 2
-"""Unless said otherwise: the two shapes of a match are fitted beside each other, each on one thread."""
 
 
 class Matcher:
@@ -70,7 +68,8 @@ class Matcher:
         progress: ProgressCallback | None = None,
     ) -> None:
         self.model = as_model(model)
-        self.config = config or FitConfig()
+        self.config = FitConfig() if config is None else config
+        check_config(self.config)
         self.threads = checked_threads(threads)
         self._asked_threads = threads or 1
         self.progress = progress
@@ -100,7 +99,7 @@ class Matcher:
         config : FitConfig or sequence of FitConfig, optional
             One for all shapes, or one for each.
         """
-        clean = [validated(as_shape(shape)) for shape in shapes]
+        clean = [validated(shape) for shape in as_shapes(shapes)]
         return self._fit_all(clean, self._configs(config, len(clean)))
 
     def dense(self, fit: Fit) -> Shape:
@@ -128,6 +127,8 @@ class Matcher:
             A fit of another template, or one that does not know its shape.
         """
         with thread_limit(1):
+            for fit in (source, target):
+                check_fit(fit)
             fits = self._agreed((source, target)) if agree else (source, target)
             return map_of_fits(fits, (source, target), self.threads)
 
@@ -144,6 +145,7 @@ class Matcher:
         configs = self._configs(config, 2)
         if landmarks is not None:
             _check_landmarks(self.model, configs)
+            landmark_places(clean, landmarks)  # before the long work
         with thread_limit(1):
             fits = self._fit_all(clean, configs)
             known = None
@@ -158,10 +160,12 @@ class Matcher:
         return MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads)
 
     def _configs(self, config: FitConfig | Sequence[FitConfig] | None, count: int) -> list[FitConfig]:
-        config = config or self.config
+        config = self.config if config is None else config
         configs = [config] * count if isinstance(config, FitConfig) else list(config)
         if len(configs) != count:
             raise OptionError(f"{count} shapes need one FitConfig, or {count} of them, not {len(configs)}")
+        for each in configs:
+            check_config(each)
         return configs
 
     def _fit_all(self, clean: Sequence[Repaired], configs: Sequence[FitConfig]) -> list[Fit]:
@@ -286,13 +290,6 @@ def register(
         As `match`.
     """
     return Matcher(model, config, threads, progress).fit(shape)
-
-
-def checked_threads(threads: int | None) -> int:
-    """The number of threads that is meant (`OptionError` if it is below 1)."""
-    if threads is not None and threads < 1:
-        raise OptionError(f"threads must be 1 or more, not {threads}")
-    return THREADS if threads is None else threads
 
 
 def _check_landmarks(model: TrainedModel, configs: Sequence[FitConfig]) -> None:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.choices import ON_NODES, PARTIALS, REFINE_NAMES, Partial, Refine
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.nodes import NodeRefineConfig
+from meshmatch.fitting.orientation import axis_vector
 from meshmatch.models.trained import TrainedModel
+
+_LEAST = {"seed": 0, "variants": 0, "screening": 0} | dict.fromkeys(
+    ("samples", "coarse_samples", "copies", "hypotheses", "careful", "finalists"), 1
+)
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,8 @@ class FitConfig:
     Raises
     ------
     OptionError
-        An unknown refinement, or an unknown word for ``partial``.
+        An unknown refinement, axis or word for ``partial``; up and front along the same axis; or a count that is too
+        small or not an integer.
     """
 
     refine: Refine = "nodes"
@@ -69,6 +76,15 @@ class FitConfig:
             )
         if self.partial not in PARTIALS:
             raise OptionError(f"partial cannot be {self.partial!r}", f"choose one of {', '.join(PARTIALS)}")
+        for name, least in _LEAST.items():
+            value = getattr(self, name)
+            if not isinstance(value, Integral) or value < least:
+                raise OptionError(
+                    f"{name} cannot be {value!r}", f"give an integer of {least} or more, or leave it out"
+                )
+        axes = [axis_vector(axis) for axis in (self.up, self.front) if axis is not None]
+        if len(axes) == 2 and axes[0] @ axes[1] != 0:
+            raise OptionError("up and front lie along the same axis", "choose two different axes")
 
     @property
     def moves_nodes(self) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.errors import OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.orientation import axis_vector, forced_frames, propose, standing_grid, with_flips
 from meshmatch.geometry.frames import Frame, RigidPose
@@ -30,13 +29,7 @@ def scan_frame(model: TrainedModel, shape: Shape) -> Frame:
 
 
 def frames_to_try(model: TrainedModel, samples: OrientedPoints, config: FitConfig) -> list[RigidPose]:
-    """Core frames to try: the category's, the aligner's (or a grid without one), or those that obey the user's axes.
-
-    Raises
-    ------
-    OptionError
-        An invalid axis, or up and front along the same axis.
-    """
+    """Core frames to try: the category's, the aligner's (or a grid without one), or those that obey the user's axes."""
     frames = aligned_frames(model, samples)
     if frames is None and model.network.aligner is None:
         frames = standing_grid(samples.points.mean(0))
@@ -101,8 +94,5 @@ def _along_body(poses: list[RigidPose]) -> list[RigidPose]:
 
 def _axes(config: FitConfig) -> tuple[Float[Floats, 3] | None, Float[Floats, 3] | None]:
     """The user's up and front."""
-    up = axis_vector(config.up) if config.up else None
-    front = axis_vector(config.front) if config.front else None
-    if up is not None and front is not None and abs(up @ front) > 0.5:
-        raise OptionError("up and front lie along the same axis", "choose two different axes")
-    return up, front
+    up = None if config.up is None else axis_vector(config.up)
+    return up, None if config.front is None else axis_vector(config.front)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
@@ -17,7 +18,7 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.repair import Repaired
 from meshmatch.templates.template import Template
 
-_HINT = "one pair of vertices a line"
+_HINT = "one target vertex for each source vertex, both counted from 0"
 
 
 def template_vertices(
@@ -34,6 +35,22 @@ def template_vertices(
         for fit, place in zip(fits, places, strict=True)
     ]
     return cKDTree(verts).query(np.mean(answers, axis=0))[1].astype(np.int64)
+
+
+def landmark_places(clean: Sequence[Repaired], landmarks: Sequence[ArrayLike]) -> list[Float[Floats, "N 3"]]:
+    """Where the landmarks of two shapes lie, in the frames of their files.
+
+    Raises
+    ------
+    OptionError
+        Not pairs of vertices, or a vertex that a shape does not have.
+    """
+    if len(landmarks) != 2:
+        raise OptionError(f"landmarks must be two lists of vertices, not {len(landmarks)}", _HINT)
+    places = [_places(part, chosen) for part, chosen in zip(clean, landmarks, strict=True)]
+    if len(places[0]) != len(places[1]):
+        raise OptionError("landmarks must come in pairs", _HINT)
+    return places
 
 
 def fits_with_landmarks(
@@ -64,9 +81,7 @@ def fits_with_landmarks(
     OptionError
         Not pairs of vertices, or a vertex that a shape does not have.
     """
-    places = [_places(part, np.asarray(chosen)) for part, chosen in zip(clean, landmarks, strict=True)]
-    if len(places[0]) != len(places[1]):
-        raise OptionError("landmarks must come in pairs", _HINT)
+    places = landmark_places(clean, landmarks)
     at = template_vertices(model.template, fits, places)
     known = [(at, place) for place in places]
     found = [
@@ -76,8 +91,9 @@ def fits_with_landmarks(
     return found, known
 
 
-def _places(part: Repaired, chosen: Int[Ints, " N"]) -> Float[Floats, "N 3"]:
+def _places(part: Repaired, vertices: ArrayLike) -> Float[Floats, "N 3"]:
     """Where vertices of a shape's file lie."""
+    chosen = np.asarray(vertices)
     if chosen.ndim != 1 or len(chosen) == 0 or chosen.dtype.kind not in "iu" or chosen.min() < 0:
         raise OptionError("landmarks must be lists of vertex numbers", _HINT)
     if chosen.max() >= len(part.original_to_repaired):

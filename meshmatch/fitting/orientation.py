@@ -90,9 +90,10 @@ def standing_grid(center: Float[Floats, 3]) -> list[RigidPose]:
 
 def axis_vector(name: str) -> Float[Floats, 3]:
     """Unit vector of an axis name such as "y", "+y" or "-z"; any other name is an `OptionError`."""
-    sign = -1.0 if name.startswith("-") else 1.0
-    axis = name.lstrip("+-").lower()
-    if axis not in ("x", "y", "z") or len(name) > 2:
+    word = str(name)
+    sign = -1.0 if word.startswith("-") else 1.0
+    axis = word.lstrip("+-").lower()
+    if axis not in ("x", "y", "z") or len(word) > 2:
         raise OptionError(f"invalid axis {name!r}", "write x, y or z, with - for the opposite direction")
     return sign * np.eye(3)["xyz".index(axis)]
 

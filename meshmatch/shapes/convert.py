@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
@@ -52,11 +53,33 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
     if isinstance(source, HasVertices):
         faces = getattr(source, "faces", getattr(source, "triangles", None))
         return _from_arrays(source.vertices, faces, name, _trimesh_colors(source))
-    if isinstance(source, tuple | list) and len(source) == 2 and np.ndim(source[0]) == 2:
+    if isinstance(source, tuple | list) and len(source) == 2 and _is_table(source[0]):
         return _from_arrays(source[0], source[1], name)
     if hasattr(source, "__array__") or isinstance(source, tuple | list):
         return _from_arrays(source, None, name)
     raise InputError(f"cannot make a shape of {type(source).__name__}", _HINT)
+
+
+def as_shapes(sources: Sequence[ShapeLike]) -> list[Shape]:
+    """The shapes that are meant, see `as_shape`.
+
+    Raises
+    ------
+    InputError
+        As `as_shape`; or a single shape instead of a list.
+    """
+    if isinstance(sources, str | os.PathLike | Shape | HasVertices) or not isinstance(sources, Iterable):
+        raise InputError(f"expected a list of shapes, not {type(sources).__name__}", "write [shape]")
+    if isinstance(sources, tuple) and len(sources) == 2 and np.asarray(sources[1]).dtype.kind in "iu":
+        raise InputError("expected a list of shapes, not one mesh", "write [(vertices, faces)]")
+    return [as_shape(source) for source in sources]
+
+
+def _is_table(values: Any) -> bool:
+    try:
+        return np.ndim(values) == 2
+    except ValueError:  # rows of different lengths
+        return False
 
 
 def _from_arrays(verts: Any, faces: Any, name: str, colors: Any = None) -> Shape:
@@ -76,4 +99,5 @@ def _trimesh_colors(mesh: Any) -> Any:
     visual: Any = getattr(mesh, "visual", None)
     if getattr(visual, "kind", None) != "vertex":
         return None
-    return np.asarray(visual.vertex_colors, np.float64) / 255.0
+    colors = np.asarray(visual.vertex_colors, np.float64)
+    return colors / 255.0 if len(colors) else None  # a trimesh.PointCloud without colours has an empty table

@@ -119,3 +119,67 @@ def test_configs_and_threads_that_do_not_fit(matcher: Matcher, sphere: Shape) ->
         matcher.match(sphere, sphere, [meshmatch.FitConfig()] * 3)
     with pytest.raises(OptionError, match="threads must be 1 or more"):
         Matcher("human", threads=0)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: Matcher(3),  # type: ignore[arg-type]
+        lambda: Matcher(meshmatch.FitConfig()),  # type: ignore[arg-type]
+        lambda: Matcher("human", threads=1.5),  # type: ignore[arg-type]
+        lambda: Matcher("human", threads="2"),  # type: ignore[arg-type]
+        lambda: Matcher("human", {"up": "y"}),  # type: ignore[arg-type]
+        lambda: meshmatch.interpolate("a.ply"),
+        lambda: meshmatch.interpolate([np.zeros((3, 3))] * 2, 2.5),  # type: ignore[arg-type]
+    ],
+)
+def test_arguments_of_other_types(call: Any) -> None:
+    with pytest.raises(MeshmatchError):
+        call()
+
+
+def test_matchers_refuse_other_types_with_a_hint(matcher: Matcher, sphere: Shape) -> None:
+    for call in (
+        lambda: matcher.fit(sphere, {"up": "y"}),  # type: ignore[arg-type]
+        lambda: matcher.fit_all("a.ply"),
+        lambda: matcher.fit_all((sphere.verts, sphere.faces)),
+        lambda: matcher.map("a.ply", "b.ply"),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(MeshmatchError) as caught:
+            call()
+        assert caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("landmarks", "told"),
+    [
+        (([0], [1], [2]), "two lists of vertices, not 3"),
+        (([0, 1], [0]), "in pairs"),
+        (([0.5], [1]), "lists of vertex numbers"),
+        (([9999], [1]), "vertex 9999 is not on"),
+    ],
+)
+def test_landmarks_are_checked_before_the_shapes_are_fitted(
+    matcher: Matcher, sphere: Shape, landmarks: Any, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Matcher, "_fit_all", lambda *_: pytest.fail("fitted"))
+    with pytest.raises(OptionError, match=told):
+        matcher.match(sphere, sphere, landmarks=landmarks)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"up": "w"},
+        {"front": ""},
+        {"up": 3},
+        {"up": "y", "front": "-y"},
+        {"seed": -1},
+        {"seed": 1.5},
+        {"samples": 0},
+    ],
+)
+def test_a_config_is_checked_when_it_is_made(wrong: dict[str, Any]) -> None:
+    with pytest.raises(OptionError) as caught:
+        meshmatch.FitConfig(**wrong)
+    assert caught.value.hint

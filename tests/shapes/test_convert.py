@@ -60,6 +60,7 @@ def test_nan_vertices_keep_their_place(cube: Shape) -> None:
         ((np.zeros((4, 3)), [[0, 1, 2.5]]), "faces must be integers"),
         (np.full((4, 3), np.nan), "no vertex has a finite position"),
         (np.zeros((0, 3)), "holds no vertices"),
+        (([[0, 0, 0], [1, 1]], [[0, 1, 2]]), "not an array of numbers"),
     ],
 )
 def test_wrong_input_is_one_line_with_a_hint(source: object, words: str) -> None:
@@ -77,6 +78,7 @@ def test_a_trimesh_there_and_back(cube: Shape) -> None:
     assert np.allclose(back.colors, colors, atol=0.5 / 255)
     assert as_shape(cube.to_trimesh()).colors is None
     assert as_shape(as_shape(cube.verts).to_trimesh()).is_cloud
+    assert as_shape(trimesh.PointCloud(cube.verts)).colors is None
 
 
 def test_only_stl_loads_trimesh(tmp_path: Path, cube: Shape) -> None:
