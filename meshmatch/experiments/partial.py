@@ -56,7 +56,9 @@ def part_of(shape: Shape, kind: Kind, seed: int) -> tuple[Shape, Int[Ints, " V_p
     return Shape(shape.verts[used], np.searchsorted(used, shape.faces[keep]), shape.name), used
 
 
-def seen_faces(shape: Shape, centers: Float[Floats, "F 3"], direction: Float[Floats, 3]) -> Bool[Bools, " F"]:
+def seen_faces(
+    shape: Shape, centers: Float[Floats, "F 3"], direction: Float[Floats, "3"]
+) -> Bool[Bools, " F"]:
     """Whether a camera far away in a direction sees the middle of each face."""
     facing = shape.face_normals @ direction > 0
     white = FacePaint(np.ones((shape.F, 3)))

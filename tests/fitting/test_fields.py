@@ -196,7 +196,7 @@ def test_pointwise_models_hold_no_landmarks(pointwise: TrainedModel) -> None:
 
 
 def test_a_field_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(ModelError, match="no field 'splines'"):
+    with pytest.raises(ModelError, match="unknown field 'splines'"):
         NetworkConfig.from_dict({"field": "splines"})
     assert NetworkConfig.from_dict({}).field == "mls"  # cards of before
 
