@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch.api.results import MatchResult
+from meshmatch.arrays import Ints
 from meshmatch.errors import InputError
 from meshmatch.maps.evaluate import Evaluation, evaluate_map
 from meshmatch.maps.files import load_map
@@ -45,17 +46,22 @@ def evaluate(
     Raises
     ------
     MeshmatchError
-        The map or the truth belongs to other shapes.
+        The map or the truth belongs to other shapes, or is something else.
     """
     source, target = as_shape(source, "source"), as_shape(target, "target")
     if isinstance(found, str | Path):
         found = load_map(found, source, target)
     vertex_map = found.map if isinstance(found, MatchResult) else found
+    if not isinstance(vertex_map, VertexMap):
+        raise InputError(
+            f"{type(found).__name__} is not a map",
+            "pass a MatchResult, a VertexMap (VertexMap.between makes one of an index), or the path of a map",
+        )
     here = there = None
-    if isinstance(truth, tuple):
-        here, there = (np.asarray(side, np.int64) for side in truth)
+    if isinstance(truth, tuple) and len(truth) == 2:
+        here, there = (_vertices(side) for side in truth)
     elif truth is not None:
-        there = np.asarray(truth, np.int64)
+        there = _vertices(truth)
         here = np.arange(source.V)
     if here is not None and there is not None and (here.ndim != 1 or here.shape != there.shape):
         raise InputError(
@@ -64,3 +70,12 @@ def evaluate(
         )
     with thread_limit(1):
         return evaluate_map(vertex_map, source, target, here, there, rng=np.random.default_rng(seed))
+
+
+def _vertices(numbers: ArrayLike) -> Ints:
+    found = np.asarray(numbers)
+    if found.dtype.kind not in "iu":
+        raise InputError(
+            f"the truth must be numbers of vertices, not {found.dtype}", "integers, counted from 0"
+        )
+    return found.astype(np.int64)

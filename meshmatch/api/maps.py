@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from meshmatch.api.results import MapPair, MatchResult, pair_of_map
+from meshmatch.errors import InputError
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.convert import ShapeLike, as_shape
@@ -43,6 +44,7 @@ def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> Ma
         return pair_of_map(match, source, target)
     found = match if isinstance(match, MatchResult | MapPair) else _maker(match)(source, target)
     if isinstance(found, MapPair):
+        found.forward.for_shapes(source, target)
         return found
     return MapPair(source, target, found.map.for_shapes(source, target), found, found.threads)
 
@@ -52,5 +54,10 @@ def _maker(match: Matcher | MapMaker | None) -> MapMaker:
         return match
     from meshmatch.api.matching import Matcher
 
-    matcher = match or Matcher()
+    matcher = Matcher() if match is None else match
+    if not isinstance(matcher, Matcher):
+        raise InputError(
+            f"{type(match).__name__} is not a map",
+            "pass a MatchResult, a VertexMap, the path of a map, a Matcher, or nothing to match the shapes",
+        )
     return lambda source, target: matcher.match(source, target)

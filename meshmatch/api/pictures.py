@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from meshmatch.api.inputs import checked_threads
 from meshmatch.api.maps import MapLike, find_maps
 from meshmatch.api.results import MapPair
 from meshmatch.arrays import Floats
@@ -29,7 +30,7 @@ from meshmatch.render.picture import Look
 from meshmatch.render.viewer import Looks, levelled, share_look, write_page
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.appearance_files import find_appearance, load_coordinates
-from meshmatch.shapes.convert import ShapeLike, as_shape
+from meshmatch.shapes.convert import ShapeLike, as_shape, as_shapes
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.label_files import Labels, labels_of
@@ -79,6 +80,10 @@ def picture(
         More than one of `match`, `values`, `labels` and `fit`; or one that does not belong to the shapes.
     """
     look = look or Look()
+    if Path(path).suffix.lower() != ".png":
+        raise OptionError(f"{Path(path).name}: a picture is a PNG", "end the name in .png")
+    if isinstance(names, str):
+        names = [names]
     with thread_limit(1):
         shown = _composed(shapes, look, match, values, labels, fit)
         if names is not None:
@@ -103,7 +108,7 @@ def _composed(
     chosen = [name for name, one in known.items() if one is not None]
     if len(chosen) > 1:
         raise OptionError(f"{' and '.join(chosen)} do not go together", "make a picture for each")
-    shapes = [as_shape(shape) for shape in given]
+    shapes = as_shapes(given)
     for name, tables in (("values", values), ("labels", labels)):
         if tables is not None and len(tables) != len(shapes):
             raise OptionError(f"{len(shapes)} shapes need as many {name}, not {len(tables)}")
@@ -116,17 +121,36 @@ def _composed(
         turns = None if maps.match is None else maps.match.rotations
         return compose_match(shapes[0], shapes[1], maps.forward, turns or (None, None), look=look)
     if values is not None:
-        return compose_values(shapes, [np.asarray(table, np.float64) for table in values], "")
+        return compose_values(shapes, [_table(*each) for each in zip(values, shapes, strict=True)], "")
     if labels is not None:
         pairs = zip(labels, shapes, strict=True)
         read = [own if isinstance(own, Labels) else labels_of(own, shape) for own, shape in pairs]
         return compose_labels(shapes, *merge_labels(read), [own.on == "faces" for own in read])
     if fit is not None:
         if len(shapes) != 1:
-            raise OptionError(f"a fit is of one shape, not of {len(shapes)}")
+            raise OptionError(f"a fit is of one shape, not of {len(shapes)}", "make a picture for each")
+        own = None if fit.repaired is None else fit.repaired.original
+        if own is not None and own.hash != shapes[0].hash:
+            raise InputError(
+                f"the fit is of {own.name or 'another shape'}, not of {shapes[0].name or 'this one'}",
+                "draw the shape that was fitted",
+            )
         return compose_fit(shapes[0], Shape(fit.points_in_file, fit.faces), fit.frame.rotation)
     looks = [_read_look(source, shape)[0] for source, shape in zip(given, shapes, strict=True)]
     return compose_shapes(list(zip(shapes, looks, strict=True)))
+
+
+def _table(values: ArrayLike, shape: Shape) -> Floats:
+    try:
+        table = np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"values of {shape.name or 'the shape'} must be numbers ({error})") from error
+    if table.ndim not in (1, 2) or len(table) != shape.V:
+        raise InputError(
+            f"values of {shape.name or 'the shape'} must be an array of ({shape.V},), not {table.shape}",
+            "one number or one colour for each vertex, and one array for each shape",
+        )
+    return table
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +206,9 @@ def view(
     MeshmatchError
         As `meshmatch.match`; or the map belongs to other shapes.
     """
+    threads = checked_threads(threads)
+    if names is not None and (isinstance(names, str) or len(names) != 2):
+        raise OptionError("a page needs two names, of the source and of the target")
     shapes = as_shape(source, "source"), as_shape(target, "target")
     maps = find_maps(*shapes, match)
     with thread_limit(1):

@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 from meshmatch.api.maps import MapLike, find_maps
 from meshmatch.api.results import MapPair
-from meshmatch.errors import OptionError
+from meshmatch.errors import InputError, OptionError
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.appearance import Appearance, vertex_colors_alone
 from meshmatch.shapes.appearance_files import load_appearance, load_coordinates
@@ -75,7 +76,7 @@ def transfer_texture(
     Parameters
     ----------
     source, target, match
-        See `meshmatch.api.transfer.find_maps`; textures and texture coordinates are read where these are files.
+        See `meshmatch.find_maps`; textures and texture coordinates are read where these are files.
     image : path, optional
         A picture for the source's texture coordinates, instead of those that its file names.
     uv : {"auto", "keep", "new"}
@@ -98,6 +99,8 @@ def transfer_texture(
         kept and are not valid; or as `meshmatch.match`.
     """
     baking.check_bake_options(options)
+    if uv not in get_args(Keep):
+        raise OptionError(f"invalid uv {uv!r}", f"choose one of {', '.join(get_args(Keep))}")
     own = None
     if uv != "new" and isinstance(target, str | Path):
         own_path = Path(target)
@@ -128,5 +131,10 @@ def _look_of(
     if image is not None:
         raise OptionError(
             "an image needs the texture coordinates of the source's file", "give the source as a path"
+        )
+    if shape.colors is None:
+        raise InputError(
+            f"{shape.name or 'the source'} has neither a texture nor colours",
+            "give the source as a path if its file has a texture, or give look",
         )
     return shape, vertex_colors_alone(shape)

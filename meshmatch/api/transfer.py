@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -69,11 +69,16 @@ def transfer_values(
         Not a row for each vertex; or as `find_maps`.
     """
     source = as_shape(source, "source")
-    numbers = np.asarray(values, np.float64)
+    numbers = _numbers(values, "values")
     if numbers.ndim not in (1, 2) or len(numbers) != source.V:
         raise InputError(
             f"values must be an array of ({source.V},) or ({source.V}, D), not {numbers.shape}",
             "one row for each vertex of the source",
+        )
+    blank = None if rule.blank is None else _numbers(rule.blank, "blank")
+    if blank is not None and blank.shape not in ((), (1,), numbers.shape[1:]):
+        raise OptionError(
+            f"blank has {blank.shape} numbers and the values {numbers.shape[1:]}", "give one number"
         )
     maps = find_maps(source, target, match)
     with thread_limit(1):
@@ -81,7 +86,6 @@ def transfer_values(
             found = pull_directions(maps.backward, maps.source, maps.target, numbers)
         else:
             found = pull_values(maps.backward, numbers)
-        blank = None if rule.blank is None else np.asarray(rule.blank, np.float64)
         confidence = _confidence(maps.backward)
         found, low = replace_low_values(found, confidence, maps.target, rule.minimum, blank, rule.fill)
     return Transferred(found, confidence, low, maps)
@@ -121,7 +125,8 @@ def transfer_colors(
     given = None if isinstance(colors, Appearance) else vertex_colors.light_of(source, colors)
     blank = None
     if rule.blank is not None:
-        blank = vertex_colors.light(vertex_colors.checked(np.asarray(rule.blank, np.float64)))
+        chosen = vertex_colors.checked(_numbers(rule.blank, "blank"))
+        blank = vertex_colors.light(np.append(chosen, 1.0)[:4])  # opaque unless it says otherwise
     maps = find_maps(source, target, match)
     with thread_limit(1):
         if given is not None:
@@ -175,6 +180,8 @@ def transfer_labels(
     blank = None if rule.blank is None else str(rule.blank)
     if blank is not None:
         given.check_blank(blank)
+    if to not in (None, *get_args(On)):
+        raise OptionError(f"labels cannot be given to {to!r}", "choose vertices or faces")
     if to == "faces" and target.is_cloud:
         raise OptionError(f"{target.name} is a point cloud: it has no faces to label", "label its vertices")
     kind: On = "vertices" if target.is_cloud else to or given.on
@@ -297,3 +304,10 @@ def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape) -> 
 
 def _confidence(back: VertexMap) -> Float[Floats, "V"]:
     return back.confidence.astype(np.float64)
+
+
+def _numbers(values: ArrayLike, name: str) -> Floats:
+    try:
+        return np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be numbers ({error})") from error

@@ -31,7 +31,7 @@ def evaluate(
     ] = None,
     picture: Annotated[
         Path | None,
-        typer.Option(metavar="PNG", help="Draw both shapes, the errors as heat (needs the truth)."),
+        typer.Option(metavar="PNG", help="Draw both shapes, the errors as a color map (needs the truth)."),
     ] = None,
     unit: Annotated[
         Literal["cm", "x100"],

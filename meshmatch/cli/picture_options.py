@@ -32,9 +32,9 @@ class PictureOptions:
             metavar="MAP", help="Of two shapes, SOURCE TARGET, a map: matched places in one colour."
         ),
     ] = None
-    confidence: Annotated[bool, typer.Option("--confidence", help="With --map: how sure it is, as heat.")] = (
-        False
-    )
+    confidence: Annotated[
+        bool, typer.Option("--confidence", help="With --map: its confidence, as a color map.")
+    ] = False
     truth: Truth = None
     points: Points = None
     unit: Annotated[
@@ -45,7 +45,7 @@ class PictureOptions:
         list[Path] | None,
         typer.Option(
             metavar="FILE",
-            help="A number for each vertex, as heat (.npy .csv); or three, as colour. Once for each shape.",
+            help="A number per vertex, as a color map (.npy .csv); or three, as a colour. Once for each shape.",
         ),
     ] = None
     title: Annotated[
@@ -71,7 +71,7 @@ class PictureOptions:
         typer.Option(
             metavar="MESH|MODEL",
             help="Over one shape: the template that `meshmatch register` laid on it, or a model whose template is "
-            "laid on it now. The distance is drawn as heat.",
+            "laid on it now. The distance is drawn as a color map.",
         ),
     ] = None
     image: Annotated[

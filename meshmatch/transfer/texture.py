@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 
@@ -32,7 +33,14 @@ class BakedMesh:
 
 
 def check_bake_options(options: BakeOptions) -> None:
-    """Refuse sizes that are out of range (`OptionError`)."""
+    """Refuse sizes that are out of range, and choices that contradict each other (`OptionError`)."""
+    for name in ("size", "samples", "padding", "workers"):
+        if not isinstance(getattr(options, name), Integral):
+            raise OptionError(f"{name} must be an integer, not {getattr(options, name)!r}")
+    if options.workers < 1:
+        raise OptionError(f"workers must be 1 or more, not {options.workers}")
+    if options.fill and options.blank is not None:
+        raise OptionError("fill and blank contradict each other", "choose one of them")
     if not 16 <= options.size <= LARGEST:
         raise OptionError(
             f"a texture has 16 to {LARGEST} texels a side, not {options.size}", "1024 or 2048 suit most"

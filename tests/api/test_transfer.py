@@ -1,6 +1,7 @@
 """Attributes in Python: from a map at hand, as files and as arrays; nothing is fitted."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -133,6 +134,7 @@ def test_what_is_not_trusted_is_kept_filled_or_blank(pair: tuple[Shape, Shape, V
         ("transfer_values", (np.zeros((642, 2, 2)),), "values must be an array"),
         ("transfer_labels", (np.zeros(7, int),), "7 labels"),
         ("transfer_weights", (-np.ones((642, 2)),), "negative"),
+        ("transfer_values", (["a"] * 642,), "values must be numbers"),
         ("transfer_landmarks", ([642],), "landmark 0 is vertex 642"),
         ("transfer_landmarks", ([[1.0, 2.0]],), "landmarks cannot be an array"),
     ],
@@ -191,3 +193,67 @@ def test_pictures_and_pages(pair: tuple[Shape, Shape, VertexMap], tmp_path: Path
     page = meshmatch.view(source, target, tmp_path / "ab.html", found)
     assert page.size == (tmp_path / "ab.html").stat().st_size
     assert not (tmp_path / "no.png").exists()
+
+
+@pytest.mark.parametrize("wrong", [3, np.zeros(642, int), "fit"])
+def test_what_is_no_map_is_refused(pair: tuple[Shape, Shape, VertexMap], wrong: Any) -> None:
+    source, target, found = pair
+    with pytest.raises(MeshmatchError):
+        meshmatch.transfer_values(source, target, np.zeros(642), wrong)
+    with pytest.raises(MeshmatchError):
+        meshmatch.evaluate(wrong, source, target)
+    with pytest.raises(InputError, match="truth"):
+        meshmatch.evaluate(found, source, target, np.zeros(642))
+
+
+def test_maps_found_for_other_shapes_are_refused(pair: tuple[Shape, Shape, VertexMap], cube: Shape) -> None:
+    source, target, found = pair
+    maps = meshmatch.find_maps(source, target, found)
+    with pytest.raises(InputError):
+        meshmatch.transfer_values(cube, target, np.zeros(cube.V), maps)
+
+
+def test_blanks_that_do_not_fit(pair: tuple[Shape, Shape, VertexMap]) -> None:
+    source, target, found = pair
+    for blank in ("red", (1.0, 2.0, 3.0)):
+        with pytest.raises(MeshmatchError, match="blank"):
+            meshmatch.transfer_values(source, target, np.zeros(642), found, rule=ConfidenceRule(blank=blank))
+    doubtful = VertexMap.between(source, target, found.index, confidence=np.zeros(source.V, np.float32))
+    painted = meshmatch.transfer_colors(
+        source, target, doubtful, colors=np.ones((642, 3)), rule=ConfidenceRule(blank=(1.0, 0.0, 0.0))
+    )
+    assert np.allclose(painted.data[painted.confidence < 0.3], [1, 0, 0, 1]) and painted.low.blank
+    with pytest.raises(OptionError, match="edges"):
+        meshmatch.transfer_labels(source, target, np.zeros(642, int), found, to="edges")  # type: ignore[arg-type]
+
+
+def test_textures_that_cannot_be_baked(pair: tuple[Shape, Shape, VertexMap]) -> None:
+    source, target, found = pair
+    with pytest.raises(InputError, match="neither a texture nor colours"):
+        meshmatch.transfer_texture(source, target, found)
+    with pytest.raises(OptionError, match="invalid uv"):
+        meshmatch.transfer_texture(source, target, found, uv="bogus")  # type: ignore[arg-type]
+    for choice in ({"workers": 0}, {"fill": True, "blank": (0.0, 0.0, 0.0, 1.0)}, {"size": 0}):
+        with pytest.raises(OptionError):
+            meshmatch.transfer_texture(source, target, found, options=meshmatch.BakeOptions(**choice))  # type: ignore[arg-type]
+
+
+def test_pictures_and_pages_that_cannot_be(pair: tuple[Shape, Shape, VertexMap], tmp_path: Path) -> None:
+    source, target, found = pair
+    file = tmp_path / "a.png"
+    for shapes, choice, told in (
+        (source, {}, "a list of shapes"),
+        ("a.ply", {}, "a list of shapes"),
+        ((source.verts, source.faces), {}, "a list of shapes"),
+        ([source], {"values": [np.zeros(3)]}, "values of .* must be an array"),
+        ([source], {"values": [["a"] * 642]}, "must be numbers"),
+    ):
+        with pytest.raises(MeshmatchError, match=told):
+            meshmatch.picture(shapes, file, **choice)  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match=r"^a\.jpg: a picture is a PNG"):
+        meshmatch.picture([source], tmp_path / "a.jpg")
+    with pytest.raises(OptionError, match="two names"):
+        meshmatch.view(source, target, tmp_path / "a.html", found, names=["one"])
+    with pytest.raises(OptionError, match="threads"):
+        meshmatch.view(source, target, tmp_path / "a.html", found, threads=0)
+    assert not list(tmp_path.iterdir())
