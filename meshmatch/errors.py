@@ -4,6 +4,9 @@ Everything that the user's data or choices can cause is a `MeshmatchError`; anyt
 its traceback.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class MeshmatchError(Exception):
     """Something that the user can put right.
@@ -51,3 +54,16 @@ class PoorFit(MeshmatchError):
 
 def _one_line(text: str) -> str:
     return " ".join(str(text).split())
+
+
+@contextmanager
+def needs(library: str, extra: str) -> Iterator[None]:
+    """Around an import: a missing library is said as the user's choice, with the extra that brings it (`OptionError`)."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name != library:
+            raise
+        raise OptionError(
+            f"this needs {library}, which is not installed", f"pip install 'meshmatch[{extra}]'"
+        ) from error

@@ -17,7 +17,7 @@ from torch import Tensor
 from meshmatch.arrays import Float
 from meshmatch.errors import TemplateError
 from meshmatch.experiments.ablation_views import BASE, Run
-from meshmatch.models.deformer import NetworkConfig
+from meshmatch.models.config import NetworkConfig
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.templates.nodes import NodeConfig, Strategy, choose_nodes
 from meshmatch.templates.registered import read_registered

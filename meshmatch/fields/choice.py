@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-import numpy as np
-import torch
-
 from meshmatch.arrays import Float, Floats
-from meshmatch.fields.field import PointField
 from meshmatch.fields.mls import build_field
-from meshmatch.fields.pointwise import Motion, PointwiseField
 from meshmatch.fields.rbf import build_rbf
+from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.geometry.kernels import Kernel
 
 FieldName = Literal["mls", "rbf", "pointwise"]
@@ -23,29 +19,19 @@ def has_nodes(name: FieldName) -> bool:
     return name != "pointwise"
 
 
-def field_at(
+def shape_functions(
     name: FieldName,
     points: Float[Floats, "P 3"],
     nodes: Float[Floats, "K 3"],
     radius: float,
     kernel: Kernel,
-    motion: Motion | None = None,
-    D: int = 0,
-) -> PointField:
-    """A representation on fixed points of the template's frame.
-
-    ``nodes``, ``radius`` and ``kernel`` are for those that have them; ``motion``, with codes of ``D`` numbers, for
-    the pointwise one.
+) -> ShapeFunctions:
+    """A representation that has nodes, on fixed points of the template's frame; radial basis functions take all nodes.
 
     Raises
     ------
     TemplateError
         The nodes do not carry the points: too few in reach (mls), two in one place (rbf).
     """
-    if name == "rbf":
-        return build_rbf(points, nodes)
-    if name == "pointwise":
-        assert motion is not None
-        at = torch.from_numpy(np.array(points)).float()
-        return PointwiseField(at, at, motion, D)
-    return build_field(points, nodes, radius, kernel)
+    assert has_nodes(name)
+    return build_rbf(points, nodes) if name == "rbf" else build_field(points, nodes, radius, kernel)

@@ -1,4 +1,4 @@
-"""What every representation of a deformation does on fixed points, and the two that are linear in node vectors.
+"""What every representation of a deformation does on fixed points, in torch: for training, and for searches by gradient.
 
 A decoder answers a code with *rows* (R, 3). For the linear representations (moving least squares, radial basis
 functions) these are the vectors of the nodes; for the pointwise one (`fields.pointwise`) they are the code itself. Who
@@ -7,13 +7,18 @@ moves points needs to know neither: a field says where its points go and what th
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.fields.choice import FieldName, shape_functions
+from meshmatch.fields.pointwise import Motion, PointwiseField
+from meshmatch.fields.shape_functions import ShapeFunctions
+from meshmatch.geometry.kernels import Kernel
 
 
 class PointField(Protocol):
@@ -70,6 +75,11 @@ class Field:
 
     phi: Float[torch.Tensor, "P K"]
     gradient: Float[torch.Tensor, "P3 K"]
+
+    @classmethod
+    def of(cls, functions: ShapeFunctions) -> Field:
+        """The same shape functions as tensors."""
+        return cls(_tensor(functions.phi), _tensor(functions.gradient))
 
     @property
     def P(self) -> int:
@@ -161,3 +171,38 @@ def apply_shape_functions(
 
 def _dense(matrix: torch.Tensor) -> torch.Tensor:
     return matrix if matrix.layout == torch.strided else matrix.to_dense()
+
+
+def _tensor(matrix: Any) -> torch.Tensor:
+    """A float32 tensor, sparse CSR or dense as the matrix is."""
+    if isinstance(matrix, np.ndarray):
+        return torch.from_numpy(matrix)
+    start, column = (torch.from_numpy(part.astype(np.int64)) for part in (matrix.indptr, matrix.indices))
+    values = torch.from_numpy(matrix.data)
+    with warnings.catch_warnings():
+        # Torch announces its CSR layout as beta at the first use: nothing a user could act on.
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(start, column, values, matrix.shape, check_invariants=True)
+
+
+def field_at(
+    name: FieldName,
+    points: Float[Floats, "P 3"],
+    nodes: Float[Floats, "K 3"],
+    radius: float,
+    kernel: Kernel,
+    motion: Motion | None = None,
+    D: int = 0,
+) -> PointField:
+    """A representation on fixed points of the template's frame; ``motion``, with codes of ``D`` numbers, if pointwise.
+
+    Raises
+    ------
+    TemplateError
+        As `shape_functions`.
+    """
+    if name == "pointwise":
+        assert motion is not None
+        at = torch.from_numpy(np.array(points)).float()
+        return PointwiseField(at, at, motion, D)
+    return Field.of(shape_functions(name, points, nodes, radius, kernel))

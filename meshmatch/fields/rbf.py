@@ -11,18 +11,17 @@ exactly.
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import TemplateError
-from meshmatch.fields.field import Field
+from meshmatch.fields.shape_functions import ShapeFunctions
 
 CONSTANT, STEEPNESS = 1.0, 50.0
 _MAX_CONDITION = 1e13
 _BLOCK = 4096
 
 
-def build_rbf(points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"]) -> Field:
+def build_rbf(points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"]) -> ShapeFunctions:
     """Evaluate the shape functions and their gradient on fixed points.
 
     The paper's numbers are for shapes in the unit sphere, so lengths are measured in the largest distance of a node from
@@ -35,8 +34,8 @@ def build_rbf(points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"]) -> Fiel
 
     Returns
     -------
-    Field
-        Dense float32 tensors; computed in float64.
+    ShapeFunctions
+        Dense float32; computed in float64.
 
     Raises
     ------
@@ -62,7 +61,7 @@ def build_rbf(points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"]) -> Fiel
         phi[here] = value @ inverse
         for k in range(3):
             gradient[here, k] = (STEEPNESS * offset[..., k] / value) @ inverse / unit
-    return Field(torch.from_numpy(phi), torch.from_numpy(gradient.reshape(3 * len(points), len(q))))
+    return ShapeFunctions(phi, gradient.reshape(3 * len(points), len(q)))
 
 
 def multiquadric(offset: Float[Floats, "*N 3"]) -> Float[Floats, "*N"]:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
-from meshmatch.fields.field import PointField
+from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.choices import WAYS, Way
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.samples import take_samples
@@ -21,6 +21,9 @@ from meshmatch.fitting.turning import FieldPath, Path, RotationBlend, StretchBle
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
+
+if TYPE_CHECKING:
+    from meshmatch.fields.pointwise import PointwiseField
 
 _SAMPLES = 2048  # of which a shape's code is read
 
@@ -103,7 +106,7 @@ class Blend:
             raise OptionError(f"unknown way to blend {way!r}", f"choose one of {', '.join(WAYS)}")
         met = [self._path(row) for row in np.eye(len(fits))]
         self._correction = self._keys - np.stack(met)
-        self._node_field: PointField | None = None
+        self._node_field: ShapeFunctions | PointwiseField | None = None
         if way == "codes" and model.has_nodes:
             self._node_field = model.field(_beside_nodes(model))
             turns = np.stack([_turns(self._node_field, vectors) for vectors in met])
@@ -152,11 +155,9 @@ class Blend:
         return Deviation(*_energies(F, S), *_energies(F, np.eye(3)[None]))
 
 
-def _turns(field: PointField, vectors: Float[Floats, "K 3"]) -> Float[Floats, "P 3 3"]:
+def _turns(field: ShapeFunctions | PointwiseField, vectors: Float[Floats, "K 3"]) -> Float[Floats, "P 3 3"]:
     """Rotations by which a pose turns the points of a field."""
-    with torch.no_grad():
-        F = field.deformation_gradient(torch.from_numpy(np.array(vectors)).float()[None])[0]
-    return polar(F.double().numpy())[0]
+    return polar(field.strain(vectors))[0]
 
 
 def _beside_nodes(model: TrainedModel) -> Float[Floats, "K 3"]:
@@ -174,18 +175,9 @@ def _energies(F: Float[Floats, "G 3 3"], S: Float[Floats, "... 3 3"]) -> tuple[f
 
 def _code_path(model: TrainedModel, shapes: Sequence[Shape], fits: Sequence[Fit]) -> Path:
     """Node vectors of blended codes; each code is that of samples of a shape in the core frame of its fit."""
-    network = model.network
-    found = []
+    network = model.inference
+    codes = []
     for shape, fit in zip(shapes, fits, strict=True):
         frame, samples = take_samples(shape, _SAMPLES, np.random.default_rng(fit.seed))
-        points = torch.from_numpy(fit.frame.apply(frame.undo(samples.points))).float()[None]
-        with torch.inference_mode():
-            found.append(network.encoder(network.encoder.features(points)))
-    codes = torch.cat(found)
-
-    @torch.inference_mode()
-    def path(weights: Floats) -> Floats:
-        blended = torch.from_numpy(weights).float()[None] @ codes
-        return network.decoder(blended)[0].double().numpy()
-
-    return path
+        codes.append(network.encode(fit.frame.apply(frame.undo(samples.points))))
+    return lambda weights: network.decode(weights @ np.stack(codes))

@@ -7,7 +7,6 @@ from numbers import Integral
 
 from meshmatch.errors import OptionError
 from meshmatch.fitting.choices import ON_NODES, PARTIALS, REFINE_NAMES, Partial, Refine
-from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.nodes import NodeRefineConfig
 from meshmatch.fitting.orientation import axis_vector
 from meshmatch.models.trained import TrainedModel
@@ -15,6 +14,18 @@ from meshmatch.models.trained import TrainedModel
 _LEAST = {"seed": 0, "variants": 0, "screening": 0} | dict.fromkeys(
     ("samples", "coarse_samples", "copies", "hypotheses", "careful", "finalists"), 1
 )
+
+
+@dataclass(frozen=True)
+class LatentRefineConfig:
+    """The paper's test-time weights L1..L3, steps and rate."""
+
+    steps: int = 2000
+    rate: float = 1e-3
+    chamfer: float = 1.0
+    volume: float = 1e-4
+    arap: float = 1e-3
+    points: int = 3000
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,11 @@ def scan_frame(model: TrainedModel, shape: Shape) -> Frame:
 def frames_to_try(model: TrainedModel, samples: OrientedPoints, config: FitConfig) -> list[RigidPose]:
     """Core frames to try: the category's, the aligner's (or a grid without one), or those that obey the user's axes."""
     frames = aligned_frames(model, samples)
-    if frames is None and model.network.aligner is None:
+    if frames is None and not model.inference.config.align_basis:
         frames = standing_grid(samples.points.mean(0))
     elif frames is None:
         points = samples.points[:_VOTERS]
-        frames = with_flips(propose(model.network, points, config.copies, config.hypotheses, config.seed))
+        frames = with_flips(propose(model.inference, points, config.copies, config.hypotheses, config.seed))
     up, front = _axes(config)
     if up is None and front is None:
         return frames

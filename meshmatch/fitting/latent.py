@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.fields.energies import arap_energy, volume_energy
-from meshmatch.fields.field import PointField
+from meshmatch.fields.field import Field, PointField
+from meshmatch.fields.shape_functions import ShapeFunctions
+from meshmatch.fitting.fit_config import LatentRefineConfig
 from meshmatch.fitting.samples import draw
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel, once_per_model
 from meshmatch.progress import Progress
 from meshmatch.shapes.sampling import farthest_points
-
-
-@dataclass(frozen=True)
-class LatentRefineConfig:
-    """The paper's test-time weights L1..L3, steps and rate."""
-
-    steps: int = 2000
-    rate: float = 1e-3
-    chamfer: float = 1.0
-    volume: float = 1e-4
-    arap: float = 1e-3
-    points: int = 3000
 
 
 class PaperEnergy:
@@ -116,7 +104,7 @@ def _on_template(model: TrainedModel, P: int) -> tuple[torch.Tensor, PointField]
     """Template points (P, 3) and the field there."""
     verts = model.template.shape.verts
     verts = verts[farthest_points(verts, P)]
-    return torch.from_numpy(verts).float(), model.field(verts).for_descent()
+    return torch.from_numpy(verts).float(), _in_torch(model.field(verts)).for_descent()
 
 
 def _chamfer(moved: torch.Tensor, points: torch.Tensor, tree: cKDTree) -> torch.Tensor:
@@ -125,3 +113,7 @@ def _chamfer(moved: torch.Tensor, points: torch.Tensor, tree: cKDTree) -> torch.
     forward = torch.from_numpy(tree.query(here)[1])
     back = torch.from_numpy(cKDTree(here).query(points.numpy())[1])
     return (moved - points[forward]).square().sum(1).mean() + (moved[back] - points).square().sum(1).mean()
+
+
+def _in_torch(field: ShapeFunctions | PointField) -> PointField:
+    return Field.of(field) if isinstance(field, ShapeFunctions) else field

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import TemplateError
-from meshmatch.fields.field import Field
+from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.system import node_system
 from meshmatch.models.trained import TrainedModel, once_per_model
 
@@ -59,7 +59,7 @@ def mirror_of(model: TrainedModel) -> Mirror | None:
     except TemplateError:  # the mirrored side has too few nodes
         return None
     here = node_system(model).field
-    assert isinstance(here, Field) and isinstance(there, Field)
+    assert isinstance(here, ShapeFunctions) and isinstance(there, ShapeFunctions)
     phi, across = _dense(here.phi), _dense(there.phi)
     square = phi.T @ phi
     square += _RIDGE * np.trace(square) / len(square) * np.eye(len(square))
@@ -67,4 +67,4 @@ def mirror_of(model: TrainedModel) -> Mirror | None:
 
 
 def _dense(phi: Any) -> Floats:
-    return np.asarray(phi.to_dense() if hasattr(phi, "to_dense") else phi, dtype=float)
+    return np.asarray(phi if isinstance(phi, np.ndarray) else phi.toarray(), dtype=float)

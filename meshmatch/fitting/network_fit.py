@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -15,7 +14,7 @@ from meshmatch.fitting.samples import draw
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, with_normals
-from meshmatch.models.deformer import Deformer
+from meshmatch.models.inference import Network
 from meshmatch.models.trained import TrainedModel
 
 # How many points the network sees of tilted copies, in turn: thin samples tip it either way where it is in doubt.
@@ -47,7 +46,7 @@ class Predictor:
 
     Attributes
     ----------
-    network : Deformer
+    network : Network
     system : NodeSystem
     core : (C,) int
         Vertices of the template by which the core frame is read off a fit.
@@ -56,7 +55,7 @@ class Predictor:
     rng : numpy.random.Generator
     """
 
-    network: Deformer
+    network: Network
     system: NodeSystem
     core: Ints
     mirror: Mirror | None
@@ -65,14 +64,12 @@ class Predictor:
     @classmethod
     def of(cls, model: TrainedModel, rng: np.random.Generator) -> Predictor:
         """The predictor of a trained model."""
-        return cls(model.network, node_system(model), model.template.core, mirror_of(model), rng)
+        return cls(model.inference, node_system(model), model.template.core, mirror_of(model), rng)
 
-    @torch.inference_mode()
     def predict(self, samples: OrientedPoints, draws: int, points: int = 2048) -> Float[Floats, "K 3"]:
         """Mean prediction of node vectors over several draws of samples, which lie in their core frame."""
-        chosen = np.stack([draw(samples, points, self.rng) for _ in range(draws)])
-        clouds = torch.from_numpy(samples.points[chosen]).float()
-        return self.network(clouds).mean(0).double().numpy()
+        clouds = [samples.points[draw(samples, points, self.rng)] for _ in range(draws)]
+        return self.network.predict(clouds).mean(0)
 
     def fit(
         self, samples: OrientedPoints, pose: RigidPose, rounds: int = 2, draws: int = 2, stride: int = 2
@@ -96,7 +93,6 @@ class Predictor:
                 pose = pose @ kabsch(self.system.verts[self.core], moved[self.core])
         return Candidate(pose, vectors, two_way_residual(self.system, local, vectors, stride))
 
-    @torch.inference_mode()
     def variants(
         self, local: OrientedPoints, coarse: OrientedPoints, pose: RigidPose, count: int, degrees: float
     ) -> list[Candidate]:
@@ -125,13 +121,12 @@ class Predictor:
 
     def _tilted(self, samples: OrientedPoints, tilts: Float[Floats, "N 3 3"]) -> list[Floats]:
         """Node vectors (K, 3) predicted from tilted samples, turned back."""
-        back = []
+        clouds = []
         for number, tilt in enumerate(tilts):
             size = _VARIANT_POINTS[number % len(_VARIANT_POINTS)]
-            cloud = samples.points[draw(samples, size, self.rng)] @ tilt.T
-            vectors = self.network(torch.from_numpy(cloud).float()[None])[0].double().numpy()
-            back.append(self.network.turned(vectors, tilt))
-        return back
+            clouds.append(samples.points[draw(samples, size, self.rng)] @ tilt.T)
+        found = self.network.predict(clouds)
+        return [self.network.rotate_rows(vectors, tilt) for vectors, tilt in zip(found, tilts, strict=True)]
 
 
 def two_way_residual(

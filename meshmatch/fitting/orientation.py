@@ -7,14 +7,12 @@ form a hypothesis. Asking again from the voted frame sharpens it.
 from __future__ import annotations
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.geometry.frames import RigidPose
-from meshmatch.models.deformer import Deformer
-from meshmatch.models.neighbours import nearest
+from meshmatch.models.inference import Network, quick_tree
 
 _AGREE = 30  # degrees: votes that are closer agree. Set by hand.
 # Turns of the core frame that a vote may be wrong by: about face, upside down, on its head, a quarter either way.
@@ -30,27 +28,22 @@ def turned_copies(count: int, seed: int) -> Float[Floats, "count 3 3"]:
     return rotations
 
 
-@torch.inference_mode()
 def ask_aligner(
-    model: Deformer, points: Float[Floats, "P 3"], turns: Float[Floats, "N 3 3"]
+    network: Network, points: Float[Floats, "P 3"], turns: Float[Floats, "N 3 3"]
 ) -> tuple[Float[Floats, "N 3 3"], Float[Floats, "N 3"]]:
     """Rotations and centers of core frames of the points, each read off one turned copy (rows x -> turn x)."""
-    assert model.aligner is not None
     middle = points.mean(0)
+    cloud = (points - middle).astype(np.float32)
     # Turning the basis the other way is cheaper than turning and indexing the points N times.
-    basis = model.aligner.basis.numpy()
-    tree_queries = torch.from_numpy(np.einsum("mk,nkl->nml", basis, turns).reshape(1, -1, 3)).float()
-    cloud = torch.from_numpy(points - middle).float()[None]
-    offsets = nearest(tree_queries, cloud)[1].view(len(turns), -1, 3)
-    matrices = torch.from_numpy(turns).float()
-    features = (offsets @ matrices.transpose(1, 2)) * 5.0
-    R, t = model.align(features)
-    back = matrices.transpose(1, 2)
-    return (back @ R).double().numpy(), (back @ t[..., None])[..., 0].double().numpy() + middle
+    queries = np.einsum("mk,nkl->nml", network.align_basis, turns).astype(np.float32)
+    offsets = cloud[quick_tree(cloud).query(queries)[1]] - queries  # N M 3
+    R, t = network.read_frames(offsets @ turns.astype(np.float32).transpose(0, 2, 1))
+    back = turns.transpose(0, 2, 1)
+    return back @ R, (back @ t[..., None])[..., 0] + middle
 
 
 def propose(
-    model: Deformer, points: Float[Floats, "P 3"], copies: int = 48, keep: int = 4, seed: int = 0
+    network: Network, points: Float[Floats, "P 3"], copies: int = 48, keep: int = 4, seed: int = 0
 ) -> list[RigidPose]:
     """Hypotheses of the core frame, most voted first.
 
@@ -60,9 +53,9 @@ def propose(
     copies : how many turned copies vote
     keep : how many hypotheses to return at most
     """
-    rotations, centers = ask_aligner(model, points, turned_copies(copies, seed))
+    rotations, centers = ask_aligner(network, points, turned_copies(copies, seed))
     # Second look: from its own proposed frame the network knows the pose best.
-    rotations, centers = ask_aligner(model, points, rotations.transpose(0, 2, 1))
+    rotations, centers = ask_aligner(network, points, rotations.transpose(0, 2, 1))
     trace = np.einsum("nij,mij->nm", rotations, rotations)
     angle = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
     close = angle < _AGREE

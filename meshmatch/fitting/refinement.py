@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
+from meshmatch.errors import needs
 from meshmatch.fitting.candidates import CandidateScorer, Interpretation, averaged, choose
 from meshmatch.fitting.choices import Refine
 from meshmatch.fitting.completion import completed
-from meshmatch.fitting.latent import refine_code
 from meshmatch.fitting.network_fit import Candidate, one_way_residual, two_way_residual
 from meshmatch.fitting.nodes import refine_nodes
 from meshmatch.fitting.part import STAGE, PartCandidate, RefinePart, cost
@@ -49,6 +49,9 @@ def _first(task: FitTask, candidates: list[Interpretation]) -> Interpretation:
 
 def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
     """The best candidate, refined by the paper's search over codes."""
+    with needs("torch", "train"):
+        from meshmatch.fitting.latent import refine_code
+
     best = candidates[0]
     local = task.samples.to_local(best.pose)
     facing = local.facing(task.system.surface(best.vectors))

@@ -11,20 +11,22 @@ the whole matrix.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from scipy.linalg import solveh_banded
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.fields.field import Field, PointField
+from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel, once_per_model
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
+
+if TYPE_CHECKING:
+    from meshmatch.fields.pointwise import PointwiseField
 
 # Where the upper triangle xx xy xz yy yz zz belongs in a 3 x 3 block, row by row.
 _BLOCK = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
@@ -42,7 +44,7 @@ class NodeSystem:
     ----------
     shape : Shape
         The template's mesh, template frame.
-    field : PointField
+    field : ShapeFunctions or PointwiseField
         The model's field on the mesh's vertices.
     strain_points : int
         At how many of them, at most, strain is measured.
@@ -51,7 +53,7 @@ class NodeSystem:
     ----------
     verts : (V, 3) template vertices, template frame
     faces : (F, 3)
-    field : PointField, on the vertices
+    field : ShapeFunctions or PointwiseField, on the vertices
     linear : whether there are node vectors, and with them what follows
     phi : (V, K), sparse or dense
     slopes : (3 G, K), gradient of the shape functions at G strain points
@@ -61,21 +63,23 @@ class NodeSystem:
     phi: Any
     slopes: Any
 
-    def __init__(self, shape: Shape, field: PointField, strain_points: int = 1500) -> None:
+    def __init__(
+        self, shape: Shape, field: ShapeFunctions | PointwiseField, strain_points: int = 1500
+    ) -> None:
         self.verts = np.asarray(shape.verts)
         self.faces = np.asarray(shape.faces)
         self.linear = field.linear
         self.strain_points = farthest_points(self.verts, min(strain_points, len(self.verts)))
         self._incidence = _vertex_faces(self.faces, len(self.verts))
         self.field = field
-        if isinstance(field, Field):
+        if isinstance(field, ShapeFunctions):
             self._compile(field)
 
-    def _compile(self, field: Field) -> None:
+    def _compile(self, field: ShapeFunctions) -> None:
         self.K = field.K
-        self.phi = _to_scipy(field.phi)
+        self.phi = field.phi.astype(np.float64)
         rows = (3 * self.strain_points[:, None] + np.arange(3)).reshape(-1)
-        self.slopes = _to_scipy(field.gradient)[rows]
+        self.slopes = field.gradient.astype(np.float64)[rows]
         row, column, self._pairs = _pair_products(self.phi)
         self._order = _band_order(row, column, self.K)
         self._band, self._place = _band_places(row, column, np.argsort(self._order))
@@ -154,16 +158,6 @@ def node_system(model: TrainedModel) -> NodeSystem:
     """The least-squares system of a model's template and field."""
     shape = model.template.shape
     return NodeSystem(shape, model.field(shape.verts))
-
-
-def _to_scipy(matrix: torch.Tensor) -> Any:
-    """In float64: a sparse matrix, or a plain array where it is dense."""
-    if matrix.layout == torch.strided:
-        return matrix.double().numpy()
-    return csr_matrix(
-        (matrix.values().double().numpy(), matrix.col_indices().numpy(), matrix.crow_indices().numpy()),
-        shape=tuple(matrix.shape),
-    )
 
 
 class _EveryPair:

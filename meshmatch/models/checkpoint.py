@@ -12,11 +12,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-import torch
+import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.numpy import save_file
 
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.models.tensor_file import TensorInfo, read_header
@@ -31,13 +31,13 @@ _FORMAT = "weights 1"
 _SHORT_ROW = 64  # of a matrix with fewer columns the scales would weigh as much as they save
 
 
-def save_weights(state: Mapping[str, torch.Tensor], path: str | Path, *, storage: str = "float16") -> str:
+def save_weights(state: Mapping[str, Any], path: str | Path, *, storage: str = "float16") -> str:
     """Write a state dict and return the sha256 of the file (64 hex digits). Same state, same file.
 
     Parameters
     ----------
     state
-        Tensors by name.
+        Arrays, or torch tensors on any device, by name.
     storage : {"float32", "float16", "int8"}
         "int8" quantises the matrices of linear layers with at least 64 columns; other weights become float16.
 
@@ -52,33 +52,34 @@ def save_weights(state: Mapping[str, torch.Tensor], path: str | Path, *, storage
     """
     if storage not in STORAGES:
         raise OptionError(f"unknown storage {storage!r}", f"choose one of {', '.join(STORAGES)}")
-    arrays: dict[str, torch.Tensor] = {}
+    arrays: dict[str, np.ndarray] = {}
     for name in sorted(state):
-        tensor = state[name].detach().cpu()
-        if tensor.is_floating_point():
-            if not tensor.isfinite().all():
+        array = state[name]
+        array = np.array(array.detach().cpu() if hasattr(array, "detach") else array, order="C")
+        floating = array.dtype.kind == "f"
+        if floating:
+            if not np.isfinite(array).all():
                 raise ModelError(
                     f"weight {name} is not finite", "the training diverged: use an earlier checkpoint"
                 )
-            tensor = tensor.float()
+            array = array.astype(np.float32)
         if name.endswith(SCALE) and name.removesuffix(SCALE) in state:
             raise ModelError(f"{name} is reserved for the scale of {name.removesuffix(SCALE)}")
-        if storage == "float32" or not (
-            name.endswith("weight") and tensor.is_floating_point() and tensor.ndim > 1
-        ):
-            arrays[name] = tensor.contiguous().clone()  # a clone: safetensors refuses shared memory
-        elif storage == "int8" and tensor.ndim == 2 and tensor.shape[1] >= _SHORT_ROW:
-            arrays[name], arrays[name + SCALE] = _quantised(tensor)
+        if storage == "float32" or not (name.endswith("weight") and floating and array.ndim > 1):
+            arrays[name] = array
+        elif storage == "int8" and array.ndim == 2 and array.shape[1] >= _SHORT_ROW:
+            arrays[name], arrays[name + SCALE] = _quantised(array)
         else:
-            half = tensor.half().contiguous()
-            arrays[name] = half if half.isfinite().all() else tensor.contiguous().clone()
+            with np.errstate(over="ignore"):
+                half = array.astype(np.float16)
+            arrays[name] = half if np.isfinite(half).all() else array
     with replace_on_success(path) as temporary:
         save_file(arrays, temporary, {_KEY: _FORMAT})
         with temporary.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
+def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
     """Read what `save_weights` wrote: float32 where it was floating.
 
     Parameters
@@ -95,24 +96,22 @@ def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> d
     held = read_header(path)
     _check(path, held, expected)
     try:
-        with safe_open(str(path), framework="pt") as file:
+        with safe_open(str(path), framework="numpy") as file:
             if (file.metadata() or {}).get(_KEY) != _FORMAT:
                 raise _mismatch(path, "it is not a weights file of meshmatch")
             arrays = {name: file.get_tensor(name) for name in held}
     except (SafetensorError, OSError) as error:
         raise ModelError(f"{path} is damaged", "fetch or make it again") from error
-    found: dict[str, torch.Tensor] = {}
+    found: dict[str, np.ndarray] = {}
     for name in expected:
-        tensor = arrays[name]
-        if tensor.dtype == torch.int8:
-            tensor = tensor.float() * arrays[name + SCALE][:, None]
-        elif tensor.is_floating_point():
-            tensor = tensor.float()
-        if tensor.is_floating_point() and not tensor.isfinite().all():
+        array = arrays[name]
+        if array.dtype == np.int8:
+            array = array.astype(np.float32) * arrays[name + SCALE][:, None]
+        elif array.dtype.kind == "f":
+            array = array.astype(np.float32)
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise _mismatch(path, f"{name} is not finite")
-        found[name] = (
-            tensor.clone() if tensor is arrays[name] else tensor
-        )  # memory of its own, aligned as torch does
+        found[name] = array
     return found
 
 
@@ -134,11 +133,11 @@ def _check(path: Path, held: Mapping[str, TensorInfo], expected: Mapping[str, tu
             raise _mismatch(path, f"the scale of {name} is missing or does not fit it")
 
 
-def _quantised(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _quantised(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(R, C) float32 -> (R, C) int8, (R,) float32."""
-    scale = matrix.abs().amax(dim=1) / 127.0
-    scale = torch.where(scale > 0, scale, torch.ones_like(scale))  # a row of zeros stays one
-    return (matrix / scale[:, None]).round().clamp(-127, 127).to(torch.int8), scale
+    scale = np.abs(matrix).max(axis=1) / np.float32(127.0)
+    scale = np.where(scale > 0, scale, np.float32(1))  # a row of zeros stays one
+    return np.clip(np.round(matrix / scale[:, None]), -127, 127).astype(np.int8), scale
 
 
 def _some(names: list[str]) -> str:

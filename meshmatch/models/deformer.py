@@ -6,76 +6,22 @@ so that the fitted template's core (a body's torso; the whole shape elsewhere) l
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Literal
+from collections.abc import Mapping, Sequence
 
+import numpy as np
 import torch
 from torch import nn
 
-from meshmatch.arrays import Float, Floats
-from meshmatch.errors import ModelError
-from meshmatch.fields.choice import FIELDS, FieldName, field_at, has_nodes
-from meshmatch.fields.field import PointField, apply_shape_functions
+from meshmatch.arrays import Float, Floats, Floats32
+from meshmatch.fields.choice import has_nodes
+from meshmatch.fields.field import PointField, apply_shape_functions, field_at
 from meshmatch.fields.pointwise import TURN_ROWS, PointwiseField, code_rows, turned_rows
 from meshmatch.geometry.kernels import Kernel
+from meshmatch.models.config import NetworkConfig
 from meshmatch.models.decoder import FlatDecoder, NodeDecoder, PointDecoder
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.models.layers import residual_mlp
 from meshmatch.models.neighbours import two_way_offsets
-
-_MAX = {
-    "code": 4096, "width": 8192, "depth": 64, "basis": 8192,
-    "align_basis": 8192, "align_width": 8192, "corrections": 64, "correct_width": 8192,
-}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class NetworkConfig:
-    """Sizes and choices of a deformer; saved in the model card (cards without ``field`` have moving least squares).
-
-    The defaults were chosen on generated bodies (docs/results.md, ablations).
-
-    A pointwise field has a decoder of its own, whatever ``decoder`` says.
-    """
-
-    encoder: Literal["basis", "point"] = "basis"
-    decoder: Literal["flat", "node"] = "flat"
-    code: int = 512
-    width: int = 768
-    depth: int = 2
-    basis: int = 768
-    align_basis: int = 512
-    align_width: int = 512
-    corrections: int = 3
-    correct_width: int = 640
-    field: FieldName = "mls"
-
-    def __post_init__(self) -> None:
-        # A card may come from anywhere: bound what building the network allocates.
-        if self.encoder not in ("basis", "point") or self.decoder not in ("flat", "node"):
-            raise ModelError(
-                f"unknown network: encoder {self.encoder!r}, decoder {self.decoder!r}", "update meshmatch"
-            )
-        if self.field not in FIELDS:
-            raise ModelError(f"unknown field {self.field!r}, only {', '.join(FIELDS)}", "update meshmatch")
-        for name, limit in _MAX.items():
-            value = getattr(self, name)
-            if type(value) is not int or not 0 <= value <= limit:
-                raise ModelError(f"network option {name} must be an integer from 0 to {limit}, not {value!r}")
-
-    @staticmethod
-    def from_dict(values: dict) -> NetworkConfig:
-        known = NetworkConfig.__dataclass_fields__
-        unknown = sorted(set(values) - set(known))
-        if unknown:
-            raise ModelError(f"unknown network options: {', '.join(unknown)}", "update meshmatch")
-        return NetworkConfig(**values)
-
-    def to_dict(self) -> dict:
-        return asdict(self)
-
-
-PAPER = NetworkConfig(encoder="point", decoder="node", width=1024, align_basis=0, corrections=0)
 
 
 def rotation_from_six(six: Float[torch.Tensor, "B 6"]) -> Float[torch.Tensor, "B 3 3"]:
@@ -151,7 +97,13 @@ class Deformer(nn.Module):
         motion = self.decoder.displacement if isinstance(self.decoder, PointDecoder) else None
         return field_at(self.config.field, points, nodes, radius, kernel, motion, self.config.code)
 
-    def turned(self, vectors: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
+    def pointwise_field(self, points: Float[Floats, "P 3"]) -> PointwiseField:
+        """The field of a pointwise network."""
+        assert isinstance(self.decoder, PointDecoder)
+        at = torch.from_numpy(np.array(points)).float()
+        return PointwiseField(at, at, self.decoder.displacement, self.config.code)
+
+    def rotate_rows(self, vectors: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
         """Rows of the deformation whose moved points (rows) are those of ``vectors`` times ``turn``."""
         if isinstance(self.decoder, PointDecoder):
             return turned_rows(vectors, turn)
@@ -193,3 +145,61 @@ class Deformer(nn.Module):
         for _ in range(self.config.corrections):
             vectors = self.correct(vectors, points)
         return vectors
+
+    # The same questions in arrays, as `models.inference.Network` has them: for fields that torch alone can evaluate.
+
+    @property
+    def align_basis(self) -> Float[Floats32, "M 3"]:
+        assert self.aligner is not None
+        return self.aligner.basis.cpu().numpy()
+
+    @torch.inference_mode()
+    def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B R 3"]:
+        """Rows for several clouds, of any number of points each, in their core frames."""
+        return np.stack([_array(self(self._tensor(cloud)))[0] for cloud in clouds])
+
+    @torch.inference_mode()
+    def read_frames(
+        self, offsets: Float[Floats32, "B M 3"]
+    ) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
+        """Rotations R and centers t of the core, scan = R core + t, from offsets of basis points to nearest points."""
+        R, t = self.align(torch.from_numpy(5 * offsets).to(self.nodes.device))
+        return _array(R), _array(t)
+
+    @torch.inference_mode()
+    def encode(self, cloud: Float[Floats, "P 3"]) -> Float[Floats, " D"]:
+        """The code of a cloud in its core frame."""
+        return _array(self.encoder(self.encoder.features(self._tensor(cloud))))[0]
+
+    @torch.inference_mode()
+    def decode(self, code: Float[Floats, " D"]) -> Float[Floats, "R 3"]:
+        """The rows of a code, without corrections."""
+        return _array(self.decoder(self._tensor(code)))[0]
+
+    def _tensor(self, array: Floats) -> torch.Tensor:
+        return torch.from_numpy(np.asarray(array, np.float32))[None].to(self.nodes.device)
+
+
+def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
+    """A network for K nodes whose weights and buffers have shapes but no memory: a card cannot ask for gigabytes."""
+    with torch.device("meta"):
+        return Deformer(
+            config,
+            nodes=torch.zeros(K, 3),
+            anchors=torch.zeros(K, 3),
+            anchor_phi=torch.zeros(K, K) if has_nodes(config.field) else None,
+            basis=torch.zeros(config.basis, 3),
+            align_basis=torch.zeros(max(config.align_basis, 1), 3),
+        )
+
+
+def with_weights(config: NetworkConfig, K: int, weights: Mapping[str, np.ndarray]) -> Deformer:
+    """A network for K nodes with given weights (`models.inference.weight_shapes`), in evaluation mode."""
+    network = blank_deformer(config, K)
+    # copies: weights that training changes are no one else's
+    network.load_state_dict({name: torch.from_numpy(np.array(w)) for name, w in weights.items()}, assign=True)
+    return network.eval()
+
+
+def _array(tensor: torch.Tensor) -> Floats:
+    return tensor.double().cpu().numpy()

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Hashable
-from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, TypeVar
-
-import torch
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.errors import ModelError
-from meshmatch.fields.choice import has_nodes
-from meshmatch.fields.field import PointField
+from meshmatch.errors import ModelError, needs
+from meshmatch.fields.choice import has_nodes, shape_functions
+from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.card import ModelCard
 from meshmatch.models.checkpoint import load_weights
-from meshmatch.models.deformer import Deformer, NetworkConfig
+from meshmatch.models.config import NetworkConfig
+from meshmatch.models.inference import Network, NodeNetwork, weight_shapes
 from meshmatch.templates.template import Template, load_template
+
+if TYPE_CHECKING:
+    from meshmatch.fields.pointwise import PointwiseField
+    from meshmatch.models.deformer import Deformer
 
 _DERIVING = threading.RLock()
 P = ParamSpec("P")
@@ -29,17 +31,29 @@ Derived = TypeVar("Derived")
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """What fitting needs of a category. ``network`` is in evaluation mode, on the CPU until `to` moves it.
+    """What fitting needs of a category.
 
+    ``inference`` answers in arrays; `network` is the same network in torch, for training and searches by gradient.
     ``derived`` holds what was computed from the model alone, see `once_per_model`.
     """
 
     card: ModelCard
     template: Template
-    network: Deformer
+    inference: Network
     derived: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
 
-    def field(self, points: Float[Floats, "P 3"]) -> PointField:
+    @classmethod
+    def of(cls, card: ModelCard, template: Template, network: Deformer) -> TrainedModel:
+        """A model of a network at hand, in evaluation mode."""
+        inference: Network = network
+        if has_nodes(network.config.field):
+            weights = {name: value.numpy(force=True) for name, value in network.state_dict().items()}
+            inference = NodeNetwork(network.config, weights)
+        made = cls(card, template, inference)
+        made.derived[torch_network.__wrapped__, (), ()] = network  # type: ignore[attr-defined]
+        return made
+
+    def field(self, points: Float[Floats, "P 3"]) -> ShapeFunctions | PointwiseField:
         """The field on points of the template's frame, with the kernel that the network was trained with.
 
         Raises
@@ -47,22 +61,20 @@ class TrainedModel:
         TemplateError
             A point has too few nodes in reach.
         """
-        nodes, radius = self.template.nodes, self.template.radius
-        return self.network.field(points, nodes, radius, self.card.field["kernel"])
+        config, nodes, radius = self.inference.config, self.template.nodes, self.template.radius
+        if has_nodes(config.field):
+            return shape_functions(config.field, points, nodes, radius, self.card.field["kernel"])
+        return self.network.pointwise_field(points)
 
     @property
-    def device(self) -> torch.device:
-        """Where the network computes."""
-        return self.network.nodes.device
-
-    def to(self, device: torch.device | str) -> TrainedModel:
-        """The same model on another device; the network is copied, and nothing derived is taken along."""
-        return TrainedModel(self.card, self.template, deepcopy(self.network).to(device))
+    def network(self) -> Deformer:
+        """The network in torch, in evaluation mode, on the CPU; needs the extra ``train``."""
+        return torch_network(self)
 
     @property
     def has_nodes(self) -> bool:
         """Whether its fits are node vectors, which can be solved for; a pointwise model has codes alone."""
-        return has_nodes(self.network.config.field)
+        return has_nodes(self.inference.config.field)
 
 
 def once_per_model(
@@ -84,31 +96,31 @@ def once_per_model(
     return once
 
 
-def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
-    """A network for K nodes whose weights and buffers have shapes but no memory: a card cannot ask for gigabytes."""
-    with torch.device("meta"):
-        return Deformer(
-            config,
-            nodes=torch.zeros(K, 3),
-            anchors=torch.zeros(K, 3),
-            anchor_phi=torch.zeros(K, K) if has_nodes(config.field) else None,
-            basis=torch.zeros(config.basis, 3),
-            align_basis=torch.zeros(max(config.align_basis, 1), 3),
-        )
+@once_per_model
+def torch_network(model: TrainedModel) -> Deformer:
+    """The network of a model whose inference is in arrays, as torch has it."""
+    assert isinstance(model.inference, NodeNetwork)
+    with needs("torch", "train"):
+        from meshmatch.models.deformer import with_weights
+
+    return with_weights(model.inference.config, model.template.K, model.inference.weights)
 
 
-def load_network(path: str | Path, config: NetworkConfig, K: int) -> Deformer:
-    """A network for K nodes with the weights of a file, in evaluation mode.
+def load_network(path: str | Path, config: NetworkConfig, K: int) -> Network:
+    """A network for K nodes with the weights of a file, in evaluation mode. A pointwise one needs torch.
 
     Raises
     ------
     ModelError
         The file is damaged, or holds the weights of another network.
     """
-    network = blank_deformer(config, K)
-    expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
-    network.load_state_dict(load_weights(path, expected), assign=True)
-    return network.eval()
+    if has_nodes(config.field):
+        return NodeNetwork(config, load_weights(path, weight_shapes(config, K)))
+    with needs("torch", "train"):
+        from meshmatch.models.deformer import blank_deformer, with_weights
+
+    expected = {key: tuple(value.shape) for key, value in blank_deformer(config, K).state_dict().items()}
+    return with_weights(config, K, load_weights(path, expected))
 
 
 def trained_model(card: ModelCard, template_file: Path, weights_file: Path) -> TrainedModel:

@@ -86,7 +86,7 @@ def _lattice_field(points: Float[Floats, "N 3"]) -> Field:
     middle, half = 0.5 * (low + high), 0.55 * float((high - low).max())
     ticks = np.linspace(-half, half, _SIDE)
     lattice = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3) + middle
-    return build_field(points, lattice, _REACH * float(ticks[1] - ticks[0]), "smooth")
+    return Field.of(build_field(points, lattice, _REACH * float(ticks[1] - ticks[0]), "smooth"))
 
 
 def deformed_source(shapes: Float[torch.Tensor, "N V 3"], augmentation: Augmentation | None = None) -> Source:

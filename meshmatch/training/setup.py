@@ -10,10 +10,11 @@ import torch
 
 from meshmatch.arrays import Float, Int, Ints
 from meshmatch.errors import TemplateError
-from meshmatch.fields.choice import field_at, has_nodes
-from meshmatch.fields.field import Field
+from meshmatch.fields.choice import has_nodes
+from meshmatch.fields.field import Field, field_at
 from meshmatch.geometry.kernels import Kernel
-from meshmatch.models.deformer import Deformer, NetworkConfig
+from meshmatch.models.config import NetworkConfig
+from meshmatch.models.deformer import Deformer
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.template import Template
 from meshmatch.templates.unregistered import ShapeSamples

@@ -4,7 +4,8 @@ import numpy as np
 import torch
 
 from meshmatch.geometry.kernels import Kernel
-from meshmatch.models.deformer import Deformer, NetworkConfig
+from meshmatch.models.config import NetworkConfig
+from meshmatch.models.deformer import Deformer
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import make_template
 from meshmatch.templates.nodes import NodeConfig
