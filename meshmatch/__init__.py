@@ -91,7 +91,10 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module 'meshmatch' has no attribute {name!r}")
     from importlib import import_module
 
-    value = getattr(import_module(_HOMES[name]), name)
+    from meshmatch.errors import needs
+
+    with needs("torch", "train"):
+        value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value  # next time without this function
     return value
 

@@ -48,6 +48,7 @@ OWNERS = {
     "safetensors": {"templates", "models", "training"},
     "scipy": {
         *(
+            "fields",
             "geometry",
             "shapes",
             "templates",
@@ -73,7 +74,7 @@ DISTRIBUTIONS = {
     "pyFM": "pyfmaps",
     "robust_laplacian": "robust-laplacian",
 }
-EXTRAS = ("meshlab", "bodies", "bench", "plots")  # what the package imports only where it is installed
+EXTRAS = ("meshlab", "train", "bench", "plots")  # what the package imports only where it is installed
 HEAVY = {"torch", "trimesh", "pymeshlab", "scipy", "safetensors", "matplotlib", "jaxtyping"}
 NO_TORCH = ("geometry", "shapes", "templates", "maps", "transfer", "render")
 FORBIDDEN_NAMES = {"utils", "util", "common", "helpers", "helper", "base", "misc"}

@@ -49,11 +49,14 @@ def train(
     command goes on from the checkpoint, exactly. On several GPUs:
     `torchrun --nproc-per-node N -m meshmatch train ...`.
     """
+    from meshmatch.errors import needs
     from meshmatch.threads import set_threads
-    from meshmatch.training import train as training
-    from meshmatch.training.bodies import Bodies
-    from meshmatch.training.pose_files import load_poses
-    from meshmatch.training.recipes import recipe_for
+
+    with needs("torch", "train"):
+        from meshmatch.training import train as training
+        from meshmatch.training.bodies import Bodies
+        from meshmatch.training.pose_files import load_poses
+        from meshmatch.training.recipes import recipe_for
 
     set_threads(threads)
     check_chart(picture)

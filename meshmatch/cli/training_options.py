@@ -78,7 +78,7 @@ TrainingShapes = Annotated[
     typer.Option(
         metavar="FOLDER",
         help="Learn from a folder that `meshmatch prepare` made, with its template. Default: generated human bodies "
-        "(needs the extra `bodies`).",
+        "(needs the extra `train`).",
     ),
 ]
 Unsupervised = Annotated[

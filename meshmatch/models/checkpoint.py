@@ -55,7 +55,7 @@ def save_weights(state: Mapping[str, Any], path: str | Path, *, storage: str = "
     arrays: dict[str, np.ndarray] = {}
     for name in sorted(state):
         array = state[name]
-        array = np.array(array.detach().cpu() if hasattr(array, "detach") else array, order="C")
+        array = np.array(array.numpy(force=True) if hasattr(array, "numpy") else array, order="C")
         floating = array.dtype.kind == "f"
         if floating:
             if not np.isfinite(array).all():
@@ -106,7 +106,8 @@ def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> d
     for name in expected:
         array = arrays[name]
         if array.dtype == np.int8:
-            array = array.astype(np.float32) * arrays[name + SCALE][:, None]
+            with np.errstate(invalid="ignore"):  # a scale that is not finite is refused below
+                array = array.astype(np.float32) * arrays[name + SCALE][:, None]
         elif array.dtype.kind == "f":
             array = array.astype(np.float32)
         if array.dtype.kind == "f" and not np.isfinite(array).all():

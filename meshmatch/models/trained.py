@@ -99,10 +99,12 @@ def once_per_model(
 @once_per_model
 def torch_network(model: TrainedModel) -> Deformer:
     """The network of a model whose inference is in arrays, as torch has it."""
-    assert isinstance(model.inference, NodeNetwork)
     with needs("torch", "train"):
-        from meshmatch.models.deformer import with_weights
+        from meshmatch.models.deformer import Deformer, with_weights
 
+    if isinstance(model.inference, Deformer):  # pointwise
+        return model.inference
+    assert isinstance(model.inference, NodeNetwork)
     return with_weights(model.inference.config, model.template.K, model.inference.weights)
 
 

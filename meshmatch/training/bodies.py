@@ -91,7 +91,7 @@ def human_source(
     Raises
     ------
     OptionError
-        The template is not made from the body model, or the extra ``bodies`` is not installed.
+        The template is not made from the body model, or the extra ``train`` is not installed.
     InputError
         The body has no joint of a name in ``poses``.
     """

@@ -114,7 +114,7 @@ def build_rig(identities: int = 4096, seed: int = 0, progress: Progress | None =
     Raises
     ------
     OptionError
-        If the extra ``bodies`` is not installed.
+        If the extra ``train`` is not installed.
     """
     try:
         import warnings
@@ -124,7 +124,7 @@ def build_rig(identities: int = 4096, seed: int = 0, progress: Progress | None =
             import anny
     except ImportError as error:
         raise OptionError(
-            "generated human bodies need the package anny", "pip install 'meshmatch[bodies]'"
+            "generated human bodies need the package anny", "pip install 'meshmatch[train]'"
         ) from error
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

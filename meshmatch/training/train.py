@@ -112,7 +112,7 @@ def train(
     InputError
         No prepared folder, or too few shapes.
     OptionError
-        Choices that do not go together, or the extra ``bodies`` is not installed.
+        Choices that do not go together, or the extra ``train`` is not installed.
     ModelError
         A name that cannot be one, or a checkpoint of another training.
     OutputError

@@ -12,7 +12,6 @@ from PIL import Image
 
 from meshmatch.api import matching
 from meshmatch.errors import InputError, OutputError
-from meshmatch.fields.mls import build_field
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.files import load_map
 from meshmatch.models.trained import TrainedModel
@@ -343,7 +342,7 @@ def test_register_in_full_resolution(
     )
     moved = replace(fake_fit(sphere), template_hash=template.hash, vectors=np.tile([0.0, 0.0, 5.0], (42, 1)))
     stub.make_fit = lambda *_, **__: moved
-    network = SimpleNamespace(field=build_field, config=SimpleNamespace(field="mls"))
+    network = SimpleNamespace(config=SimpleNamespace(field="mls"))
     model = TrainedModel(small_card(), template, network)  # type: ignore[arg-type]
     monkeypatch.setattr(matching, "as_model", lambda name: model)
     output = two[0].with_name("fitted.ply")

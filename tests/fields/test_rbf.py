@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from meshmatch.errors import TemplateError
+from meshmatch.fields.field import Field
 from meshmatch.fields.rbf import build_rbf
 
 
@@ -32,7 +33,7 @@ def textbook(x: np.ndarray, nodes: np.ndarray, vectors: np.ndarray) -> np.ndarra
 def test_displacement_and_gradient_equal_the_textbook(cloud: tuple[np.ndarray, np.ndarray]) -> None:
     points, nodes = cloud
     vectors = np.random.default_rng(1).standard_normal((len(nodes), 3))
-    field = build_rbf(points, nodes)
+    field = Field.of(build_rbf(points, nodes))
     assert field.linear
     given = torch.from_numpy(vectors).float()[None]
     moved, F = field.displacement(given)[0].numpy(), field.deformation_gradient(given)[0].numpy()
@@ -47,7 +48,7 @@ def test_displacement_and_gradient_equal_the_textbook(cloud: tuple[np.ndarray, n
 
 def test_the_field_passes_through_its_node_vectors(cloud: tuple[np.ndarray, np.ndarray]) -> None:
     nodes = cloud[1]
-    assert np.allclose(build_rbf(nodes, nodes).phi.numpy(), np.eye(len(nodes)), atol=1e-6)
+    assert np.allclose(Field.of(build_rbf(nodes, nodes)).phi.numpy(), np.eye(len(nodes)), atol=1e-6)
 
 
 def test_a_shift_of_all_nodes_is_nearly_one_of_the_points() -> None:
@@ -55,14 +56,14 @@ def test_a_shift_of_all_nodes_is_nearly_one_of_the_points() -> None:
     ticks = np.linspace(-1, 1, 6)
     nodes = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     points = np.random.default_rng(2).uniform(-0.5, 0.5, (20, 3))
-    sums = build_rbf(points, nodes).phi.sum(1).numpy()
+    sums = Field.of(build_rbf(points, nodes)).phi.sum(1).numpy()
     assert np.allclose(sums, 1, atol=0.01)
     assert not np.allclose(sums, 1, atol=1e-7)
 
 
 def test_unit_and_place_do_not_matter(cloud: tuple[np.ndarray, np.ndarray]) -> None:
     points, nodes = cloud
-    near, far = build_rbf(points, nodes), build_rbf(100 * points + 5, 100 * nodes + 5)
+    near, far = Field.of(build_rbf(points, nodes)), Field.of(build_rbf(100 * points + 5, 100 * nodes + 5))
     assert torch.allclose(near.phi, far.phi, atol=1e-5)
     assert torch.allclose(near.gradient, 100 * far.gradient, atol=1e-4)
 
@@ -70,5 +71,5 @@ def test_unit_and_place_do_not_matter(cloud: tuple[np.ndarray, np.ndarray]) -> N
 def test_two_nodes_in_one_place_are_refused(cloud: tuple[np.ndarray, np.ndarray]) -> None:
     points, nodes = cloud
     with pytest.raises(TemplateError, match="too close together") as caught:
-        build_rbf(points, np.concatenate([nodes, nodes[:1]]))
+        Field.of(build_rbf(points, np.concatenate([nodes, nodes[:1]])))
     assert "rbf" in caught.value.hint

@@ -30,7 +30,7 @@ def egg_model(kernel: Kernel = "smooth", network: NetworkConfig = NETWORK) -> Tr
         field={"kernel": kernel, "radius": template.radius, "nodes": template.K},
         seed=0,
     )
-    return TrainedModel(card, template, small_network(template, network, kernel=kernel).eval())
+    return TrainedModel.of(card, template, small_network(template, network, kernel=kernel).eval())
 
 
 def write_model(model: TrainedModel, folder: Path) -> Path:

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from meshmatch.cli import main
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.fields.choice import FIELDS
-from meshmatch.fields.field import Field
+from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import Blend
 from meshmatch.fitting.dense import dense_shape
@@ -120,7 +121,7 @@ def test_answers_turn_with_the_points(model: TrainedModel) -> None:
     with torch.no_grad():
         answer = model.network(torch.from_numpy(scan_of(model.template.shape).points).float()[None])
     vectors = answer[0].double().numpy()
-    turned = system.moved(model.network.turned(vectors, turn))
+    turned = system.moved(model.inference.rotate_rows(vectors, turn))
     # radial basis functions turn only nearly
     near = 0.02 if model.network.config.field == "rbf" else 1e-5
     assert np.abs(turned - system.moved(vectors) @ turn).max() < near
@@ -146,8 +147,8 @@ def test_it_is_laid_on_a_shape_and_refined(model: TrainedModel) -> None:
 def test_the_dense_system_is_the_sparse_one(rbf: TrainedModel) -> None:
     """One field, its matrices once dense and once sparse: the same least squares."""
     field, shape = rbf.field(rbf.template.shape.verts), rbf.template.shape
-    assert isinstance(field, Field)
-    sparse = NodeSystem(shape, Field(field.phi.to_sparse_csr(), field.gradient.to_sparse_csr()), 50)
+    assert isinstance(field, ShapeFunctions)
+    sparse = NodeSystem(shape, ShapeFunctions(csr_matrix(field.phi), csr_matrix(field.gradient)), 50)
     dense = NodeSystem(shape, field, 50)
     rng = np.random.default_rng(0)
     A = rng.standard_normal((shape.V, 3, 3))

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from meshmatch.errors import ModelError, OptionError
+from meshmatch.fields.field import Field
 from meshmatch.fields.mls import build_field
 from meshmatch.fitting.choices import Refine
 from meshmatch.fitting.dense import dense_shape
@@ -35,7 +36,7 @@ def model(request: pytest.FixtureRequest) -> TrainedModel:
 def shape_functions(model: TrainedModel, kernel: Kernel) -> tuple[np.ndarray, np.ndarray]:
     """Dense phi (V, K) and gradient (3 V, K) on the template's vertices, float64."""
     template = model.template
-    field = build_field(template.shape.verts, template.nodes, template.radius, kernel)
+    field = Field.of(build_field(template.shape.verts, template.nodes, template.radius, kernel))
     return field.phi.to_dense().double().numpy(), field.gradient.to_dense().double().numpy()
 
 

@@ -1,14 +1,14 @@
 """The mirror of a symmetric template: a reading of the mirrored scan is a reading of the scan."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from meshmatch.api.inputs import as_model
-from meshmatch.fields.field import Field
+from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.mirror import Mirror, mirror_of
 from meshmatch.fitting.network_fit import Predictor
 from meshmatch.fitting.system import node_system
@@ -48,8 +48,8 @@ def test_the_mirrored_deformation_moves_the_mirrored_template_to_the_mirror_imag
     moved = system.moved(mirror.vectors(vectors))
     # an oracle without the solve: the field itself, asked at the mirrored vertices
     over = human.field(system.verts * FLIP)
-    assert isinstance(over, Field)
-    across = over.for_training().phi.to_dense().double().numpy()
+    assert isinstance(over, ShapeFunctions)
+    across = over.phi.toarray().astype(float)
     wanted = (system.verts * FLIP + across @ vectors) * FLIP
     assert np.abs(moved - system.verts).max() > 0.01
     assert np.abs(moved - wanted).max() < 2e-3
@@ -66,14 +66,14 @@ def test_a_mirror_adds_as_many_readings_which_a_network_without_sides_reads_the_
     model = egg_model()
     system = node_system(model)
     scan = scan_of(Shape(system.verts, system.faces), 200)
-    asked: list[torch.Tensor] = []
+    asked: list[np.ndarray] = []
 
-    class Still(torch.nn.Module):
-        def forward(self, points: torch.Tensor) -> torch.Tensor:
-            asked.append(points)
-            return torch.full((1, system.K, 3), 0.1)
+    class Still:
+        def predict(self, clouds: Sequence[np.ndarray]) -> np.ndarray:
+            asked.extend(clouds)
+            return np.full((len(clouds), system.K, 3), 0.1)
 
-        def turned(self, vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        def rotate_rows(self, vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
             return vectors
 
     network: Any = Still()
@@ -82,6 +82,6 @@ def test_a_mirror_adds_as_many_readings_which_a_network_without_sides_reads_the_
     predictor = Predictor(network, system, model.template.core, mirror, np.random.default_rng(0))
     found = predictor.variants(scan, scan, RigidPose.identity(), 2, 0.0)
     assert len(found) == 4
-    first, last = (np.sort(asked[k][0].numpy() * flip, axis=0) for k, flip in ((0, 1.0), (3, FLIP)))
+    first, last = (np.sort(asked[k] * flip, axis=0) for k, flip in ((0, 1.0), (3, FLIP)))
     assert np.allclose(first, last, atol=1e-6)
     assert np.allclose(found[0].vectors, 0.1) and np.allclose(found[3].vectors, 0.1 * FLIP)

@@ -1,5 +1,6 @@
 """The network's own fit: rigid motions, the residual, and readings from tilted frames."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -109,16 +110,19 @@ def test_a_tilted_reading_is_turned_back(
     nodes = torch.from_numpy(model.template.nodes).float()
     first = torch.from_numpy(scan.points[:200]).float()
 
-    class Follower(torch.nn.Module):
-        def forward(self, points: torch.Tensor) -> torch.Tensor:
+    class Follower:
+        def predict(self, clouds: Sequence[np.ndarray]) -> np.ndarray:
+            return np.stack([self.follow(torch.from_numpy(cloud).float()[None]) for cloud in clouds])
+
+        def follow(self, points: torch.Tensor) -> np.ndarray:
             # the points are the first ones, turned and in another order: their moments tell the turn
             U, _, Vh = torch.linalg.svd(
                 _moment(points[0]).double() @ torch.linalg.inv(_moment(first).double())
             )
-            return ((U @ Vh).float() @ nodes.T).T[None] - nodes
+            return (((U @ Vh).float() @ nodes.T).T - nodes).double().numpy()
 
-        def turned(self, vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
-            return model.network.turned(vectors, turn)
+        def rotate_rows(self, vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
+            return model.inference.rotate_rows(vectors, turn)
 
     def _moment(points: torch.Tensor) -> torch.Tensor:
         # third-order moments turn like vectors: three of them make a frame

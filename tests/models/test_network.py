@@ -4,15 +4,19 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from meshmatch.errors import ModelError
+from meshmatch.fields.field import Field
 from meshmatch.fields.mls import build_field
 from meshmatch.models.checkpoint import save_weights
+from meshmatch.models.config import PAPER, NetworkConfig
 from meshmatch.models.decoder import FlatDecoder, NodeDecoder
-from meshmatch.models.deformer import PAPER, Deformer, NetworkConfig, rotation_from_six
+from meshmatch.models.deformer import Deformer, blank_deformer, rotation_from_six, with_weights
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
+from meshmatch.models.inference import NodeNetwork, weight_shapes
 from meshmatch.models.layers import ResidualBlock, residual_mlp
 from meshmatch.models.neighbours import nearest, two_way_offsets
 from meshmatch.models.registry import built_in_folder, load_model
@@ -182,7 +186,7 @@ def test_predicted_rotations_are_rotations() -> None:
 
 def test_zero_nodes_move_nothing() -> None:
     egg = egg_template()
-    field = build_field(egg.shape.verts, egg.nodes, egg.radius, "smooth")
+    field = Field.of(build_field(egg.shape.verts, egg.nodes, egg.radius, "smooth"))
     zero = torch.zeros(1, egg.K, 3)
     assert torch.equal(field.displacement(zero), torch.zeros(1, 162, 3))
     assert torch.equal(field.deformation_gradient(zero), torch.eye(3).expand(1, 162, 3, 3))
@@ -227,8 +231,47 @@ def test_saved_networks_come_back_bit_for_bit(networks, config, tmp_path: Path) 
     model = networks[config.encoder]
     save_weights(model.state_dict(), tmp_path / "weights.safetensors", storage="float32")
     found = load_network(tmp_path / "weights.safetensors", config, model.K)
+    assert isinstance(found, NodeNetwork)
     points = clouds()
-    assert torch.equal(found(points), model(points))
+    assert torch.equal(with_weights(config, model.K, found.weights)(points), model(points))
+
+
+@pytest.mark.parametrize("config", [NETWORK, POINTS, PAPER, NetworkConfig()], ids=str)
+def test_the_names_and_shapes_of_weights_are_those_of_torch(config: NetworkConfig) -> None:
+    wanted = {name: tuple(value.shape) for name, value in blank_deformer(config, 7).state_dict().items()}
+    assert weight_shapes(config, 7) == wanted
+
+
+@CONFIGS
+def test_arrays_and_torch_give_the_same_answers(networks: dict[str, Deformer], config: NetworkConfig) -> None:
+    model = networks[config.encoder]
+    inference = NodeNetwork(config, {name: value.numpy() for name, value in model.state_dict().items()})
+    points = clouds(3, 60).double().numpy()
+    several = [points[0], points[1], points[2, :40]]
+    assert np.allclose(inference.predict(several), model_answers(model, several), atol=2e-5)
+    turn = rotation_from_six(torch.randn(1, 6, generator=seeded()))[0].double().numpy()
+    rows = inference.predict(several)[0]
+    assert np.allclose(inference.rotate_rows(rows, turn), model.rotate_rows(rows, turn), atol=1e-6)
+    assert np.allclose(inference.encode(points[0]), model.encode(points[0]), atol=2e-5)
+    code = model.encode(points[0])
+    assert np.allclose(inference.decode(code), model.decode(code), atol=2e-5)
+    if config.align_basis:
+        offsets = torch.randn(4, config.align_basis, 3, generator=seeded()).numpy()
+        for ours, theirs in zip(inference.read_frames(offsets), model.read_frames(offsets), strict=True):
+            assert np.allclose(ours, theirs, atol=2e-5)
+
+
+def model_answers(model: Deformer, clouds: list[np.ndarray]) -> np.ndarray:
+    """One cloud at a time: torch has no batches of different sizes."""
+    with torch.inference_mode():
+        return np.concatenate([model(torch.from_numpy(c).float()[None]).numpy() for c in clouds])
+
+
+def test_the_model_that_ships_answers_the_same_in_arrays_and_in_torch(human: TrainedModel) -> None:
+    rng = np.random.default_rng(0)
+    several = [rng.permutation(human.template.shape.verts)[:count] for count in (700, 1400, 2048)]
+    apart = np.abs(human.inference.predict(several) - model_answers(human.network, several))
+    assert apart.max() < 1e-5
 
 
 def test_configs_survive_their_card_and_unknown_options_do_not() -> None:
@@ -256,8 +299,8 @@ def test_the_model_that_ships_leaves_its_own_template_at_rest(human: TrainedMode
     rest = torch.from_numpy(human.template.shape.verts[::3].copy()).float()[None]
     field = human.field(human.template.shape.verts)
     with torch.inference_mode():
-        moved = field.displacement(human.network(rest))[0]
-    assert moved.norm(dim=1).mean() < 0.035  # 5 cm on a body
+        moved = field.displaced(human.network(rest)[0].double().numpy())
+    assert np.linalg.norm(moved, axis=1).mean() < 0.035  # 5 cm on a body
 
 
 def test_another_template_beside_the_weights_is_refused(tmp_path: Path) -> None:

@@ -314,7 +314,7 @@ def test_without_the_extra_the_hint_says_what_to_install(monkeypatch: pytest.Mon
     monkeypatch.setitem(__import__("sys").modules, "anny", None)
     with pytest.raises(OptionError, match="anny") as caught:
         build_rig(2)
-    assert "meshmatch[bodies]" in caught.value.hint
+    assert "meshmatch[train]" in caught.value.hint
 
 
 def test_parts_follow_the_joints(rig: Rig) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from meshmatch.fields.field import Field
 from meshmatch.fields.mls import build_field
 from meshmatch.models.deformer import Deformer
 from meshmatch.templates.template import Template
@@ -87,7 +88,7 @@ def test_distances_by_hand() -> None:
 
 def test_loss_points_are_the_field(egg: Template, points: LossPoints) -> None:
     at = loss_vertices(egg, 1000)
-    field = build_field(egg.shape.verts[at], egg.nodes, egg.radius, "smooth")
+    field = Field.of(build_field(egg.shape.verts[at], egg.nodes, egg.radius, "smooth"))
     vectors = 0.1 * torch.randn(2, egg.K, 3, generator=torch.Generator().manual_seed(0))
     moved = field.displacement(vectors) + torch.from_numpy(egg.shape.verts[at]).float()
     assert torch.allclose(points.moved(vectors), moved, atol=1e-6)

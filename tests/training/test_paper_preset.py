@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from meshmatch.cli import main
+from meshmatch.fields.field import Field
 from meshmatch.fields.mls import build_field
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
@@ -85,7 +86,7 @@ def test_its_fits_are_moved_with_the_papers_kernel(loaded: TrainedModel, eggs: P
     fit = Fitter(loaded, QUICK).fit(load_shape(eggs / "egg0.ply"))
     template = loaded.template
     phi = {
-        kernel: build_field(template.shape.verts, template.nodes, template.radius, kernel)
+        kernel: Field.of(build_field(template.shape.verts, template.nodes, template.radius, kernel))
         .phi.to_dense()
         .double()
         for kernel in ("cubic", "smooth")

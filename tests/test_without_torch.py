@@ -1,0 +1,60 @@
+"""Matching where torch is not installed: it works, and what does need torch says which extra brings it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = ROOT / "templates" / "samples" / "climber.ply"
+BLOCKED = """
+import sys
+class Without:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == "torch":
+            raise ModuleNotFoundError("No module named 'torch'", name="torch")
+sys.meta_path.insert(0, Without())
+"""
+
+
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    """A fresh interpreter without torch."""
+    return subprocess.run([sys.executable, "-c", BLOCKED + code], capture_output=True, text=True, cwd=ROOT)
+
+
+@pytest.mark.slow
+def test_a_shape_is_matched_without_torch() -> None:
+    done = run(
+        "import meshmatch\n"
+        f"found = meshmatch.match({str(SAMPLE)!r}, {str(SAMPLE)!r})\n"
+        "print(found.map.verdict, found.map.confidence.mean() > 0.8)"
+    )
+    assert (done.stdout.strip(), done.stderr) == ("good True", "")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["train", "-o", "model", "--shapes", "nowhere"],
+        ["register", str(SAMPLE), "-o", "fitted.ply", "--refine", "latent"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_what_needs_torch_says_so_in_a_line(words: list[str], tmp_path: Path) -> None:
+    done = run(
+        f"import os\nos.chdir({str(tmp_path)!r})\nfrom meshmatch.cli import main\nsys.exit(main({words!r}))"
+    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-2:] == [
+        "error: this needs torch, which is not installed",
+        "hint: pip install 'meshmatch[train]'",
+    ]
+    assert not (tmp_path / "fitted.ply").exists()
+
+
+def test_the_library_says_it_too() -> None:
+    done = run(
+        "import meshmatch\ntry:\n    meshmatch.train\nexcept meshmatch.MeshmatchError as error:\n    print(error.hint)"
+    )
+    assert done.stdout.strip() == "pip install 'meshmatch[train]'"
