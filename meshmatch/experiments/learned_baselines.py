@@ -221,7 +221,8 @@ def load_transmatch(folder: str | Path) -> TransModel:
         hint = "train one: python -m meshmatch.experiments.learned_baselines transmatch"
         raise ModelError(f"{folder} holds no TransMatch: cannot read {WORDS}", hint) from error
     expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    network.load_state_dict(load_weights(Path(folder) / WEIGHTS, expected))
+    weights = load_weights(Path(folder) / WEIGHTS, expected)
+    network.load_state_dict({key: torch.from_numpy(array) for key, array in weights.items()})
     return TransModel(network.eval(), load_template(Path(folder) / TEMPLATE), words)
 
 
