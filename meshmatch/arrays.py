@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.errors import InputError
 
@@ -25,6 +25,7 @@ __all__ = [
     "Ints32",
     "UInt8",
     "UInts8",
+    "as_numbers",
     "frozen",
     "read_only",
 ]
@@ -60,3 +61,16 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
     """The same array, read-only from now on."""
     array.setflags(write=False)
     return array
+
+
+def as_numbers(values: ArrayLike, name: str, finite: bool = False) -> Floats:
+    """An array of numbers; `InputError` where they are something else, such as words or rows of different lengths."""
+    try:
+        found = np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{name} must be numbers ({error})", "pass an array, one row for each vertex"
+        ) from error
+    if finite and not np.isfinite(found).all():
+        raise InputError(f"{name} must be finite, but holds nan or infinite values")
+    return found

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from meshmatch.api.inputs import checked_threads
 from meshmatch.api.maps import MapLike, find_maps
 from meshmatch.api.results import MapPair
-from meshmatch.arrays import Floats
+from meshmatch.arrays import Floats, as_numbers
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.outputs import replace_on_success
@@ -141,10 +141,7 @@ def _composed(
 
 
 def _table(values: ArrayLike, shape: Shape) -> Floats:
-    try:
-        table = np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"values of {shape.name or 'the shape'} must be numbers ({error})") from error
+    table = as_numbers(values, f"values of {shape.name or 'the shape'}")
     if table.ndim not in (1, 2) or len(table) != shape.V:
         raise InputError(
             f"values of {shape.name or 'the shape'} must be an array of ({shape.V},), not {table.shape}",

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from meshmatch.api.maps import MapLike, find_maps
 from meshmatch.api.results import ConfidenceRule, Transferred
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, as_numbers
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.convert import ShapeLike, as_shape
@@ -69,13 +69,13 @@ def transfer_values(
         Not a row for each vertex; or as `find_maps`.
     """
     source = as_shape(source, "source")
-    numbers = _numbers(values, "values")
+    numbers = as_numbers(values, "values")
     if numbers.ndim not in (1, 2) or len(numbers) != source.V:
         raise InputError(
             f"values must be an array of ({source.V},) or ({source.V}, D), not {numbers.shape}",
             "one row for each vertex of the source",
         )
-    blank = None if rule.blank is None else _numbers(rule.blank, "blank")
+    blank = None if rule.blank is None else as_numbers(rule.blank, "blank")
     if blank is not None and blank.shape not in ((), (1,), numbers.shape[1:]):
         raise OptionError(
             f"blank has {blank.shape} numbers and the values {numbers.shape[1:]}", "give one number"
@@ -125,7 +125,7 @@ def transfer_colors(
     given = None if isinstance(colors, Appearance) else vertex_colors.light_of(source, colors)
     blank = None
     if rule.blank is not None:
-        chosen = vertex_colors.checked(_numbers(rule.blank, "blank"))
+        chosen = vertex_colors.checked(as_numbers(rule.blank, "blank"))
         blank = vertex_colors.light(np.append(chosen, 1.0)[:4])  # opaque unless it says otherwise
     maps = find_maps(source, target, match)
     with thread_limit(1):
@@ -304,10 +304,3 @@ def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape) -> 
 
 def _confidence(back: VertexMap) -> Float[Floats, "V"]:
     return back.confidence.astype(np.float64)
-
-
-def _numbers(values: ArrayLike, name: str) -> Floats:
-    try:
-        return np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be numbers ({error})") from error

@@ -27,7 +27,7 @@ from meshmatch.maps.table_files import check_numbered, read_by_suffix, short_flo
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.array_files import read_npy, read_npz
-from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.convert import ShapeLike, as_shape
 
 CSV_COLUMNS = ("source_vertex", "target_vertex", "face", "w0", "w1", "w2", "confidence")
 _ARRAYS = ("index", "face", "barycentric", "confidence")
@@ -58,7 +58,7 @@ def check_suffix(path: str | Path) -> str:
     return table_files.check_suffix(path, _FORMATS, "maps")
 
 
-def load_map(path: str | Path, source: Shape | None = None, target: Shape | None = None) -> VertexMap:
+def load_map(path: str | Path, source: ShapeLike | None = None, target: ShapeLike | None = None) -> VertexMap:
     """Read a map, and check it against the shapes if they are given (`VertexMap.for_shapes`).
 
     What the file does not contain is filled in from the shapes (names, counts, hashes) or stays unknown.
@@ -74,6 +74,8 @@ def load_map(path: str | Path, source: Shape | None = None, target: Shape | None
     check_suffix(path)
     readers = {suffix: read for suffix, (_, read) in _FORMATS.items()}
     found = read_by_suffix(path, readers, "maps", f"a map holds an array 'index': {DIRECTION}")
+    source = None if source is None else as_shape(source)
+    target = None if target is None else as_shape(target)
     return found.for_shapes(source, target, Path(path).name)
 
 

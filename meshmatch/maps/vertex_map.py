@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, frozen
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, as_numbers, frozen
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.map_checks import UNKNOWN, check_faces, check_range, checked_arrays, corners_of, misfit
@@ -177,12 +177,12 @@ class VertexMap:
         return corners_of(self.target_faces, self.face, self.index)
 
     def points(self, target: Shape) -> Float[Floats, "V_source 3"]:
-        """The matched points on `target`, in its own frame and unit.
+        """The matched points on `target`, in its own frame and unit; another pose of it with the same faces will do.
 
         Raises
         ------
         InputError
-            `target` is not the shape that this map leads to.
+            `target` has other vertices or faces than the shape that this map leads to.
         """
         if self.target_vertices not in (UNKNOWN, target.V):
             raise InputError(
@@ -224,14 +224,14 @@ class VertexMap:
         InputError
             Not one row for each vertex of the target; or as `sparse`.
         """
-        values = np.asarray(values, np.float64)
+        numbers = as_numbers(values, "values")
         matrix = self.sparse()
-        if values.ndim not in (1, 2) or len(values) != matrix.shape[1]:
+        if numbers.ndim not in (1, 2) or len(numbers) != matrix.shape[1]:
             raise InputError(
                 f"the map {_way(self)} needs values (V,) or (V, D) of the {matrix.shape[1]} vertices of its target, "
-                f"not an array of {values.shape}"
+                f"not an array of {numbers.shape}"
             )
-        return np.asarray(matrix @ values)
+        return np.asarray(matrix @ numbers)
 
     def functional(
         self, basis_source: ArrayLike, basis_target: ArrayLike
@@ -251,14 +251,14 @@ class VertexMap:
         Raises
         ------
         InputError
-            As `apply`, or the source's functions do not have a row for each of its vertices.
+            As `apply`; the source's functions do not have a row for each vertex; or a value is not finite.
         """
-        basis = np.asarray(basis_source, np.float64)
+        basis = as_numbers(basis_source, "a basis", finite=True)
         if basis.ndim != 2 or len(basis) != self.source_vertices:
             raise InputError(
                 f"a basis of the source must be an array of ({self.source_vertices}, K), not {basis.shape}"
             )
-        pulled = self.apply(basis_target).reshape(len(basis), -1)
+        pulled = self.apply(as_numbers(basis_target, "a basis", finite=True)).reshape(len(basis), -1)
         return np.asarray(np.linalg.lstsq(basis, pulled, rcond=None)[0])
 
     def compose(self, other: VertexMap) -> VertexMap:

@@ -12,6 +12,8 @@ from meshmatch.errors import InputError, OptionError, OutputError
 from meshmatch.maps import MAP_SUFFIXES, files
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes import Shape
+from meshmatch.shapes.files import save_shape
 from tests.maps.test_vertex_map import A, B, C, random_map
 
 CARRIES = {
@@ -219,3 +221,12 @@ def test_a_shape_that_has_changed_is_refused(tmp_path: Path) -> None:
 
 def test_the_list_of_suffixes_is_that_of_the_formats() -> None:
     assert tuple(files._FORMATS) == MAP_SUFFIXES
+
+
+def test_shapes_to_check_may_be_files_or_arrays(tmp_path: Path, cube: Shape) -> None:
+    save_map(tmp_path / "m.npz", VertexMap.identity(cube))
+    save_shape(tmp_path / "cube.ply", cube)
+    found = load_map(tmp_path / "m.npz", tmp_path / "cube.ply", (cube.verts, cube.faces))
+    assert found.target_faces is not None
+    with pytest.raises(InputError):
+        load_map(tmp_path / "m.npz", cube.verts[:5])

@@ -218,3 +218,11 @@ def test_what_a_bare_map_cannot_say() -> None:
             VertexMap.identity(A).apply(wrong)
     with pytest.raises(InputError, match="a basis of the source must be an array"):
         VertexMap.identity(A).functional(np.ones((3, 2)), np.ones((A.V, 2)))
+
+
+def test_values_that_are_no_numbers(cube: Shape) -> None:
+    found = VertexMap.identity(cube)
+    with pytest.raises(InputError, match="must be numbers"):
+        found.apply(["a"] * cube.V)
+    with pytest.raises(InputError, match="must be finite"):
+        found.functional(np.full((cube.V, 1), np.nan), np.ones((cube.V, 1)))
