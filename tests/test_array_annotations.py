@@ -13,7 +13,7 @@ from tests.array_annotations import checked
 
 @jaxtyped(typechecker=checked)
 def corners(
-    verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], weights: Float[Floats, "V"] | None = None
+    verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], weights: Float[Floats, " V"] | None = None
 ) -> tuple[Float[Floats, "F 3 3"], int]:
     return (verts[faces] if len(faces) != 2 else verts), len(verts)
 

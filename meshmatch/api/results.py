@@ -173,6 +173,6 @@ class Transferred(Generic[T]):
     """
 
     data: T
-    confidence: Float[Floats, "N"]
+    confidence: Float[Floats, " N"]
     low: LowConfidence
     maps: MapPair

@@ -302,5 +302,5 @@ def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape) -> 
     )
 
 
-def _confidence(back: VertexMap) -> Float[Floats, "V"]:
+def _confidence(back: VertexMap) -> Float[Floats, " V"]:
     return back.confidence.astype(np.float64)

@@ -57,7 +57,7 @@ def part_of(shape: Shape, kind: Kind, seed: int) -> tuple[Shape, Int[Ints, " V_p
 
 
 def seen_faces(
-    shape: Shape, centers: Float[Floats, "F 3"], direction: Float[Floats, "3"]
+    shape: Shape, centers: Float[Floats, "F 3"], direction: Float[Floats, " 3"]
 ) -> Bool[Bools, " F"]:
     """Whether a camera far away in a direction sees the middle of each face."""
     facing = shape.face_normals @ direction > 0

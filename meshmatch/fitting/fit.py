@@ -107,7 +107,7 @@ def vertex_distance(points: Float[Floats, "V 3"], verts: Float[Floats, "N 3"]) -
     return np.asarray(cKDTree(points).query(verts)[0])
 
 
-def axis_name(direction: Float[Floats, "3"]) -> str:
+def axis_name(direction: Float[Floats, " 3"]) -> str:
     """The signed axis nearest to a direction, such as "+y"."""
     axis = int(np.abs(direction).argmax())
     return ("+" if direction[axis] > 0 else "-") + "xyz"[axis]

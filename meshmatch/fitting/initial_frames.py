@@ -92,7 +92,7 @@ def _along_body(poses: list[RigidPose]) -> list[RigidPose]:
     ]
 
 
-def _axes(config: FitConfig) -> tuple[Float[Floats, "3"] | None, Float[Floats, "3"] | None]:
+def _axes(config: FitConfig) -> tuple[Float[Floats, " 3"] | None, Float[Floats, " 3"] | None]:
     """The user's up and front."""
     up = None if config.up is None else axis_vector(config.up)
     return up, None if config.front is None else axis_vector(config.front)

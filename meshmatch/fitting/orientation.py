@@ -75,13 +75,13 @@ def with_flips(poses: list[RigidPose]) -> list[RigidPose]:
     return [RigidPose(pose.rotation @ flip, pose.center) for flip in _FLIPS for pose in poses]
 
 
-def standing_grid(center: Float[Floats, "3"]) -> list[RigidPose]:
+def standing_grid(center: Float[Floats, " 3"]) -> list[RigidPose]:
     """Six axes up, twelve turns about each: for networks without an aligner."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     return [RigidPose(pose.rotation, center) for axis in axes for pose in forced_frames(axis, None)]
 
 
-def axis_vector(name: str) -> Float[Floats, "3"]:
+def axis_vector(name: str) -> Float[Floats, " 3"]:
     """Unit vector of an axis name such as "y", "+y" or "-z"; any other name is an `OptionError`."""
     word = str(name)
     sign = -1.0 if word.startswith("-") else 1.0
@@ -92,7 +92,7 @@ def axis_vector(name: str) -> Float[Floats, "3"]:
 
 
 def forced_frames(
-    up: Float[Floats, "3"] | None, front: Float[Floats, "3"] | None, turns: int = 12
+    up: Float[Floats, " 3"] | None, front: Float[Floats, " 3"] | None, turns: int = 12
 ) -> list[RigidPose]:
     """Core frames that obey given axes: all turns about the one that is given, or the only one if both are."""
     along, other = (up, front) if up is not None else (front, None)

@@ -27,7 +27,7 @@ class Frame:
 
     scale: float
     rotation: Float[Floats, "3 3"]
-    center: Float[Floats, "3"]
+    center: Float[Floats, " 3"]
 
     def __post_init__(self) -> None:
         rotation = read_only(self.rotation, np.float64, "a frame's rotation")
@@ -86,7 +86,7 @@ class RigidPose:
     """
 
     rotation: Float[Floats, "3 3"]
-    center: Float[Floats, "3"]
+    center: Float[Floats, " 3"]
 
     @classmethod
     def identity(cls) -> RigidPose:

@@ -143,7 +143,7 @@ def compose_errors(
     source: Shape,
     target: Shape,
     vertex_map: VertexMap,
-    known: tuple[Int[Ints, "N"], Int[Ints, "N"]],
+    known: tuple[Int[Ints, " N"], Int[Ints, " N"]],
     errors: Errors,
     unit: ErrorUnit = "cm",
     limits: tuple[float, float] | None = None,
@@ -163,7 +163,7 @@ def compose_errors(
 
 
 def _painted_points(
-    shape: Shape, vertices: Int[Ints, "N"], values: Float[Floats, "N"], scale: Scale
+    shape: Shape, vertices: Int[Ints, " N"], values: Float[Floats, " N"], scale: Scale
 ) -> Panel:
     """A shape with numbers at some of its vertices: interpolated where these lie close together, else drawn as balls.
 
@@ -204,7 +204,7 @@ def compose_fit(
     return Composition(panels, scale, "the template over the shape", record).rotated((turn, turn))
 
 
-def distances(shape: Shape, fitted: Shape) -> Float[Floats, "V"]:
+def distances(shape: Shape, fitted: Shape) -> Float[Floats, " V"]:
     """Distance of each vertex of a shape to the surface of another; nan where it has no position."""
     found = MappedMesh.of(fitted).query(shape.verts).distance
     return found if shape.invalid is None else np.where(shape.invalid, np.nan, found)
@@ -255,7 +255,7 @@ def compose_light(shapes: Sequence[Shape], light: Sequence[Float[Floats, "V C"]]
 
 def compose_labels(
     shapes: Sequence[Shape],
-    codes: Sequence[Int[Ints, "N"]],
+    codes: Sequence[Int[Ints, " N"]],
     names: Sequence[str],
     on_faces: Sequence[bool] | None = None,
 ) -> Composition:
@@ -275,7 +275,7 @@ def compose_labels(
     return Composition(tuple(panels), legend, f"{len(names)} labels", {"labels": list(names)})
 
 
-def merge_labels(labels: Sequence[Labels]) -> tuple[list[Int[Ints, "N"]], list[str]]:
+def merge_labels(labels: Sequence[Labels]) -> tuple[list[Int[Ints, " N"]], list[str]]:
     """Labels of several shapes by one list of names, sorted, so that a name has one color: codes of each, and names."""
     names = sorted({str(name) for own in labels for name in own.names}, key=_by_number)
     number = {name: k for k, name in enumerate(names)}

@@ -117,11 +117,11 @@ def facing_alike(
     return np.stack([np.cross(upward, ahead), upward, ahead])
 
 
-def _axis(name: str) -> Float[Floats, "3"]:
+def _axis(name: str) -> Float[Floats, " 3"]:
     return _AXES[name.lstrip("+").lower()]
 
 
-def _samples(shape: Shape) -> tuple[Float[Floats, "N 3"], Float[Floats, "N"]]:
+def _samples(shape: Shape) -> tuple[Float[Floats, "N 3"], Float[Floats, " N"]]:
     """Points all over the surface, centered, in units of sqrt(area), and the share of the area around each."""
     if shape.is_cloud:
         points = shape.verts if shape.invalid is None else shape.verts[~shape.invalid]
@@ -138,8 +138,8 @@ def _samples(shape: Shape) -> tuple[Float[Floats, "N 3"], Float[Floats, "N"]]:
 
 
 def _upward(
-    points: Float[Floats, "N 3"], ahead: Float[Floats, "3"] | None
-) -> tuple[Float[Floats, "3"], bool]:
+    points: Float[Floats, "N 3"], ahead: Float[Floats, " 3"] | None
+) -> tuple[Float[Floats, " 3"], bool]:
     """The axis that points up, and whether the shape stands on it by itself."""
     extents = np.ptp(points, axis=0)
     free = [k for k in range(3) if ahead is None or ahead[k] == 0]
@@ -156,7 +156,7 @@ def _upward(
     return np.eye(3)[max(free, key=lambda k: score[k])], False
 
 
-def _support(points: Float[Floats, "N 3"], upward: Float[Floats, "3"]) -> float:
+def _support(points: Float[Floats, "N 3"], upward: Float[Floats, " 3"]) -> float:
     """How far inside the footprint the center of mass lies; negative: outside."""
     from scipy.spatial import ConvexHull, QhullError
 
@@ -170,8 +170,8 @@ def _support(points: Float[Floats, "N 3"], upward: Float[Floats, "3"]) -> float:
 
 
 def _chest(
-    points: Float[Floats, "N 3"], weights: Float[Floats, "N"], upward: Float[Floats, "3"]
-) -> Float[Floats, "3"] | None:
+    points: Float[Floats, "N 3"], weights: Float[Floats, " N"], upward: Float[Floats, " 3"]
+) -> Float[Floats, " 3"] | None:
     """Unit vector to the front of a standing body; None if its chest is round."""
     level = np.flatnonzero(upward == 0)
     height = points @ upward

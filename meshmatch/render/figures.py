@@ -90,7 +90,7 @@ class Figure:
     solid: list[Surface]
     glass: list[Surface]
     box: Float[Floats, "2 2"]
-    spot: Float[Floats, "4"]
+    spot: Float[Floats, " 4"]
     hollow: bool
 
 
@@ -142,7 +142,7 @@ def drawn_points(shape: Shape) -> Float[Floats, "N 3"]:
     return shape.verts[used] if used.any() else shape.verts[:1]
 
 
-def _valid_faces(shape: Shape) -> Int[Ints, "N"]:
+def _valid_faces(shape: Shape) -> Int[Ints, " N"]:
     """Indices of the faces whose corners all have a position."""
     if shape.invalid is None:
         return np.arange(shape.F)
@@ -201,7 +201,7 @@ def _linear(
     return to_linear(np.clip(np.nan_to_num(array[:, :3]), 0.0, 1.0))
 
 
-def _spacing(points: Float[Floats, "N 3"]) -> Float[Floats, "N"]:
+def _spacing(points: Float[Floats, "N 3"]) -> Float[Floats, " N"]:
     """Distance of each point of a cloud to its fifth neighbor: discs as large nearly close the surface."""
     if len(points) < 2:
         return np.full(len(points), 0.05)

@@ -59,9 +59,9 @@ class GroundPose:
     """
 
     rotation: Float[Floats, "3 3"]
-    foot: Float[Floats, "3"]
+    foot: Float[Floats, " 3"]
     scale: float
-    half: Float[Floats, "3"]
+    half: Float[Floats, " 3"]
 
     def apply(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
         """Points of the file on the figure's ground."""
@@ -93,7 +93,7 @@ class Viewport:
 
     def at(
         self, column: NDArray[Any], row: NDArray[Any]
-    ) -> tuple[Float[Floats, "..."], Float[Floats, "..."]]:
+    ) -> tuple[Float[Floats, " ..."], Float[Floats, " ..."]]:
         """x and y of places in the picture, counted in pixels from its upper left corner."""
         return self.left + self.pixel * column, self.top - self.pixel * row
 
@@ -117,10 +117,10 @@ class Page:
     """
 
     viewport: Viewport
-    feet: Float[Floats, "N"]
+    feet: Float[Floats, " N"]
     font_size: float
     names: Float[Floats, "N 2"]
-    room: Float[Floats, "N"]
+    room: Float[Floats, " N"]
     legend: int
 
 
@@ -164,7 +164,7 @@ def lay_out(
 
 def _row(
     boxes: list[Float[Floats, "2 2"]], aspect: float | None
-) -> tuple[Float[Floats, "N"], Float[Floats, "2 2"]]:
+) -> tuple[Float[Floats, " N"], Float[Floats, "2 2"]]:
     """Figures beside each other: x of each one's foot, and the box of all.
 
     ``aspect`` is width over height to fill, by wider gaps; None for the narrowest row.

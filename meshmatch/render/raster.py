@@ -115,7 +115,7 @@ def _band(
 
 def _shaded(
     scene: Scene, hits: Hits, seen: Float[Floats32, "N 2"]
-) -> tuple[Float[Floats32, "N 3"], Float[Floats32, "N"]]:
+) -> tuple[Float[Floats32, "N 3"], Float[Floats32, " N"]]:
     """Light times alpha, and alpha, of all rays."""
     light = np.zeros((len(hits.face), 3), np.float32)
     alpha = np.zeros(len(hits.face), np.float32)
@@ -212,9 +212,9 @@ def _fine(
     seen: Float[Floats32, "P 2"],
     low: int,
     corner: tuple[int, int],
-    chosen: Int[Ints, "N"],
+    chosen: Int[Ints, " N"],
     places: Float[Floats, "R 2"],
-) -> tuple[Float[Floats32, "N 3"], Float[Floats32, "N"]]:
+) -> tuple[Float[Floats32, "N 3"], Float[Floats32, " N"]]:
     """Light times alpha, and alpha, of chosen pixels of a band, each the mean over places in it."""
     shape = (len(hits.face) // viewport.width, viewport.width)
     row, column = np.divmod(np.repeat(chosen, len(places)), shape[1])
@@ -240,14 +240,14 @@ def _fine(
 
 def _reused(
     finer: Hits,
-    met: Int[Ints, "N"],
-    row: Int[Ints, "N"],
-    column: Int[Ints, "N"],
+    met: Int[Ints, " N"],
+    row: Int[Ints, " N"],
+    column: Int[Ints, " N"],
     hits: Hits,
     seen: Float[Floats32, "P 2"],
     shape: tuple[int, int],
     pixel: float,
-) -> tuple[Float[Floats32, "N 2"], Bool[Bools, "N"]]:
+) -> tuple[Float[Floats32, "N 2"], Bool[Bools, " N"]]:
     """Visibility of fine rays from the pixels around them that lie on the same surface, and where there is one."""
     place, flat, normal = finer.place[met], finer.flat[met], finer.normal[met]
     solid = finer.face[met] >= 0

@@ -131,7 +131,7 @@ class Scale:
         return list(zip(places, words, strict=True))
 
 
-def _round_ends(finite: Float[Floats, "N"]) -> tuple[float, float]:
+def _round_ends(finite: Float[Floats, " N"]) -> tuple[float, float]:
     low, high = float(finite.min()), float(finite.max())
     bulk = float(np.quantile(finite, 0.99))
     if bulk > 0 and high > 1.6 * bulk:

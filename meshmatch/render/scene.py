@@ -29,16 +29,16 @@ class Ground:
     ``spots`` are ellipses in the picture plane, outside of which nothing is drawn: x, y, half width, half height.
     """
 
-    normal: Float[Floats, "3"]
+    normal: Float[Floats, " 3"]
     height: float
     spots: Float[Floats, "K 4"]
 
-    def depth(self, x: Float[Floats, "N"], y: Float[Floats, "N"]) -> Float[Floats, "N"]:
+    def depth(self, x: Float[Floats, " N"], y: Float[Floats, " N"]) -> Float[Floats, " N"]:
         """z of the plane at points of the picture."""
         a, b, c = self.normal
         return np.asarray((self.height - a * x - b * y) / c)
 
-    def strength(self, x: Float[Floats, "N"], y: Float[Floats, "N"]) -> Float[Floats32, "N"]:
+    def strength(self, x: Float[Floats, " N"], y: Float[Floats, " N"]) -> Float[Floats32, " N"]:
         """How strongly shadows are drawn at points of the picture, 0 to 1: they fade out towards the rims."""
         strength = np.zeros(len(x), np.float32)
         for left, top, width, height in self.spots:
@@ -63,15 +63,15 @@ class Hits:
         Height above the surface from which light is looked for, so that a surface does not shade itself.
     """
 
-    face: Int[Ints, "N"]
+    face: Int[Ints, " N"]
     place: Float[Floats32, "N 3"]
     flat: Float[Floats32, "N 3"]
     normal: Float[Floats32, "N 3"]
     color: Float[Floats32, "N 3"]
-    lift: Float[Floats32, "N"]
+    lift: Float[Floats32, " N"]
 
     @classmethod
-    def none(cls, face: Int[Ints, "N"]) -> Hits:
+    def none(cls, face: Int[Ints, " N"]) -> Hits:
         """No hits yet: ``face`` is -1 everywhere."""
         place, flat, normal, color = np.zeros((4, len(face), 3), np.float32)
         return cls(face, place, flat, normal, color, np.full(len(face), _LIFT, np.float32))
@@ -107,7 +107,7 @@ class Scene:
 
     def blocked(
         self, places: Float[Floats32, "N 3"], directions: Float[Floats32, "N 3"], reach: float
-    ) -> Bool[Bools, "N"]:
+    ) -> Bool[Bools, " N"]:
         """Whether anything lies within reach of each place along a unit direction."""
         found = self._embree.run(
             np.ascontiguousarray(places, np.float32),
@@ -117,7 +117,7 @@ class Scene:
         )
         return np.asarray(found >= 0)
 
-    def look(self, x: Float[Floats, "N"], y: Float[Floats, "N"], pixel: float) -> Hits:
+    def look(self, x: Float[Floats, " N"], y: Float[Floats, " N"], pixel: float) -> Hits:
         """What is seen at points of the picture plane; ``pixel`` is the size of a pixel, for textures."""
         count = len(x)
         face = np.full(count, -1, np.int64)
@@ -148,8 +148,8 @@ class Scene:
         return hits
 
     def _describe(
-        self, hits: Hits, rows: Int[Ints, "N"], weights: Float[Floats32, "N 3"], pixel: float
-    ) -> Bool[Bools, "N"]:
+        self, hits: Hits, rows: Int[Ints, " N"], weights: Float[Floats32, "N 3"], pixel: float
+    ) -> Bool[Bools, " N"]:
         """Fill in rows of the hits; whether each is a hole in its texture."""
         face = hits.face[rows]
         holes = np.zeros(len(rows), bool)

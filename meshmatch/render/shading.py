@@ -21,7 +21,7 @@ _SHADOW_REACH = 1.6
 _AT_ONCE = 20_000  # rows: what belongs to them then stays in the processor's cache
 
 
-def _unit(x: float, y: float, z: float) -> Float[Floats32, "3"]:
+def _unit(x: float, y: float, z: float) -> Float[Floats32, " 3"]:
     return (np.array([x, y, z]) / np.linalg.norm([x, y, z])).astype(np.float32)
 
 
@@ -70,7 +70,7 @@ _SKY_SET, _SKY_FAR = _sky_directions()
 
 
 def visibility(
-    scene: Scene, hits: Hits, rows: Int[Ints, "N"], row: Int[Ints, "N"], column: Int[Ints, "N"]
+    scene: Scene, hits: Hits, rows: Int[Ints, " N"], row: Int[Ints, " N"], column: Int[Ints, " N"]
 ) -> Float[Floats32, "N 2"]:
     """Shares of the key lamp and of the sky that reach ``rows`` of the hits.
 
@@ -105,8 +105,8 @@ def _lamp_seen(
     flat: Float[Floats32, "N 3"],
     normal: Float[Floats32, "N 3"],
     aims: Float[Floats32, "R 3"],
-    reaches: Float[Floats32, "R"],
-) -> Float[Floats32, "N"]:
+    reaches: Float[Floats32, " R"],
+) -> Float[Floats32, " N"]:
     # At a grazing angle a facet shades its neighbors although the smooth surface is lit: shadows fade there.
     grazing = np.clip((flat @ _KEY) / np.float32(0.3), 0.0, 1.0)
     facing = np.flatnonzero((normal @ _KEY > -0.2) & (grazing > 0))
@@ -123,8 +123,8 @@ def _sky_seen(
     flat: Float[Floats32, "N 3"],
     normal: Float[Floats32, "N 3"],
     aims: Float[Floats32, "R 3"],
-    reaches: Float[Floats32, "R"],
-) -> Float[Floats32, "N"]:
+    reaches: Float[Floats32, " R"],
+) -> Float[Floats32, " N"]:
     side, up = _tangents(normal)
     taken = np.zeros(len(places), np.float32)
     for (x, y, z), reach in zip(aims, reaches, strict=True):
@@ -146,7 +146,7 @@ def _tangents(normal: Float[Floats32, "N 3"]) -> tuple[Float[Floats32, "N 3"], F
     )
 
 
-def shade(hits: Hits, rows: Int[Ints, "N"], seen: Float[Floats32, "N 2"]) -> Float[Floats32, "N 3"]:
+def shade(hits: Hits, rows: Int[Ints, " N"], seen: Float[Floats32, "N 2"]) -> Float[Floats32, "N 3"]:
     """Linear light that rows of the hits send to the viewer; ``seen`` as from `visibility`."""
     normal, color = hits.normal[rows], hits.color[rows]
     lamp, sky = seen[:, 0], seen[:, 1]
@@ -165,7 +165,7 @@ def shade(hits: Hits, rows: Int[Ints, "N"], seen: Float[Floats32, "N 2"]) -> Flo
     return np.asarray(color * light + (gloss + 0.06 * edge)[:, None], np.float32)
 
 
-def shadow(seen: Float[Floats32, "N 2"]) -> Float[Floats32, "N"]:
+def shadow(seen: Float[Floats32, "N 2"]) -> Float[Floats32, " N"]:
     """How dark the ground is, 0 to 1, where shares ``seen`` of lamp and sky reach it."""
     dark = 0.30 * (1.0 - seen[:, 0]) + 0.52 * (1.0 - seen[:, 1])
     return np.asarray(np.clip(dark, 0.0, 0.85), np.float32)

@@ -23,7 +23,7 @@ class Paint(Protocol):
     """What gives a triangle its color at each of its points."""
 
     def at(
-        self, faces: Int[Ints, "N"], weights: Float[AnyFloats, "N 3"], footprint: float
+        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
     ) -> Float[AnyFloats, "N C"]:
         """Colors, three or four columns, at points of triangles given by barycentric weights; a fourth value below a
         half is a hole.
@@ -48,7 +48,7 @@ class VertexPaint:
         object.__setattr__(self, "colors", np.asarray(self.colors, np.float32))
 
     def at(
-        self, faces: Int[Ints, "N"], weights: Float[AnyFloats, "N 3"], footprint: float
+        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
     ) -> Float[AnyFloats, "N C"]:
         corners = self.faces[faces]
         if self.sharp:
@@ -66,7 +66,7 @@ class FacePaint:
         object.__setattr__(self, "colors", np.asarray(self.colors, np.float32))
 
     def at(
-        self, faces: Int[Ints, "N"], weights: Float[AnyFloats, "N 3"], footprint: float
+        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
     ) -> Float[AnyFloats, "N C"]:
         return self.colors[faces]
 
@@ -100,7 +100,7 @@ class Surface:
         drawn = self.verts[used]
         return np.stack([drawn.min(axis=0), drawn.max(axis=0)])
 
-    def moved(self, shift: Float[Floats, "3"]) -> Surface:
+    def moved(self, shift: Float[Floats, " 3"]) -> Surface:
         """The surface translated by ``shift``."""
         return replace(self, verts=self.verts + shift)
 
@@ -110,10 +110,10 @@ class SomeFaces:
     """The paint of a mesh of which only some triangles are drawn."""
 
     paint: Paint
-    chosen: Int[Ints, "N"]
+    chosen: Int[Ints, " N"]
 
     def at(
-        self, faces: Int[Ints, "N"], weights: Float[AnyFloats, "N 3"], footprint: float
+        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
     ) -> Float[AnyFloats, "N C"]:
         return self.paint.at(self.chosen[faces], weights, footprint)
 
@@ -122,7 +122,7 @@ def mesh_surface(
     verts: Float[AnyFloats, "V 3"],
     faces: Int[Ints, "F 3"],
     paint: Paint,
-    chosen: Int[Ints, "N"] | None = None,
+    chosen: Int[Ints, " N"] | None = None,
 ) -> Surface:
     """A mesh, or the ``chosen`` of its triangles; normals are smooth, also across the duplicate vertices of texture
     seams and stl files.
@@ -151,7 +151,7 @@ def balls(centers: Float[AnyFloats, "K 3"], radius: float, colors: Float[AnyFloa
 def discs(
     centers: Float[AnyFloats, "K 3"],
     normals: Float[AnyFloats, "K 3"],
-    radius: Float[AnyFloats, "K"],
+    radius: Float[AnyFloats, " K"],
     colors: Float[AnyFloats, "K 3"],
 ) -> Surface:
     """A flat octagon for every center, perpendicular to its normal, with its radius."""
