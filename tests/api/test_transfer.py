@@ -13,6 +13,7 @@ from meshmatch.api.results import MapPair
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.render.picture import Look
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
@@ -180,12 +181,13 @@ def test_evaluate_takes_arrays(pair: tuple[Shape, Shape, VertexMap]) -> None:
 
 def test_pictures_and_pages(pair: tuple[Shape, Shape, VertexMap], tmp_path: Path) -> None:
     source, target, found = pair
-    plain = meshmatch.picture([source, target], tmp_path / "two.png", names=["one", "other"])
-    assert plain[0] > plain[1] > 100
+    look = Look(size=(160, 100))
+    plain = meshmatch.picture([source, target], tmp_path / "two.png", look=look, names=["one", "other"])
+    assert plain == (160, 100)
     for number, given in enumerate(
         ({"match": found}, {"values": [source.verts[:, 0]] * 2}, {"labels": [[0] * 642] * 2})
     ):
-        meshmatch.picture([source, target], tmp_path / f"{number}.png", **given)  # type: ignore[arg-type]
+        meshmatch.picture([source, target], tmp_path / f"{number}.png", look=look, **given)  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="match and values do not go together"):
         meshmatch.picture([source, target], tmp_path / "no.png", match=found, values=[[0.0] * 642] * 2)
     with pytest.raises(OptionError, match="2 shapes need as many values, not 1"):
