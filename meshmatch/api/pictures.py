@@ -135,7 +135,7 @@ def _composed(
                 f"the fit is of {own.name or 'another shape'}, not of {shapes[0].name or 'this one'}",
                 "draw the shape that was fitted",
             )
-        return compose_fit(shapes[0], Shape(fit.points_in_file, fit.faces), fit.frame.rotation)
+        return compose_fit(shapes[0], fit.shape, fit.frame.rotation)
     looks = [_read_look(source, shape)[0] for source, shape in zip(given, shapes, strict=True)]
     return compose_shapes(list(zip(shapes, looks, strict=True)))
 

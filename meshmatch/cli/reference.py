@@ -105,7 +105,16 @@ def _entry(name: str, thing: object, level: str) -> str:
         if not key.startswith("_")
     ]
     methods = [(key, value) for key, value in members if inspect.isfunction(value)]
+    properties = [_property(key, value.fget) for key, value in members if isinstance(value, property)]
+    if properties:
+        text += "\nProperties:\n\n" + "\n".join(properties) + "\n"
     return "\n".join([text, *(_entry(f"{name}.{key}", value, "####") for key, value in methods)])
+
+
+def _property(name: str, read: object) -> str:
+    """A line with the name, the type and the first sentence of a property."""
+    annotation = getattr(read, "__annotations__", {}).get("return", "")
+    return f"- `{name}: {_written(annotation)}` {(inspect.getdoc(read) or '').splitlines()[0]}"
 
 
 def _signature(thing: object) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,6 +12,10 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.repair import Repaired
+from meshmatch.shapes.shape import Shape
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 Verdict = Literal["good", "fair", "poor"]
 ReasonCode = Literal["residual", "unreached", "part", "empty"]
@@ -92,6 +96,15 @@ class Fit:
     def points_in_file(self) -> Float[Floats, "V 3"]:
         """Template vertices in the frame and unit of the shape's file."""
         return self.frame.undo(self.points)
+
+    @property
+    def shape(self) -> Shape:
+        """The fitted template, in the frame and unit of the shape's file."""
+        return Shape(self.points_in_file, self.faces)
+
+    def to_trimesh(self) -> Trimesh:
+        """The fitted template as a `trimesh.Trimesh`, in the frame and unit of the shape's file."""
+        return self.shape.to_trimesh()
 
     def check_template(self, expected: str) -> None:
         """Refuse a fit of another template than the one with this hash (`OptionError`)."""

@@ -63,6 +63,8 @@ def test_a_fit_is_whole(model: TrainedModel, egg: Shape, fits: dict[Refine, Fit]
     assert np.array_equal(fit.faces, model.template.shape.faces)
     assert np.array_equal(fit.resting, model.template.shape.verts)
     assert np.allclose(fit.frame.apply(fit.points_in_file), fit.points)
+    mesh = fit.to_trimesh()
+    assert np.array_equal(mesh.vertices, fit.points_in_file) and np.array_equal(mesh.faces, fit.faces)
     R = fit.frame.rotation
     assert np.allclose(R @ R.T, np.eye(3))
     assert np.linalg.det(R) == pytest.approx(1)
