@@ -8,10 +8,9 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import OptionError, OutputError
-from meshmatch.render import Look, Panel, position_colors, render_shapes
+from meshmatch.render import Look, Panel, layout, position_colors, render_shapes
 from meshmatch.render import picture as module
 from meshmatch.render.colors import to_linear, to_srgb
-from meshmatch.render.layout import HEIGHT
 from meshmatch.render.scales import Scale, label_colors, label_swatches
 from meshmatch.shapes import Shape
 from meshmatch.shapes.appearance import vertex_colors_alone
@@ -73,16 +72,21 @@ def test_a_wide_shape_is_limited_by_the_width(tmp_path: Path) -> None:
     assert rows.mean() == pytest.approx(29.5, abs=1)
 
 
-def test_without_a_size_the_picture_takes_the_room_that_the_shapes_need(tmp_path: Path) -> None:
+def test_without_a_size_the_picture_takes_the_room_that_the_shapes_need(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    height = 200  # four times smaller: the same shares
+    monkeypatch.setattr(layout, "HEIGHT", height)
+    monkeypatch.setattr(layout, "_WIDEST", 500)
     bare = replace(SMALL, size=None)
     narrow = draw(tmp_path, (box((0.1, 1, 0.1)), None), look=bare).shape
     wide = draw(tmp_path, (box((1.5, 1, 0.1)), None), look=bare).shape
     very_wide = draw(tmp_path, (box((9, 1, 0.1)), None), look=bare).shape
-    assert narrow[0] == wide[0] == HEIGHT
-    assert narrow[1] < 0.7 * HEIGHT
-    assert wide[1] == pytest.approx(1.5 * 0.91 * HEIGHT + 0.09 * HEIGHT, abs=3)
-    assert very_wide[1] == 2000
-    assert very_wide[0] < 0.5 * HEIGHT
+    assert narrow[0] == wide[0] == height
+    assert narrow[1] < 0.7 * height
+    assert wide[1] == pytest.approx(1.5 * 0.91 * height + 0.09 * height, abs=3)
+    assert very_wide[1] == 500
+    assert very_wide[0] < 0.5 * height
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z", "+z", "Z"])
