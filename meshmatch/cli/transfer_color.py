@@ -5,15 +5,15 @@ from typing import Annotated
 
 import typer
 
-from meshmatch.cli import transfers
+from meshmatch.cli import transfer_options
 from meshmatch.cli.console import Console, print_json
 from meshmatch.cli.options import RuleOptions, RunOptions, grouped
 
 
 @grouped
 def transfer_color(
-    source: transfers.Source,
-    target: transfers.Target,
+    source: transfer_options.Source,
+    target: transfer_options.Target,
     output: Annotated[
         Path,
         typer.Option(
@@ -24,7 +24,7 @@ def transfer_color(
             ".csv .ply.",
         ),
     ],
-    maps: transfers.MapOptions,
+    maps: transfer_options.MapOptions,
     rules: RuleOptions,
     run: RunOptions,
     values: Annotated[
@@ -34,7 +34,7 @@ def transfer_color(
             help="Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colours.",
         ),
     ] = None,
-    picture: transfers.Picture = None,
+    picture: transfer_options.Picture = None,
 ) -> None:
     """Transfer vertex colours, or other numbers per vertex.
 
@@ -52,7 +52,7 @@ def transfer_color(
         save_values,
     )
 
-    transfer = transfers.Transfer(source, target, maps, run, Console(run.quiet))
+    transfer = transfer_options.Transfer(source, target, maps, run, Console(run.quiet))
     (colors.check_suffix if values is None else check_values_suffix)(output)
     with transfer.outputs([output], [values], picture) as (temporary,):
         a, b = load_shape(source), load_shape(target)
@@ -66,7 +66,7 @@ def transfer_color(
         else:
             result = transfer_values(a, b, given.numbers, transfer, rule=rule)
             save_values(temporary, Values(result.data, given.names), b)
-    transfers.tell_low(transfer.console, result.low, rule.minimum)
+    transfer_options.tell_low(transfer.console, result.low, rule.minimum)
     what = "colours" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
     transfer.console.say(f"wrote {output}: {what} for the {b.V} vertices of {transfer.names[1]}")
     if picture is not None:
@@ -82,5 +82,5 @@ def transfer_color(
         transfer.draw(picture, result.maps, shown)
     if run.json:
         record = transfer.record(result.maps, float(result.confidence.mean()))
-        record |= transfers.low_record(result.low, rule.minimum)
+        record |= transfer_options.low_record(result.low, rule.minimum)
         print_json({"output": output, "picture": picture, "columns": columns} | record)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from meshmatch.cli import transfers
+from meshmatch.cli import transfer_options
 from meshmatch.cli.console import Console, print_json
 from meshmatch.cli.options import RuleOptions, RunOptions, grouped
 
@@ -14,8 +14,8 @@ On = Literal["vertices", "faces"]
 
 @grouped
 def transfer_labels(
-    source: transfers.Source,
-    target: transfers.Target,
+    source: transfer_options.Source,
+    target: transfer_options.Target,
     output: Annotated[
         Path,
         typer.Option("--output", "-o", metavar="FILE", help="Labels: .npy .csv .txt .json, or TGT as .ply."),
@@ -26,14 +26,14 @@ def transfer_labels(
             metavar="FILE", help="A whole number or a word per vertex or face of SRC: .npy .csv .txt .json."
         ),
     ],
-    maps: transfers.MapOptions,
+    maps: transfer_options.MapOptions,
     rules: RuleOptions,
     run: RunOptions,
     on: Annotated[
         On | None, typer.Option(help="What the labels of FILE belong to. Default: told by their number.")
     ] = None,
     to: Annotated[On | None, typer.Option(help="What of TGT gets labels. Default: the same.")] = None,
-    picture: transfers.Picture = None,
+    picture: transfer_options.Picture = None,
 ) -> None:
     """Transfer labels of vertices or faces.
 
@@ -46,7 +46,7 @@ def transfer_labels(
     from meshmatch.shapes.files import load_shape
     from meshmatch.transfer.label_files import check_labels_suffix, load_labels, save_labels
 
-    transfer = transfers.Transfer(source, target, maps, run, Console(run.quiet))
+    transfer = transfer_options.Transfer(source, target, maps, run, Console(run.quiet))
     rule = rules.rule(rules.blank)
     check_labels_suffix(output)
     with transfer.outputs([output], [labels], picture) as (temporary,):
@@ -55,7 +55,7 @@ def transfer_labels(
         result = transferred(a, b, given, transfer, to=to, rule=rule)
         found = result.data
         save_labels(temporary, found, b)
-    transfers.tell_low(transfer.console, result.low, rule.minimum, found.on)
+    transfer_options.tell_low(transfer.console, result.low, rule.minimum, found.on)
     used = len(np.unique(found.codes))
     transfer.console.say(
         f"wrote {output}: {used} different labels on the {len(found.codes)} {found.on} of {transfer.names[1]}"
@@ -70,6 +70,6 @@ def transfer_labels(
         transfer.draw(picture, result.maps, shown)
     if run.json:
         record = transfer.record(result.maps, float(result.maps.backward.confidence.mean()))
-        record |= transfers.low_record(result.low, rule.minimum)
+        record |= transfer_options.low_record(result.low, rule.minimum)
         ends = {"from": given.on, "to": found.on, "labels": used}
         print_json({"output": output, "picture": picture} | ends | record)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from meshmatch.cli import transfers
+from meshmatch.cli import transfer_options
 from meshmatch.cli.console import Console, print_json
 from meshmatch.cli.options import RunOptions, grouped
 
@@ -14,8 +14,8 @@ _FAR = 0.02  # of the size of a shape: a landmark this far from its surface is w
 
 @grouped
 def transfer_landmarks(
-    source: transfers.Source,
-    target: transfers.Target,
+    source: transfer_options.Source,
+    target: transfer_options.Target,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="FILE", help="Landmarks of TGT: .csv .json .pp.")
     ],
@@ -27,12 +27,12 @@ def transfer_landmarks(
             help="Landmarks of SRC, as vertices or positions: .csv .json, MeshLab's .pp, or .txt .npy of vertices.",
         ),
     ],
-    maps: transfers.MapOptionsWithPairs,
+    maps: transfer_options.MapOptionsWithPairs,
     run: RunOptions,
     min_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Landmarks of less confidence are named.")
     ] = 0.3,
-    picture: transfers.Picture = None,
+    picture: transfer_options.Picture = None,
 ) -> None:
     """Transfer landmarks to exact points on the surface of another shape.
 
@@ -46,7 +46,7 @@ def transfer_landmarks(
     from meshmatch.shapes.files import load_shape
     from meshmatch.transfer.landmark_files import check_landmarks_suffix, load_landmarks, save_landmarks
 
-    transfer = transfers.Transfer(source, target, maps, run, Console(run.quiet))
+    transfer = transfer_options.Transfer(source, target, maps, run, Console(run.quiet))
     console = transfer.console
     check_landmarks_suffix(output)
     with transfer.outputs([output], [landmarks], picture) as (temporary,):

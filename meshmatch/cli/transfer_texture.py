@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from meshmatch.cli import transfers
+from meshmatch.cli import transfer_options
 from meshmatch.cli.console import Console, Json, print_json
 from meshmatch.cli.options import RuleOptions, RunOptions, grouped
 from meshmatch.errors import OptionError
@@ -49,8 +49,8 @@ class TextureOptions:
 
 @grouped
 def transfer_texture(
-    source: transfers.Source,
-    target: transfers.Target,
+    source: transfer_options.Source,
+    target: transfer_options.Target,
     output: Annotated[
         Path,
         typer.Option(
@@ -62,10 +62,10 @@ def transfer_texture(
         ),
     ],
     texture: TextureOptions,
-    maps: transfers.MapOptions,
+    maps: transfer_options.MapOptions,
     rules: RuleOptions,
     run: RunOptions,
-    picture: transfers.Picture = None,
+    picture: transfer_options.Picture = None,
 ) -> None:
     """Transfer the texture of one shape to another.
 
@@ -82,7 +82,7 @@ def transfer_texture(
     from meshmatch.transfer.bake import BakeOptions
     from meshmatch.transfer.texture import check_bake_options
 
-    transfer = transfers.Transfer(source, target, maps, run, Console(run.quiet))
+    transfer = transfer_options.Transfer(source, target, maps, run, Console(run.quiet))
     size, uv, image = texture.size, texture.uv, texture.image
     blank = colors.parse_color(rules.blank)
     rule = rules.rule(blank)
@@ -104,8 +104,8 @@ def transfer_texture(
         if painted:
             done = transfer_colors(a, b, transfer, colors=look, rule=rule)
             colors.save(temporary[0], b, done.data)
-            transfers.tell_low(transfer.console, done.low, rule.minimum)
-            record, pair = transfers.low_record(done.low, rule.minimum), done.maps
+            transfer_options.tell_low(transfer.console, done.low, rule.minimum)
+            record, pair = transfer_options.low_record(done.low, rule.minimum), done.maps
         else:
             with transfer.console.progress() as report:
                 made = transferred(a, target, transfer, uv=uv, options=baking, look=look, progress=report)

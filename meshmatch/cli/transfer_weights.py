@@ -5,19 +5,19 @@ from typing import Annotated
 
 import typer
 
-from meshmatch.cli import transfers
+from meshmatch.cli import transfer_options
 from meshmatch.cli.console import Console, print_json
 from meshmatch.cli.options import RunOptions, grouped
 
 
 @grouped
 def transfer_weights(
-    source: transfers.Source,
-    target: transfers.Target,
+    source: transfer_options.Source,
+    target: transfer_options.Target,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="FILE", help="Skin weights of TGT: .npz .json.")
     ],
-    maps: transfers.MapOptions,
+    maps: transfer_options.MapOptions,
     run: RunOptions,
     weights: Annotated[
         Path | None,
@@ -30,7 +30,7 @@ def transfer_weights(
     min_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Minimum confidence for weights to be trusted.")
     ] = 0.3,
-    picture: transfers.Picture = None,
+    picture: transfer_options.Picture = None,
 ) -> None:
     """Transfer skin weights.
 
@@ -44,7 +44,7 @@ def transfer_weights(
     from meshmatch.shapes.files import load_shape
     from meshmatch.transfer.weight_files import check_weights_suffix, load_weights, save_weights
 
-    transfer = transfers.Transfer(source, target, maps, run, Console(run.quiet))
+    transfer = transfer_options.Transfer(source, target, maps, run, Console(run.quiet))
     rule = ConfidenceRule(min_confidence, fill)
     check_weights_suffix(output)
     with transfer.outputs([output], [weights], picture) as (temporary,):
@@ -55,7 +55,7 @@ def transfer_weights(
         result = transferred(a, b, given, transfer, influences=influences, rule=rule)
         matrix = result.data.matrix
         save_weights(temporary, result.data)
-    transfers.tell_low(transfer.console, result.low, min_confidence)
+    transfer_options.tell_low(transfer.console, result.low, min_confidence)
     bare = int((np.diff(matrix.indptr) == 0).sum())
     if bare:
         transfer.console.warn(
@@ -73,6 +73,6 @@ def transfer_weights(
         transfer.draw(picture, result.maps, shown)
     if run.json:
         record = transfer.record(result.maps, float(result.confidence.mean()))
-        record |= transfers.low_record(result.low, min_confidence)
+        record |= transfer_options.low_record(result.low, min_confidence)
         counts = {"joints": len(given.names), "used_joints": used, "without_weights": bare}
         print_json({"output": output, "picture": picture} | counts | record)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from meshmatch.cli import options, transfers
+from meshmatch.cli import options, transfer_options
 from meshmatch.cli.console import Console, print_json
 from meshmatch.cli.options import RunOptions, grouped
 
@@ -15,7 +15,7 @@ def view(
     source: options.Source,
     target: options.Target,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="PAGE", help="The page: one .html file.")],
-    maps: transfers.ViewMapOptions,
+    maps: transfer_options.ViewMapOptions,
     run: RunOptions,
 ) -> None:
     """Make a page that shows two shapes and the map between them.
@@ -27,7 +27,7 @@ def view(
     from meshmatch.render.viewer import check_page
 
     check_page(output)
-    transfer = transfers.Transfer(source, target, maps, run, Console(run.quiet))
+    transfer = transfer_options.Transfer(source, target, maps, run, Console(run.quiet))
     with transfer.outputs([output], []) as (temporary,):
         page = viewed(source, target, temporary, transfer, up=maps.up, front=maps.front, names=transfer.names)
     for note in page.notes:

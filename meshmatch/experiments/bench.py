@@ -26,6 +26,7 @@ from meshmatch.errors import MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.experiments.scores import SetScores, evaluate_set
 from meshmatch.experiments.sets import ALL_SETS, SET_NAMES, BenchSet, Pair, load_set
+from meshmatch.fitting.choices import ON_NODES
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig, Partial, Refine
 from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
@@ -70,7 +71,7 @@ class OurMethod:
 
     def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:
         """Build the map from two fits."""
-        return self._matcher().map(source_fit, target_fit, agree=self.refine == "nodes")
+        return self._matcher().map(source_fit, target_fit, agree=self.refine in ON_NODES)
 
 
 @dataclass(frozen=True)

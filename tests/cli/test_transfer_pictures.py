@@ -150,7 +150,7 @@ def test_a_picture_that_cannot_be_is_told_before_the_work(
     def begun(*_: object, **__: object) -> None:
         raise AssertionError("the work began")
 
-    monkeypatch.setattr("meshmatch.cli.transfers.Transfer.__call__", begun)
+    monkeypatch.setattr("meshmatch.cli.transfer_options.Transfer.__call__", begun)
     before = sorted(path.name for path in pair.iterdir())
     answer = run(*call(verb, "--picture", picture, map="in.png"))
     assert answer.status == 1
