@@ -2,9 +2,12 @@
 
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+
+from meshmatch.errors import needs
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "templates" / "samples" / "climber.ply"
@@ -58,3 +61,8 @@ def test_the_library_says_it_too() -> None:
         "import meshmatch\ntry:\n    meshmatch.train\nexcept meshmatch.MeshmatchError as error:\n    print(error.hint)"
     )
     assert done.stdout.strip() == "pip install 'meshmatch[train]'"
+
+
+def test_another_missing_library_is_not_taken_for_torch() -> None:
+    with pytest.raises(ModuleNotFoundError, match="no_such_library"), needs("torch", "train"):
+        import_module("no_such_library")
