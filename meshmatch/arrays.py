@@ -68,9 +68,7 @@ def as_numbers(values: ArrayLike, name: str, finite: bool = False) -> Floats:
     try:
         found = np.asarray(values, np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(
-            f"{name} must be numbers ({error})", "pass an array, one row for each vertex"
-        ) from error
+        raise InputError(f"{name} must be numbers ({error})", "pass an array, one row for each vertex") from error
     if finite and not np.isfinite(found).all():
         raise InputError(f"{name} must be finite, but holds nan or infinite values")
     return found

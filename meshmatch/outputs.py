@@ -28,9 +28,7 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"cannot make the folder {path}: {error.strerror}", "choose another folder"
-        ) from error
+        raise OutputError(f"cannot make the folder {path}: {error.strerror}", "choose another folder") from error
 
 
 @contextmanager
@@ -55,27 +53,21 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
     if final.exists() and not os.access(final, os.W_OK):
         raise OutputError(f"cannot write {path}: it is write-protected", "choose another name with -o")
     if not folder.is_dir():
-        raise OutputError(
-            f"cannot write {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}"
-        )
+        raise OutputError(f"cannot write {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}")
     # A name has 255 bytes at most, and a letter up to 4 of them.
     temporary = folder / f".{path.stem[:40]}.{secrets.token_hex(4)}{path.suffix}"
     try:
         temporary.touch(exist_ok=False)  # tells now, not after minutes of work
         mode = temporary.stat().st_mode  # some writers make files that only their owner may read
     except OSError as error:
-        raise OutputError(
-            f"cannot write {path}: {error.strerror}", "choose another folder with -o"
-        ) from error
+        raise OutputError(f"cannot write {path}: {error.strerror}", "choose another folder with -o") from error
     try:
         yield temporary
         temporary.chmod(mode)
         os.replace(temporary, final)
     except OSError as error:
         if error.filename in (None, str(temporary), temporary):
-            raise OutputError(
-                f"cannot write {path}: {error.strerror or error}", "is the disk full?"
-            ) from error
+            raise OutputError(f"cannot write {path}: {error.strerror or error}", "is the disk full?") from error
         raise
     finally:
         temporary.unlink(missing_ok=True)
@@ -101,9 +93,7 @@ def folder_on_success(path: str | Path) -> Iterator[Path]:
     if path.is_dir() and any(path.iterdir()):
         raise OutputError(f"the folder {path} is not empty", "choose a new one, or empty it first")
     if not folder.is_dir():
-        raise OutputError(
-            f"cannot make {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}"
-        )
+        raise OutputError(f"cannot make {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}")
     temporary = folder / f".{path.name[:40]}.{secrets.token_hex(4)}"
     try:
         temporary.mkdir()

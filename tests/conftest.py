@@ -127,7 +127,5 @@ def icosphere(splits: int) -> Shape:
         ab, bc, ca = len(verts) + inverse.reshape(3, -1)
         a, b, c = faces.T
         verts = np.concatenate([verts, verts[unique].mean(axis=1)])
-        faces = np.concatenate(
-            [np.stack(t, 1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
-        )
+        faces = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
     return Shape(verts / np.linalg.norm(verts, axis=1, keepdims=True), faces, f"sphere{splits}")

@@ -251,9 +251,7 @@ def test_the_rule_sees_a_circle() -> None:
 
 def test_a_library_is_known_by_its_owners_alone() -> None:
     found = ((module, name) for module, tree in trees().items() for name in sorted(third_party(tree)))
-    strangers = [
-        f"{module}: {name}" for module, name in found if room_of(module) not in OWNERS.get(name, set())
-    ]
+    strangers = [f"{module}: {name}" for module, name in found if room_of(module) not in OWNERS.get(name, set())]
     none(strangers)
 
 
@@ -280,9 +278,7 @@ def bare(requirements: Iterable[str]) -> set[str]:
 
 def test_dependencies_are_those_that_are_imported() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    used = {DISTRIBUTIONS.get(name, name) for name in set().union(*map(third_party, trees().values()))} | {
-        "numpy"
-    }
+    used = {DISTRIBUTIONS.get(name, name) for name in set().union(*map(third_party, trees().values()))} | {"numpy"}
     core = bare(project["dependencies"])
     optional = bare(item for extra in EXTRAS for item in project["optional-dependencies"].get(extra, ()))
     assert used == core | optional

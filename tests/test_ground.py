@@ -70,10 +70,7 @@ def test_failed_output_leaves_the_old_one(tmp_path: Path, stop: type[BaseExcepti
 
 
 def test_output_folder_is_checked_before_the_work(tmp_path: Path) -> None:
-    with (
-        pytest.raises(OutputError, match="no folder") as caught,
-        replace_on_success(tmp_path / "no" / "a.npy"),
-    ):
+    with pytest.raises(OutputError, match="no folder") as caught, replace_on_success(tmp_path / "no" / "a.npy"):
         pytest.fail("the block must not run")
     assert "mkdir" in caught.value.hint
     with pytest.raises(OutputError, match="it is a folder"), replace_on_success(tmp_path):
@@ -90,10 +87,7 @@ def test_folder_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_full_disk_is_an_output_error_but_a_missing_input_is_not(tmp_path: Path) -> None:
-    with (
-        pytest.raises(OutputError, match="No space left"),
-        replace_on_success(tmp_path / "a.npy") as temporary,
-    ):
+    with pytest.raises(OutputError, match="No space left"), replace_on_success(tmp_path / "a.npy") as temporary:
         raise OSError(errno.ENOSPC, "No space left on device", str(temporary))
     with pytest.raises(FileNotFoundError), replace_on_success(tmp_path / "a.npy"):
         (tmp_path / "other").read_bytes()
@@ -182,9 +176,7 @@ def counts() -> dict[str, int]:
     import torch
     from threadpoolctl import threadpool_info
 
-    found = {
-        each["filepath"]: each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"
-    }
+    found = {each["filepath"]: each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
     return found | {"torch": torch.get_num_threads()}
 
 

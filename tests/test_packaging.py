@@ -33,9 +33,7 @@ def metadata(wheel: zipfile.ZipFile) -> email.message.Message:
 def test_the_wheel_holds_templates_weights_and_samples(wheel: zipfile.ZipFile) -> None:
     held = set(wheel.namelist())
     bundled = {f"human/human-{pose}.safetensors" for pose in "TAI"}
-    bundled |= {
-        f"models/human/{name}" for name in ("card.json", "weights.safetensors", "template.safetensors")
-    }
+    bundled |= {f"models/human/{name}" for name in ("card.json", "weights.safetensors", "template.safetensors")}
     assert {f"meshmatch/_templates/{name}" for name in bundled} <= held
     assert len([name for name in held if name.startswith("meshmatch/_templates/samples/")]) >= 2
 
@@ -69,9 +67,7 @@ def test_the_wheel_holds_the_viewer_with_the_licence_of_three(wheel: zipfile.Zip
     assert notice.startswith("The MIT License")
     assert notice in (folder / "three.min.js").read_text(encoding="utf-8")
     assert [
-        name
-        for name in wheel.namelist()
-        if name.endswith(".dist-info/licenses/meshmatch/render/viewer/three.LICENSE")
+        name for name in wheel.namelist() if name.endswith(".dist-info/licenses/meshmatch/render/viewer/three.LICENSE")
     ]
 
 
@@ -106,9 +102,7 @@ def test_a_checkout_finds_its_templates() -> None:
     assert location.bundled_folder() == ROOT / "templates"
 
 
-def test_an_installed_package_finds_its_own_before_any_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_installed_package_finds_its_own_before_any_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = fake_package(tmp_path, monkeypatch)
     (tmp_path / "pyproject.toml").touch()
     (tmp_path / "templates").mkdir()

@@ -65,9 +65,7 @@ def test_the_readme_has_two_commands_that_the_shell_understands(scripts: list[st
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_a_command_needs_nothing_before_it_and_stops_at_the_first_failure(
-    scripts: list[str], number: int
-) -> None:
+def test_a_command_needs_nothing_before_it_and_stops_at_the_first_failure(scripts: list[str], number: int) -> None:
     lines = scripts[number].strip().split("\n")
     assert all(line.endswith("&&") for line in lines[:-1])
     words = commands(scripts[number])
@@ -127,9 +125,7 @@ def test_python_on_a_page_compiles_and_names_what_exists(page: Path) -> None:
                 assert {alias.name for alias in node.names} <= set(dir(module))
 
 
-def test_the_python_of_the_readme_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, remembered_fits: None
-) -> None:
+def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, remembered_fits: None) -> None:
     (tmp_path / "templates").symlink_to(ROOT / "templates")
     monkeypatch.chdir(tmp_path)
     found: dict[str, Any] = {}

@@ -45,9 +45,7 @@ def test_a_shape_is_matched_without_torch() -> None:
     ids=lambda words: words[0],
 )
 def test_what_needs_torch_says_so_in_a_line(words: list[str], tmp_path: Path) -> None:
-    done = run(
-        f"import os\nos.chdir({str(tmp_path)!r})\nfrom meshmatch.cli import main\nsys.exit(main({words!r}))"
-    )
+    done = run(f"import os\nos.chdir({str(tmp_path)!r})\nfrom meshmatch.cli import main\nsys.exit(main({words!r}))")
     assert done.returncode == 1
     assert done.stderr.splitlines()[-2:] == [
         "error: this needs torch, which is not installed",

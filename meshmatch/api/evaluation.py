@@ -75,7 +75,5 @@ def evaluate(
 def _vertices(numbers: ArrayLike) -> Ints:
     found = np.asarray(numbers)
     if found.dtype.kind not in "iu":
-        raise InputError(
-            f"the truth must be numbers of vertices, not {found.dtype}", "integers, counted from 0"
-        )
+        raise InputError(f"the truth must be numbers of vertices, not {found.dtype}", "integers, counted from 0")
     return found.astype(np.int64)

@@ -76,21 +76,16 @@ def validated(shape: Shape) -> Repaired:
     name = shape.name or "the shape"
     if fixed.is_cloud and fixed.V < MINIMUM_POINTS:
         places = "position" if fixed.V == 1 else "positions"
-        raise InputError(
-            f"{name} has only {fixed.V} distinct point {places}", f"at least {MINIMUM_POINTS} are needed"
-        )
+        raise InputError(f"{name} has only {fixed.V} distinct point {places}", f"at least {MINIMUM_POINTS} are needed")
     if not fixed.is_cloud and fixed.F < MINIMUM_FACES:
-        raise InputError(
-            f"{name} has only {fixed.F} usable triangles", f"at least {MINIMUM_FACES} are needed"
-        )
+        raise InputError(f"{name} has only {fixed.F} usable triangles", f"at least {MINIMUM_FACES} are needed")
     if fixed.is_cloud and on_a_line(fixed.verts):
         raise InputError(f"{name} has no surface: all its points lie on a line", "is it a point cloud?")
     if not fixed.area > 0:
         raise InputError(f"{name} has no surface area", "are all its points the same, or on a line?")
     if clean.far_parts:
         raise InputError(
-            f"{name} contains {clean.far_parts + 1} large parts far apart",
-            "save each object in a file of its own",
+            f"{name} contains {clean.far_parts + 1} large parts far apart", "save each object in a file of its own"
         )
     return clean
 

@@ -100,9 +100,7 @@ class Step:
     @property
     def record(self) -> dict[str, float]:
         """Time and deviations, for JSON."""
-        return {"time": round(self.time, 9)} | {
-            key: round(value, 6) for key, value in asdict(self.deviation).items()
-        }
+        return {"time": round(self.time, 9)} | {key: round(value, 6) for key, value in asdict(self.deviation).items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,9 +175,7 @@ def interpolate(
         first = config if isinstance(config, FitConfig) or config is None else config[0]
         fits = agreed_fits(matcher.model, repaired, fits, first)
         blend = Blend(matcher.model, fits, None, repaired, options.way)
-        steps, place, distance = _steps(
-            blend, fits, np.linspace(options.start, options.stop, frames), options, matcher
-        )
+        steps, place, distance = _steps(blend, fits, np.linspace(options.start, options.stop, frames), options, matcher)
     return Interpolation(
         steps, tuple(fits), tuple(blend.times.tolist()), place, distance, time.monotonic() - began, notes
     )

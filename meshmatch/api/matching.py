@@ -89,9 +89,7 @@ class Matcher:
         """
         return self.fit_all([shape], config)[0]
 
-    def fit_all(
-        self, shapes: Sequence[ShapeLike], config: FitConfig | Sequence[FitConfig] | None = None
-    ) -> list[Fit]:
+    def fit_all(self, shapes: Sequence[ShapeLike], config: FitConfig | Sequence[FitConfig] | None = None) -> list[Fit]:
         """Fit the template to several shapes, some beside each other; where one fails, the others stop.
 
         Parameters
@@ -171,9 +169,7 @@ class Matcher:
     def _fit_all(self, clean: Sequence[Repaired], configs: Sequence[FitConfig]) -> list[Fit]:
         stop = threading.Event()
         names = [part.shape.name for part in clean]
-        labels = [
-            f"{name} ({number + 1})" if names.count(name) > 1 else name for number, name in enumerate(names)
-        ]
+        labels = [f"{name} ({number + 1})" if names.count(name) > 1 else name for number, name in enumerate(names)]
 
         def one(number: int) -> Fit:
             def report(stage: str, name: str, share: float) -> None:
@@ -207,9 +203,7 @@ class Matcher:
         """The fit with its shape, and with what its user should know."""
         notes = [f"{clean.shape.name}: {note}" for note in clean.notes]
         if config.for_model(self.model).refine != config.refine:
-            notes.append(
-                f"model {self.model.card.name} is pointwise and has no nodes: its code was refined instead"
-            )
+            notes.append(f"model {self.model.card.name} is pointwise and has no nodes: its code was refined instead")
         return replace(fit, repaired=clean, notes=tuple(notes))
 
     def _agreed(
@@ -296,7 +290,6 @@ def _check_landmarks(model: TrainedModel, configs: Sequence[FitConfig]) -> None:
     for config in configs:
         if not config.moves_nodes:
             raise OptionError(
-                f"landmarks need refine='nodes', not {config.refine!r}",
-                "leave out the landmarks, or choose nodes",
+                f"landmarks need refine='nodes', not {config.refine!r}", "leave out the landmarks, or choose nodes"
             )
     check_landmarks(model)

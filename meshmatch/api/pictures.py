@@ -114,9 +114,7 @@ def _composed(
             raise OptionError(f"{len(shapes)} shapes need as many {name}, not {len(tables)}")
     if match is not None:
         if len(shapes) != 2:
-            raise OptionError(
-                f"a map is of two shapes, not of {len(shapes)}", "give the source, then the target"
-            )
+            raise OptionError(f"a map is of two shapes, not of {len(shapes)}", "give the source, then the target")
         maps = find_maps(shapes[0], shapes[1], match)
         turns = None if maps.match is None else maps.match.rotations
         return compose_match(shapes[0], shapes[1], maps.forward, turns or (None, None), look=look)

@@ -93,9 +93,7 @@ class MapPair:
             return invert_map(self.forward, self.source, self.target, self.threads)
 
 
-def pair_of_map(
-    found: VertexMap, source: Shape, target: Shape, threads: int = 1, label: str = "the map"
-) -> MapPair:
+def pair_of_map(found: VertexMap, source: Shape, target: Shape, threads: int = 1, label: str = "the map") -> MapPair:
     """A map at hand as a pair; `InputError` where it belongs to other shapes or has the opposite direction."""
     return MapPair(source, target, found.for_shapes(source, target, label), None, threads)
 
@@ -117,9 +115,7 @@ def map_of_fits(fits: tuple[Fit, Fit], before_agreement: tuple[Fit, Fit], thread
 def shape_of(fit: Fit) -> Repaired:
     """The repaired shape that a fit is of."""
     if fit.repaired is None:
-        raise OptionError(
-            "this fit does not know its shape", "make it with meshmatch.register or Matcher.fit"
-        )
+        raise OptionError("this fit does not know its shape", "make it with meshmatch.register or Matcher.fit")
     return fit.repaired
 
 

@@ -120,18 +120,14 @@ def transfer_texture(
     return TexturedResult(made.mesh, made.baked, atlas, maps, time.monotonic() - began)
 
 
-def _look_of(
-    source: ShapeLike, image: str | Path | None, look: Appearance | None
-) -> tuple[Shape, Appearance]:
+def _look_of(source: ShapeLike, image: str | Path | None, look: Appearance | None) -> tuple[Shape, Appearance]:
     shape = as_shape(source, "source")
     if look is not None:
         return shape, look
     if isinstance(source, str | Path):
         return shape, load_appearance(source, shape, image)
     if image is not None:
-        raise OptionError(
-            "an image needs the texture coordinates of the source's file", "give the source as a path"
-        )
+        raise OptionError("an image needs the texture coordinates of the source's file", "give the source as a path")
     if shape.colors is None:
         raise InputError(
             f"{shape.name or 'the source'} has neither a texture nor colours",

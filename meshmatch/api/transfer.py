@@ -24,12 +24,7 @@ from meshmatch.transfer.face_labels import mean_of_corners, pull_face_labels
 from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, named
 from meshmatch.transfer.landmark_files import load_landmarks
 from meshmatch.transfer.landmarks import Landmarks, at_points, at_vertices, push_landmarks
-from meshmatch.transfer.low_confidence import (
-    LowConfidence,
-    replace_low_labels,
-    replace_low_values,
-    replace_low_weights,
-)
+from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels, replace_low_values, replace_low_weights
 from meshmatch.transfer.weight_files import SkinWeights, load_weights, weights_of
 
 if TYPE_CHECKING:
@@ -77,9 +72,7 @@ def transfer_values(
         )
     blank = None if rule.blank is None else as_numbers(rule.blank, "blank")
     if blank is not None and blank.shape not in ((), (1,), numbers.shape[1:]):
-        raise OptionError(
-            f"blank has {blank.shape} numbers and the values {numbers.shape[1:]}", "give one number"
-        )
+        raise OptionError(f"blank has {blank.shape} numbers and the values {numbers.shape[1:]}", "give one number")
     maps = find_maps(source, target, match)
     with thread_limit(1):
         if directions:

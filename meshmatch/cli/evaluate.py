@@ -25,13 +25,10 @@ def evaluate(
     ] = 15.0,
     curve: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Draw the cumulative error curve, .png, .svg or .pdf (needs the truth)."
-        ),
+        typer.Option(metavar="FILE", help="Draw the cumulative error curve, .png, .svg or .pdf (needs the truth)."),
     ] = None,
     picture: Annotated[
-        Path | None,
-        typer.Option(metavar="PNG", help="Draw both shapes, the errors as a color map (needs the truth)."),
+        Path | None, typer.Option(metavar="PNG", help="Draw both shapes, the errors as a color map (needs the truth).")
     ] = None,
     unit: Annotated[
         Literal["cm", "x100"],

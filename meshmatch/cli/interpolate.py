@@ -27,18 +27,14 @@ class SequenceOptions:
     start: Annotated[
         float, typer.Option("--from", metavar="T", help="Time of the first shape; below 0 is before A.")
     ] = 0.0
-    stop: Annotated[
-        float, typer.Option("--to", metavar="T", help="Time of the last shape; above 1 is beyond B.")
-    ] = 1.0
+    stop: Annotated[float, typer.Option("--to", metavar="T", help="Time of the last shape; above 1 is beyond B.")] = 1.0
     mesh: Annotated[
         Literal["source", "template"],
         typer.Option(help="Mesh that moves: that of A, with all its detail, or the model's template."),
     ] = "source"
     blend: Annotated[
         Literal["field", "codes"],
-        typer.Option(
-            help="Blend the local rotation and stretch of the surface (field), or the network's codes."
-        ),
+        typer.Option(help="Blend the local rotation and stretch of the surface (field), or the network's codes."),
     ] = "field"
     place: Annotated[
         Literal["auto", "files", "source"],
@@ -47,14 +43,12 @@ class SequenceOptions:
             "source: all as A; auto: files, unless the files seem to have different units."
         ),
     ] = "auto"
-    format: Annotated[
-        Literal["ply", "obj", "off", "glb"], typer.Option(help="Format of the files in a folder.")
-    ] = "ply"
+    format: Annotated[Literal["ply", "obj", "off", "glb"], typer.Option(help="Format of the files in a folder.")] = (
+        "ply"
+    )
     plot: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Plot how well each shape keeps volume and distances: .png, .svg or .pdf."
-        ),
+        typer.Option(metavar="FILE", help="Plot how well each shape keeps volume and distances: .png, .svg or .pdf."),
     ] = None
 
     def options(self) -> "InterpolationOptions":
@@ -154,8 +148,7 @@ def _draw_strip(path: Path, result: "Interpolation", met: dict[float, str]) -> N
     from meshmatch.render.picture import render_shapes
 
     panels = [
-        Panel(step.shape, label=met.get(step.time, f"{step.time:.3g}"), rotation=step.rotation)
-        for step in result.steps
+        Panel(step.shape, label=met.get(step.time, f"{step.time:.3g}"), rotation=step.rotation) for step in result.steps
     ]
     render_shapes(panels, path)
 

@@ -64,12 +64,8 @@ def show(name: Name) -> None:
 
 @models.command()
 def add(
-    folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="A model folder, such as `meshmatch train` writes.")
-    ],
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Replace your own model of the same name.")
-    ] = False,
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A model folder, such as `meshmatch train` writes.")],
+    replace: Annotated[bool, typer.Option("--replace", help="Replace your own model of the same name.")] = False,
     json: options.Json = False,
 ) -> None:
     """Copy a model into your registry.
@@ -121,6 +117,4 @@ def verify(
         print_json({"models": checked})
     wrong = sum(model["sha256"] is None for model in checked)
     if wrong:
-        raise ModelError(
-            f"{wrong} {'model is' if wrong == 1 else 'models are'} damaged", "see the lines above"
-        )
+        raise ModelError(f"{wrong} {'model is' if wrong == 1 else 'models are'} damaged", "see the lines above")

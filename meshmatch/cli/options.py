@@ -29,9 +29,7 @@ Threads = Annotated[int, typer.Option(min=1, help="Number of threads.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary; warnings stay.")]
 
 
-PAIRS_HELP = (
-    "Known pairs that the map must honour: a source vertex and a target vertex a line, counted from 0."
-)
+PAIRS_HELP = "Known pairs that the map must honour: a source vertex and a target vertex a line, counted from 0."
 
 
 def check_axes(up: Axis | None, front: Axis | None) -> None:
@@ -49,8 +47,7 @@ class FitOptions:
     """How a template is fitted."""
 
     model: Annotated[
-        str,
-        typer.Option(metavar="NAME", help="Model: a name (see `meshmatch models list`) or a model folder."),
+        str, typer.Option(metavar="NAME", help="Model: a name (see `meshmatch models list`) or a model folder.")
     ] = "human"
     refine: Annotated[
         Refine,
@@ -59,12 +56,11 @@ class FitOptions:
             "none: the network alone."
         ),
     ] = "nodes"
-    up: Annotated[
-        Axis | None, _axis("Axis of the file that points up. Default: detect. With two shapes, of both.")
-    ] = None
+    up: Annotated[Axis | None, _axis("Axis of the file that points up. Default: detect. With two shapes, of both.")] = (
+        None
+    )
     front: Annotated[
-        Axis | None,
-        _axis("Axis of the file that the shape faces. Default: detect. With two shapes, of both."),
+        Axis | None, _axis("Axis of the file that the shape faces. Default: detect. With two shapes, of both.")
     ] = None
     partial: Annotated[
         bool | None,
@@ -83,9 +79,7 @@ class FitOptions:
         """The same for the library."""
         from meshmatch.fitting.fit_config import FitConfig
 
-        return FitConfig(
-            refine=self.refine, seed=self.seed, up=self.up, front=self.front, partial=self._partial
-        )
+        return FitConfig(refine=self.refine, seed=self.seed, up=self.up, front=self.front, partial=self._partial)
 
     @property
     def _partial(self) -> Literal["auto", "yes", "no"]:
@@ -105,10 +99,7 @@ class PairOptions(FitOptions):
     source_front: Annotated[Axis | None, _axis("Front axis of the first shape.")] = None
     target_up: Annotated[Axis | None, _axis("Up axis of the second shape.")] = None
     target_front: Annotated[Axis | None, _axis("Front axis of the second shape.")] = None
-    known_pairs: Annotated[
-        Path | None,
-        typer.Option("--landmarks", metavar="FILE", help=PAIRS_HELP),
-    ] = None
+    known_pairs: Annotated[Path | None, typer.Option("--landmarks", metavar="FILE", help=PAIRS_HELP)] = None
 
     def check(self) -> None:
         """Refuse axes that lie along one line (`OptionError`), before anything is loaded."""
@@ -146,9 +137,7 @@ class PairOptions(FitOptions):
 class RunOptions:
     """How a verb that takes long behaves."""
 
-    strict: Annotated[
-        bool, typer.Option("--strict", help="Write nothing and exit with 1 if a fit is poor.")
-    ] = False
+    strict: Annotated[bool, typer.Option("--strict", help="Write nothing and exit with 1 if a fit is poor.")] = False
     json: Json = False
     threads: Threads = 2
     quiet: Quiet = False
@@ -162,8 +151,7 @@ class RuleOptions:
         bool, typer.Option("--fill", help="Replace values of low confidence by those of their neighbours.")
     ] = False
     blank: Annotated[
-        str | None,
-        typer.Option(metavar="VALUE", help="Or write VALUE there. Default: keep them as they are."),
+        str | None, typer.Option(metavar="VALUE", help="Or write VALUE there. Default: keep them as they are.")
     ] = None
     min_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Minimum confidence for a value to be trusted.")

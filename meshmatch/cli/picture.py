@@ -46,8 +46,7 @@ def picture(
     shown.check(len(shapes))
     if name and len(name) != len(shapes):
         raise OptionError(
-            f"{len(shapes)} shapes need {len(shapes)} names, not {len(name)}",
-            "give --name once for each shape",
+            f"{len(shapes)} shapes need {len(shapes)} names, not {len(name)}", "give --name once for each shape"
         )
     look = how.look()
     check_distinct([output], [*shapes, *shown.files])
@@ -64,9 +63,7 @@ def picture(
         print_json(record | {"width": width, "height": height} | made.record)
 
 
-def _labels(
-    paths: list[Path], subjects: "list[Subject]", names: list[str] | None, labels: list[str]
-) -> list[str]:
+def _labels(paths: list[Path], subjects: "list[Subject]", names: list[str] | None, labels: list[str]) -> list[str]:
     """The words below the panels with the names that the user gave; files of one name get their folders."""
     files: dict[str, set[str]] = {}
     for path, subject in zip(paths, subjects, strict=True):

@@ -28,18 +28,15 @@ class PictureOptions:
 
     map: Annotated[
         Path | None,
-        typer.Option(
-            metavar="MAP", help="Of two shapes, SOURCE TARGET, a map: matched places in one colour."
-        ),
+        typer.Option(metavar="MAP", help="Of two shapes, SOURCE TARGET, a map: matched places in one colour."),
     ] = None
-    confidence: Annotated[
-        bool, typer.Option("--confidence", help="With --map: its confidence, as a color map.")
-    ] = False
+    confidence: Annotated[bool, typer.Option("--confidence", help="With --map: its confidence, as a color map.")] = (
+        False
+    )
     truth: Truth = None
     points: Points = None
     unit: Annotated[
-        Literal["cm", "x100"],
-        typer.Option(help="Of errors: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100."),
+        Literal["cm", "x100"], typer.Option(help="Of errors: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100.")
     ] = "cm"
     values: Annotated[
         list[Path] | None,
@@ -58,8 +55,7 @@ class PictureOptions:
     labels: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="FILE",
-            help="A label for each vertex or face (.npy .csv .txt .json). Once for each shape.",
+            metavar="FILE", help="A label for each vertex or face (.npy .csv .txt .json). Once for each shape."
         ),
     ] = None
     on: Annotated[
@@ -75,8 +71,7 @@ class PictureOptions:
         ),
     ] = None
     image: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="A texture for a shape whose file names none, or another one."),
+        Path | None, typer.Option(metavar="FILE", help="A texture for a shape whose file names none, or another one.")
     ] = None
     plain: Annotated[bool, typer.Option("--plain", help="Without textures, colours and nodes.")] = False
     seed: Seed = 0
@@ -102,9 +97,7 @@ class PictureOptions:
             raise OptionError(f"a map is of two shapes, not of {count}", "name the source, then the target")
         for name, wanted in (("--confidence", self.confidence), ("--truth and --points", known)):
             if wanted and self.map is None:
-                raise OptionError(
-                    f"{name} need a map" if "and" in name else f"{name} needs a map", "add --map"
-                )
+                raise OptionError(f"{name} need a map" if "and" in name else f"{name} needs a map", "add --map")
         if self.confidence and known:
             raise OptionError("--confidence and the truth both color the shapes", "make a picture for each")
         for name, files in (("--values", self.values), ("--labels", self.labels)):
@@ -118,9 +111,7 @@ class PictureOptions:
         if self.title is not None and not self.values:
             raise OptionError("--title needs --values", "give the values, or leave out --title")
         if self.range is not None and not (self.values or self.fit or known):
-            raise OptionError(
-                "--range needs a color scale", "it goes with --values, --truth, --points and --fit"
-            )
+            raise OptionError("--range needs a color scale", "it goes with --values, --truth, --points and --fit")
 
 
 @dataclass(frozen=True)
@@ -128,17 +119,13 @@ class LookOptions:
     """How it is shown."""
 
     view: Annotated[View, typer.Option(help="The side that is shown.")] = "quarter"
-    up: Annotated[Axis | None, typer.Option(help="The files' axis that points up. Guessed if not given.")] = (
+    up: Annotated[Axis | None, typer.Option(help="The files' axis that points up. Guessed if not given.")] = None
+    front: Annotated[Axis | None, typer.Option(help="The files' axis that the shapes face. Guessed if not given.")] = (
         None
     )
-    front: Annotated[
-        Axis | None, typer.Option(help="The files' axis that the shapes face. Guessed if not given.")
-    ] = None
     size: Annotated[
         str | None,
-        typer.Option(
-            metavar="WxH", help="Width and height in pixels, such as 1200x800. Fitted if not given."
-        ),
+        typer.Option(metavar="WxH", help="Width and height in pixels, such as 1200x800. Fitted if not given."),
     ] = None
     background: Annotated[
         str, typer.Option(metavar="COLOR", help="white, dark, transparent, or a colour such as #e8f0f8.")
@@ -230,9 +217,7 @@ def compose(options: PictureOptions, subjects: list[Subject], look: "Look", voic
 
         labels = [load_labels(*pair, options.on) for pair in zip(options.labels, shapes, strict=True)]
         return compose_labels(shapes, *merge_labels(labels), [own.on == "faces" for own in labels])
-    return compose_shapes(
-        [(each.template or each.shape, each.appearance) for each in subjects], plain=options.plain
-    )
+    return compose_shapes([(each.template or each.shape, each.appearance) for each in subjects], plain=options.plain)
 
 
 def _compose_map(options: PictureOptions, shapes: "list[Shape]", look: "Look") -> "Composition":
@@ -255,9 +240,7 @@ def _compose_map(options: PictureOptions, shapes: "list[Shape]", look: "Look") -
     return compose_errors(source, target, found, (here, there), errors, options.unit, options.range, look)
 
 
-def _compose_fit(
-    options: PictureOptions, fit: str, shape: "Shape", look: "Look", voice: Console
-) -> "Composition":
+def _compose_fit(options: PictureOptions, fit: str, shape: "Shape", look: "Look", voice: Console) -> "Composition":
     """The template over a shape, from the file of a fit or by a model, which is fitted now."""
     from meshmatch.render.compose import compose_fit
     from meshmatch.shapes.files import SUFFIXES, load_shape

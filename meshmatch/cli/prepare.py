@@ -38,8 +38,7 @@ def prepare(
     console = Console(quiet)
     parts = None if labels is None else load_points(labels)
     config = PrepareConfig(
-        NodeConfig(strategy, nodes, radius, seed=seed),
-        *(faces, decimate, template, align, scale, landmarks, parts),
+        NodeConfig(strategy, nodes, radius, seed=seed), *(faces, decimate, template, align, scale, landmarks, parts)
     )
     with console.progress() as progress:
         made = prepare_shapes(shapes, output, config, progress)

@@ -27,26 +27,13 @@ API = {
     "Matching": ("match", "register", "Matcher", "MatchResult", "Fit", "FitConfig", "VertexMap", "evaluate"),
     "Transfers": (
         *("transfer_texture", "transfer_colors", "transfer_values", "transfer_labels", "transfer_weights"),
-        *(
-            "transfer_landmarks",
-            "find_maps",
-            "ConfidenceRule",
-            "BakeOptions",
-            "Transferred",
-            "TexturedResult",
-        ),
+        *("transfer_landmarks", "find_maps", "ConfidenceRule", "BakeOptions", "Transferred", "TexturedResult"),
     ),
     "Shapes and files": (
         *("Shape", "Frame", "load_shape", "save_shape", "load_map", "save_map", "load_model"),
         *("MeshmatchError",),
     ),
-    "Sequences, pictures and pages": (
-        "interpolate",
-        "InterpolationOptions",
-        "Interpolation",
-        "picture",
-        "view",
-    ),
+    "Sequences, pictures and pages": ("interpolate", "InterpolationOptions", "Interpolation", "picture", "view"),
     "Own categories": ("prepare", "train"),
 }
 
@@ -152,9 +139,7 @@ def _default(value: object) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Write the pages, or with --check say whether the files are what would be written."""
-    parser = argparse.ArgumentParser(
-        prog="python -m meshmatch.cli.reference", description="Write the references."
-    )
+    parser = argparse.ArgumentParser(prog="python -m meshmatch.cli.reference", description="Write the references.")
     parser.add_argument("folder", nargs="?", type=Path, default=DOCS, help="where cli.md and api.md are")
     parser.add_argument("--check", action="store_true", help="write nothing; status 1 if a page is stale")
     words = parser.parse_args(arguments)

@@ -25,12 +25,9 @@ def register(
     ],
     how: FitOptions,
     run: RunOptions,
-    dense: Annotated[
-        bool, typer.Option("--dense", help="Write the template in its full resolution.")
-    ] = False,
+    dense: Annotated[bool, typer.Option("--dense", help="Write the template in its full resolution.")] = False,
     picture: Annotated[
-        Path | None,
-        typer.Option(metavar="PNG", help="Draw the template over the shape, coloured by distance."),
+        Path | None, typer.Option(metavar="PNG", help="Draw the template over the shape, coloured by distance.")
     ] = None,
 ) -> None:
     """Fit the model's template to one shape.
@@ -73,11 +70,5 @@ def register(
     if picture is not None:
         console.say(f"drew {picture}: the template over the shape, and their distance")
     if run.json:
-        record = {
-            "output": output,
-            "picture": picture,
-            "vertices": fitted.V,
-            "faces": fitted.F,
-            "dense": dense,
-        }
+        record = {"output": output, "picture": picture, "vertices": fitted.V, "faces": fitted.F, "dense": dense}
         print_json(record | how.record | words.fit_record(loaded.name, fit) | {"notes": list(fit.notes)})

@@ -5,9 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-Shapes = Annotated[
-    Path, typer.Argument(metavar="SHAPES", help="A folder of shapes, or the one shape of a template.")
-]
+Shapes = Annotated[Path, typer.Argument(metavar="SHAPES", help="A folder of shapes, or the one shape of a template.")]
 PreparedFolder = Annotated[
     Path, typer.Option("--output", "-o", metavar="FOLDER", help="The output folder; made if needed.")
 ]
@@ -28,9 +26,7 @@ AlignOption = Annotated[
 ]
 ScaleOption = Annotated[
     Literal["area", "sphere"],
-    typer.Option(
-        help="What is made equal to the template's: surface area, or the radius around the centroid."
-    ),
+    typer.Option(help="What is made equal to the template's: surface area, or the radius around the centroid."),
 ]
 Landmarks = Annotated[
     str | None,
@@ -49,14 +45,10 @@ Strategy = Annotated[
 ]
 Labels = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FILE", help="The part of every vertex of a single shape: one number a line, from 0."
-    ),
+    typer.Option(metavar="FILE", help="The part of every vertex of a single shape: one number a line, from 0."),
 ]
 Nodes = Annotated[int, typer.Option(min=4, max=10_000, help="Number of control nodes.")]
-Radius = Annotated[
-    float, typer.Option(min=1e-6, help="Support radius of a node, in units of sqrt(surface area).")
-]
+Radius = Annotated[float, typer.Option(min=1e-6, help="Support radius of a node, in units of sqrt(surface area).")]
 Faces = Annotated[int, typer.Option(min=100, help="Triangles of the low resolution.")]
 Decimate = Annotated[
     Literal["fast", "meshlab"],
@@ -66,12 +58,10 @@ Decimate = Annotated[
 ]
 
 ModelFolder = Annotated[
-    Path,
-    typer.Option("--output", "-o", metavar="FOLDER", help="The model folder; also holds the checkpoint."),
+    Path, typer.Option("--output", "-o", metavar="FOLDER", help="The model folder; also holds the checkpoint.")
 ]
 BodyTemplate = Annotated[
-    str,
-    typer.Option(metavar="NAME", help="A bundled template (human-T, human-A, human-I), or a bundle's file."),
+    str, typer.Option(metavar="NAME", help="A bundled template (human-T, human-A, human-I), or a bundle's file.")
 ]
 TrainingShapes = Annotated[
     Path | None,
@@ -84,8 +74,7 @@ TrainingShapes = Annotated[
 Unsupervised = Annotated[
     bool,
     typer.Option(
-        "--unsupervised",
-        help="Learn without correspondence even if the shapes are registered; others always are.",
+        "--unsupervised", help="Learn without correspondence even if the shapes are registered; others always are."
     ),
 ]
 PresetOption = Annotated[
@@ -101,9 +90,7 @@ FieldOption = Annotated[
 ]
 Start = Annotated[
     str | None,
-    typer.Option(
-        metavar="MODEL", help="Begin with the weights of a trained model of the same template and preset."
-    ),
+    typer.Option(metavar="MODEL", help="Begin with the weights of a trained model of the same template and preset."),
 ]
 Rate = Annotated[float | None, typer.Option(min=0.0, help="Learning rate; default: the preset's.")]
 Blend = Annotated[
@@ -123,9 +110,7 @@ Stiffness = Annotated[
         "what differs more from shape to shape, such as organs.",
     ),
 ]
-ModelName = Annotated[
-    str | None, typer.Option(metavar="NAME", help="The model's name; default: the folder's.")
-]
+ModelName = Annotated[str | None, typer.Option(metavar="NAME", help="The model's name; default: the folder's.")]
 Category = Annotated[
     str | None, typer.Option(help="What it matches; default: human, or the name of the folder of shapes.")
 ]
@@ -137,9 +122,7 @@ Minutes = Annotated[
 Identities = Annotated[int, typer.Option(min=1, help="How many different bodies are generated.")]
 Poses = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FILE", help="Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md)."
-    ),
+    typer.Option(metavar="FILE", help="Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md)."),
 ]
 PoseShare = Annotated[
     float, typer.Option(min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
@@ -147,13 +130,8 @@ PoseShare = Annotated[
 Bf16 = Annotated[
     bool | None, typer.Option("--bf16/--no-bf16", help="bfloat16 arithmetic; default: the preset's choice.")
 ]
-Workers = Annotated[
-    int | None, typer.Option(min=0, help="Processes that draw batches; default: the preset's.")
-]
+Workers = Annotated[int | None, typer.Option(min=0, help="Processes that draw batches; default: the preset's.")]
 LossPicture = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Draw the losses of this run over its steps: .png, .svg or .pdf."),
+    Path | None, typer.Option(metavar="FILE", help="Draw the losses of this run over its steps: .png, .svg or .pdf.")
 ]
-Fresh = Annotated[
-    bool, typer.Option("--fresh", help="Start anew instead of going on from the folder's checkpoint.")
-]
+Fresh = Annotated[bool, typer.Option("--fresh", help="Start anew instead of going on from the folder's checkpoint.")]

@@ -30,8 +30,7 @@ def transfer_color(
     values: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE",
-            help="Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colours.",
+            metavar="FILE", help="Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colours."
         ),
     ] = None,
     picture: transfer_options.Picture = None,
@@ -44,13 +43,7 @@ def transfer_color(
     from meshmatch.api.transfer import transfer_colors, transfer_values
     from meshmatch.shapes.files import load_shape
     from meshmatch.transfer import colors
-    from meshmatch.transfer.value_files import (
-        Values,
-        check_values_suffix,
-        load_values,
-        parse_blank,
-        save_values,
-    )
+    from meshmatch.transfer.value_files import Values, check_values_suffix, load_values, parse_blank, save_values
 
     transfer = transfer_options.Transfer(source, target, maps, run, Console(run.quiet))
     (colors.check_suffix if values is None else check_values_suffix)(output)

@@ -17,14 +17,11 @@ def transfer_labels(
     source: transfer_options.Source,
     target: transfer_options.Target,
     output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="FILE", help="Labels: .npy .csv .txt .json, or TGT as .ply."),
+        Path, typer.Option("--output", "-o", metavar="FILE", help="Labels: .npy .csv .txt .json, or TGT as .ply.")
     ],
     labels: Annotated[
         Path,
-        typer.Option(
-            metavar="FILE", help="A whole number or a word per vertex or face of SRC: .npy .csv .txt .json."
-        ),
+        typer.Option(metavar="FILE", help="A whole number or a word per vertex or face of SRC: .npy .csv .txt .json."),
     ],
     maps: transfer_options.MapOptions,
     rules: RuleOptions,

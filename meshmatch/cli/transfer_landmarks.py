@@ -16,9 +16,7 @@ _FAR = 0.02  # of the size of a shape: a landmark this far from its surface is w
 def transfer_landmarks(
     source: transfer_options.Source,
     target: transfer_options.Target,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="Landmarks of TGT: .csv .json .pp.")
-    ],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="Landmarks of TGT: .csv .json .pp.")],
     landmarks: Annotated[
         Path,
         typer.Option(

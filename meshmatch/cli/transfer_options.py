@@ -24,9 +24,7 @@ if TYPE_CHECKING:
 
 Source = Annotated[Path, typer.Argument(metavar="SRC", help="Shape to transfer from.")]
 Target = Annotated[Path, typer.Argument(metavar="TGT", help="Shape to transfer to.")]
-Picture = Annotated[
-    Path | None, typer.Option(metavar="PNG", help="Draw both shapes with what was transferred.")
-]
+Picture = Annotated[Path | None, typer.Option(metavar="PNG", help="Draw both shapes with what was transferred.")]
 
 
 @dataclass(frozen=True)
@@ -36,9 +34,7 @@ class MapOptions(PairOptions):
     map: Annotated[
         Path | None,
         typer.Option(
-            "--map",
-            metavar="MAP",
-            help="Map from SRC to TGT that `meshmatch match` wrote. Default: match them.",
+            "--map", metavar="MAP", help="Map from SRC to TGT that `meshmatch match` wrote. Default: match them."
         ),
     ] = None
 

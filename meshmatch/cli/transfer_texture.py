@@ -24,14 +24,11 @@ class TextureOptions:
     """What is baked, and how."""
 
     image: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Image for the texture coordinates of SRC, instead of its own."),
+        Path | None, typer.Option(metavar="FILE", help="Image for the texture coordinates of SRC, instead of its own.")
     ] = None
     uv: Annotated[
         Literal["auto", "keep", "new"],
-        typer.Option(
-            help="Texture coordinates of TGT. auto: reuse valid ones; keep: reuse or fail; new: unwrap."
-        ),
+        typer.Option(help="Texture coordinates of TGT. auto: reuse valid ones; keep: reuse or fail; new: unwrap."),
     ] = "auto"
     size: Annotated[int, typer.Option(metavar="TEXELS", help="Width and height of the texture.")] = 2048
     samples: Annotated[
@@ -86,9 +83,7 @@ def transfer_texture(
     size, uv, image = texture.size, texture.uv, texture.image
     blank = colors.parse_color(rules.blank)
     rule = rules.rule(blank)
-    baking = BakeOptions(
-        size, texture.samples, texture.padding, rules.min_confidence, rules.fill, blank, run.threads
-    )
+    baking = BakeOptions(size, texture.samples, texture.padding, rules.min_confidence, rules.fill, blank, run.threads)
     check_bake_options(baking)
     check_textured(output, _COLORS)
     a, b = load_shape(source), load_shape(target)
@@ -130,20 +125,12 @@ def _tell_baked(console: Console, made: "TexturedResult", rule: "ConfidenceRule"
     if atlas.note:
         console.say(f"note: {atlas.note}")
     if baked.low:
-        became = (
-            "filled in from around" if rule.fill else "kept as it is" if rule.blank is None else "left blank"
-        )
-        console.say(
-            f"{100 * baked.low:.1f} % of the surface has less confidence than {rule.minimum:g}: {became}"
-        )
+        became = "filled in from around" if rule.fill else "kept as it is" if rule.blank is None else "left blank"
+        console.say(f"{100 * baked.low:.1f} % of the surface has less confidence than {rule.minimum:g}: {became}")
     if baked.torn > _WORTH_SAYING:
-        console.say(
-            f"note: the map is discontinuous on {100 * baked.torn:.1f} % of the surface; colours are cut there"
-        )
+        console.say(f"note: the map is discontinuous on {100 * baked.torn:.1f} % of the surface; colours are cut there")
     whose = "its own texture coordinates" if atlas.own else "new texture coordinates"
-    console.say(
-        f"{whose}: {100 * baked.used:.0f} % of the texture lies on the surface ({made.seconds:.1f} s)"
-    )
+    console.say(f"{whose}: {100 * baked.used:.0f} % of the texture lies on the surface ({made.seconds:.1f} s)")
     return {
         "size": size,
         "uv": "own" if atlas.own else "new",

@@ -14,9 +14,7 @@ from meshmatch.cli.options import RunOptions, grouped
 def transfer_weights(
     source: transfer_options.Source,
     target: transfer_options.Target,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="Skin weights of TGT: .npz .json.")
-    ],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="Skin weights of TGT: .npz .json.")],
     maps: transfer_options.MapOptions,
     run: RunOptions,
     weights: Annotated[
@@ -58,13 +56,9 @@ def transfer_weights(
     transfer_options.tell_low(transfer.console, result.low, min_confidence)
     bare = int((np.diff(matrix.indptr) == 0).sum())
     if bare:
-        transfer.console.warn(
-            f"{bare} of the {b.V} vertices have no weights: no joint moves them on {a.name}"
-        )
+        transfer.console.warn(f"{bare} of the {b.V} vertices have no weights: no joint moves them on {a.name}")
     used = len(np.unique(matrix.indices))
-    transfer.console.say(
-        f"wrote {output}: weights of {used} joints for the {b.V} vertices of {transfer.names[1]}"
-    )
+    transfer.console.say(f"wrote {output}: weights of {used} joints for the {b.V} vertices of {transfer.names[1]}")
     if picture is not None:
         from meshmatch.render.compose import compose_labels
         from meshmatch.transfer.attributes import most_votes

@@ -169,12 +169,7 @@ def refined(model: TrainedModel, start: Start, how: Refinement, seed: int) -> Fl
 
 
 def errors_of(
-    model: TrainedModel,
-    run: Run,
-    subjects: Sequence[Subject],
-    reference: str,
-    methods: Sequence[str],
-    measure: Measure,
+    model: TrainedModel, run: Run, subjects: Sequence[Subject], reference: str, methods: Sequence[str], measure: Measure
 ) -> dict[str, dict[str, Any]]:
     """By method: mean and median geodesic error in cm over all landmarks of all ordered pairs, CPU seconds of refining.
 
@@ -188,9 +183,7 @@ def errors_of(
         began = time.process_time()
         rows = [refined(model, start, how, measure.seed) for start in starts]
         seconds = (time.process_time() - began) / len(subjects)
-        fitted = [
-            start.frame.undo(node_system(model).moved(each)) for start, each in zip(starts, rows, strict=True)
-        ]
+        fitted = [start.frame.undo(node_system(model).moved(each)) for start, each in zip(starts, rows, strict=True)]
         errors = pair_errors(subjects, fitted)
         found[method] = {
             "mean_cm": round(float(np.mean(errors)), 4),
@@ -203,9 +196,7 @@ def errors_of(
     return found
 
 
-def pair_errors(
-    subjects: Sequence[Subject], fitted: Sequence[Float[Floats, "V 3"]]
-) -> Float[Floats, "pairs N"]:
+def pair_errors(subjects: Sequence[Subject], fitted: Sequence[Float[Floats, "V 3"]]) -> Float[Floats, "pairs N"]:
     """Errors in cm of the maps through templates that were fitted to shapes, in their files' frames."""
     errors = []
     nearest = [cKDTree(points).query(one.marks)[1] for one, points in zip(subjects, fitted, strict=True)]

@@ -212,8 +212,7 @@ def claims(known: Known, sets: Sequence[str]) -> list[Claim]:
             alike = [  # what is measured once is not compared
                 run
                 for run in known.trained
-                if replace(run, seed=BASE.seed) == BASE
-                and all((run, where, how) in known.errors for how in hows)
+                if replace(run, seed=BASE.seed) == BASE and all((run, where, how) in known.errors for how in hows)
             ]
             errors = [[known.errors[run, where, how]["mean_cm"] for run in alike] for how in hows]
             found.append(_rising(where, "refined with regularisers < by Chamfer alone < not at all", errors))

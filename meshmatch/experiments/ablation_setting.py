@@ -172,9 +172,7 @@ class Pool:
     held_out: Batch
     source: Source
 
-    def batch(
-        self, step: int, count: int, shapes: int, seed: int, encoder: BasisEncoder | PointEncoder
-    ) -> Batch:
+    def batch(self, step: int, count: int, shapes: int, seed: int, encoder: BasisEncoder | PointEncoder) -> Batch:
         """The batch of a step, of the scans of the first ``shapes``: a function of its arguments."""
         generator = torch.Generator().manual_seed((seed * 2_654_435_761 + step) % (2**63))
         chosen = torch.randint(min(shapes * SCANS, len(self.targets)), (count,), generator=generator)

@@ -32,9 +32,7 @@ from meshmatch.training.train import CardFacts, export
 _BATCHES = 2
 
 
-def train_run(
-    run: Run, setting: Setting, folder: Path, *, minutes: float = 0.0, steps: int = 0
-) -> dict[str, Any]:
+def train_run(run: Run, setting: Setting, folder: Path, *, minutes: float = 0.0, steps: int = 0) -> dict[str, Any]:
     """Train from the beginning, write a model folder, and say how it went.
 
     The budget is time or a number of steps. Time is the processor's where the network is on it, so that what else the

@@ -146,22 +146,13 @@ VIEWS = {
         "Table 5",
         ("when", "regularisers"),
         (
-            *(
-                Row(("training", each), replace(BASE, constraint=each), paper)
-                for each, paper in _PAPER5.items()
-            ),
+            *(Row(("training", each), replace(BASE, constraint=each), paper) for each, paper in _PAPER5.items()),
             *(Row(("test time", words), BASE, paper, how) for how, words, paper in _PAPER5_TEST),
         ),
     ),
-    "figure9": View(
-        "Figure 9", ("training shapes",), _numbers("shapes", (250, 500, 1000, 2000)), across=True
-    ),
-    "figure10": View(
-        "Figure 10", ("supervised points",), _numbers("supervised", (50, 100, 1000)), across=True
-    ),
-    "figure8": View(
-        "Figure 8", ("template",), tuple(Row((pose,), replace(BASE, pose=pose)) for pose in "TAI")
-    ),
+    "figure9": View("Figure 9", ("training shapes",), _numbers("shapes", (250, 500, 1000, 2000)), across=True),
+    "figure10": View("Figure 10", ("supervised points",), _numbers("supervised", (50, 100, 1000)), across=True),
+    "figure8": View("Figure 8", ("template",), tuple(Row((pose,), replace(BASE, pose=pose)) for pose in "TAI")),
     "table7": View(
         "Table 7",
         ("nodes by", "template"),
@@ -191,14 +182,8 @@ CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
         "with vol+arap+Z: mls < rbf < pointwise",
         tuple(replace(BASE, field=each) for each in ("mls", "rbf", "pointwise")),
     ),
-    (
-        "mls: vol+arap+Z < vol+arap < none",
-        tuple(replace(BASE, constraint=each) for each in reversed(TABLE4)),
-    ),
-    (
-        "mls: both regularisers < none",
-        (replace(BASE, constraint="vol+arap"), replace(BASE, constraint="none")),
-    ),
+    ("mls: vol+arap+Z < vol+arap < none", tuple(replace(BASE, constraint=each) for each in reversed(TABLE4))),
+    ("mls: both regularisers < none", (replace(BASE, constraint="vol+arap"), replace(BASE, constraint="none"))),
     (
         "pointwise: vol+arap < vol+arap+Z (Z does not pay)",
         tuple(replace(BASE, field="pointwise", constraint=each) for each in TABLE4[1:]),

@@ -41,16 +41,7 @@ from meshmatch.experiments.ablation_errors import (
 from meshmatch.experiments.ablation_results import Claim, claims, draw_views, tables
 from meshmatch.experiments.ablation_setting import Preset, Setting
 from meshmatch.experiments.ablation_training import is_trained, memory, timed, train_run
-from meshmatch.experiments.ablation_views import (
-    BASE,
-    CODED,
-    VIEWS,
-    Known,
-    Run,
-    all_runs,
-    by_time,
-    methods_of,
-)
+from meshmatch.experiments.ablation_views import BASE, CODED, VIEWS, Known, Run, all_runs, by_time, methods_of
 from meshmatch.experiments.sets import ALL_SETS, CLOUD_SET, BenchSet, load_set
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.registry import find_model
@@ -100,9 +91,7 @@ class Kept:
             budget = {"steps": 0 if base is None else int(base["steps"])}
 
         def measured() -> dict[str, Any]:
-            runner.tell(
-                f"training {run.name}: {', '.join(f'{value:g} {name}' for name, value in budget.items())}"
-            )
+            runner.tell(f"training {run.name}: {', '.join(f'{value:g} {name}' for name, value in budget.items())}")
             try:
                 found = train_run(run, self.setting, self.folder / run.name / "model", **budget)
             except TemplateError as error:
@@ -135,9 +124,7 @@ class Kept:
                 loaded = as_model(folder / "model")
                 new = errors_of(loaded, run, self.subjects(bench), self.model, missing, self.measure)
                 for how, record in new.items():
-                    kept[how] = runner.keep(
-                        *self._error(run, bench.name, how, trained), {**self.here(), **record}
-                    )
+                    kept[how] = runner.keep(*self._error(run, bench.name, how, trained), {**self.here(), **record})
             found |= {(run, bench.name, how): record for how, record in kept.items() if record is not None}
         return found
 

@@ -67,9 +67,7 @@ def animal_errors(shapes: Shapes, truth: Mapping[str, Ints], maps: Maps) -> dict
     }
 
 
-def save_known_points(
-    folder: Path, truth: Mapping[str, Ints], shapes: Shapes, template: str, count: int
-) -> None:
+def save_known_points(folder: Path, truth: Mapping[str, Ints], shapes: Shapes, template: str, count: int) -> None:
     """The same ``count`` landmarks of every animal, far apart on the template, as files for `prepare`."""
     make_folder(folder)
     at = farthest_points(shapes[template].verts[truth[template]], count)
@@ -108,13 +106,7 @@ def main(
             save_known_points(landmarks, truth, shapes, template, points)
         config = NodeConfig("geodesic", nodes, radius, 0.03, seed=seed)
         model, went = category.trained(
-            data / "animal",
-            training,
-            config,
-            how="rigid",
-            scale="area",
-            template=template,
-            landmarks=landmarks,
+            data / "animal", training, config, how="rigid", scale="area", template=template, landmarks=landmarks
         )
         rows += category.compared(model, measured, category.network_and_nodes(seed), pairs, errors)[0]
     columns = {"method": "method", "pairs": "pairs:d", "mean": "mean_x100:.1f"}

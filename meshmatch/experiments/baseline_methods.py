@@ -200,9 +200,7 @@ class ZoomOut:
         frame = sqrt_area_frame(shape)
         whole = Shape(frame.apply(shape.verts), shape.faces, shape.name, invalid=shape.invalid)
         thin = decimate(whole, self.faces)
-        used, faces = np.unique(
-            thin.faces, return_inverse=True
-        )  # a lone vertex makes the mass matrix singular
+        used, faces = np.unique(thin.faces, return_inverse=True)  # a lone vertex makes the mass matrix singular
         thin = Shape(thin.verts[used], faces.reshape(-1, 3), thin.name)
         with library("ZoomOut"):
             from pyFM.mesh import TriMesh
@@ -223,9 +221,7 @@ class ZoomOut:
             from pyFM.spectral import FM_to_p2p
 
             model = FunctionalMapping(first, second)
-            model.preprocess(
-                self.descriptors, "WKS", subsample_step=5, k_process=self.last, k_descr=self.last
-            )
+            model.preprocess(self.descriptors, "WKS", subsample_step=5, k_process=self.last, k_descr=self.last)
             heat = [mesh_HKS(mesh, self.descriptors, k=self.last)[:, ::5] for mesh in (first, second)]
             model.add_descriptors(*heat)
             model.fit(K=(self.first, self.first), w_orient=self.orient)

@@ -97,9 +97,7 @@ def plain_baselines(seed: int) -> list[Baseline]:
     return rows
 
 
-def learned_baselines(
-    coded: str | None, coded_steps: int, transmatch: Path | None, seed: int
-) -> list[Baseline]:
+def learned_baselines(coded: str | None, coded_steps: int, transmatch: Path | None, seed: int) -> list[Baseline]:
     """The methods that were trained; those whose model is not given cannot run.
 
     Raises
@@ -122,9 +120,7 @@ def learned_baselines(
         words = load_transmatch(transmatch).words
         model = f"{words.get('date')} step {words.get('steps')}"
         minutes = float(words.get("minutes", 0.0))
-        rows[1] = Baseline(
-            "transmatch", "TransMatch", TransMatch(str(transmatch), seed=seed), "", minutes, model
-        )
+        rows[1] = Baseline("transmatch", "TransMatch", TransMatch(str(transmatch), seed=seed), "", minutes, model)
     return rows
 
 
@@ -143,12 +139,7 @@ def our_baselines(model: str, seed: int, threads: int) -> list[Baseline]:
 
 
 def measured(
-    row: Baseline,
-    bench: BenchSet,
-    folder: Path,
-    limit: int | None,
-    late: bool,
-    **how: Any,
+    row: Baseline, bench: BenchSet, folder: Path, limit: int | None, late: bool, **how: Any
 ) -> dict[str, Any] | None:
     """One result: read from the folder, or measured and written there; None if it is not there and it is too late.
 

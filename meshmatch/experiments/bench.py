@@ -211,10 +211,7 @@ def save_maps(folder: Path, bench: BenchSet, maps: Maps) -> None:
 def load_maps(folder: Path, bench: BenchSet, pairs: Iterable[Pair]) -> dict[Pair, Ints]:
     """Maps that were made elsewhere, checked against their shapes."""
     shapes = {name: bench.shape(name) for name in sorted({name for pair in pairs for name in pair})}
-    return {
-        pair: load_map(_map_path(folder, bench, pair), shapes[pair[0]], shapes[pair[1]]).index
-        for pair in pairs
-    }
+    return {pair: load_map(_map_path(folder, bench, pair), shapes[pair[0]], shapes[pair[1]]).index for pair in pairs}
 
 
 def scores_table(sets: Sequence[SetScores]) -> Table:
@@ -259,9 +256,7 @@ def main(
             given = evaluate_set(bench, load_maps(maps, bench, pairs), pairs=pairs, cache=cache)
             runs.append(SetRun(given, {}, {}, {}, {}))
         else:
-            runs.append(
-                run_set(bench, method, pairs, cache=cache, jobs=jobs, threads=threads, save=save_maps)
-            )
+            runs.append(run_set(bench, method, pairs, cache=cache, jobs=jobs, threads=threads, save=save_maps))
     scores = [each.scores for each in runs]
     if curve is not None:
         draw_curves({each.bench.name: each.joined for each in scores}, curve)

@@ -115,10 +115,7 @@ def through(places: Mapping[str, Float[Floats, "V 3"]], shapes: Shapes) -> dict[
     """Maps through registered vertices: nearest of the source's, the same one on the target, nearest target vertex."""
     to = {name: cKDTree(places[name]).query(shape.verts)[1] for name, shape in shapes.items()}
     back = {name: cKDTree(shape.verts).query(places[name])[1] for name, shape in shapes.items()}
-    return {
-        (a, b): VertexMap.between(shapes[a], shapes[b], back[b][to[a]])
-        for a, b in category.ordered_pairs(shapes)
-    }
+    return {(a, b): VertexMap.between(shapes[a], shapes[b], back[b][to[a]]) for a, b in category.ordered_pairs(shapes)}
 
 
 def meshmonk_places(
@@ -134,17 +131,14 @@ def meshmonk_places(
             runner.tell(f"meshmonk: {name}")
             turned = shape.vertex_normals @ frames[name].rotation.T
             found = viscoelastic(
-                (ours.verts, ours.vertex_normals, ours.faces),
-                (frames[name].apply(shape.verts), turned, shape.faces),
+                (ours.verts, ours.vertex_normals, ours.faces), (frames[name].apply(shape.verts), turned, shape.faces)
             )
             np.save(file, frames[name].undo(found))
         places[name] = np.load(file, allow_pickle=False)
     return places
 
 
-def by_meshmonk(
-    folder: Path, training: category.Training, nodes: NodeConfig, template: str, shapes: Shapes
-) -> Maps:
+def by_meshmonk(folder: Path, training: category.Training, nodes: NodeConfig, template: str, shapes: Shapes) -> Maps:
     """Maps through meshmonk's registrations of the template, prepared as for a training."""
     made = prepare(folder, training.work, PrepareConfig(nodes, template=template, align="near"))
     words = json.loads((training.work / "prepared.json").read_text(encoding="utf-8"))
@@ -216,9 +210,7 @@ def main(
         category.carried_picture(picture, Look(up="z", front="-y"), shapes, truth[first][:, 1], sure, first)
         notes.append(f"wrote {picture}")
     record = {"template": template, "unseen": strange, "training": went, "rows": rows}
-    return runner.Report(
-        record, [runner.table("Hearts: Euclidean error x 100 / sqrt(area)", rows, columns)], notes
-    )
+    return runner.Report(record, [runner.table("Hearts: Euclidean error x 100 / sqrt(area)", rows, columns)], notes)
 
 
 if __name__ == "__main__":

@@ -42,9 +42,7 @@ def table_legs(shape: Shape, keypoints: Int[Ints, " N"]) -> Int[Ints, " V"]:
     low = (shape.verts - top) @ down > _BELOW * down @ down
     faces = shape.faces[low[shape.faces].all(1)]
     ends = faces[:, [0, 1, 2]].reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
-    piece = connected_components(
-        coo_matrix((np.ones(len(ends[0])), ends), (shape.V, shape.V)), directed=False
-    )[1]
+    piece = connected_components(coo_matrix((np.ones(len(ends[0])), ends), (shape.V, shape.V)), directed=False)[1]
     sizes = np.bincount(piece[low], minlength=piece.max() + 1)
     number = np.where(sizes > _SMALLEST, np.cumsum(sizes > _SMALLEST) - 1, -1)
     return np.where(low, number[piece], -1)
@@ -66,9 +64,7 @@ def leg_confidence(legs: Mapping[str, Int[Ints, " V"]], maps: Maps) -> dict[str,
     }
 
 
-def leg_errors(
-    shapes: Shapes, keypoints: Mapping[str, Int[Ints, " N"]], maps: Maps, near: float
-) -> dict[str, float]:
+def leg_errors(shapes: Shapes, keypoints: Mapping[str, Int[Ints, " N"]], maps: Maps, near: float) -> dict[str, float]:
     """Errors at the ends of tables' legs, over the target's diagonal, whichever leg is called the first and whichever
     way round they are counted: of the eight numberings of a square the one that suits a pair best. A table looks the
     same in all of them; a leg that lies between two others is wrong in each."""

@@ -114,9 +114,7 @@ class Transformer(nn.Module):
         angle = (math.pi * points[..., None, :] * self.frequencies[:, None]).flatten(-2)
         return torch.cat([points, angle.sin(), angle.cos()], -1)
 
-    def forward(
-        self, points: Float[Tensor, "B P 3"], template: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "B N 3"]:
+    def forward(self, points: Float[Tensor, "B P 3"], template: Float[Tensor, "N 3"]) -> Float[Tensor, "B N 3"]:
         seen = self.embed_shape(self._waves(points))
         latents = self.read(self.latents.expand(len(points), -1, -1), seen)
         for block in self.think:
@@ -129,12 +127,7 @@ class Transformer(nn.Module):
 
 @torch.no_grad()
 def draw_batch(
-    template: Template,
-    source: Source,
-    scan: ScanConfig,
-    shapes: int,
-    targets: int,
-    generator: torch.Generator,
+    template: Template, source: Source, scan: ScanConfig, shapes: int, targets: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "B P 3"], Int[Tensor, " N"], Float[Tensor, "B N 3"]]:
     """Scans, chosen template vertices, and where these belong; upright, turned about y."""
     verts = source(shapes, generator)
@@ -282,9 +275,7 @@ def _predict(network: Transformer, scan: Floats, turns: Floats, rest: Floats) ->
 @runner.command
 def main(
     method: Annotated[Literal["coded", "transmatch"], Argument(help="which to train")],
-    output: Annotated[
-        Path | None, Option("-o", "--output", help="folder; by default the method's name")
-    ] = None,
+    output: Annotated[Path | None, Option("-o", "--output", help="folder; by default the method's name")] = None,
     steps: Annotated[int, Option(min=1, help="of the whole training")] = 1500,
     minutes: Annotated[float | None, Option(help="of this run at most")] = None,
     identities: Annotated[int, Option(min=1, help="people that bodies are blended from")] = 1024,
@@ -309,9 +300,7 @@ def main(
     recipe = coded_recipe(train, points, width)
     train_model(template, source, folder, recipe, facts, report=lambda now: runner.tell(now.words))
     card = read_card(folder / CARD)
-    return runner.Report(
-        {"steps": card.steps, "minutes": card.training_minutes, **card.metrics["validation"]}
-    )
+    return runner.Report({"steps": card.steps, "minutes": card.training_minutes, **card.metrics["validation"]})
 
 
 if __name__ == "__main__":

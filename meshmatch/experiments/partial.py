@@ -56,9 +56,7 @@ def part_of(shape: Shape, kind: Kind, seed: int) -> tuple[Shape, Int[Ints, " V_p
     return Shape(shape.verts[used], np.searchsorted(used, shape.faces[keep]), shape.name), used
 
 
-def seen_faces(
-    shape: Shape, centers: Float[Floats, "F 3"], direction: Float[Floats, " 3"]
-) -> Bool[Bools, " F"]:
+def seen_faces(shape: Shape, centers: Float[Floats, "F 3"], direction: Float[Floats, " 3"]) -> Bool[Bools, " F"]:
     """Whether a camera far away in a direction sees the middle of each face."""
     facing = shape.face_normals @ direction > 0
     white = FacePaint(np.ones((shape.F, 3)))
@@ -117,9 +115,7 @@ def main(
     benches = [load_set(name, data) for name in runner.names_of(sets, SET_NAMES, "set")]
     methods = OurMethod(model, seed=seed), OurMethod(model, seed=seed, partial=partial)
     rows = [measure(bench, kind, *methods, limit_pairs, cache) for bench in benches for kind in KINDS]
-    return runner.Report(
-        {"rows": rows}, [runner.table("Parts matched to wholes, cm at 1.9 m2", rows, COLUMNS)]
-    )
+    return runner.Report({"rows": rows}, [runner.table("Parts matched to wholes, cm at 1.9 m2", rows, COLUMNS)])
 
 
 if __name__ == "__main__":

@@ -85,9 +85,7 @@ def refined(model: TrainedModel, shapes: Sequence[Shape], steps: int, seed: int)
         energy = PaperEnergy(model, scan, code, np.random.default_rng(seed))
 
         def refine(
-            config: NodeRefineConfig | LatentRefineConfig,
-            scan: OrientedPoints = scan,
-            start: Floats = fit.vectors,
+            config: NodeRefineConfig | LatentRefineConfig, scan: OrientedPoints = scan, start: Floats = fit.vectors
         ) -> Floats:
             if isinstance(config, NodeRefineConfig):
                 return refine_nodes(system, scan, start, config)
@@ -141,9 +139,7 @@ def body_errors(model: TrainedModel, subjects: Sequence[Subject]) -> dict[str, f
     errors = {}
     for name in METHODS:
         distances = [
-            np.linalg.norm(
-                system.moved(each.answers[name].vectors) - each.fit.frame.apply(each.shape.verts), axis=1
-            )
+            np.linalg.norm(system.moved(each.answers[name].vectors) - each.fit.frame.apply(each.shape.verts), axis=1)
             for each in subjects
         ]
         errors[name] = float(np.mean([float(far.mean()) * CM_PER_UNIT for far in distances]))
@@ -173,9 +169,7 @@ def rows_of(name: str, subjects: Sequence[Subject], errors: dict[str, float]) ->
     rows: list[dict[str, Any]] = []
     for method in METHODS:
         answers = [subject.answers[method] for subject in subjects]
-        means = {
-            key: float(np.mean([getattr(each, key) for each in answers])) for key in ("cpu", "wall", "energy")
-        }
+        means = {key: float(np.mean([getattr(each, key) for each in answers])) for key in ("cpu", "wall", "energy")}
         rows.append({"set": name, "method": method, "error_cm": errors[method], **means})
     _, code, nodes = rows
     faster = code["cpu"] / nodes["cpu"]

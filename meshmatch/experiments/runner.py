@@ -234,9 +234,7 @@ def recall(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
         found = json.loads(path.read_text(encoding="utf-8"))
         before = dict(found["asked"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(
-            f"{path} is not a result of this experiment", "remove it to measure again"
-        ) from error
+        raise InputError(f"{path} is not a result of this experiment", "remove it to measure again") from error
     now = plain(asked)
     if differences := sorted(key for key in {*before, *now} if before.get(key) != now.get(key)):
         raise OptionError(

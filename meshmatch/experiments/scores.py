@@ -75,8 +75,7 @@ class TruthDistances:
             self.path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(
-                f"cannot keep distances in {self.path.parent}: {error.strerror}",
-                "choose a folder with --cache",
+                f"cannot keep distances in {self.path.parent}: {error.strerror}", "choose a folder with --cache"
             ) from error
         geodesics = GeodesicDistances(self.target)
         with replace_on_success(self.path) as temporary:
@@ -172,8 +171,7 @@ class SetScores:
         """Plain numbers. The mean over points is the mean over pairs, for every pair has as many points."""
         digits = {"share_over_15cm": 5, "flips": 5}
         rounded = {
-            name: round(value, digits.get(name, 4))
-            for name, value in summary(list(self.errors.values())).items()
+            name: round(value, digits.get(name, 4)) for name, value in summary(list(self.errors.values())).items()
         }
         return {
             "pairs": len(self.errors),
@@ -186,11 +184,7 @@ class SetScores:
 
 
 def evaluate_set(
-    bench: BenchSet,
-    maps: Mapping[Pair, ArrayLike],
-    *,
-    pairs: Sequence[Pair] | None = None,
-    cache: Path | None = None,
+    bench: BenchSet, maps: Mapping[Pair, ArrayLike], *, pairs: Sequence[Pair] | None = None, cache: Path | None = None
 ) -> SetScores:
     """Errors of maps on a set, at the source's landmarks, as geodesic distance on the target.
 
@@ -214,9 +208,7 @@ def evaluate_set(
     if strangers := sorted(set(wanted) - set(bench.pairs)):
         raise InputError(f"{bench.name} has no pair {' -> '.join(strangers[0])}")
     if missing := [pair for pair in wanted if pair not in maps]:
-        raise InputError(
-            f"{bench.name}: {len(missing)} maps are missing, the first {' -> '.join(missing[0])}"
-        )
+        raise InputError(f"{bench.name}: {len(missing)} maps are missing, the first {' -> '.join(missing[0])}")
     sources: dict[str, list[str]] = defaultdict(list)
     for source, target in wanted:
         sources[target].append(source)

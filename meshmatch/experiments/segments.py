@@ -34,13 +34,7 @@ from typer import Option
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.experiments import category, runner
 from meshmatch.experiments.category import Maps, Shapes
-from meshmatch.experiments.keypoint_parts import (
-    keypoint_parts,
-    leg_confidence,
-    leg_errors,
-    mean_overlap,
-    table_legs,
-)
+from meshmatch.experiments.keypoint_parts import keypoint_parts, leg_confidence, leg_errors, mean_overlap, table_legs
 from meshmatch.experiments.scores import area_under_curve
 from meshmatch.experiments.sets import load_folder
 from meshmatch.fitting.fit_config import FitConfig

@@ -87,9 +87,7 @@ def load_set(name: str, data: Path) -> BenchSet:
     folder = Path(data) / ("scape" if name == CLOUD_SET else name)
     shapes = tuple(sorted((path.stem for path in folder.glob("*.ply")), key=_by_number))
     if not shapes:
-        raise InputError(
-            f"no shapes in {folder}", f"--data names the folder that holds {', '.join(SET_NAMES)}"
-        )
+        raise InputError(f"no shapes in {folder}", f"--data names the folder that holds {', '.join(SET_NAMES)}")
     if name == "shrec19":
         lines = (folder / "pairs.txt").read_text(encoding="ascii").split("\n")
         pairs = tuple((words[0], words[1]) for words in (line.split() for line in lines) if words)

@@ -147,9 +147,7 @@ def keep_to_cores(count: int) -> int:
 
 def record_of(name: str, case: Case, costs: list[Cost]) -> dict[str, Any]:
     """A case's row: medians, bars, whether they are met, every run."""
-    middle = Cost(
-        *(statistics.median(values) for values in zip(*(asdict(c).values() for c in costs), strict=True))
-    )
+    middle = Cost(*(statistics.median(values) for values in zip(*(asdict(c).values() for c in costs), strict=True)))
     return {
         "case": name,
         **{key: round(value, 3) for key, value in asdict(middle).items()},

@@ -84,9 +84,7 @@ def loss(one: Float[Floats, "N 3"], two: Float[Floats, "N 3"]) -> dict[str, floa
 def nearest_map(a: Shape, b: Shape) -> VertexMap:
     """From a to b, which lie in one place: the nearest points of b's surface that face the same way."""
     places = MappedMesh.of(b).query(a.verts, a.vertex_normals)
-    return VertexMap.between(
-        a, b, places.vertex, face=places.face, barycentric=places.barycentric, verdict="good"
-    )
+    return VertexMap.between(a, b, places.vertex, face=places.face, barycentric=places.barycentric, verdict="good")
 
 
 def trip_of(name: str, folder: Path) -> Trip:

@@ -20,11 +20,7 @@ def has_nodes(name: FieldName) -> bool:
 
 
 def shape_functions(
-    name: FieldName,
-    points: Float[Floats, "P 3"],
-    nodes: Float[Floats, "K 3"],
-    radius: float,
-    kernel: Kernel,
+    name: FieldName, points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radius: float, kernel: Kernel
 ) -> ShapeFunctions:
     """A representation that has nodes, on fixed points of the template's frame; radial basis functions take all nodes.
 

@@ -22,8 +22,6 @@ def arap_energy(F: Float[torch.Tensor, "*B 3 3"]) -> Float[torch.Tensor, "*B"]:
     """|F^T F - I| (Frobenius) of every point."""
     # Six dot products of columns: a batched 3 x 3 matmul is several times slower on a CPU.
     a, b, c = F[..., 0], F[..., 1], F[..., 2]
-    diagonal = (
-        ((a * a).sum(-1) - 1).square() + ((b * b).sum(-1) - 1).square() + ((c * c).sum(-1) - 1).square()
-    )
+    diagonal = ((a * a).sum(-1) - 1).square() + ((b * b).sum(-1) - 1).square() + ((c * c).sum(-1) - 1).square()
     mixed = (a * b).sum(-1).square() + (a * c).sum(-1).square() + (b * c).sum(-1).square()
     return (diagonal + 2 * mixed + 1e-12).sqrt()

@@ -23,10 +23,7 @@ from meshmatch.templates.support import MINIMUM_EIGENVALUE, support_pairs
 
 
 def build_field(
-    points: Float[Floats, "P 3"],
-    nodes: Float[Floats, "K 3"],
-    radius: float | Float[Floats, " K"],
-    kernel: Kernel,
+    points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radius: float | Float[Floats, " K"], kernel: Kernel
 ) -> ShapeFunctions:
     """Evaluate the shape functions and their gradient on fixed points.
 
@@ -53,9 +50,7 @@ def build_field(
     P, K = len(points), len(nodes)
     radii = np.broadcast_to(np.asarray(radius, np.float64), (K,))
     at, of = support_pairs(points, nodes, radii)  # sorted by point
-    sums = csr_matrix(
-        (np.ones(len(at)), (at, np.arange(len(at)))), (P, len(at))
-    )  # over the nodes of each point
+    sums = csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))), (P, len(at)))  # over the nodes of each point
     offset = points[at] - nodes[of]
     weight, slope = KERNELS[kernel](np.linalg.norm(offset, axis=1), radii[of])
     slope_vector = slope[:, None] * offset  # dw/dx
@@ -75,9 +70,7 @@ def build_field(
         moment_slope = (sums @ (slope_vector[:, k, None] * outer)).reshape(P, 4, 4)
         left = (constant[:, None] @ moment_slope)[:, 0]  # p^T M^-1 dM
         gradient[:, k] = (
-            weight * solved[:, k + 1] / scale
-            - weight * (left[at] * solved).sum(1)
-            + slope_vector[:, k] * along
+            weight * solved[:, k + 1] / scale - weight * (left[at] * solved).sum(1) + slope_vector[:, k] * along
         )
     return _assemble(at, of, phi, gradient, (P, K))
 

@@ -78,9 +78,7 @@ class PointwiseField:
         with torch.no_grad():
             return self.displacement(torch.from_numpy(np.array(rows)).float()[None])[0].double().numpy()
 
-    def strain(
-        self, rows: Float[Floats, "R 3"], at: Int[Ints, " N"] | slice = slice(None)
-    ) -> Float[Floats, "N 3 3"]:
+    def strain(self, rows: Float[Floats, "R 3"], at: Int[Ints, " N"] | slice = slice(None)) -> Float[Floats, "N 3 3"]:
         """F of one answer at some of the points, in float64."""
         index = at if isinstance(at, slice) else torch.from_numpy(at)
         part = PointwiseField(self.points, self.points[index], self.motion, self.D)

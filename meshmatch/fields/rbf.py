@@ -48,8 +48,7 @@ def build_rbf(points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"]) -> Shap
     among = multiquadric(q[:, None] - q)
     if not np.linalg.cond(among) < _MAX_CONDITION:
         raise TemplateError(
-            "nodes lie too close together to interpolate between them",
-            "use fewer nodes, or another field than rbf",
+            "nodes lie too close together to interpolate between them", "use fewer nodes, or another field than rbf"
         )
     inverse = np.linalg.inv(among)
     phi = np.empty((len(points), len(q)), np.float32)

@@ -38,9 +38,7 @@ class ShapeFunctions:
         """Displacement of the points by node vectors, in float64."""
         return np.asarray(self.phi.astype(np.float64) @ rows)
 
-    def strain(
-        self, rows: Float[Floats, "K 3"], at: Int[Ints, " N"] | slice = slice(None)
-    ) -> Float[Floats, "N 3 3"]:
+    def strain(self, rows: Float[Floats, "K 3"], at: Int[Ints, " N"] | slice = slice(None)) -> Float[Floats, "N 3 3"]:
         """F = I + sum_i u_i (grad Phi_i)^T at some of the points, F[..., a, k] = dx'_a / dx_k, in float64."""
         slopes = np.asarray(self.gradient.astype(np.float64) @ rows).reshape(-1, 3, 3)
         return slopes.transpose(0, 2, 1)[at] + np.eye(3)

@@ -17,13 +17,7 @@ import numpy as np
 from meshmatch.arrays import Float, Floats
 from meshmatch.fitting.fit import Fit, vertex_distance
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.nodes import (
-    NodeRefineConfig,
-    add_landmarks,
-    geometric_between,
-    nearest_rotations,
-    pair_terms,
-)
+from meshmatch.fitting.nodes import NodeRefineConfig, add_landmarks, geometric_between, nearest_rotations, pair_terms
 from meshmatch.fitting.samples import Landmarks, take_samples
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.oriented import OrientedPoints
@@ -146,9 +140,7 @@ class Member:
     partial: bool = False
 
 
-def agree(
-    system: NodeSystem, members: Sequence[Member], nodes: NodeRefineConfig
-) -> list[Float[Floats, "K 3"]]:
+def agree(system: NodeSystem, members: Sequence[Member], nodes: NodeRefineConfig) -> list[Float[Floats, "K 3"]]:
     """Refine the fits of several shapes together: better node vectors for each.
 
     Parameters

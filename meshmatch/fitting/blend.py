@@ -88,9 +88,7 @@ class Blend:
         self._curve = CubicSpline(self.times, np.eye(len(fits)), bc_type="natural")
         self._keys = np.stack([fit.vectors for fit in fits])
         self._system = node_system(model)
-        self._stretches = StretchBlend(
-            [polar(self._system.deformation_gradient(key))[1] for key in self._keys]
-        )
+        self._stretches = StretchBlend([polar(self._system.deformation_gradient(key))[1] for key in self._keys])
         if way == "field":
             if not model.has_nodes:
                 raise OptionError(

@@ -49,10 +49,7 @@ class Comparison(Protocol[Interpretation]):
 
 
 def choose(
-    candidates: Sequence[Interpretation],
-    count: int,
-    comparison: Comparison[Interpretation],
-    progress: Progress,
+    candidates: Sequence[Interpretation], count: int, comparison: Comparison[Interpretation], progress: Progress
 ) -> Interpretation:
     """The best of several interpretations, refined.
 

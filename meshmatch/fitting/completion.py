@@ -23,9 +23,7 @@ _NEAR, _HOME = 0.06, 0.06
 _MAX_ADDED = 3  # points that are added for each sample, at most
 
 
-def visible_vertices(
-    system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"]
-) -> Bool[Bools, " V"]:
+def visible_vertices(system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> Bool[Bools, " V"]:
     """Whether samples (core frame) show each vertex of the template as fitted.
 
     Vertices beyond a cut have the edge of the samples near by, but the edge belongs elsewhere on the template.
@@ -39,11 +37,7 @@ def visible_vertices(
 
 
 def completed(
-    system: NodeSystem,
-    local: OrientedPoints,
-    vectors: Float[Floats, "K 3"],
-    share: float,
-    rng: np.random.Generator,
+    system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"], share: float, rng: np.random.Generator
 ) -> OrientedPoints:
     """Samples (core frame) of a ``share`` of the surface, with points of the fitted template where they show nothing."""
     surface = system.surface(vectors)

@@ -82,17 +82,13 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         if self.refine not in REFINE_NAMES:
-            raise OptionError(
-                f"unknown refinement {self.refine!r}", f"choose one of {', '.join(REFINE_NAMES)}"
-            )
+            raise OptionError(f"unknown refinement {self.refine!r}", f"choose one of {', '.join(REFINE_NAMES)}")
         if self.partial not in PARTIALS:
             raise OptionError(f"partial cannot be {self.partial!r}", f"choose one of {', '.join(PARTIALS)}")
         for name, least in _LEAST.items():
             value = getattr(self, name)
             if not isinstance(value, Integral) or value < least:
-                raise OptionError(
-                    f"{name} cannot be {value!r}", f"give an integer of {least} or more, or leave it out"
-                )
+                raise OptionError(f"{name} cannot be {value!r}", f"give an integer of {least} or more, or leave it out")
         axes = [axis_vector(axis) for axis in (self.up, self.front) if axis is not None]
         if len(axes) == 2 and axes[0] @ axes[1] != 0:
             raise OptionError("up and front lie along the same axis", "choose two different axes")
@@ -110,9 +106,7 @@ class FitConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): more samples, refined more stiffly."""
         if roughness <= 0:
             return self
-        return replace(
-            self, samples=round(self.samples * (1 + roughness)), nodes=self.nodes.for_noise(roughness)
-        )
+        return replace(self, samples=round(self.samples * (1 + roughness)), nodes=self.nodes.for_noise(roughness))
 
 
 def check_landmarks(model: TrainedModel) -> None:

@@ -20,9 +20,7 @@ from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.shape import Shape
 
 # All of these were set by hand.
-_EMPTY = (
-    0.06  # a fit of the whole that leaves this share of the template without surface may be one of a part
-)
+_EMPTY = 0.06  # a fit of the whole that leaves this share of the template without surface may be one of a part
 _OPEN = 0.3  # so may a bad one of a mesh with a boundary of so many sqrt(area)
 _CLOSER = 0.85  # a part is believed if its residual is that much smaller
 _MISSING = 0.03  # and if it lacks that much of the surface

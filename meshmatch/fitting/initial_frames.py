@@ -42,8 +42,7 @@ def frames_to_try(model: TrainedModel, samples: OrientedPoints, config: FitConfi
     obeying = [
         pose
         for pose in frames
-        if (up is None or pose.rotation[:, 1] @ up > _OBEYS)
-        and (front is None or pose.rotation[:, 2] @ front > _OBEYS)
+        if (up is None or pose.rotation[:, 1] @ up > _OBEYS) and (front is None or pose.rotation[:, 2] @ front > _OBEYS)
     ]
     return obeying or forced_frames(up, front)
 
@@ -63,9 +62,7 @@ def _template_samples(model: TrainedModel) -> OrientedPoints:
     return template_samples(model.template)
 
 
-def frames_of_part(
-    model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool
-) -> list[RigidPose]:
+def frames_of_part(model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool) -> list[RigidPose]:
     """Core frames to try for a part, whose middle is not that of the whole, and which a vote seldom knows.
 
     Besides those of `frames_to_try`: all turns about the user's axes, or, if the search is to be ``wide``, about the
@@ -85,11 +82,7 @@ def frames_of_part(
 
 def _along_body(poses: list[RigidPose]) -> list[RigidPose]:
     """Every pose with its origin at several places along its own up axis."""
-    return [
-        RigidPose(pose.rotation, pose.center + away * pose.rotation[:, 1])
-        for pose in poses
-        for away in _ALONG
-    ]
+    return [RigidPose(pose.rotation, pose.center + away * pose.rotation[:, 1]) for pose in poses for away in _ALONG]
 
 
 def _axes(config: FitConfig) -> tuple[Float[Floats, " 3"] | None, Float[Floats, " 3"] | None]:

@@ -31,8 +31,7 @@ def template_vertices(
     """
     verts = template.shape.verts
     answers = [
-        verts[cKDTree(fit.points).query(fit.frame.apply(place))[1]]
-        for fit, place in zip(fits, places, strict=True)
+        verts[cKDTree(fit.points).query(fit.frame.apply(place))[1]] for fit, place in zip(fits, places, strict=True)
     ]
     return cKDTree(verts).query(np.mean(answers, axis=0))[1].astype(np.int64)
 
@@ -85,8 +84,7 @@ def fits_with_landmarks(
     at = template_vertices(model.template, fits, places)
     known = [(at, place) for place in places]
     found = [
-        Fitter(model, config).fit(part.shape, held)
-        for config, part, held in zip(configs, clean, known, strict=True)
+        Fitter(model, config).fit(part.shape, held) for config, part, held in zip(configs, clean, known, strict=True)
     ]
     return found, known
 

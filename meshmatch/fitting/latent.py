@@ -28,11 +28,7 @@ class PaperEnergy:
     """
 
     def __init__(
-        self,
-        model: TrainedModel,
-        samples: OrientedPoints,
-        config: LatentRefineConfig,
-        rng: np.random.Generator,
+        self, model: TrainedModel, samples: OrientedPoints, config: LatentRefineConfig, rng: np.random.Generator
     ) -> None:
         self.config = config
         drawn = samples.points[draw(samples, config.points, rng)]
@@ -48,9 +44,7 @@ class PaperEnergy:
         if not self.config.volume and not self.config.arap:
             return chamfer
         F = field.deformation_gradient(vectors)[0]
-        return (
-            chamfer + self.config.volume * volume_energy(F).mean() + self.config.arap * arap_energy(F).mean()
-        )
+        return chamfer + self.config.volume * volume_energy(F).mean() + self.config.arap * arap_energy(F).mean()
 
     def value(self, vectors: Float[Floats, "K 3"]) -> float:
         """The same of an array."""

@@ -115,9 +115,7 @@ class Predictor:
         if self.mirror is not None:
             mirrored = replace(local, points=self.mirror.points(local.points))
             found += [self.mirror.vectors(vectors) for vectors in self._tilted(mirrored, tilts)]
-        return [
-            Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors, 1)) for vectors in found
-        ]
+        return [Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors, 1)) for vectors in found]
 
     def _tilted(self, samples: OrientedPoints, tilts: Float[Floats, "N 3 3"]) -> list[Floats]:
         """Node vectors (K, 3) predicted from tilted samples, turned back."""
@@ -130,11 +128,7 @@ class Predictor:
 
 
 def two_way_residual(
-    system: NodeSystem,
-    samples: OrientedPoints,
-    vectors: Float[Floats, "K 3"],
-    stride: int = 2,
-    cap: float = 0.1,
+    system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"], stride: int = 2, cap: float = 0.1
 ) -> float:
     """Mean of the capped 6-D nearest-neighbour distances, template to samples and back (units of sqrt(area)).
 
@@ -149,11 +143,7 @@ def two_way_residual(
 
 
 def one_way_residual(
-    system: NodeSystem,
-    samples: OrientedPoints,
-    vectors: Float[Floats, "K 3"],
-    stride: int = 2,
-    cap: float = 0.1,
+    system: NodeSystem, samples: OrientedPoints, vectors: Float[Floats, "K 3"], stride: int = 2, cap: float = 0.1
 ) -> float:
     """Mean of the capped 6-D distances from every ``stride``-th sample to the template, by the samples' weights."""
     return float(_back_residual(system.surface(vectors), samples, stride, cap))

@@ -187,11 +187,7 @@ def _nearest_pairs(
 
 
 def _shared_pairs(
-    system: NodeSystem,
-    samples: OrientedPoints,
-    surface: OrientedPoints,
-    scale: float,
-    config: NodeRefineConfig,
+    system: NodeSystem, samples: OrientedPoints, surface: OrientedPoints, scale: float, config: NodeRefineConfig
 ) -> Terms:
     """Every sample pairs with all of the template from where noise may have brought it.
 
@@ -232,9 +228,7 @@ def _summed(
 ) -> Terms:
     """Sum w (n n^T + share I) and its product with the point, per template vertex."""
     x, y, z = normal.T
-    entries = (
-        np.stack([x * x + share, x * y, x * z, y * y + share, y * z, z * z + share], 1) * weight[:, None]
-    )
+    entries = np.stack([x * x + share, x * y, x * z, y * y + share, y * z, z * z + share], 1) * weight[:, None]
     along = (normal * point).sum(1, keepdims=True)
     pull = weight[:, None] * (normal * along + share * point)
     return _sums(at, entries, V), _sums(at, pull, V)

@@ -139,8 +139,6 @@ def _variants(task: FitTask, candidate: PartCandidate) -> list[PartCandidate]:
     whole = completed(task.system, local, candidate.fit.vectors, candidate.share, task.predictor.rng)
     near, pose, config = local.first(_COARSE), candidate.fit.pose, task.config
     return [
-        PartCandidate(
-            candidate.share, replace(each, residual=one_way_residual(task.system, local, each.vectors))
-        )
+        PartCandidate(candidate.share, replace(each, residual=one_way_residual(task.system, local, each.vectors)))
         for each in task.predictor.variants(whole, near, pose, config.variants, config.tilt)
     ]

@@ -63,9 +63,7 @@ class NodeSystem:
     phi: Any
     slopes: Any
 
-    def __init__(
-        self, shape: Shape, field: ShapeFunctions | PointwiseField, strain_points: int = 1500
-    ) -> None:
+    def __init__(self, shape: Shape, field: ShapeFunctions | PointwiseField, strain_points: int = 1500) -> None:
         self.verts = np.asarray(shape.verts)
         self.faces = np.asarray(shape.faces)
         self.linear = field.linear

@@ -106,11 +106,7 @@ class FieldPath:
     """
 
     def __init__(
-        self,
-        system: NodeSystem,
-        keys: Sequence[Floats],
-        core: Int[Ints, " C"],
-        config: TurnConfig | None = None,
+        self, system: NodeSystem, keys: Sequence[Floats], core: Int[Ints, " C"], config: TurnConfig | None = None
     ) -> None:
         self._system, self._config = system, config or TurnConfig()
         self._keys = np.stack(keys)
@@ -203,9 +199,7 @@ def _regions(system: NodeSystem, edges: Int[Ints, "E 2"]) -> Int[Ints, " V"]:
     V = len(system.verts)
     length = np.linalg.norm(system.verts[edges[:, 0]] - system.verts[edges[:, 1]], axis=1)
     graph = csr_matrix((np.maximum(length, 1e-12), (edges[:, 0], edges[:, 1])), (V, V))
-    found = dijkstra(
-        graph, directed=False, indices=system.strain_points, min_only=True, return_predecessors=True
-    )
+    found = dijkstra(graph, directed=False, indices=system.strain_points, min_only=True, return_predecessors=True)
     number = np.full(V + 1, -1)
     number[system.strain_points] = np.arange(len(system.strain_points))
     return number[np.where(found[2] < 0, V, found[2])]

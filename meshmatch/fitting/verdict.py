@@ -72,9 +72,7 @@ def judge(
     gap = cKDTree(points).query(local.points)[0]
     missed = float(weighted_mean(gap > _REACH, local.weights))
     if missed > _GOOD_SHARE:
-        reasons.append(
-            Reason("unreached", f"{100 * missed:.0f} % of the shape is not reached by the template")
-        )
+        reasons.append(Reason("unreached", f"{100 * missed:.0f} % of the shape is not reached by the template"))
     empty = empty_share(local, points)
     if partial:
         lost = empty if hidden is None else hidden
@@ -119,8 +117,6 @@ def cloud_allowance(
     clean = sample_surface(surface, len(local.points), rng)
     drawn = sample_surface(surface, min(V, len(local.points)), rng).points
     cloud = Shape(drawn + noise * rng.standard_normal(drawn.shape), np.empty((0, 3), np.int64))
-    expected = two_way_residual(
-        system, OrientedPoints(cloud.verts, cloud.vertex_normals, signed=False), vectors
-    )
+    expected = two_way_residual(system, OrientedPoints(cloud.verts, cloud.vertex_normals, signed=False), vectors)
     clear = two_way_residual(system, clean, vectors)
     return float(np.sqrt(max(expected**2 - clear**2, 0.0)))

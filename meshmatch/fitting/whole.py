@@ -56,8 +56,7 @@ def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list
     estimates = [estimate_scale(task.system, task.samples, candidate, fit_again) for candidate in best]
     scale, samples, first = min(estimates, key=lambda estimate: estimate[2].residual)
     others = [
-        Candidate(RigidPose(each.pose.rotation, each.pose.center / scale), each.vectors, each.residual)
-        for each in best
+        Candidate(RigidPose(each.pose.rotation, each.pose.center / scale), each.vectors, each.residual) for each in best
     ]
     return task.rescaled(scale, samples), [first, *others]
 

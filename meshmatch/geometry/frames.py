@@ -33,9 +33,7 @@ class Frame:
         rotation = read_only(self.rotation, np.float64, "a frame's rotation")
         center = read_only(self.center, np.float64, "a frame's center")
         if rotation.shape != (3, 3) or center.shape != (3,):
-            raise InputError(
-                f"a frame needs a (3, 3) rotation and a (3,) center, not {rotation.shape}, {center.shape}"
-            )
+            raise InputError(f"a frame needs a (3, 3) rotation and a (3,) center, not {rotation.shape}, {center.shape}")
         if not (np.isfinite(self.scale) and self.scale > 0 and np.isfinite(center).all()):
             raise InputError(
                 f"a frame's scale must be positive and finite, not {self.scale}", "has the shape any size?"

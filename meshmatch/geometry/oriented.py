@@ -76,9 +76,7 @@ class OrientedPoints:
         if self.signed:
             return self
         out, back = (
-            reference.tree.query(with_normals(self.points, sign * self.normals), distance_upper_bound=_REACH)[
-                0
-            ]
+            reference.tree.query(with_normals(self.points, sign * self.normals), distance_upper_bound=_REACH)[0]
             for sign in (1, -1)
         )
         turned = np.where((back < out)[:, None], -self.normals, self.normals)
@@ -87,9 +85,7 @@ class OrientedPoints:
     def rows(self, rows: slice | Bool[Bools, " P"]) -> OrientedPoints:
         """Some of the samples."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
-        taken: dict[str, Any] = {
-            name: array[rows] for name, array in arrays.items() if isinstance(array, np.ndarray)
-        }
+        taken: dict[str, Any] = {name: array[rows] for name, array in arrays.items() if isinstance(array, np.ndarray)}
         return replace(self, **taken)
 
 

@@ -34,9 +34,7 @@ def unit(vectors: Float[Floats, "N D"]) -> Float[Floats, "N D"]:
     return np.asarray(vectors / np.where(lengths > 0, lengths, 1.0)[:, None])
 
 
-def triangle_vectors(
-    verts: Float[NDArray[Any], "V 3"], faces: Int[NDArray[Any], "F 3"]
-) -> Float[Floats, "F 3"]:
+def triangle_vectors(verts: Float[NDArray[Any], "V 3"], faces: Int[NDArray[Any], "F 3"]) -> Float[Floats, "F 3"]:
     """Normal of each triangle by the right-hand rule, twice its area long."""
     a, b, c = (verts[faces[:, k]] for k in range(3))
     return cross_product(b - a, c - a)
@@ -57,9 +55,7 @@ def vertex_areas(verts: Float[Floats, "V 3"], faces: Int[NDArray[Any], "F 3"]) -
     return share_areas(triangle_areas(verts, faces), faces, len(verts))
 
 
-def vertex_normals(
-    verts: Float[NDArray[Any], "V 3"], faces: Int[NDArray[Any], "F 3"]
-) -> Float[Floats, "V 3"]:
+def vertex_normals(verts: Float[NDArray[Any], "V 3"], faces: Int[NDArray[Any], "F 3"]) -> Float[Floats, "V 3"]:
     """Unit normals, the area-weighted mean of the triangles around; zeros where there is none."""
     return average_normals(triangle_vectors(verts, faces), faces, len(verts))
 
@@ -69,9 +65,7 @@ def share_areas(areas: Float[Floats, " F"], faces: Int[NDArray[Any], "F 3"], V: 
     return np.asarray(np.bincount(faces.ravel(), np.repeat(areas / 3.0, 3), V), np.float64)
 
 
-def average_normals(
-    vectors: Float[Floats, "F 3"], faces: Int[NDArray[Any], "F 3"], V: int
-) -> Float[Floats, "V 3"]:
+def average_normals(vectors: Float[Floats, "F 3"], faces: Int[NDArray[Any], "F 3"], V: int) -> Float[Floats, "V 3"]:
     """Unit normals of V vertices from the normals of triangles, whose lengths are their weights."""
     corners = faces.ravel()
     sums = np.empty((V, 3))
@@ -96,10 +90,7 @@ def blend(values: Float[Floats, "N K D"], weights: Float[NDArray[Any], "N K"]) -
 
 
 def closest_on_triangles(
-    points: Float[Floats, "N 3"],
-    a: Float[Floats, "N 3"],
-    b: Float[Floats, "N 3"],
-    c: Float[Floats, "N 3"],
+    points: Float[Floats, "N 3"], a: Float[Floats, "N 3"], b: Float[Floats, "N 3"], c: Float[Floats, "N 3"]
 ) -> Float[Floats, "N 3"]:
     """Barycentric weights of the point of triangle (a, b, c)[n] that is closest to points[n].
 

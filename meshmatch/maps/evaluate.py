@@ -120,9 +120,7 @@ def map_errors(
     """
     index, a, b = (np.asarray(ids) for ids in (index, source_points, target_points))
     if a.shape != b.shape or a.ndim != 1 or not a.size:
-        raise InputError(
-            f"the truth needs one target point for each source point, not {a.shape} and {b.shape}"
-        )
+        raise InputError(f"the truth needs one target point for each source point, not {a.shape} and {b.shape}")
     for ids, size, side in ((a, len(index), "source"), (b, geodesics.V, "target")):
         if ids.dtype.kind not in "iu" or ids.min() < 0 or ids.max() >= size:
             raise InputError(f"the truth names points that are not among the {size} vertices of the {side}")
@@ -139,11 +137,7 @@ def coverage(index: ArrayLike, target: Shape) -> Coverage:
 
 
 def distortion(
-    index: ArrayLike,
-    source: GeodesicDistances,
-    target: GeodesicDistances,
-    rng: np.random.Generator,
-    samples: int = 80,
+    index: ArrayLike, source: GeodesicDistances, target: GeodesicDistances, rng: np.random.Generator, samples: int = 80
 ) -> float:
     """Mean change of the distance between two points under a map, in units of sqrt(area).
 
@@ -224,9 +218,6 @@ def evaluate_map(
         errors = map_errors(vertex_map.index, source_points, target_points, GeodesicDistances(target))
     if not source.is_cloud and not target.is_cloud:
         stretched = distortion(
-            vertex_map.index,
-            GeodesicDistances(source),
-            GeodesicDistances(target),
-            rng or np.random.default_rng(0),
+            vertex_map.index, GeodesicDistances(source), GeodesicDistances(target), rng or np.random.default_rng(0)
         )
     return Evaluation(coverage(vertex_map.index, target), stretched, errors)

@@ -183,9 +183,7 @@ def _read_mat(path: Path) -> VertexMap:
     record = _plain(read_mat(path.read_bytes(), _KNOWN))
     reasons = record.get("reasons", ())
     record["reasons"] = tuple(reasons) if isinstance(reasons, list) else ()
-    return _from_record(
-        {name: np.ravel(value) if name in _LISTS else value for name, value in record.items()}
-    )
+    return _from_record({name: np.ravel(value) if name in _LISTS else value for name, value in record.items()})
 
 
 _FORMATS: dict[str, tuple[Callable[[Path, VertexMap], None], Callable[[Path], VertexMap]]] = {

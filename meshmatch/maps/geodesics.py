@@ -74,17 +74,13 @@ def surface_graph(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> csr_m
     that every distance is finite; a mean over a body with loose eyes must not lose a point.
     """
     size = len(verts)
-    i, j, length = (
-        np.concatenate(p) for p in zip(edge_arcs(verts, faces), diagonal_arcs(verts, faces), strict=True)
-    )
+    i, j, length = (np.concatenate(p) for p in zip(edge_arcs(verts, faces), diagonal_arcs(verts, faces), strict=True))
     first = same_rows(verts)
     other = np.flatnonzero(first != np.arange(size))
     first = first[other]
     i, j = np.concatenate([i, first]), np.concatenate([j, other])
     length = np.concatenate([length, np.zeros(len(first))])
-    count, part = connected_components(
-        csr_matrix((np.ones(len(i)), (i, j)), shape=(size, size)), directed=False
-    )
+    count, part = connected_components(csr_matrix((np.ones(len(i)), (i, j)), shape=(size, size)), directed=False)
     if count > 1:
         bi, bj = _bridges(verts, part)
         i, j = np.concatenate([i, bi]), np.concatenate([j, bj])

@@ -67,10 +67,7 @@ def reassign_islands(
 
 
 def small_islands(
-    edges: Int[Ints, "E 2"],
-    length: Float[Floats, " E"],
-    image: Float[Floats, "V 3"],
-    areas: Float[Floats, " V"],
+    edges: Int[Ints, "E 2"], length: Float[Floats, " E"], image: Float[Floats, "V 3"], areas: Float[Floats, " V"]
 ) -> Bool[Bools, " V"]:
     """True on small pieces between discontinuities: edges whose ends have images much further apart than they are.
 

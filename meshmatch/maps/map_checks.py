@@ -31,16 +31,12 @@ def checked_arrays(
     vertex = whole_numbers(index, f"{label}: index")
     size = len(vertex) if vertex.ndim else 0
     if vertex.ndim != 1 or size == 0:
-        raise InputError(
-            f"{label}: index must be a list of (V_source,) vertices, not an array of {vertex.shape}"
-        )
+        raise InputError(f"{label}: index must be a list of (V_source,) vertices, not an array of {vertex.shape}")
     if target_vertices != UNKNOWN and target_vertices < 1:
         raise InputError(f"{label}: a target needs vertices, not {target_vertices}")
     check_range(vertex, target_vertices, label)
     faces = np.full(size, -1) if face is None else whole_numbers(face, f"{label}: face")
-    weights = np.array(
-        np.tile([1.0, 0.0, 0.0], (size, 1)) if barycentric is None else barycentric, np.float64
-    )
+    weights = np.array(np.tile([1.0, 0.0, 0.0], (size, 1)) if barycentric is None else barycentric, np.float64)
     trust = np.array(np.ones(size) if confidence is None else confidence, np.float32)
     for name, array, shape in (
         ("face", faces, (size,)),
@@ -61,9 +57,7 @@ def checked_arrays(
 def check_faces(face: Int[Ints, " V_source"], target_faces: int, label: str) -> None:
     """Refuse faces that a target of so many does not have (`InputError`)."""
     if face.max() >= target_faces:
-        raise InputError(
-            f"{label} names face {int(face.max())}, but its target has only {target_faces} faces"
-        )
+        raise InputError(f"{label} names face {int(face.max())}, but its target has only {target_faces} faces")
 
 
 def misfit(side: str, made_for: str, vertices: int, digest: str, shape: Shape) -> str:
@@ -75,15 +69,11 @@ def misfit(side: str, made_for: str, vertices: int, digest: str, shape: Shape) -
     if vertices not in (UNKNOWN, shape.V):
         return f"{side}: {made_for or 'a mesh'} of {vertices} vertices, but {name} has {shape.V}"
     if digest not in ("", shape.hash):
-        return (
-            f"{side}: {made_for or 'a mesh'} ({digest}), but {name} is {shape.hash}: vertices or faces differ"
-        )
+        return f"{side}: {made_for or 'a mesh'} ({digest}), but {name} is {shape.hash}: vertices or faces differ"
     return ""
 
 
-def corners_of(
-    faces: Int[Ints, "F 3"] | None, face: Int[Ints, " N"], vertex: Int[Ints, " N"]
-) -> Int[Ints, "N 3"]:
+def corners_of(faces: Int[Ints, "F 3"] | None, face: Int[Ints, " N"], vertex: Int[Ints, " N"]) -> Int[Ints, "N 3"]:
     """Corners of faces (N,); where the face is -1, three times the vertex itself."""
     corners = np.repeat(vertex[:, None], 3, axis=1)
     inside = face >= 0
@@ -102,9 +92,7 @@ def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None
         raise InputError(
             f"{label}: vertex {int(np.argmax(index))} is matched to vertex {int(index.max())}, "
             f"but the target has only {target_vertices} vertices",
-            "it looks 1-based: subtract 1"
-            if one_based
-            else "is it a map to another shape, or the other way round?",
+            "it looks 1-based: subtract 1" if one_based else "is it a map to another shape, or the other way round?",
         )
 
 

@@ -68,9 +68,7 @@ def expectation(
     for low in range(0, len(points), _CHUNK):
         part = slice(low, low + _CHUNK)
         distance, index = tree.query(points[part], min(_SAMPLES, tree.n))
-        further = np.square(distance) - np.square(
-            distance[:, :1]
-        )  # the closest keeps its weight at any distance
+        further = np.square(distance) - np.square(distance[:, :1])  # the closest keeps its weight at any distance
         weight = prior[index] * np.exp(-0.5 * further / noise**2)
         weight /= weight.sum(1, keepdims=True)
         for mean, value in zip(means, sampled, strict=True):
@@ -81,12 +79,7 @@ def expectation(
 
 
 def most_likely_points(
-    target: Shape,
-    fit: Fit,
-    noise: float,
-    moved: Float[Floats, "N 3"],
-    resting: Float[Floats, "N 3"],
-    workers: int = 1,
+    target: Shape, fit: Fit, noise: float, moved: Float[Floats, "N 3"], resting: Float[Floats, "N 3"], workers: int = 1
 ) -> Footpoints:
     """The points of a cloud that most likely lie at ``moved`` on the fitted and at ``resting`` on the resting template.
 
@@ -108,8 +101,5 @@ def _samples(fit: Fit) -> tuple[csr_matrix, Floats]:
     F, T = len(fit.faces), len(fit.points)
     rows = np.repeat(np.arange(F), 3)
     centers = csr_matrix((np.full(3 * F, 1 / 3), (rows, fit.faces.reshape(-1))), (F, T))
-    areas = (
-        vertex_areas(fit.points, fit.faces),
-        triangle_areas(fit.points, fit.faces),
-    )  # half of the whole each
+    areas = (vertex_areas(fit.points, fit.faces), triangle_areas(fit.points, fit.faces))  # half of the whole each
     return vstack([identity(T), centers]).tocsr(), np.concatenate([0.5 * area for area in areas])

@@ -17,16 +17,7 @@ from meshmatch.shapes.paths import existing
 
 T = TypeVar("T")
 # What a damaged file raises in the readers of the standard library and NumPy.
-_DAMAGE = (
-    ValueError,
-    TypeError,
-    LookupError,
-    ArithmeticError,
-    RecursionError,
-    EOFError,
-    StopIteration,
-    csv.Error,
-)
+_DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError, RecursionError, EOFError, StopIteration, csv.Error)
 
 
 def check_suffix(path: str | Path, suffixes: Iterable[str], what: str) -> str:
@@ -35,8 +26,7 @@ def check_suffix(path: str | Path, suffixes: Iterable[str], what: str) -> str:
     if suffix not in suffixes:
         given = f"'{suffix}'" if suffix else "a name without a suffix"
         raise OptionError(
-            f"{Path(path).name}: {given} is not a format for {what}",
-            f"end the name in one of {' '.join(suffixes)}",
+            f"{Path(path).name}: {given} is not a format for {what}", f"end the name in one of {' '.join(suffixes)}"
         )
     return suffix
 
@@ -55,9 +45,7 @@ def read_by_suffix(path: str | Path, readers: Mapping[str, Callable[[Path], T]],
     path = existing(Path(path), hint)
     suffix = path.suffix.lower()
     if suffix not in readers:
-        raise InputError(
-            f"{path.name}: {what} are not read from '{suffix}' files", f"choose {', '.join(readers)}"
-        )
+        raise InputError(f"{path.name}: {what} are not read from '{suffix}' files", f"choose {', '.join(readers)}")
     try:
         return readers[suffix](path)
     except MeshmatchError as error:
@@ -112,9 +100,7 @@ def write_npy(path: Path, array: np.ndarray) -> None:
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
     """A compressed npz file; see `write_npy`."""
     with path.open("wb") as file:
-        np.savez_compressed(
-            file, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()}
-        )
+        np.savez_compressed(file, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()})
 
 
 def short_floats(values: np.ndarray) -> list[Any]:

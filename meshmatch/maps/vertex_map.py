@@ -132,9 +132,7 @@ class VertexMap:
             The map was made for another mesh, runs from target to source, or names a vertex or a face that the
             target does not have. The message calls it `label`.
         """
-        sides = [
-            (side, shape) for side, shape in (("source", source), ("target", target)) if shape is not None
-        ]
+        sides = [(side, shape) for side, shape in (("source", source), ("target", target)) if shape is not None]
         misfits = [self._misfit(side, shape) for side, shape in sides]
         if source is not None and target is not None and any(misfits):
             reversed_fits = not self._misfit("source", target) and not self._misfit("target", source)
@@ -207,8 +205,7 @@ class VertexMap:
         kept = weight > 0
         rows = np.repeat(np.arange(self.source_vertices), 3)[kept]
         matrix = csr_array(
-            (weight[kept], (rows, self.corners().ravel()[kept])),
-            shape=(self.source_vertices, self.target_vertices),
+            (weight[kept], (rows, self.corners().ravel()[kept])), shape=(self.source_vertices, self.target_vertices)
         )
         matrix.sum_duplicates()
         return matrix
@@ -233,9 +230,7 @@ class VertexMap:
             )
         return np.asarray(matrix @ numbers)
 
-    def functional(
-        self, basis_source: ArrayLike, basis_target: ArrayLike
-    ) -> Float[Floats, "K_source K_target"]:
+    def functional(self, basis_source: ArrayLike, basis_target: ArrayLike) -> Float[Floats, "K_source K_target"]:
         """The functional map C of this map (Ovsjanikov et al. 2012), which goes the other way: it takes coefficients
         of a function on the *target* to those of the pulled-back function on the *source*.
 
@@ -279,11 +274,8 @@ class VertexMap:
             starts = _named(other.source, other.source_vertices, other.source_hash)
             backwards = ends == _named(other.target, other.target_vertices, other.target_hash)
             raise InputError(
-                f"cannot join {_way(self)} with {_way(other)}: the first ends on {ends}, "
-                f"the second starts on {starts}",
-                "the second runs the wrong way round"
-                if backwards
-                else "the first must end where the second starts",
+                f"cannot join {_way(self)} with {_way(other)}: the first ends on {ends}, the second starts on {starts}",
+                "the second runs the wrong way round" if backwards else "the first must end where the second starts",
             )
         check_range(self.index, other.source_vertices, _way(self))
         worse = max(self.verdict, other.verdict, key=("good", "fair", "unknown", "poor").index)

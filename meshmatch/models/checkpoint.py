@@ -59,9 +59,7 @@ def save_weights(state: Mapping[str, Any], path: str | Path, *, storage: str = "
         floating = array.dtype.kind == "f"
         if floating:
             if not np.isfinite(array).all():
-                raise ModelError(
-                    f"weight {name} is not finite", "the training diverged: use an earlier checkpoint"
-                )
+                raise ModelError(f"weight {name} is not finite", "the training diverged: use an earlier checkpoint")
             array = array.astype(np.float32)
         if name.endswith(SCALE) and name.removesuffix(SCALE) in state:
             raise ModelError(f"{name} is reserved for the scale of {name.removesuffix(SCALE)}")

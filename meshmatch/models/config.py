@@ -38,9 +38,7 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         # A card may come from anywhere: bound what building the network allocates.
         if self.encoder not in ("basis", "point") or self.decoder not in ("flat", "node"):
-            raise ModelError(
-                f"unknown network: encoder {self.encoder!r}, decoder {self.decoder!r}", "update meshmatch"
-            )
+            raise ModelError(f"unknown network: encoder {self.encoder!r}, decoder {self.decoder!r}", "update meshmatch")
         if self.field not in FIELDS:
             raise ModelError(f"unknown field {self.field!r}, only {', '.join(FIELDS)}", "update meshmatch")
         for name, limit in _MAX.items():

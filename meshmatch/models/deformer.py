@@ -65,9 +65,7 @@ class Deformer(nn.Module):
         self.register_buffer("anchors", anchors)
         self.register_buffer("anchor_phi", anchor_phi)
         if config.encoder == "basis":
-            self.encoder: BasisEncoder | PointEncoder = BasisEncoder(
-                basis, config.width, config.depth, config.code
-            )
+            self.encoder: BasisEncoder | PointEncoder = BasisEncoder(basis, config.width, config.depth, config.code)
         else:
             self.encoder = PointEncoder(config.code)
         self.decoder: FlatDecoder | NodeDecoder | PointDecoder
@@ -79,9 +77,7 @@ class Deformer(nn.Module):
         else:
             self.decoder = NodeDecoder(config.code, nodes, config.width)
         self.aligner = BasisEncoder(align_basis, config.align_width, 2, 9) if config.align_basis else None
-        self.corrector = (
-            residual_mlp(A * 10, config.correct_width, 1, 3 * rows) if config.corrections else None
-        )
+        self.corrector = residual_mlp(A * 10, config.correct_width, 1, 3 * rows) if config.corrections else None
 
     @property
     def K(self) -> int:
@@ -159,9 +155,7 @@ class Deformer(nn.Module):
         return np.stack([_array(self(self._tensor(cloud)))[0] for cloud in clouds])
 
     @torch.inference_mode()
-    def read_frames(
-        self, offsets: Float[Floats32, "B M 3"]
-    ) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
+    def read_frames(self, offsets: Float[Floats32, "B M 3"]) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
         """Rotations R and centers t of the core, scan = R core + t, from offsets of basis points to nearest points."""
         R, t = self.align(torch.from_numpy(5 * offsets).to(self.nodes.device))
         return _array(R), _array(t)

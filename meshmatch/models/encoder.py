@@ -48,9 +48,7 @@ class PointEncoder(nn.Module):
             layers += [nn.Conv1d(a, b, 1), nn.BatchNorm1d(b)]
             layers += [nn.ReLU()] if i < len(sizes) - 2 else []
         self.points = nn.Sequential(*layers)
-        self.head = nn.Sequential(
-            nn.Linear(latent, latent), nn.ReLU(), nn.Dropout(dropout), nn.Linear(latent, outputs)
-        )
+        self.head = nn.Sequential(nn.Linear(latent, latent), nn.ReLU(), nn.Dropout(dropout), nn.Linear(latent, outputs))
 
     def features(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B P E"]:
         """Encodings of unit length."""

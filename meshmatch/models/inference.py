@@ -35,9 +35,7 @@ class Network(Protocol):
         """Rows for several clouds, of any number of points each, in their core frames."""
         ...
 
-    def read_frames(
-        self, offsets: Float[Floats32, "B M 3"]
-    ) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
+    def read_frames(self, offsets: Float[Floats32, "B M 3"]) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
         """Rotations R and centers t of the core, scan = R core + t, from offsets of basis points to nearest points."""
         ...
 
@@ -78,9 +76,7 @@ class NodeNetwork:
             vectors = self._correct(vectors, points, trees)
         return vectors.astype(np.float64)
 
-    def read_frames(
-        self, offsets: Float[Floats32, "B M 3"]
-    ) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
+    def read_frames(self, offsets: Float[Floats32, "B M 3"]) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
         out = self._residual_mlp("aligner.network", 5 * offsets.reshape(len(offsets), -1)).astype(np.float64)
         return rotation_from_six(out[:, :6]), out[:, 6:]
 

@@ -107,8 +107,7 @@ def locate_model(name: str | Path) -> Path:
     if isinstance(name, Path) or os.sep in text or "/" in text or text in (".", ".."):
         if not _is_folder(folder):
             raise ModelError(
-                f"there is no model folder {text[:200]}",
-                "give the name of a model, or a folder with a card.json",
+                f"there is no model folder {text[:200]}", "give the name of a model, or a folder with a card.json"
             )
         return folder
     try:
@@ -177,8 +176,7 @@ def verify_model(name: str | Path) -> ModelCard:
     registered = folder.parent in (built_in_folder(), user_folder()) and not folder.name.startswith(".")
     if registered and folder.name != card.name:
         raise ModelError(
-            f"the folder {folder.name} holds a model called {card.name}",
-            "remove it, and add it again from its source",
+            f"the folder {folder.name} holds a model called {card.name}", "remove it, and add it again from its source"
         )
     return card
 
@@ -211,8 +209,7 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
     _restore_interrupted()
     target = user_folder() / card.name
     taken = ModelError(
-        f"there is a model called {card.name} already",
-        f"`meshmatch models remove {card.name}`, or --replace",
+        f"there is a model called {card.name} already", f"`meshmatch models remove {card.name}`, or --replace"
     )
     if target.exists() and not replace:
         raise taken

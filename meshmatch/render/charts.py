@@ -85,9 +85,7 @@ class Bar:
 def check_chart(path: str | Path) -> None:
     """Refuse a file name that is not .png, .svg or .pdf, or a missing matplotlib (`OptionError`)."""
     if Path(path).suffix.lower() not in _METADATA:
-        raise OptionError(
-            f"{Path(path).name}: unsupported chart format", "end the name in .png, .svg or .pdf"
-        )
+        raise OptionError(f"{Path(path).name}: unsupported chart format", "end the name in .png, .svg or .pdf")
     if find_spec("matplotlib") is None:
         raise OptionError("charts need matplotlib", "pip install 'meshmatch[plots]'")
 
@@ -133,9 +131,7 @@ def draw_lines(charts: Sequence[Chart], path: str | Path, ylabel: str) -> None:
             _draw_chart(axes, chart, pens)
         row[0].set_ylabel(_short(ylabel))
         row[0].set_ylim(bottom=0)
-        handles = {
-            str(line.get_label()): line for axes in row for line in axes.lines if line.get_gid() == "named"
-        }
+        handles = {str(line.get_label()): line for axes in row for line in axes.lines if line.get_gid() == "named"}
         columns = max(1, min(len(handles), 88 // (6 + max(map(len, handles)))))
         figure.legend(handles=list(handles.values()), loc="outside upper left", ncols=columns)
 
@@ -153,9 +149,7 @@ def _draw_chart(axes: Axes, chart: Chart, pens: Mapping[str, Mapping[str, Any]])
         axes.set_xticks(chart.ticks, [f"{tick:g}" for tick in chart.ticks])
     axes.set_xlabel(_short(chart.xlabel))
     for name, line in chart.lines.items():
-        axes.plot(
-            line.x, line.y, marker="o", clip_on=False, gid="named", label=_short(name, 40), **pens[name]
-        )
+        axes.plot(line.x, line.y, marker="o", clip_on=False, gid="named", label=_short(name, 40), **pens[name])
         if len(line.spread):
             low, high = np.maximum(np.subtract(line.y, line.spread), 0), np.add(line.y, line.spread)
             axes.fill_between(line.x, low, high, color=pens[name]["color"], alpha=0.18, linewidth=0)
@@ -165,16 +159,11 @@ def _draw_chart(axes: Axes, chart: Chart, pens: Mapping[str, Mapping[str, Any]])
         share = (place - places.min()) / max(float(np.ptp(places)), 1e-9)
         side = "left" if share < 0.2 else "right" if share > 0.8 else "center"
         offset: dict[str, Any] = {"xytext": (0, 4), "textcoords": "offset points"}
-        axes.annotate(
-            _short(name, 30), (place, 1), xycoords=("data", "axes fraction"), ha=side, color=_GREY, **offset
-        )
+        axes.annotate(_short(name, 30), (place, 1), xycoords=("data", "axes fraction"), ha=side, color=_GREY, **offset)
 
 
 def draw_losses(
-    path: str | Path,
-    steps: Sequence[int],
-    terms: Mapping[str, Sequence[float]],
-    validation: Mapping[int, float],
+    path: str | Path, steps: Sequence[int], terms: Mapping[str, Sequence[float]], validation: Mapping[int, float]
 ) -> None:
     """Draw the losses of a training over its steps on logarithmic axes: the total and the validation error large, the
     other terms small below.
@@ -197,9 +186,7 @@ def draw_losses(
     groups = [group for group in (large, [name for name in lines if name not in large]) if group]
     pens = {name: _pen(k) for k, name in enumerate(name for group in groups for name in group)}
     with _saved(path, 6.4, 3.4 + 1.6 * (len(groups) - 1)) as figure:
-        column = figure.subplots(
-            len(groups), sharex=True, squeeze=False, height_ratios=(2, 1)[: len(groups)]
-        )[:, 0]
+        column = figure.subplots(len(groups), sharex=True, squeeze=False, height_ratios=(2, 1)[: len(groups)])[:, 0]
         for axes, group in zip(column, groups, strict=True):
             for name in group:
                 above = name == "validation"
@@ -233,9 +220,7 @@ def _label_few_decades(axes: Axes) -> None:
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
 
 
-def draw_bars(
-    groups: Mapping[str, Sequence[Bar]], path: str | Path, axis: str, limit: float | None = None
-) -> None:
+def draw_bars(groups: Mapping[str, Sequence[Bar]], path: str | Path, axis: str, limit: float | None = None) -> None:
     """Draw groups of horizontal bars, all on one axis from 0.
 
     Parameters

@@ -96,11 +96,7 @@ def compose_shapes(
 
 
 def compose_match(
-    source: Shape,
-    target: Shape,
-    vertex_map: VertexMap,
-    rotations: Rotations = (None, None),
-    look: Look | None = None,
+    source: Shape, target: Shape, vertex_map: VertexMap, rotations: Rotations = (None, None), look: Look | None = None
 ) -> Composition:
     """The source colored by position and the target in the colors that the map transfers to it; grey: unmatched.
 
@@ -124,9 +120,7 @@ def matched_colors(
     return np.where(matched[:, None], pull_values(back, colors), UNKNOWN)
 
 
-def compose_confidence(
-    source: Shape, target: Shape, vertex_map: VertexMap, look: Look | None = None
-) -> Composition:
+def compose_confidence(source: Shape, target: Shape, vertex_map: VertexMap, look: Look | None = None) -> Composition:
     """Source and target colored by the confidence of the map: low is dark."""
     back = invert_map(vertex_map, source, target)
     scale = Scale(0.0, 1.0, "confidence of the map", reverse=True)
@@ -153,18 +147,14 @@ def compose_errors(
     factor, title = _ERROR_UNITS[unit]
     values = np.asarray(errors.values, np.float64) * factor
     scale = Scale.of(values, title, limits)
-    panels = [
-        _painted_points(shape, at, values, scale) for shape, at in zip((source, target), known, strict=True)
-    ]
+    panels = [_painted_points(shape, at, values, scale) for shape, at in zip((source, target), known, strict=True)]
     gaps = any((np.asarray(panel.colors) == UNKNOWN).all(axis=1).any() for panel in panels)
     record = {"points": int(values.size), "mean_cm": errors.mean_cm, "mean_x100": 100 * errors.mean}
     shown = Composition(tuple(panels), replace(scale, unknown=gaps), "the errors of the map", record)
     return shown.rotated(_same_side(source, target, vertex_map, look))
 
 
-def _painted_points(
-    shape: Shape, vertices: Int[Ints, " N"], values: Float[Floats, " N"], scale: Scale
-) -> Panel:
+def _painted_points(shape: Shape, vertices: Int[Ints, " N"], values: Float[Floats, " N"], scale: Scale) -> Panel:
     """A shape with numbers at some of its vertices: interpolated where these lie close together, else drawn as balls.
 
     In between, a vertex takes the weighted mean of its nearest known ones; one far from all has no value.
@@ -187,10 +177,7 @@ def _painted_points(
 
 
 def compose_fit(
-    shape: Shape,
-    fitted: Shape,
-    rotation: Float[Floats, "3 3"] | None = None,
-    limits: tuple[float, float] | None = None,
+    shape: Shape, fitted: Shape, rotation: Float[Floats, "3 3"] | None = None, limits: tuple[float, float] | None = None
 ) -> Composition:
     """A fitted template (same frame and unit) as blue glass over the shape, and the shape colored by its distance."""
     distance = distances(shape, fitted)
@@ -228,9 +215,7 @@ def compose_values(
     tables = [table[:, 0] if table.ndim == 2 and table.shape[1] == 1 else table for table in values]
     if all(table.ndim == 1 for table in tables):
         scale = Scale.of(np.concatenate(tables), title, limits)
-        panels = [
-            Panel(shape, scale.colors(table), shape.name) for shape, table in zip(shapes, tables, strict=True)
-        ]
+        panels = [Panel(shape, scale.colors(table), shape.name) for shape, table in zip(shapes, tables, strict=True)]
         caption = f"numbers from {scale.low:g} to {scale.high:g}"
         return Composition(tuple(panels), scale, caption, {"range": [scale.low, scale.high]})
     for shape, table in zip(shapes, tables, strict=True):
@@ -303,11 +288,7 @@ def _with_points(
 
 
 def _same_side(
-    source: Shape,
-    target: Shape,
-    vertex_map: VertexMap,
-    look: Look | None,
-    rotations: Rotations = (None, None),
+    source: Shape, target: Shape, vertex_map: VertexMap, look: Look | None, rotations: Rotations = (None, None)
 ) -> Rotations:
     axes = (None, None) if look is None else (look.up, look.front)
     return same_side(source, target, vertex_map, rotations, *axes)

@@ -16,9 +16,7 @@ from meshmatch.shapes.shape import Shape
 Rotations = tuple[Float[Floats, "3 3"] | None, Float[Floats, "3 3"] | None]
 """Of source and target into y up, z to the viewer; None where unknown."""
 
-_AXES = {
-    sign + name: (-1.0 if sign else 1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in ("", "-")
-}
+_AXES = {sign + name: (-1.0 if sign else 1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in ("", "-")}
 _MAX_POINTS = 20_000  # a larger shape is thinned to so many
 # Lengths in units of sqrt(area), tuned on bodies in many poses, quadrupeds and furniture.
 _TALL = 1.05  # minimum height of a standing body
@@ -92,9 +90,7 @@ def same_side(
     return first, second
 
 
-def facing_alike(
-    shape: Shape, points: Float[Floats, "N 3"], seen: Float[Floats, "N 3"]
-) -> Float[Floats, "3 3"]:
+def facing_alike(shape: Shape, points: Float[Floats, "N 3"], seen: Float[Floats, "N 3"]) -> Float[Floats, "3 3"]:
     """Rotation that shows a shape from the side from which another one is seen; if it stands by itself, upright.
 
     Parameters
@@ -137,9 +133,7 @@ def _samples(shape: Shape) -> tuple[Float[Floats, "N 3"], Float[Floats, " N"]]:
     return (points - np.average(points, axis=0, weights=weights)) / unit, weights / weights.sum()
 
 
-def _upward(
-    points: Float[Floats, "N 3"], ahead: Float[Floats, " 3"] | None
-) -> tuple[Float[Floats, " 3"], bool]:
+def _upward(points: Float[Floats, "N 3"], ahead: Float[Floats, " 3"] | None) -> tuple[Float[Floats, " 3"], bool]:
     """The axis that points up, and whether the shape stands on it by itself."""
     extents = np.ptp(points, axis=0)
     free = [k for k in range(3) if ahead is None or ahead[k] == 0]
@@ -149,10 +143,7 @@ def _upward(
             if extents[axis] >= _TALL and _support(points, sign * np.eye(3)[axis]) > minimum:
                 return sign * np.eye(3)[axis], True
     usual = {1: 0.1, 2: 0.0, 0: -0.4}
-    score = {
-        k: usual[k] + 0.3 * extents[k] + float(np.clip(_support(points, np.eye(3)[k]), -0.3, 0.15))
-        for k in free
-    }
+    score = {k: usual[k] + 0.3 * extents[k] + float(np.clip(_support(points, np.eye(3)[k]), -0.3, 0.15)) for k in free}
     return np.eye(3)[max(free, key=lambda k: score[k])], False
 
 

@@ -94,9 +94,7 @@ class Figure:
     hollow: bool
 
 
-def build_figures(
-    panels: Sequence[Panel], up: str | None, front: str | None, turn: float, tilt: float
-) -> list[Figure]:
+def build_figures(panels: Sequence[Panel], up: str | None, front: str | None, turn: float, tilt: float) -> list[Figure]:
     """Build the surfaces of all panels, all seen from the same side (`Look` has the parameters).
 
     Raises
@@ -175,9 +173,7 @@ def _skin(
         if not len(valid):  # embree needs a triangle even for an empty scene
             return mesh_surface(verts[:1], np.zeros((1, 3), np.int64), FacePaint(np.ones((1, 3))))
         return mesh_surface(verts, shape.faces, paint, None if len(valid) == shape.F else valid)
-    colors = (
-        paint.colors if isinstance(paint, VertexPaint) else np.tile(to_linear(np.array(CLAY)), (shape.V, 1))
-    )
+    colors = paint.colors if isinstance(paint, VertexPaint) else np.tile(to_linear(np.array(CLAY)), (shape.V, 1))
     drawn = np.arange(shape.V) if shape.invalid is None else np.flatnonzero(~shape.invalid)
     step = max(1, -(-len(drawn) // MOST_POINTS))
     drawn = drawn[::step]
@@ -189,9 +185,7 @@ def _skin(
     return discs(verts[drawn], normals, 1.1 * np.clip(spacing, 0.4 * typical, 1.6 * typical), colors[drawn])
 
 
-def _linear(
-    colors: ArrayLike | None, count: int, plain: tuple[float, float, float]
-) -> Float[Floats, "count 3"]:
+def _linear(colors: ArrayLike | None, count: int, plain: tuple[float, float, float]) -> Float[Floats, "count 3"]:
     """Linear colors of sRGB ones, or of the plain one if none are given."""
     if colors is None:
         return np.tile(to_linear(np.array(plain)), (count, 1))

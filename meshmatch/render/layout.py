@@ -91,9 +91,7 @@ class Viewport:
     top: float
     pixel: float
 
-    def at(
-        self, column: NDArray[Any], row: NDArray[Any]
-    ) -> tuple[Float[Floats, " ..."], Float[Floats, " ..."]]:
+    def at(self, column: NDArray[Any], row: NDArray[Any]) -> tuple[Float[Floats, " ..."], Float[Floats, " ..."]]:
         """x and y of places in the picture, counted in pixels from its upper left corner."""
         return self.left + self.pixel * column, self.top - self.pixel * row
 
@@ -145,9 +143,7 @@ def lay_out(
     margin = _MARGIN * min(height, 1.5 * width)
     free = np.array([width - 2 * margin, height - sum(strips) - (1.6 if sum(strips) else 2) * margin])
     if free.min() < 8 and sum(strips):
-        raise OptionError(
-            f"{width} x {height} pixels leave no room above names and legend", "make the picture larger"
-        )
+        raise OptionError(f"{width} x {height} pixels leave no room above names and legend", "make the picture larger")
     feet, whole = _row(boxes, free[0] / free[1])
     wide, tall = whole[1] - whole[0]
     pixel = max(wide / free[0], tall / free[1], 1e-9)
@@ -162,9 +158,7 @@ def lay_out(
     return Page(viewport, feet, font_size, names, room, height - strips[1])
 
 
-def _row(
-    boxes: list[Float[Floats, "2 2"]], aspect: float | None
-) -> tuple[Float[Floats, " N"], Float[Floats, "2 2"]]:
+def _row(boxes: list[Float[Floats, "2 2"]], aspect: float | None) -> tuple[Float[Floats, " N"], Float[Floats, "2 2"]]:
     """Figures beside each other: x of each one's foot, and the box of all.
 
     ``aspect`` is width over height to fill, by wider gaps; None for the narrowest row.
@@ -186,9 +180,7 @@ def _strips(named: bool, legend: Legend | None, width: int, font_size: float) ->
     return round(2.3 * font_size) if named else 0, legend_rows
 
 
-def _natural_size(
-    wide: float, tall: float, named: bool, legend: Legend | None, font_size: float
-) -> tuple[int, int]:
+def _natural_size(wide: float, tall: float, named: bool, legend: Legend | None, font_size: float) -> tuple[int, int]:
     """A legend comes on top of the usual height, so that it takes nothing from the shapes."""
     names = _strips(named, None, HEIGHT, font_size)[0]
     margin = _MARGIN * HEIGHT

@@ -90,9 +90,7 @@ def _draw_swatches(image: Image.Image, swatches: Swatches, top: int, unit: float
         x = (W - sum(wide for _, _, wide in line) + 1.2 * unit) / 2
         for number, words, wide in line:
             color = np.round(255 * np.array(swatches.colors[number])).astype(np.uint8)
-            _paste(
-                image, np.broadcast_to(color, (side, side, 3)), round(x), round(y + 0.4 * unit), 0.3 * side
-            )
+            _paste(image, np.broadcast_to(color, (side, side, 3)), round(x), round(y + 0.4 * unit), 0.3 * side)
             room = wide - 2.7 * unit
             text, size = fitting(words, unit, room + 1)
             write(image, (x + side + 0.45 * unit, y + 0.4 * unit + side / 2), text, size, ink, "lm")

@@ -54,9 +54,7 @@ def fitting(text: str, size: float, room: float) -> tuple[str, float]:
     return text, size
 
 
-def write(
-    image: Image.Image, place: tuple[float, float], text: str, size: float, ink: Ink, anchor: str = "mm"
-) -> None:
+def write(image: Image.Image, place: tuple[float, float], text: str, size: float, ink: Ink, anchor: str = "mm") -> None:
     """Write a line; ``anchor`` as in Pillow. On a picture with alpha the letters are opaque."""
     fill = (*ink, 255) if image.mode == "RGBA" else ink
     ImageDraw.Draw(image).text(place, text, fill=fill, font=font(size), anchor=anchor)

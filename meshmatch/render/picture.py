@@ -147,12 +147,8 @@ def _image(panels: list[Panel], look: Look) -> Image.Image:
 
 def _trace(figures: list[Figure], page: Page, look: Look) -> raster.Layer:
     shifts = [np.array([foot, 0.0, 0.0]) for foot in page.feet]
-    solid = [
-        part.moved(shift) for figure, shift in zip(figures, shifts, strict=True) for part in figure.solid
-    ]
-    glass = [
-        part.moved(shift) for figure, shift in zip(figures, shifts, strict=True) for part in figure.glass
-    ]
+    solid = [part.moved(shift) for figure, shift in zip(figures, shifts, strict=True) for part in figure.solid]
+    glass = [part.moved(shift) for figure, shift in zip(figures, shifts, strict=True) for part in figure.glass]
     ground = None
     if look.ground and look.tilt > 0:
         spots = np.stack([figure.spot for figure in figures])

@@ -42,9 +42,7 @@ class Layer:
 def draw(scene: Scene, viewport: Viewport) -> Layer:
     """Draw a scene. The same scene gives the same picture, whatever the size of a band."""
     H, W = viewport.height, viewport.width
-    whole = Layer(
-        np.zeros((H, W, 3), np.float32), np.zeros((H, W), np.float32), np.full((H, W), -np.inf, np.float32)
-    )
+    whole = Layer(np.zeros((H, W, 3), np.float32), np.zeros((H, W), np.float32), np.full((H, W), -np.inf, np.float32))
     left, top, right, bottom = _extent(scene, viewport)
     if left >= right or top >= bottom:
         return whole
@@ -99,9 +97,7 @@ def _band(
     depth = np.where(hits.face >= 0, hits.place[:, 2], -np.inf).reshape(shape).astype(np.float32)
     kind = hits.face.reshape(shape) >= 0
     rim = _differs(kind.astype(np.float32)[..., None], 0.5) | slivers(edges, low, depth, viewport)
-    inner = (
-        _differs(np.sqrt(np.clip(np.concatenate([light, alpha[..., None]], axis=2), 0, 1)), _CONTRAST) & ~rim
-    )
+    inner = _differs(np.sqrt(np.clip(np.concatenate([light, alpha[..., None]], axis=2), 0, 1)), _CONTRAST) & ~rim
     for chosen, places in ((rim, _RIM), (inner, _INNER)):
         chosen[: first - low] = chosen[last - low :] = False
         found = np.flatnonzero(chosen)
@@ -134,9 +130,7 @@ def _shaded(
 def composite(glass: Layer, base: Layer, reach: float) -> Layer:
     """Glass over a base layer, which hides it where it lies further behind than ``reach``."""
     with np.errstate(invalid="ignore"):
-        ahead = np.nan_to_num(
-            (glass.depth - base.depth) / np.float32(reach) + 1, nan=1.0, posinf=1.0, neginf=0.0
-        )
+        ahead = np.nan_to_num((glass.depth - base.depth) / np.float32(reach) + 1, nan=1.0, posinf=1.0, neginf=0.0)
     shown = np.clip(ahead, 0, 1).astype(np.float32)
     through = 1 - glass.alpha * shown
     return Layer(
@@ -146,9 +140,7 @@ def composite(glass: Layer, base: Layer, reach: float) -> Layer:
     )
 
 
-def _smooth(
-    values: Float[Floats32, "H W 2"], hits: Hits, which: Bool[Bools, "H W"], pixel: float, side: int
-) -> None:
+def _smooth(values: Float[Floats32, "H W 2"], hits: Hits, which: Bool[Bools, "H W"], pixel: float, side: int) -> None:
     """Filter visibility in place over blocks of pixels of this side, as far as they belong to one surface.
 
     Only pixels ``which`` take part.

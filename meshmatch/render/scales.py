@@ -16,14 +16,7 @@ from meshmatch.shapes.palette import UNKNOWN, label_colors
 __all__ = ["UNKNOWN", "Scale", "Swatches", "label_colors", "label_swatches", "nice_step"]
 
 # Lightness, chroma, hue in degrees (Oklab). Lightness alone orders them, so a grey print can be read too.
-_WARM = (
-    (0.93, 0.025, 85),
-    (0.86, 0.12, 88),
-    (0.74, 0.165, 58),
-    (0.58, 0.20, 28),
-    (0.40, 0.15, 2),
-    (0.27, 0.10, 335),
-)
+_WARM = ((0.93, 0.025, 85), (0.86, 0.12, 88), (0.74, 0.165, 58), (0.58, 0.20, 28), (0.40, 0.15, 2), (0.27, 0.10, 335))
 _COLD = ((0.93, 0.025, 85), (0.80, 0.09, 230), (0.62, 0.14, 252), (0.44, 0.15, 264), (0.30, 0.11, 275))
 _FINE = 256
 
@@ -65,18 +58,11 @@ class Scale:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
-            raise OptionError(
-                f"a scale cannot run from {self.low:g} to {self.high:g}", "the lower number comes first"
-            )
+            raise OptionError(f"a scale cannot run from {self.low:g} to {self.high:g}", "the lower number comes first")
 
     @classmethod
     def of(
-        cls,
-        values: ArrayLike,
-        title: str = "",
-        limits: tuple[float, float] | None = None,
-        *,
-        reverse: bool = False,
+        cls, values: ArrayLike, title: str = "", limits: tuple[float, float] | None = None, *, reverse: bool = False
     ) -> Scale:
         """A scale for these numbers: round ends, from 0 if they are not negative and reach down to it.
 
@@ -145,10 +131,7 @@ def _round_ends(finite: Float[Floats, " N"]) -> tuple[float, float]:
         spread = abs(high) if high else 1.0
         low, high = (0.0, spread) if low >= 0 else (low, low + spread)
     step = nice_step(high - low, 5)
-    return (
-        float(np.floor(low / step + 1e-9) * step),
-        float(np.ceil(high / step - 1e-9) * step),
-    )
+    return (float(np.floor(low / step + 1e-9) * step), float(np.ceil(high / step - 1e-9) * step))
 
 
 def nice_step(span: float, parts: int) -> float:

@@ -85,9 +85,9 @@ class Scene:
         starts = np.cumsum([0, *(len(part.verts) for part in surfaces[:-1])])
         self._first = np.cumsum([0, *(len(part.faces) for part in surfaces)])
         self.verts = np.concatenate([part.verts for part in surfaces]).astype(np.float32)
-        self.faces = np.concatenate(
-            [part.faces + start for part, start in zip(surfaces, starts, strict=True)]
-        ).astype(np.int32)
+        self.faces = np.concatenate([part.faces + start for part, start in zip(surfaces, starts, strict=True)]).astype(
+            np.int32
+        )
         self._normals = np.concatenate([part.normals for part in surfaces]).astype(np.float32)
         corners = self.verts[self.faces]
         flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

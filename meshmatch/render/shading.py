@@ -85,9 +85,7 @@ def visibility(
     for number, end in enumerate(ends):  # rows of one subset share their directions
         own = order[ends[number - 1] if number else 0 : end]
         subset = number % _SUBSETS
-        few = slice(
-            None, None, 2 if number >= _SUBSETS else 1
-        )  # the larger blocks of the ground need fewer per pixel
+        few = slice(None, None, 2 if number >= _SUBSETS else 1)  # the larger blocks of the ground need fewer per pixel
         lamp = _KEY_SET[subset, few], _KEY_FAR[subset, few]
         sky = _SKY_SET[subset, few], _SKY_FAR[subset, few]
         for first in range(0, len(own), _AT_ONCE):

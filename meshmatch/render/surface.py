@@ -22,9 +22,7 @@ AnyFloats = NDArray[np.floating[Any]]
 class Paint(Protocol):
     """What gives a triangle its color at each of its points."""
 
-    def at(
-        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
-    ) -> Float[AnyFloats, "N C"]:
+    def at(self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float) -> Float[AnyFloats, "N C"]:
         """Colors, three or four columns, at points of triangles given by barycentric weights; a fourth value below a
         half is a hole.
 
@@ -47,9 +45,7 @@ class VertexPaint:
     def __post_init__(self) -> None:
         object.__setattr__(self, "colors", np.asarray(self.colors, np.float32))
 
-    def at(
-        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
-    ) -> Float[AnyFloats, "N C"]:
+    def at(self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float) -> Float[AnyFloats, "N C"]:
         corners = self.faces[faces]
         if self.sharp:
             return self.colors[np.take_along_axis(corners, weights.argmax(axis=1)[:, None], axis=1)[:, 0]]
@@ -65,9 +61,7 @@ class FacePaint:
     def __post_init__(self) -> None:
         object.__setattr__(self, "colors", np.asarray(self.colors, np.float32))
 
-    def at(
-        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
-    ) -> Float[AnyFloats, "N C"]:
+    def at(self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float) -> Float[AnyFloats, "N C"]:
         return self.colors[faces]
 
 
@@ -112,17 +106,12 @@ class SomeFaces:
     paint: Paint
     chosen: Int[Ints, " N"]
 
-    def at(
-        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
-    ) -> Float[AnyFloats, "N C"]:
+    def at(self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float) -> Float[AnyFloats, "N C"]:
         return self.paint.at(self.chosen[faces], weights, footprint)
 
 
 def mesh_surface(
-    verts: Float[AnyFloats, "V 3"],
-    faces: Int[Ints, "F 3"],
-    paint: Paint,
-    chosen: Int[Ints, " N"] | None = None,
+    verts: Float[AnyFloats, "V 3"], faces: Int[Ints, "F 3"], paint: Paint, chosen: Int[Ints, " N"] | None = None
 ) -> Surface:
     """A mesh, or the ``chosen`` of its triangles; normals are smooth, also across the duplicate vertices of texture
     seams and stl files.
@@ -136,9 +125,7 @@ def mesh_surface(
 
 def balls(centers: Float[AnyFloats, "K 3"], radius: float, colors: Float[AnyFloats, "K 3"]) -> Surface:
     """A ball around every center in its color; the fewer, the finer."""
-    verts, faces = _ball(
-        4 if len(centers) <= 60 else 3 if len(centers) <= 1_000 else 2 if len(centers) <= 5_000 else 1
-    )
+    verts, faces = _ball(4 if len(centers) <= 60 else 3 if len(centers) <= 1_000 else 2 if len(centers) <= 5_000 else 1)
     count = len(centers)
     return Surface(
         (centers[:, None] + radius * verts).reshape(-1, 3),

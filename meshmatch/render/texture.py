@@ -39,9 +39,7 @@ class TexturePaint:
         sizes = np.array([_texels(material) for material in look.materials])[look.material]
         self._density = np.sqrt(flat * sizes / np.maximum(solid, 1e-20)).astype(np.float32)
 
-    def at(
-        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
-    ) -> Float[Floats32, "N 4"]:
+    def at(self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float) -> Float[Floats32, "N 4"]:
         """Linear colors and 1, or 0 for a hole (see `Paint.at`)."""
         weights = np.asarray(weights, np.float32)
         out = np.ones((len(faces), 4), np.float32)
@@ -62,9 +60,7 @@ class TexturePaint:
         return out
 
 
-def _solid(
-    material: Material, image: Float[Floats32, " N"], factor: Float[Floats32, " N"]
-) -> Bool[Bools, " N"]:
+def _solid(material: Material, image: Float[Floats32, " N"], factor: Float[Floats32, " N"]) -> Bool[Bools, " N"]:
     """Whether there is anything, by the alpha of the image and of its factor.
 
     Half-transparent glass is drawn as if it were solid; what an image cuts out, such as hair from its card, is not.

@@ -62,9 +62,7 @@ def align(shape: OrientedPoints, target: OrientedPoints, how: Align, keep: int =
     for each in sorted(rough, key=lambda found: found.residual):
         if len(chosen) < max(keep, 4) and all(each.pose.angle_to(other.pose) > _CLOSE for other in chosen):
             chosen.append(each)
-    fine = sorted(
-        (_icp(fine_shape, fine_target, each.pose, 25) for each in chosen), key=lambda found: found.residual
-    )
+    fine = sorted((_icp(fine_shape, fine_target, each.pose, 25) for each in chosen), key=lambda found: found.residual)
     if fine[0].residual > _CLEARLY * given.residual:
         fine.insert(0, given)
     else:

@@ -107,9 +107,7 @@ def vertex_colors_alone(shape: Shape) -> Appearance:
     if shape.colors is not None:
         colors = np.concatenate([to_linear(shape.colors[:, :3]), shape.colors[:, 3:]], axis=1)
     alpha: Alpha = "blend" if colors is not None and (colors[:, 3] < 1).any() else "opaque"
-    return Appearance(
-        (Material(alpha=alpha),), np.zeros(shape.F, np.int64), np.zeros((shape.F, 3, 2)), colors
-    )
+    return Appearance((Material(alpha=alpha),), np.zeros(shape.F, np.int64), np.zeros((shape.F, 3, 2)), colors)
 
 
 def no_coordinates(name: str) -> InputError:

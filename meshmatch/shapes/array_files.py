@@ -85,9 +85,7 @@ def _array(file: IO[bytes], name: str, most: int) -> NDArray[Any]:
     if array.dtype.kind == "U" and array.size:
         characters = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("=")).reshape(-1)
         codes = characters.view(np.uint32)
-        if (
-            (codes > _LAST_CHARACTER) | ((codes >= 0xD800) & (codes < 0xE000))
-        ).any():  # the latter are halves
+        if ((codes > _LAST_CHARACTER) | ((codes >= 0xD800) & (codes < 0xE000))).any():  # the latter are halves
             raise ValueError(f"{name} holds invalid characters")
     return array
 

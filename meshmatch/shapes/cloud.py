@@ -13,9 +13,7 @@ from meshmatch.shapes.orientation import agreeing_flips
 LARGEST = 20_000
 
 
-def local_areas(
-    points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None = None
-) -> Float[Floats, " V"]:
+def local_areas(points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None = None) -> Float[Floats, " V"]:
     """(V,) area that each point stands for, squared units; 0 for an invalid one.
 
     Among points scattered with density n over a surface, the disc that just holds a point's k nearest others
@@ -49,9 +47,7 @@ def local_areas(
     return areas
 
 
-def estimate_normals(
-    points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None = None
-) -> Float[Floats, "V 3"]:
+def estimate_normals(points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None = None) -> Float[Floats, "V 3"]:
     """(V, 3) unit normals: where the neighbourhood is thinnest; zeros for an invalid point.
 
     Signs are made to agree between neighbours (Hoppe et al. 1992, section 3.3), then each connected part is

@@ -89,9 +89,7 @@ def _from_arrays(verts: Any, faces: Any, name: str, colors: Any = None) -> Shape
     except (TypeError, ValueError) as error:
         raise InputError(f"{name or 'the shape'}: not an array of numbers ({error})", _HINT) from error
     if verts.ndim != 2 or verts.shape[1] != 3:
-        raise InputError(
-            f"{name or 'the shape'}: vertices must be an array of (V, 3), not {verts.shape}", _HINT
-        )
+        raise InputError(f"{name or 'the shape'}: vertices must be an array of (V, 3), not {verts.shape}", _HINT)
     return Shape.with_invalid(verts, faces, name, colors)
 
 

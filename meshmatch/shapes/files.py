@@ -56,8 +56,7 @@ def load_shape(path: str | Path) -> Shape:
     suffix = path.suffix.lower()
     if suffix not in _READERS:
         raise InputError(
-            f"{path.name}: unsupported file format {suffix or '(no suffix)'}",
-            f"meshmatch reads {', '.join(SUFFIXES)}",
+            f"{path.name}: unsupported file format {suffix or '(no suffix)'}", f"meshmatch reads {', '.join(SUFFIXES)}"
         )
     data = read_bytes(path)
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
@@ -69,9 +68,7 @@ def check_suffix(path: Path) -> str:
     """The suffix in lower case; `OptionError` if shapes are not written with it."""
     suffix = path.suffix.lower()
     if suffix not in _WRITERS:
-        raise OptionError(
-            f"cannot write a shape as {suffix or '(no suffix)'}", f"choose one of {', '.join(_WRITERS)}"
-        )
+        raise OptionError(f"cannot write a shape as {suffix or '(no suffix)'}", f"choose one of {', '.join(_WRITERS)}")
     return suffix
 
 

@@ -15,11 +15,7 @@ UNKNOWN = (0.62, 0.64, 0.67)
 def oklab_to_linear(lab: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
     """Light (N, 3) of colours (N, 3) in Oklab, where equal steps look equal (Ottosson 2020)."""
     roots = lab @ np.array(
-        [
-            [1.0, 1.0, 1.0],
-            [0.3963377774, -0.1055613458, -0.0894841775],
-            [0.2158037573, -0.0638541728, -1.291485548],
-        ]
+        [[1.0, 1.0, 1.0], [0.3963377774, -0.1055613458, -0.0894841775], [0.2158037573, -0.0638541728, -1.291485548]]
     )
     return np.asarray(
         roots**3

@@ -66,9 +66,7 @@ def find_parts(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], cross: Floa
     return Parts(outlier[part], int(outlier.sum()), len(areas) - int(outlier.sum()), len(far), share)
 
 
-def _gaps(
-    verts: Floats, faces: Ints, face_areas: Floats, part: Ints, body: Ints, others: Ints
-) -> tuple[Floats, float]:
+def _gaps(verts: Floats, faces: Ints, face_areas: Floats, part: Ints, body: Ints, others: Ints) -> tuple[Floats, float]:
     """Distance (parts,) of each of the `others` to the parts in `body`, else 0; and the body's diagonal."""
     from scipy.spatial import cKDTree
 

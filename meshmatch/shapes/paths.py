@@ -29,9 +29,7 @@ def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path
             raise InputError(f"{path} is a folder, not a file", hint or "give the name of a file")
         if not path.exists():
             if path.is_symlink():
-                raise InputError(
-                    f"{path} is a link to a file that is not there", "mend the link, or name the file"
-                )
+                raise InputError(f"{path} is a link to a file that is not there", "mend the link, or name the file")
             raise InputError(f"there is no file {path}", hint or _similar(path, suffixes))
         if not path.is_file():
             raise InputError(
@@ -43,13 +41,10 @@ def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}", hint or "check the name") from error
     if size == 0:
-        raise InputError(
-            f"{path.name} is empty (0 bytes)", hint or "was the download or the export cut short?"
-        )
+        raise InputError(f"{path.name} is empty (0 bytes)", hint or "was the download or the export cut short?")
     if size > LARGEST_FILE:
         raise InputError(
-            f"{path.name} is too large: {size / 2**30:.1f} GiB",
-            f"the limit is {LARGEST_FILE / 2**30:.0f} GiB",
+            f"{path.name} is too large: {size / 2**30:.1f} GiB", f"the limit is {LARGEST_FILE / 2**30:.0f} GiB"
         )
     return path
 

@@ -40,11 +40,7 @@ def collapse_edges(
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(np.array(verts), np.array(faces, np.int32)))
     meshes.meshing_decimation_quadric_edge_collapse(
-        targetfacenum=int(target),
-        qualitythr=0.5,
-        planarquadric=True,
-        preservetopology=True,
-        preservenormal=True,
+        targetfacenum=int(target), qualitythr=0.5, planarquadric=True, preservetopology=True, preservenormal=True
     )
     mesh = meshes.current_mesh()
     mesh.compact()

@@ -154,9 +154,7 @@ def _result(
 ) -> Repaired:  # fmt: skip
     chosen = np.flatnonzero(kept)
     if len(chosen) == 0:
-        raise InputError(
-            f"{shape.name or 'the shape'} has no usable vertex", "is it a mesh or a point cloud at all?"
-        )
+        raise InputError(f"{shape.name or 'the shape'} has no usable vertex", "is it a mesh or a point cloud at all?")
     if len(chosen) == shape.V and not notes:
         every = np.arange(shape.V)
         return Repaired(shape, every, every, (), shape, which)
@@ -199,9 +197,7 @@ def _valid(shape: Shape, notes: list[str]) -> Bools:
         return np.ones(shape.V, bool)
     count = int(shape.invalid.sum())
     if count == shape.V:
-        raise InputError(
-            f"{shape.name or 'the shape'}: no vertex has a position (all NaN)", "export it again"
-        )
+        raise InputError(f"{shape.name or 'the shape'}: no vertex has a position (all NaN)", "export it again")
     _note(notes, count, "vertex", "without a position (NaN) dropped")
     return ~shape.invalid
 

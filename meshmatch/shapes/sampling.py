@@ -48,18 +48,14 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
     areas = shape.vertex_areas if shape.is_cloud else shape.face_areas
     total = np.cumsum(areas)
     if not total[-1] > 0:
-        raise InputError(
-            f"{shape.name or 'the shape'} has no surface to sample", "all its faces are degenerate"
-        )
+        raise InputError(f"{shape.name or 'the shape'} has no surface to sample", "all its faces are degenerate")
     if shape.is_cloud:
         chosen = _draw_points(areas, P, rng)
         weights = np.zeros((P, 3))
         weights[:, 0] = 1.0
         normals = shape.vertex_normals[chosen]
         face = np.full(P, -1, np.int64)
-        return Samples(
-            shape.verts[chosen], normals, signed=False, face=face, barycentric=weights, vertex=chosen
-        )
+        return Samples(shape.verts[chosen], normals, signed=False, face=face, barycentric=weights, vertex=chosen)
     # side="right" steps over faces without area
     face = np.searchsorted(total, rng.random(P) * total[-1], side="right").astype(np.int64)
     face = np.minimum(face, np.flatnonzero(areas)[-1])

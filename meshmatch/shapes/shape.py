@@ -65,8 +65,7 @@ class Shape:
             raise InputError(f"{label} has no vertices")
         if not np.isfinite(verts).all():
             raise InputError(
-                f"{label}: some vertex positions are not finite",
-                "load it with load_shape, which marks them invalid",
+                f"{label}: some vertex positions are not finite", "load it with load_shape, which marks them invalid"
             )
         if len(faces) and (faces.min() < 0 or faces.max() >= len(verts)):
             worst = int(faces.min()) if faces.min() < 0 else int(faces.max())
@@ -89,11 +88,7 @@ class Shape:
 
     @classmethod
     def with_invalid(
-        cls,
-        verts: Float[Floats, "V 3"],
-        faces: Int[Ints, "F 3"],
-        name: str,
-        colors: Float[Floats, "V 4"] | None = None,
+        cls, verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], name: str, colors: Float[Floats, "V 4"] | None = None
     ) -> Shape:
         """A shape some of whose positions may be NaN or infinite: these are marked in `invalid`, and moved to the
         centroid of the others.
@@ -104,17 +99,13 @@ class Shape:
             As for the class; or no position is finite.
         """
         if len(verts) == 0:
-            raise InputError(
-                f"{name or 'the shape'} holds no vertices", "is it a mesh or a point cloud at all?"
-            )
+            raise InputError(f"{name or 'the shape'} holds no vertices", "is it a mesh or a point cloud at all?")
         # Squared areas must not overflow: a position of 1e60 is invalid too.
         usable = np.asarray((np.abs(verts) < 1e60).all(axis=1))
         if usable.all():
             return cls(verts, faces, name, colors)
         if not usable.any():
-            raise InputError(
-                f"{name or 'the shape'}: no vertex has a finite position (all NaN)", "export it again"
-            )
+            raise InputError(f"{name or 'the shape'}: no vertex has a finite position (all NaN)", "export it again")
         verts = verts.copy()
         verts[~usable] = verts[usable].mean(axis=0)
         return cls(verts, faces, name, colors, ~usable)

@@ -79,9 +79,7 @@ def make_template(
     small = Shape(frame.apply(small.verts), faces, name)
     parts = np.zeros(shape.V, np.int64) if labels is None else np.asarray(labels, np.int64)
     if parts.shape != (shape.V,):
-        raise TemplateError(
-            f"{len(parts)} labels for {shape.V} vertices of {shape.name}", "one label a vertex, from 0"
-        )
+        raise TemplateError(f"{len(parts)} labels for {shape.V} vertices of {shape.name}", "one label a vertex, from 0")
     if parts.min() < 0:
         raise TemplateError(f"{shape.name} has a label below 0: {parts.min()}", "count parts from 0")
     names = tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1))

@@ -53,9 +53,7 @@ class NodeConfig:
 
     def __post_init__(self) -> None:
         if self.strategy not in STRATEGIES:
-            raise OptionError(
-                f"unknown node strategy {self.strategy!r}", f"choose one of {', '.join(STRATEGIES)}"
-            )
+            raise OptionError(f"unknown node strategy {self.strategy!r}", f"choose one of {', '.join(STRATEGIES)}")
         if self.K < 4:
             raise OptionError(f"{self.K} nodes are too few", "moving least squares needs at least 4")
         if not 0 < self.radius < np.inf:
@@ -113,11 +111,7 @@ def choose_nodes(
 
 
 def _allowed(
-    shape: Shape,
-    config: NodeConfig,
-    candidates: Float[Floats, "N 3"],
-    labels: Int[Ints, " V"] | None,
-    samples: Samples,
+    shape: Shape, config: NodeConfig, candidates: Float[Floats, "N 3"], labels: Int[Ints, " V"] | None, samples: Samples
 ) -> Iterator[Bool[Bools, " N"]]:
     """Which candidates a strategy keeps; a weaker rule follows, for when one leaves some vertices without nodes.
 
@@ -155,9 +149,7 @@ def _complete(
         bad = poorly_supported(shape.verts, nodes, config.radius)
         if not len(bad):
             return nodes
-        extra = candidates[
-            cKDTree(candidates).query(shape.verts[bad], k=min(40, len(candidates)))[1].reshape(-1)
-        ]
+        extra = candidates[cKDTree(candidates).query(shape.verts[bad], k=min(40, len(candidates)))[1].reshape(-1)]
         spread = farthest_points(np.concatenate([nodes, extra]), min(len(nodes) + 8, len(nodes) + len(extra)))
         fresh = spread[spread >= len(nodes)] - len(nodes)
         if not len(fresh):
@@ -171,9 +163,7 @@ def _complete(
     )
 
 
-def _parts_allowed(
-    shape: Shape, parts: Int[Ints, " V"], touched: list, own: Int[Ints, " N"]
-) -> Bool[Bools, " N"]:
+def _parts_allowed(shape: Shape, parts: Int[Ints, " V"], touched: list, own: Int[Ints, " N"]) -> Bool[Bools, " N"]:
     """Drop candidates that touch a part which does not border on their own."""
     neighbours = _part_neighbours(shape, parts)
     home = parts[own]
@@ -210,9 +200,7 @@ def _geodesic_allowed(shape: Shape, touched: list, own: Int[Ints, " N"], share: 
     return np.array([np.isfinite(distance[place[i], hits]).all() for i, hits in enumerate(touched)])
 
 
-def spectral_clusters(
-    shape: Shape, clusters: int, rng: np.random.Generator, functions: int = 12
-) -> Int[Ints, " V"]:
+def spectral_clusters(shape: Shape, clusters: int, rng: np.random.Generator, functions: int = 12) -> Int[Ints, " V"]:
     """k-means on the global point signature (Rustamov 2007) of Laplace-Beltrami eigenvectors.
 
     Returns labels from 0, at most ``clusters`` of them, none without a vertex.

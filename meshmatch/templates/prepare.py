@@ -150,8 +150,7 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         # the way from the template's file to its frame, read off two of its vertices' places
         template_marks = sqrt_area_frame(Shape(first.shape.verts[low[0]], low[1], name)).apply(template_marks)
     samples, frames, residuals = collect_samples(
-        *(made, found, marks, template_marks, how, config.scale, config.nodes.seed),
-        progress.between(0.5, 1.0),
+        *(made, found, marks, template_marks, how, config.scale, config.nodes.seed), progress.between(0.5, 1.0)
     )
     if not registered and np.median(residuals) > MAX_RESIDUAL:
         raise InputError(
@@ -183,9 +182,7 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         "align": how,
         "scale": config.scale,
         "landmarks": samples.landmarks.shape[1],
-        "frames": [
-            {"scale": f.scale, "rotation": f.rotation.tolist(), "center": f.center.tolist()} for f in frames
-        ],
+        "frames": [{"scale": f.scale, "rotation": f.rotation.tolist(), "center": f.center.tolist()} for f in frames],
         "apart": [round(residual, 5) for residual in residuals],
         "config": asdict(config.nodes),
     }

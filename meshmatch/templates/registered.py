@@ -89,9 +89,7 @@ def read_registered(folder: str | Path, template: Template) -> Float[Floats32, "
         words = read_prepared(folder)
         shapes = load_file(folder / "shapes.safetensors")["verts"]
     except (OSError, ValueError, KeyError, SafetensorError) as error:
-        raise InputError(
-            f"{folder} is not a prepared folder", "run `meshmatch prepare FOLDER -o OUT` first"
-        ) from error
+        raise InputError(f"{folder} is not a prepared folder", "run `meshmatch prepare FOLDER -o OUT` first") from error
     if words.get("template") != template.hash:
         raise InputError(f"{folder} was prepared for another template", "prepare it again")
     if words.get("scale", "area") != "area":

@@ -111,9 +111,7 @@ def save_template(template: Template, path: str | Path) -> None:
     }
     with replace_on_success(path) as temporary:
         save_file(
-            {name: np.ascontiguousarray(a) for name, a in arrays.items()},
-            temporary,
-            {"template": json.dumps(words)},
+            {name: np.ascontiguousarray(a) for name, a in arrays.items()}, temporary, {"template": json.dumps(words)}
         )
 
 
@@ -135,21 +133,15 @@ def load_template(path: str | Path) -> Template:
                 raise KeyError("arrays")
             arrays = {name: file.get_tensor(name) for name in _ARRAYS}
     except (SafetensorError, KeyError, ValueError, OSError, RecursionError) as error:
-        raise TemplateError(
-            f"{path.name} is not a template bundle", "make one with `meshmatch prepare`"
-        ) from error
+        raise TemplateError(f"{path.name} is not a template bundle", "make one with `meshmatch prepare`") from error
     if words.get("schema") != SCHEMA:
-        raise TemplateError(
-            f"{path.name} has template schema {words.get('schema')}, not {SCHEMA}", "update meshmatch"
-        )
+        raise TemplateError(f"{path.name} has template schema {words.get('schema')}, not {SCHEMA}", "update meshmatch")
     try:
         template = _template(words, arrays)
     except (KeyError, TypeError, ValueError, IndexError, InputError) as error:
         raise TemplateError(f"{path.name} is not a template bundle: {error}", "make it again") from error
     if template.hash != words.get("hash"):
-        raise TemplateError(
-            f"{path.name} is damaged: its content does not match its hash", "make or fetch it again"
-        )
+        raise TemplateError(f"{path.name} is damaged: its content does not match its hash", "make or fetch it again")
     return template
 
 

@@ -182,9 +182,7 @@ def read_samples(folder: str | Path, template: Template) -> ShapeSamples:
         if not fits or len(at) != found.landmarks.shape[1] or (len(at) and at.max() >= template.shape.V):
             raise KeyError("arrays that do not belong together")
     except (OSError, ValueError, KeyError, StopIteration, SafetensorError) as error:
-        raise InputError(
-            f"{folder} is not a prepared folder", "run `meshmatch prepare FOLDER -o OUT` first"
-        ) from error
+        raise InputError(f"{folder} is not a prepared folder", "run `meshmatch prepare FOLDER -o OUT` first") from error
     if prepared.get("template") != template.hash:
         raise InputError(f"{folder} was prepared for another template", "prepare it again")
     return found

@@ -33,9 +33,7 @@ class ChamferLoss(Objective):
 
     landmarks: float = 1.0
 
-    def __call__(
-        self, model: Deformer, batch: CloudBatch, points: SurfacePoints, generator: torch.Generator
-    ) -> Terms:
+    def __call__(self, model: Deformer, batch: CloudBatch, points: SurfacePoints, generator: torch.Generator) -> Terms:
         code = model.encoder(batch.encode_features)
         rows = model.decoder(code)
         terms, fit = self._energies(rows, batch, points)

@@ -74,9 +74,7 @@ def build_lattice(samples: ShapeSamples) -> Lattice | None:
     phi = field.phi.to_dense()
     gradient = field.gradient.to_dense()[: 3 * N * P].reshape(N, P, 3, -1)
     return Lattice(
-        phi[: N * P].reshape(N, P, -1),
-        gradient,
-        phi[N * P :].reshape(N, samples.landmarks.shape[1], field.K),
+        phi[: N * P].reshape(N, P, -1), gradient, phi[N * P :].reshape(N, samples.landmarks.shape[1], field.K)
     )
 
 
@@ -162,7 +160,5 @@ def deformed_normals(
 ) -> Float[torch.Tensor, "*B 3"]:
     """Unit normals after a deformation with gradient F: its cofactors on the normals."""
     a, b, c = F.unbind(-1)  # columns
-    cofactors = torch.stack(
-        [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -1
-    )
+    cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -1)
     return torch.nn.functional.normalize((cofactors @ normals[..., None])[..., 0], dim=-1)

@@ -61,19 +61,11 @@ def standing_body(rig: Rig, pose: str) -> Shape:
     return Shape(verts.double().numpy(), rig.faces.numpy(), f"human-{pose}")
 
 
-def human_template(
-    rig: Rig, pose: str, config: NodeConfig, low: tuple[Int[Ints, " V"], Int[Ints, "F 3"]]
-) -> Template:
+def human_template(rig: Rig, pose: str, config: NodeConfig, low: tuple[Int[Ints, " V"], Int[Ints, "F 3"]]) -> Template:
     """Template of the mean body. ``rig`` carries the full mesh; ``low`` is its low resolution (vertices, faces)."""
     labels, names = body_parts(rig)
     core = np.flatnonzero(np.isin(labels, [names.index(part) for part in _CORE]))
     made = make_template(
-        standing_body(rig, pose),
-        f"human-{pose}",
-        config,
-        labels=labels,
-        label_names=names,
-        core=core,
-        low=low,
+        standing_body(rig, pose), f"human-{pose}", config, labels=labels, label_names=names, core=core, low=low
     )
     return replace(made, pose=pose, source=SOURCE, licence=LICENCE)

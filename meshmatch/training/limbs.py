@@ -93,9 +93,7 @@ def draw_limbs(draw: Draw, arm: torch.Tensor, family: torch.Tensor) -> Limbs:
         draw.uniform(-50, 110), draw.normal(5, 20), draw.normal(85, 28), draw.uniform(-30, 110),
         draw.uniform(-50, 130), draw.normal(75, 28), draw.normal(80, 22),
     ])[arm, at].clamp(-60, 135)  # fmt: skip
-    any_elbow = draw.choice(
-        [0.45, 0.4, 0.15], [draw.normal(10, 14).abs(), draw.uniform(0, 145), draw.normal(90, 25)]
-    )
+    any_elbow = draw.choice([0.45, 0.4, 0.15], [draw.normal(10, 14).abs(), draw.uniform(0, 145), draw.normal(90, 25)])
     elbow = torch.stack([any_elbow] * FOLDED + [draw.normal(95, 26), draw.normal(130, 14)])[arm, at]
     # A positive twist turns the forearm inwards. An arm that is raised turns outwards in its socket, or palms would
     # face away from each other overhead.
@@ -149,7 +147,5 @@ _LEG_FIELDS = ("hip_flexion", "hip_abduction", "hip_twist", "knee", "ankle")
 
 def with_legs(arms: Limbs, legs: Limbs) -> Limbs:
     """The arms of one draw with the legs of another."""
-    values = {
-        name: getattr(legs if name in _LEG_FIELDS else arms, name) for name in arms.__dataclass_fields__
-    }
+    values = {name: getattr(legs if name in _LEG_FIELDS else arms, name) for name in arms.__dataclass_fields__}
     return Limbs(**values)

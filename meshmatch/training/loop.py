@@ -104,11 +104,7 @@ class Trainer:
         self.points = points.to(self.device)
         self.average = {n: p.detach().clone() for n, p in model.named_parameters()}
         self.optimiser = torch.optim.AdamW(
-            model.parameters(),
-            lr=config.rate,
-            betas=(0.9, 0.99),
-            weight_decay=config.weight_decay,
-            fused=True,
+            model.parameters(), lr=config.rate, betas=(0.9, 0.99), weight_decay=config.weight_decay, fused=True
         )
         self.step = 0
         self.seconds = 0.0

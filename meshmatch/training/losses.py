@@ -89,9 +89,7 @@ class CorrespondenceLoss(Objective):
     align: float = 0.3
     robust: bool = False
 
-    def __call__(
-        self, model: Deformer, batch: Batch, points: LossPoints, generator: torch.Generator
-    ) -> Terms:
+    def __call__(self, model: Deformer, batch: Batch, points: LossPoints, generator: torch.Generator) -> Terms:
         code = model.encoder(batch.encode_features)
         rows = model.decoder(code)
         moved = points.moved(rows)

@@ -79,9 +79,7 @@ class GivenPoses:
         vectors = vectors.astype(np.float32)
         if not np.isfinite(vectors).all():
             pose, joint, _ = np.argwhere(~np.isfinite(vectors))[0]
-            raise InputError(
-                f"pose {pose} has a rotation of {self.joints[joint][:80]!r} that is not a number", _HINT
-            )
+            raise InputError(f"pose {pose} has a rotation of {self.joints[joint][:80]!r} that is not a number", _HINT)
         angle = np.linalg.norm(vectors, axis=2)
         if angle.max() > 2 * math.pi + 1e-3:
             pose, joint = np.unravel_index(int(angle.argmax()), angle.shape)
@@ -153,9 +151,7 @@ def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
         raise InputError(f"there is no file {path}", _HINT)
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise InputError(
-                f"{path.name}: it is larger than {MAX_BYTES // 10**6} MB", "split it, or keep fewer poses"
-            )
+            raise InputError(f"{path.name}: it is larger than {MAX_BYTES // 10**6} MB", "split it, or keep fewer poses")
         joints, vectors = read(path)
     except _DAMAGE as error:
         raise InputError(f"{path.name} is not a file of poses: {error}", _HINT) from error

@@ -18,11 +18,7 @@ from meshmatch.training.skeleton import forward_kinematics, penetration
 
 
 def sample_free_pose(
-    rig: Rig,
-    heads: Float[torch.Tensor, "B J 3"],
-    generator: torch.Generator,
-    tries: int = 8,
-    tolerance: float = 0.02,
+    rig: Rig, heads: Float[torch.Tensor, "B J 3"], generator: torch.Generator, tries: int = 8, tolerance: float = 0.02
 ) -> tuple[Float[torch.Tensor, "B J 3 3"], Float[torch.Tensor, "B J 3"]]:
     """Of several drawn poses keep the first that is free of self-intersection, else the best.
 
@@ -60,13 +56,7 @@ def sample_pose(
     flex = draw.choice([0.6, 0.25, 0.15], [draw.normal(4, 10), draw.uniform(-30, 75), draw.normal(35, 20)])
     spine = torch.stack([flex, draw.normal(0, 20), draw.normal(0, 14)], -1) * DEGREE
     spine = spine * (0.6 + 0.8 * torch.rand(B, 1, generator=generator))
-    for name, share in (
-        ("spine05", 0.15),
-        ("spine04", 0.25),
-        ("spine03", 0.2),
-        ("spine02", 0.2),
-        ("spine01", 0.2),
-    ):
+    for name, share in (("spine05", 0.15), ("spine04", 0.25), ("spine03", 0.2), ("spine02", 0.2), ("spine01", 0.2)):
         vectors[:, joint(name)] = spine * share + draw.normal3(2)
     neck = torch.stack([draw.normal(2, 18), draw.normal(0, 28), draw.normal(0, 14)], -1) * DEGREE
     for name, share in (("neck01", 0.3), ("neck02", 0.2), ("neck03", 0.2), ("head", 0.3)):
@@ -119,12 +109,7 @@ def _pose_arm(vectors, extra, rig, heads, side, suffix, limbs, draw) -> None:
     rest_arm, rest_fore = unit(elbow - upper), unit(wrist - elbow)
     elevation, azimuth = limbs.arm_elevation * DEGREE, limbs.arm_azimuth * DEGREE
     target = torch.stack(
-        [
-            side * elevation.sin() * azimuth.cos(),
-            -elevation.cos(),
-            elevation.sin() * azimuth.sin(),
-        ],
-        -1,
+        [side * elevation.sin() * azimuth.cos(), -elevation.cos(), elevation.sin() * azimuth.sin()], -1
     )
     swing = rotation_between(rest_arm, target)
     # The shoulder girdle takes part of every elevation.
@@ -149,13 +134,9 @@ def _pose_leg(vectors, extra, rig, heads, side, suffix, limbs, draw) -> None:
     hip, knee, ankle = (heads[:, joint(name + suffix)] for name in ("upperleg01", "lowerleg01", "foot"))
     rest_thigh, rest_shin = unit(knee - hip), unit(ankle - knee)
     flexion, spread = limbs.hip_flexion * DEGREE, limbs.hip_abduction * DEGREE
-    target = torch.stack(
-        [side * spread.sin(), -spread.cos() * flexion.cos(), spread.cos() * flexion.sin()], -1
-    )
+    target = torch.stack([side * spread.sin(), -spread.cos() * flexion.cos(), spread.cos() * flexion.sin()], -1)
     # Flex first, then spread: a plain smallest rotation would roll the knee outwards.
-    flex = rotation_from_vector(
-        torch.stack([-flexion, torch.zeros_like(flexion), torch.zeros_like(flexion)], -1)
-    )
+    flex = rotation_from_vector(torch.stack([-flexion, torch.zeros_like(flexion), torch.zeros_like(flexion)], -1))
     flexed = (flex @ rest_thigh[..., None])[..., 0]
     twist = -side * limbs.hip_twist[:, None] * DEGREE * rest_thigh
     extra[joint("upperleg01" + suffix)] = (

@@ -54,9 +54,7 @@ class Recipe:
             loss = replace(loss, blend=wanted.pop("blend"))
         known = {each.name for each in fields(TrainConfig)}
         if unknown := sorted(wanted.keys() - known):
-            raise OptionError(
-                f"unknown training setting {unknown[0]!r}", f"choose from {', '.join(sorted(known))}"
-            )
+            raise OptionError(f"unknown training setting {unknown[0]!r}", f"choose from {', '.join(sorted(known))}")
         return replace(self, network=network, train=replace(self.train, **({"loss": loss} | wanted)))
 
 
@@ -80,9 +78,7 @@ def paper() -> Recipe:
 def small_data() -> Recipe:
     """For fewer than a hundred registered shapes: a small network that finds no orientation; measured on
     hearts and animals (docs/categories.md)."""
-    network = NetworkConfig(
-        code=128, width=256, depth=1, basis=384, align_basis=0, corrections=2, correct_width=256
-    )
+    network = NetworkConfig(code=128, width=256, depth=1, basis=384, align_basis=0, corrections=2, correct_width=256)
     loss = CorrespondenceLoss(volume=1e-3, arap=1e-3, blend=1e-3, robust=True)
     train = TrainConfig(
         steps=3000, shapes=8, scans_per_shape=1, decay=0.5, warm_up=100, average=0.99, loss=loss, workers=0
@@ -100,16 +96,12 @@ def clouds() -> Recipe:
 def paper_clouds() -> Recipe:
     """The paper's network and weights for shapes without correspondence."""
     loss = ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4)
-    train = TrainConfig(
-        steps=4000, shapes=8, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=loss, workers=0
-    )
+    train = TrainConfig(steps=4000, shapes=8, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=loss, workers=0)
     scan = ScanConfig(points=1024, noise=0.0, scale=0.0)
     return Recipe(PAPER, train, scan, "cubic", storage="float16")
 
 
-def recipe_for(
-    shapes: str | Path | None = None, preset: Preset = "default", unsupervised: bool = False
-) -> Recipe:
+def recipe_for(shapes: str | Path | None = None, preset: Preset = "default", unsupervised: bool = False) -> Recipe:
     """How a folder that `meshmatch prepare` made is learned, or generated bodies where there is none.
 
     With correspondence where all shapes are registered, unless ``unsupervised``; by the recipe for small data where

@@ -65,12 +65,7 @@ class Rig:
     def restricted(self, keep: Int[Ints, " K"], faces: Int[Ints, "F 3"]) -> Rig:
         """The same bodies on some of the vertices, joined by other triangles of these."""
         chosen = torch.from_numpy(keep)
-        return replace(
-            self,
-            rest=self.rest[:, chosen],
-            weights=self.weights[chosen],
-            faces=torch.from_numpy(faces),
-        )
+        return replace(self, rest=self.rest[:, chosen], weights=self.weights[chosen], faces=torch.from_numpy(faces))
 
 
 def _sample_phenotypes(B: int, rng: np.random.Generator) -> dict[str, torch.Tensor]:
@@ -123,9 +118,7 @@ def build_rig(identities: int = 4096, seed: int = 0, progress: Progress | None =
             warnings.simplefilter("ignore")
             import anny
     except ImportError as error:
-        raise OptionError(
-            "generated human bodies need the package anny", "pip install 'meshmatch[train]'"
-        ) from error
+        raise OptionError("generated human bodies need the package anny", "pip install 'meshmatch[train]'") from error
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model = anny.Anny(topology="notoes", phenotypes="all", local_changes="all", skinning_method="lbs")

@@ -21,9 +21,7 @@ def rotation_from_vector(vector: Float[torch.Tensor, "*B 3"]) -> Float[torch.Ten
     return torch.eye(3).to(vector) + sine * cross + (1 - cosine) * (cross @ cross)
 
 
-def rotation_between(
-    a: Float[torch.Tensor, "*B 3"], b: Float[torch.Tensor, "*B 3"]
-) -> Float[torch.Tensor, "*B 3"]:
+def rotation_between(a: Float[torch.Tensor, "*B 3"], b: Float[torch.Tensor, "*B 3"]) -> Float[torch.Tensor, "*B 3"]:
     """Smallest rotation that takes unit vectors a to b, as rotation vectors."""
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)

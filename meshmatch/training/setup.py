@@ -26,9 +26,7 @@ from meshmatch.training.losses import LossPoints
 from meshmatch.training.scans import ScanConfig
 
 
-def fill_basis(
-    points: Float[torch.Tensor, "B P 3"], M: int, generator: torch.Generator
-) -> Float[torch.Tensor, "M 3"]:
+def fill_basis(points: Float[torch.Tensor, "B P 3"], M: int, generator: torch.Generator) -> Float[torch.Tensor, "M 3"]:
     """Basis points spread where shapes of the category are: farthest points of jittered samples."""
     flat = points.flatten(0, 1)
     flat = flat[torch.randperm(len(flat), generator=generator)[:20_000]]

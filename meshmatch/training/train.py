@@ -243,9 +243,7 @@ def _begin(model: Deformer, template: Template, recipe: Recipe, facts: CardFacts
     model.load_state_dict(start.network.state_dict())
 
 
-def export(
-    trainer: Trainer, template: Template, output: Path, recipe: Recipe, facts: CardFacts, score: float
-) -> None:
+def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, facts: CardFacts, score: float) -> None:
     """Write the averaged weights as a model folder, with the validation error ``score``; the card comes last."""
     (output / CARD).unlink(missing_ok=True)
     save_template(template, output / TEMPLATE)
@@ -253,11 +251,7 @@ def export(
     settings: dict[str, Any] = {"train": asdict(recipe.train), "scan": asdict(recipe.scan)}
     if isinstance(facts.start, TrainedModel):
         begun = facts.start.card
-        settings["start"] = {
-            "model": begun.name,
-            "weights_sha256": begun.weights_sha256,
-            "steps": begun.steps,
-        }
+        settings["start"] = {"model": begun.name, "weights_sha256": begun.weights_sha256, "steps": begun.steps}
     frame: dict[str, Any] = {} if facts.frame is None else {"frame": facts.frame}
     card = ModelCard(
         name=facts.name,

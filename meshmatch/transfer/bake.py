@@ -122,9 +122,7 @@ def bake(
     def first(at: Ints) -> None:
         face = on[at]
         row, column = np.divmod(at, size)
-        weights, place, held = locator.locate(
-            face, (column + 0.5).astype(np.float32), (row + 0.5).astype(np.float32)
-        )
+        weights, place, held = locator.locate(face, (column + 0.5).astype(np.float32), (row + 0.5).astype(np.float32))
         low[at] = locator.confidence(face, weights) < options.min_confidence
         footprint = sampler.footprint(place, locator.reach.take(face))
         _store(pixels, at, sampler.colors(place, held, footprint))
@@ -151,10 +149,7 @@ def bake(
 
     done = 0.0
     with ThreadPoolExecutor(options.workers) as pool:
-        for work, share, which in (
-            (first, 0.5, lambda: texels),
-            (again, 0.45, lambda: _several(chart, coarse, size)),
-        ):
+        for work, share, which in ((first, 0.5, lambda: texels), (again, 0.45, lambda: _several(chart, coarse, size))):
             if work is again and options.samples == 1:
                 break
             chosen = which()

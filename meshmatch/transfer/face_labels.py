@@ -57,9 +57,7 @@ def pull_face_labels(
 def _around_corners(back: VertexMap, source: Shape, target: Shape, labels: Ints, on_faces: bool) -> csr_array:
     """(F_target, labels): whatever occurs around the places of a face's corners, however small its weight."""
     at = corners_of(source.faces, back.face, back.index)
-    touched = csr_array(
-        (np.ones(at.size), (np.repeat(np.arange(len(at)), 3), at.ravel())), (len(at), source.V)
-    )
+    touched = csr_array((np.ones(at.size), (np.repeat(np.arange(len(at)), 3), at.ravel())), (len(at), source.V))
     occurring = one_hot(labels)
     if on_faces:
         occurring = csr_array(faces_at_vertices(source, np.ones(source.F)) @ occurring)
@@ -88,8 +86,7 @@ def _sampled_votes(
     corners = target.faces[faces]
     normals = back.apply(known_normals(source))
     points, facing = (
-        np.einsum("pk,nkd->npd", spread, values[corners]).reshape(-1, 3)
-        for values in (back.points(source), normals)
+        np.einsum("pk,nkd->npd", spread, values[corners]).reshape(-1, 3) for values in (back.points(source), normals)
     )
     found = MappedMesh.of(source).query(points, facing, workers)
     voter = np.repeat(np.arange(len(faces)), len(spread))

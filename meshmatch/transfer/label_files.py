@@ -81,9 +81,7 @@ class Labels:
         try:
             return int(text)
         except ValueError:
-            raise OptionError(
-                f"--blank {text}: labels are whole numbers here", "such as --blank -1"
-            ) from None
+            raise OptionError(f"--blank {text}: labels are whole numbers here", "such as --blank -1") from None
 
 
 def named(codes: Ints, given: Labels, on: On, blank: str | None) -> Labels:
@@ -272,9 +270,7 @@ def save_labels(path: Path, labels: Labels, shape: Shape) -> None:
 
 def _check_range(path: Path, labels: Labels, bits: int) -> None:
     if any(not -(2 ** (bits - 1)) <= int(name) < 2 ** (bits - 1) for name in labels.names):
-        raise OptionError(
-            f"{path.name}: this format holds labels of at most {bits} bits", "choose .csv or .json"
-        )
+        raise OptionError(f"{path.name}: this format holds labels of at most {bits} bits", "choose .csv or .json")
 
 
 def _write_ply(path: Path, labels: Labels, shape: Shape) -> None:

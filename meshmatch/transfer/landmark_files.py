@@ -143,10 +143,7 @@ def _read_json(path: Path) -> list[_Entry]:
         return [_named(name, value, k) for k, (name, value) in enumerate(record.items())]
     if not isinstance(record, list):
         raise InputError("it holds no list of landmarks")
-    return [
-        _entry(item, k) if isinstance(item, dict) else _named(str(k), item, k)
-        for k, item in enumerate(record)
-    ]
+    return [_entry(item, k) if isinstance(item, dict) else _named(str(k), item, k) for k, item in enumerate(record)]
 
 
 def _named(name: str, value: Any, number: int) -> _Entry:
@@ -195,10 +192,7 @@ def _read_pp(path: Path) -> list[_Entry]:
     for point in root.iter("point"):
         if point.get("active", "1") == "0":
             continue  # a name of a template that nobody has placed
-        record = {
-            "name": point.get("name"),
-            "position": [float(point.get(axis, "nan")) for axis in "xyz"],
-        }
+        record = {"name": point.get("name"), "position": [float(point.get(axis, "nan")) for axis in "xyz"]}
         entries.append(_entry(record, len(entries)))
     return entries
 
@@ -219,17 +213,11 @@ def save_landmarks(path: Path, landmarks: Landmarks) -> None:
     suffix = check_landmarks_suffix(path)
     columns = (landmarks.vertex, landmarks.points, landmarks.face, landmarks.barycentric)
     rows = list(
-        zip(
-            landmarks.names,
-            *(column.tolist() for column in columns),
-            short_floats(landmarks.confidence),
-            strict=True,
-        )
+        zip(landmarks.names, *(column.tolist() for column in columns), short_floats(landmarks.confidence), strict=True)
     )
     if suffix == ".csv":
         cells = (
-            [name, vertex, *xyz, face, *weights, confidence]
-            for name, vertex, xyz, face, weights, confidence in rows
+            [name, vertex, *xyz, face, *weights, confidence] for name, vertex, xyz, face, weights, confidence in rows
         )
         write_rows(path, COLUMNS, cells)
         return

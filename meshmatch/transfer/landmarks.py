@@ -122,8 +122,7 @@ def at_faces(
     bad = np.flatnonzero((face < 0) | (face >= shape.F))
     if len(bad):
         raise InputError(
-            f"landmark {names[bad[0]]} is in face {face[bad[0]]}, but {shape.name or 'the source'} has "
-            f"{shape.F} faces",
+            f"landmark {names[bad[0]]} is in face {face[bad[0]]}, but {shape.name or 'the source'} has {shape.F} faces",
             "faces are counted from 0; are they landmarks of the source?",
         )
     bad = np.flatnonzero(~((weights >= -1e-9).all(axis=1) & (np.abs(weights.sum(axis=1) - 1.0) < 1e-4)))

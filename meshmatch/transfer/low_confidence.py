@@ -68,9 +68,7 @@ def _graph(points: Floats, pairs: Ints) -> csr_array:
     # A length of 0 would be no edge at all.
     length = np.maximum(length, max(1e-3 * float(np.median(length)), 1e-30) if len(length) else 1.0)
     both = np.concatenate([pairs, pairs[:, ::-1]])
-    return csr_array(
-        coo_array((np.tile(length, 2), (both[:, 0], both[:, 1])), shape=(len(points), len(points)))
-    )
+    return csr_array(coo_array((np.tile(length, 2), (both[:, 0], both[:, 1])), shape=(len(points), len(points))))
 
 
 def nearest_known(graph: csr_array, known: Bools) -> Ints:
@@ -82,10 +80,7 @@ def nearest_known(graph: csr_array, known: Bools) -> Ints:
     if not known[some].any():
         return nearest
     distance, _, first = dijkstra(
-        csr_array(graph[some][:, some]),
-        indices=np.flatnonzero(known[some]),
-        min_only=True,
-        return_predecessors=True,
+        csr_array(graph[some][:, some]), indices=np.flatnonzero(known[some]), min_only=True, return_predecessors=True
     )
     reached = np.isfinite(distance)
     nearest[some[reached]] = some[first[reached]]

@@ -136,9 +136,7 @@ class MappedMesh:
         weights[face < 0] = (1.0, 0.0, 0.0)
         return MappedFootpoints(vertex, face, weights, distance, confidence)
 
-    def _search(
-        self, points: Floats, normals: Floats, workers: int, near: Floats | None = None
-    ) -> tuple[Ints, Floats]:
+    def _search(self, points: Floats, normals: Floats, workers: int, near: Floats | None = None) -> tuple[Ints, Floats]:
         """The best item of each point, a triangle or a lone vertex, and the weights of its corners.
 
         Centers come nearest first, so that a search ends where no further item can be better. That is exact
@@ -206,9 +204,7 @@ class MappedMesh:
         return np.maximum(-cosine, 0.0)
 
 
-def discontinuous_faces(
-    source_to_target: VertexMap, source: Shape, target: Shape
-) -> Bool[Bools, " F_source"]:
+def discontinuous_faces(source_to_target: VertexMap, source: Shape, target: Shape) -> Bool[Bools, " F_source"]:
     """True for a face whose image on the target is far longer than the face itself.
 
     A map to vertices alone moves each point by up to an edge of the target, which is allowed for.
@@ -247,7 +243,5 @@ def known_normals(shape: Shape) -> Float[Floats, "V 3"]:
 def normals_at(found: VertexMap, target: Shape) -> Float[Floats, "V_source 3"]:
     """The target's unit normals at the matched points; zeros on a cloud."""
     return unit(
-        interpolate(
-            known_normals(target), corners_of(target.faces, found.face, found.index), found.barycentric
-        )
+        interpolate(known_normals(target), corners_of(target.faces, found.face, found.index), found.barycentric)
     )

@@ -83,9 +83,7 @@ class MaterialSampler:
             out[:, rows] = self._of_one(number, face[rows], weights[:, rows], footprint[rows])
         return out
 
-    def _of_one(
-        self, number: int, face: NDArray[np.integer], weights: Floats32, footprint: Floats32
-    ) -> Floats32:
+    def _of_one(self, number: int, face: NDArray[np.integer], weights: Floats32, footprint: Floats32) -> Floats32:
         made, pyramid = self.materials[number], self._pyramids[number]
         out = np.ones((4, len(face)), np.float32)
         if pyramid is not None:
@@ -133,10 +131,7 @@ def known_texels(material: Material, uv: Floats) -> Bools | None:
     uv = uv - np.floor(uv.min(axis=1, keepdims=True) / 2.0) * 2.0 if "clamp" not in material.wrap else uv
     corners = uv * np.array([width, height])
     size = corners.max(axis=1) - corners.min(axis=1) + 1.0
-    if (
-        np.prod(size, axis=1).sum() > 16.0 * width * height + 64.0 * len(uv)
-        or rows_of(corners).sum() > MOST_ROWS
-    ):
+    if np.prod(size, axis=1).sum() > 16.0 * width * height + 64.0 * len(uv) or rows_of(corners).sum() > MOST_ROWS:
         return None
     known = np.zeros((height, width), bool)
     found = spans(corners)
@@ -157,9 +152,7 @@ def _texels_at(points: Floats, material: Material, shape: tuple[int, ...]) -> tu
     return wrapped(row, shape[0], material.wrap[1]), wrapped(column, shape[1], material.wrap[0])
 
 
-def _densities(
-    walker: SurfaceWalker, materials: tuple[Material, ...], material: Ints, uv: Floats
-) -> Floats32:
+def _densities(walker: SurfaceWalker, materials: tuple[Material, ...], material: Ints, uv: Floats) -> Floats32:
     """(F,) texels of its image that lie along a unit of length on each face.
 
     As an area has them, or half of what the densest direction has if that is more. Without an image a face counts
@@ -192,10 +185,7 @@ def _charts(walker: SurfaceWalker, look: Appearance, pictured: Bools) -> Ints32:
     joined = []
     for k in range(3):
         face = np.flatnonzero(walker.opposite[:, k] >= 0)
-        other, edge = (
-            walker.opposite[face, k].astype(np.int64),
-            walker.opposite_edge[face, k].astype(np.int64),
-        )
+        other, edge = (walker.opposite[face, k].astype(np.int64), walker.opposite_edge[face, k].astype(np.int64))
         rows = np.arange(len(face))
         ends, theirs = ((k + 1) % 3, (k + 2) % 3), ((edge + 1) % 3, (edge + 2) % 3)
         # the other face runs along the edge the other way round, unless it is turned over

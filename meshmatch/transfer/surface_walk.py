@@ -13,13 +13,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.topology import same_rows
-from meshmatch.geometry.triangles import (
-    blend,
-    closest_on_triangles,
-    interpolate,
-    squared_lengths,
-    triangle_areas,
-)
+from meshmatch.geometry.triangles import blend, closest_on_triangles, interpolate, squared_lengths, triangle_areas
 from meshmatch.shapes.shape import Shape
 
 _INSIDE = np.float32(-1e-5)
@@ -191,9 +185,7 @@ def duals(first: Floats, second: Floats) -> tuple[Floats, Floats]:
     determinant = a * c - b * b
     flat = determinant <= 1e-14 * a * c
     share = np.where(flat, 0.0, 1.0 / np.where(flat, 1.0, determinant))[:, None]
-    return share * (c[:, None] * first - b[:, None] * second), share * (
-        a[:, None] * second - b[:, None] * first
-    )
+    return share * (c[:, None] * first - b[:, None] * second), share * (a[:, None] * second - b[:, None] * first)
 
 
 def _a_face_of_each_vertex(faces: Ints, V: int) -> Ints:

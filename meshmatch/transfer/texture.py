@@ -42,15 +42,12 @@ def check_bake_options(options: BakeOptions) -> None:
     if options.fill and options.blank is not None:
         raise OptionError("fill and blank contradict each other", "choose one of them")
     if not 16 <= options.size <= LARGEST:
-        raise OptionError(
-            f"a texture has 16 to {LARGEST} texels a side, not {options.size}", "1024 or 2048 suit most"
-        )
+        raise OptionError(f"a texture has 16 to {LARGEST} texels a side, not {options.size}", "1024 or 2048 suit most")
     if not 1 <= options.samples <= 8:
         raise OptionError(f"a texel takes 1 to 8 samples each way, not {options.samples}", "2 or 3 suit most")
     if not 0 <= options.padding <= options.size // 4:
         raise OptionError(
-            f"padding of {options.padding} texels does not go with {options.size}",
-            f"choose 0 to {options.size // 4}",
+            f"padding of {options.padding} texels does not go with {options.size}", f"choose 0 to {options.size // 4}"
         )
 
 

@@ -18,14 +18,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
-from meshmatch.maps.table_files import (
-    check_numbered,
-    check_suffix,
-    read_by_suffix,
-    read_rows,
-    write_npy,
-    write_rows,
-)
+from meshmatch.maps.table_files import check_numbered, check_suffix, read_by_suffix, read_rows, write_npy, write_rows
 from meshmatch.shapes.array_files import read_npy
 from meshmatch.shapes.shape import Shape
 
@@ -55,9 +48,7 @@ def load_values(path: str | Path, shape: Shape) -> Values:
     found = read_by_suffix(path, readers, "values", _HINT)
     name, rows = Path(path).name, len(found.numbers)
     if rows != shape.V:
-        raise InputError(
-            f"{name} has {rows} rows, but {shape.name or 'the source'} has {shape.V} vertices", _HINT
-        )
+        raise InputError(f"{name} has {rows} rows, but {shape.name or 'the source'} has {shape.V} vertices", _HINT)
     if found.numbers.size == 0:
         raise InputError(f"{name} has no columns", _HINT)
     return found

@@ -22,14 +22,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array, issparse
 
 from meshmatch.errors import InputError
-from meshmatch.maps.table_files import (
-    check_suffix,
-    read_by_suffix,
-    read_json,
-    short_floats,
-    write_json,
-    write_npz,
-)
+from meshmatch.maps.table_files import check_suffix, read_by_suffix, read_json, short_floats, write_json, write_npz
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.array_files import read_npz
 from meshmatch.shapes.shape import Shape
@@ -82,9 +75,7 @@ def weights_of(matrix: csr_array | ArrayLike, shape: Shape) -> SkinWeights:
     InputError
         Not numbers, not a row for each vertex, or negative.
     """
-    sparse = csr_array(
-        matrix if issparse(matrix) else _table("weights", matrix, np.float64), dtype=np.float64
-    )
+    sparse = csr_array(matrix if issparse(matrix) else _table("weights", matrix, np.float64), dtype=np.float64)
     names = tuple(str(joint) for joint in range(sparse.shape[1]))
     return _normalized("the array", SkinWeights(sparse, names), shape)
 
@@ -93,9 +84,7 @@ def _read_gltf(path: Path) -> SkinWeights:
     from meshmatch.shapes.formats.gltf_skin import read_skin
 
     skin = read_skin(path, path.read_bytes())
-    return SkinWeights(
-        csr_array((skin.weight, (skin.vertex, skin.joint)), (skin.V, len(skin.names))), skin.names
-    )
+    return SkinWeights(csr_array((skin.weight, (skin.vertex, skin.joint)), (skin.V, len(skin.names))), skin.names)
 
 
 def _from_record(record: Any) -> SkinWeights:
@@ -144,9 +133,7 @@ def _normalized(name: str, weights: SkinWeights, shape: Shape) -> SkinWeights:
         )
     matrix.sum_duplicates()
     if matrix.nnz and matrix.data.min() < 0:
-        raise InputError(
-            f"{name}: a weight is negative ({matrix.data.min():g})", "weights are shares from 0 to 1"
-        )
+        raise InputError(f"{name}: a weight is negative ({matrix.data.min():g})", "weights are shares from 0 to 1")
     total = np.asarray(matrix.sum(axis=1)).ravel()
     if not (total > 0).any():
         raise InputError(f"{name}: all weights are 0", "is it the right file?")

@@ -169,15 +169,7 @@ def test_landmarks_are_checked_before_the_shapes_are_fitted(
 
 @pytest.mark.parametrize(
     "wrong",
-    [
-        {"up": "w"},
-        {"front": ""},
-        {"up": 3},
-        {"up": "y", "front": "-y"},
-        {"seed": -1},
-        {"seed": 1.5},
-        {"samples": 0},
-    ],
+    [{"up": "w"}, {"front": ""}, {"up": 3}, {"up": "y", "front": "-y"}, {"seed": -1}, {"seed": 1.5}, {"samples": 0}],
 )
 def test_a_config_is_checked_when_it_is_made(wrong: dict[str, Any]) -> None:
     with pytest.raises(OptionError) as caught:

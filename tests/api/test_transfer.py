@@ -36,10 +36,7 @@ def test_a_map_at_hand_is_turned_round() -> None:
     assert np.array_equal(maps.forward.index, forward.index)
     assert np.allclose(maps.backward.points(coarse), back.points(coarse), atol=1e-12)
     assert meshmatch.find_maps(coarse, fine, maps) is maps
-    assert (
-        meshmatch.find_maps(coarse, fine, lambda source, target: MapPair(source, target, forward)).match
-        is None
-    )
+    assert meshmatch.find_maps(coarse, fine, lambda source, target: MapPair(source, target, forward)).match is None
 
 
 def test_shapes_and_map_may_be_files(tmp_path: Path) -> None:
@@ -97,9 +94,7 @@ def test_arrays_of_all_kinds(pair: tuple[Shape, Shape, VertexMap]) -> None:
     assert np.array_equal(labels.data.values, words)
     assert labels.low.low == 0
     weights = np.eye(3)[np.arange(V) % 3]
-    assert np.allclose(
-        meshmatch.transfer_weights(source, target, weights, found).data.matrix.toarray(), weights
-    )
+    assert np.allclose(meshmatch.transfer_weights(source, target, weights, found).data.matrix.toarray(), weights)
     points = meshmatch.transfer_landmarks(source, target, [3, 5], found).data
     assert np.allclose(points.points, target.verts[[3, 5]])
     places = meshmatch.transfer_landmarks(source, target, source.verts[[3, 5]], found).data

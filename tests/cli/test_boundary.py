@@ -31,13 +31,7 @@ def test_version(run: Run) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [
-        ["nonsense"],
-        ["match", "a.ply"],
-        ["match", "a.ply", "b.ply"],
-        ["info", "--nonsense", "a.ply"],
-        ["models", "x"],
-    ],
+    [["nonsense"], ["match", "a.ply"], ["match", "a.ply", "b.ply"], ["info", "--nonsense", "a.ply"], ["models", "x"]],
 )
 def test_a_wrong_command_line_is_2(run: Run, words: list[str]) -> None:
     answer = run(*words)

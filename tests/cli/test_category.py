@@ -40,12 +40,7 @@ def eggs(tmp_path: Path) -> Path:
 def test_prepare_says_what_it_chose(run: Run, eggs: Path, tmp_path: Path) -> None:
     answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1], "--json")
     record = json.loads(answer.out)
-    assert (record["registered"], record["align"], record["scale"], record["landmarks"]) == (
-        0,
-        "rigid",
-        "area",
-        0,
-    )
+    assert (record["registered"], record["align"], record["scale"], record["landmarks"]) == (0, "rigid", "area", 0)
     assert "which lies nearest to all others" in answer.err
     assert "3 shapes without correspondence" in answer.err
 
@@ -155,14 +150,8 @@ def test_known_points_and_preset_reach_the_training(
         (["prepare", "eggs", "-o", "out", "--template", "bad/same.npy"], "it has points in only 1 place"),
         (["prepare", "eggs", "-o", "out", "--template", "bad/line.npy"], "on no surface"),
         (["prepare", "bad", "-o", "out"], "no shape in bad could be used"),
-        (
-            ["prepare", "bad/three.npy", "-o", "out"],
-            "three.npy cannot be a template: it has points in only 3 places",
-        ),
-        (
-            ["prepare", "bad/same.npy", "-o", "out"],
-            "same.npy cannot be a template: it has points in only 1 place",
-        ),
+        (["prepare", "bad/three.npy", "-o", "out"], "three.npy cannot be a template: it has points in only 3 places"),
+        (["prepare", "bad/same.npy", "-o", "out"], "same.npy cannot be a template: it has points in only 1 place"),
         (["prepare", "bad/line.npy", "-o", "out"], "on no surface"),
         (["train", "-o", "mine", "--unsupervised"], "learning without correspondence needs a folder"),
         (["train", "-o", "mine", "--shapes", "alone"], "one shape is too few"),

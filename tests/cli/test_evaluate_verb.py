@@ -86,9 +86,7 @@ def test_threshold(run: Run, files: tuple[Path, ...], tmp_path: Path) -> None:
 
 
 def test_seed_chooses_the_pairs_of_the_distortion(run: Run, files: tuple[Path, ...]) -> None:
-    values = [
-        json.loads(run("evaluate", *files, "--seed", seed, "--json").out)["distortion"] for seed in "010"
-    ]
+    values = [json.loads(run("evaluate", *files, "--seed", seed, "--json").out)["distortion"] for seed in "010"]
     assert values[0] == values[2] != values[1]
 
 
@@ -120,12 +118,7 @@ def test_units_draw_different_curves(run: Run, files: tuple[Path, ...], tmp_path
     ],
 )
 def test_what_cannot_be_is_told(
-    run: Run,
-    files: tuple[Path, ...],
-    tmp_path: Path,
-    words: list[str],
-    told: str,
-    monkeypatch: pytest.MonkeyPatch,
+    run: Run, files: tuple[Path, ...], tmp_path: Path, words: list[str], told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("short.txt").write_text("0\n1\n2\n")
@@ -137,9 +130,7 @@ def test_what_cannot_be_is_told(
     assert told in answer.err or "not among the 642 vertices" in answer.err
 
 
-def test_a_map_of_other_shapes_is_refused(
-    run: Run, files: tuple[Path, ...], tmp_path: Path, torus: Shape
-) -> None:
+def test_a_map_of_other_shapes_is_refused(run: Run, files: tuple[Path, ...], tmp_path: Path, torus: Shape) -> None:
     save_shape(tmp_path / "t.ply", torus)
     answer = run("evaluate", files[0], tmp_path / "t.ply", files[2])
     assert answer.status == 1
@@ -185,19 +176,14 @@ def test_the_errors_as_heat_on_both_shapes(
     assert ("cm" if unit == "cm" else "sqrt(area)") in legends[0].title
 
 
-def test_a_picture_of_errors_needs_the_truth_and_a_place(
-    run: Run, files: tuple[Path, ...], tmp_path: Path
-) -> None:
+def test_a_picture_of_errors_needs_the_truth_and_a_place(run: Run, files: tuple[Path, ...], tmp_path: Path) -> None:
     truth = write_truth(tmp_path, "column")
     before = sorted(path.name for path in tmp_path.iterdir())
     for words, told in (
         (["--picture", tmp_path / "e.png"], "needs the truth"),
         ([*truth, "--picture", tmp_path / "e.jpg"], "is a PNG"),
         ([*truth, "--picture", tmp_path / "no" / "e.png"], "no folder"),
-        (
-            [*truth, "--picture", tmp_path / "e.png", "--curve", tmp_path / "e.png"],
-            "an output of this command",
-        ),
+        ([*truth, "--picture", tmp_path / "e.png", "--curve", tmp_path / "e.png"], "an output of this command"),
     ):
         answer = run("evaluate", *files, *words)
         assert answer.status == 1

@@ -66,19 +66,10 @@ def test_parts_holes_axis_and_unit(run: Run, tmp_path: Path, sphere: Shape) -> N
 
 @pytest.mark.parametrize(
     ("length", "unit"),
-    [
-        (1.75, "metres"),
-        (175, "centimetres"),
-        (1750, "millimetres"),
-        (69, "inches"),
-        (5.7, "feet"),
-        (12, None),
-    ],
+    [(1.75, "metres"), (175, "centimetres"), (1750, "millimetres"), (69, "inches"), (5.7, "feet"), (12, None)],
 )
 def test_unit_of_a_person(run: Run, tmp_path: Path, sphere: Shape, length: float, unit: str | None) -> None:
-    save_shape(
-        tmp_path / "a.ply", Shape(sphere.verts * [0.1 * length, 0.5 * length, 0.1 * length], sphere.faces)
-    )
+    save_shape(tmp_path / "a.ply", Shape(sphere.verts * [0.1 * length, 0.5 * length, 0.1 * length], sphere.faces))
     found = record(run, tmp_path / "a.ply")
     assert (found["longest_along"], found["unit_if_a_person"]) == ("y", unit)
 

@@ -147,12 +147,7 @@ def test_a_shape_and_itself(eggs: Path) -> None:
     ],
 )
 def test_bad_choices_write_nothing(
-    run: Run,
-    eggs: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    words: tuple[str | float, ...],
-    said: str,
+    run: Run, eggs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str | float, ...], said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     model = () if "--model" in words else ("--model", eggs / "model")
@@ -199,6 +194,4 @@ def test_the_samples(run: Run, tmp_path: Path) -> None:
     assert record["frames"][1]["volume"] < 0.03  # node vectors on straight lines: 0.21
     assert record["frames"][1]["arap"] < 0.07
     own = load_shape(dancer)
-    assert (
-        np.abs(load_shape(tmp_path / "out" / "frame-000.ply").verts - own.verts).max() < 1e-6 * own.diagonal
-    )
+    assert np.abs(load_shape(tmp_path / "out" / "frame-000.ply").verts - own.verts).max() < 1e-6 * own.diagonal

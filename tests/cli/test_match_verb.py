@@ -56,14 +56,7 @@ def test_match_defaults(run: Run, two: tuple[Path, Path], stub: FakeMatching) ->
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        ["--refine", "much"],
-        ["--up", "w"],
-        ["--front", "forward"],
-        ["--seed", "-1"],
-        ["--threads", "0"],
-    ],
+    "words", [["--refine", "much"], ["--up", "w"], ["--front", "forward"], ["--seed", "-1"], ["--threads", "0"]]
 )
 def test_match_refuses_values_that_do_not_exist(
     run: Run, two: tuple[Path, Path], stub: FakeMatching, words: list[str]
@@ -247,9 +240,7 @@ def test_files_of_one_name_are_told_apart(run: Run, two: tuple[Path, Path], stub
     assert (record["source"], record["target"]) == (str(two[0]), str(other))
 
 
-def test_a_real_ctrl_c_in_the_long_work(
-    run: Run, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_real_ctrl_c_in_the_long_work(run: Run, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     def slow(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)
         pytest.fail("the signal was swallowed")
@@ -317,9 +308,7 @@ def test_register_json(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> 
     assert record["output"] == str(two[0].with_name("fitted.ply"))
 
 
-def test_register_says_what_repair_did(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching, sphere: Shape
-) -> None:
+def test_register_says_what_repair_did(run: Run, two: tuple[Path, Path], stub: FakeMatching, sphere: Shape) -> None:
     faces = np.concatenate([sphere.faces, sphere.faces[:3]])
     save_shape(two[0], Shape(sphere.verts, faces))
     output = two[0].with_name("fitted.ply")
@@ -337,9 +326,7 @@ def test_register_in_full_resolution(
 ) -> None:
     """A translation of all nodes moves the dense template by as much, then out of the core frame."""
     nodes = sphere.verts[:42]
-    template = Template(
-        "ball", Shape(CORNERS, FACES), sphere, nodes, 1.2, np.zeros(4, int), ("all",), np.arange(4)
-    )
+    template = Template("ball", Shape(CORNERS, FACES), sphere, nodes, 1.2, np.zeros(4, int), ("all",), np.arange(4))
     moved = replace(fake_fit(sphere), template_hash=template.hash, vectors=np.tile([0.0, 0.0, 5.0], (42, 1)))
     stub.make_fit = lambda *_, **__: moved
     network = SimpleNamespace(config=SimpleNamespace(field="mls"))
@@ -349,15 +336,11 @@ def test_register_in_full_resolution(
     answer = run("register", two[0], "-o", output, "--dense", "--json")
     assert (answer.status, json.loads(answer.out)["vertices"]) == (0, 642)
     fitted = load_shape(output)
-    assert np.allclose(
-        fitted.verts, 2.0 * (sphere.verts + np.array([0, 0, 5])) + np.array([10, 0, 0]), atol=1e-5
-    )
+    assert np.allclose(fitted.verts, 2.0 * (sphere.verts + np.array([0, 0, 5])) + np.array([10, 0, 0]), atol=1e-5)
     assert np.array_equal(fitted.faces, sphere.faces)
 
 
-def test_full_resolution_needs_the_template_of_the_fit(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching
-) -> None:
+def test_full_resolution_needs_the_template_of_the_fit(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     answer = run("register", two[0], "-o", two[0].with_name("fitted.ply"), "--dense")
     assert answer.status == 1
     assert "another template" in answer.err

@@ -85,17 +85,13 @@ def test_an_output_that_is_a_link_keeps_the_link(tmp_path: Path) -> None:
 
 def test_a_file_that_is_write_protected_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.txt").write_text("mine")
-    monkeypatch.setattr(
-        os, "access", lambda path, mode: Path(path).name != "a.txt"
-    )  # root may write everywhere
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "a.txt")  # root may write everywhere
     with pytest.raises(OutputError, match="write-protected"), replace_on_success(tmp_path / "a.txt"):
         pass
     assert os.listdir(tmp_path) == ["a.txt"]
 
 
-@pytest.mark.parametrize(
-    ("name", "told"), [("loop.ply", "a link to a file"), ("pipe.ply", "not a regular file")]
-)
+@pytest.mark.parametrize(("name", "told"), [("loop.ply", "a link to a file"), ("pipe.ply", "not a regular file")])
 def test_inputs_that_are_no_files(run: Run, tmp_path: Path, name: str, told: str) -> None:
     (tmp_path / "loop.ply").symlink_to("loop.ply")
     os.mkfifo(tmp_path / "pipe.ply")  # nobody ever writes into it
@@ -107,9 +103,7 @@ def test_inputs_that_are_no_files(run: Run, tmp_path: Path, name: str, told: str
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
-@pytest.mark.parametrize(
-    "words", [["info", "a.ply"], ["info", "a.ply", "--json"], ["models", "show", "human"]]
-)
+@pytest.mark.parametrize("words", [["info", "a.ply"], ["info", "a.ply", "--json"], ["models", "show", "human"]])
 def test_a_full_disk_behind_stdout_is_told(tmp_path: Path, cube: Shape, words: list[str]) -> None:
     save_shape(tmp_path / "a.ply", cube)
     with open("/dev/full", "w") as full:

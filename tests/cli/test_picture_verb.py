@@ -131,10 +131,7 @@ def test_numbers_become_heat_on_one_scale(run: Run, two: tuple[Path, Path], draw
 def test_three_numbers_are_a_colour(run: Run, two: tuple[Path, Path], drawn: Drawn) -> None:
     colors = np.random.default_rng(0).random((V, 3))
     np.save(two[0].with_name("c.npy"), colors)
-    assert (
-        run("picture", two[0], "--values", two[0].with_name("c.npy"), "-o", two[0].with_name("o.png")).status
-        == 0
-    )
+    assert run("picture", two[0], "--values", two[0].with_name("c.npy"), "-o", two[0].with_name("o.png")).status == 0
     assert np.array_equal(drawn.panels[0].colors, colors)
     assert drawn.look.legend is None
 
@@ -178,9 +175,7 @@ def test_a_map_as_colours(run: Run, turned_map: tuple[Path, Path, Path], drawn: 
     assert answer.status == 0, answer.err
     assert "matched places in one colour" in answer.err
     one, other = drawn.panels
-    assert np.asarray(other.colors)[np.load(a.with_name("truth.npy"))] == pytest.approx(
-        np.asarray(one.colors)
-    )
+    assert np.asarray(other.colors)[np.load(a.with_name("truth.npy"))] == pytest.approx(np.asarray(one.colors))
     assert [one.label, other.label] == ["a.ply", "c.ply"]
 
 
@@ -216,9 +211,7 @@ def test_a_registered_mesh_over_its_shape(run: Run, two: tuple[Path, Path], draw
     shape = load_shape(two[0])
     over = two[0].with_name("fitted.ply")
     save_shape(over, Shape(1.5 * shape.verts, shape.faces))
-    answer = run(
-        "picture", two[0], "--fit", over, "-o", two[0].with_name("o.png"), "--json", "--range", "0", "1"
-    )
+    answer = run("picture", two[0], "--fit", over, "-o", two[0].with_name("o.png"), "--json", "--range", "0", "1")
     assert answer.status == 0, answer.err
     assert json.loads(answer.out)["distance_mean"] == pytest.approx(0.5, abs=0.01)
     assert drawn.panels[0].over is not None
@@ -246,16 +239,9 @@ def test_a_model_is_fitted_to_the_shape_first(
 
 @pytest.mark.parametrize(
     "what",
-    [
-        "human-T",
-        "human",
-        bundled_folder() / "human" / "human-A.safetensors",
-        bundled_folder() / "models" / "human",
-    ],
+    ["human-T", "human", bundled_folder() / "human" / "human-A.safetensors", bundled_folder() / "models" / "human"],
 )
-def test_templates_and_models_show_their_nodes(
-    run: Run, two: tuple[Path, Path], drawn: Drawn, what: object
-) -> None:
+def test_templates_and_models_show_their_nodes(run: Run, two: tuple[Path, Path], drawn: Drawn, what: object) -> None:
     answer = run("picture", what, "-o", two[0].with_name("o.png"))
     assert answer.status == 0, answer.err
     (panel,) = drawn.panels
@@ -297,10 +283,7 @@ def test_another_image(run: Run, tmp_path: Path) -> None:
     (tmp_path / "other.png").write_bytes(encoded(quarters(8)))
     out = tmp_path / "o.png"
     words = ("--view", "front", "--up", "y", "--front", "z", "--no-names", *SMALL)
-    assert (
-        run("picture", tmp_path / "square.obj", "--image", tmp_path / "other.png", "-o", out, *words).status
-        == 0
-    )
+    assert run("picture", tmp_path / "square.obj", "--image", tmp_path / "other.png", "-o", out, *words).status == 0
     with Image.open(out) as image:
         picture = np.asarray(image, dtype=int)
     red, green, blue, white = picture[24, 32], picture[24, 64], picture[56, 32], picture[56, 64]
@@ -413,9 +396,7 @@ def test_words_that_are_none_are_usage(run: Run, files: Path, words: list[str]) 
     assert not (files / "o.png").exists()
 
 
-def test_a_picture_that_fails_leaves_what_was_there(
-    run: Run, files: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_picture_that_fails_leaves_what_was_there(run: Run, files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = files / "o.png"
     out.write_bytes(b"before")
 
@@ -446,10 +427,7 @@ def test_an_unknown_value_is_grey(run: Run, two: tuple[Path, Path], drawn: Drawn
     values = np.arange(float(V))
     values[5] = np.nan
     np.save(two[0].with_name("v.npy"), values)
-    assert (
-        run("picture", two[0], "--values", two[0].with_name("v.npy"), "-o", two[0].with_name("o.png")).status
-        == 0
-    )
+    assert run("picture", two[0], "--values", two[0].with_name("v.npy"), "-o", two[0].with_name("o.png")).status == 0
     assert tuple(np.asarray(drawn.panels[0].colors)[5]) == UNKNOWN
     scale = drawn.look.legend
     assert isinstance(scale, Scale)

@@ -64,11 +64,7 @@ def test_too_few_and_too_many_nodes_are_refused(run: Run, folder: Path, tmp_path
 
 @pytest.mark.parametrize("strategy", ["spectral", "geodesic", "uniform"])
 def test_one_shape_becomes_a_template(
-    run: Run,
-    two: tuple[Path, Path],
-    tmp_path: Path,
-    strategy: str,
-    pictures: list[tuple[Sequence[Panel], Path]],
+    run: Run, two: tuple[Path, Path], tmp_path: Path, strategy: str, pictures: list[tuple[Sequence[Panel], Path]]
 ) -> None:
     record = made(run("prepare", two[0], "-o", tmp_path / "out", "--strategy", strategy, *FEW, "--json"))
     template = load_template(tmp_path / "out" / "template.safetensors")
@@ -80,18 +76,14 @@ def test_one_shape_becomes_a_template(
     assert np.array_equal(panel.points, template.nodes)
 
 
-def test_the_nodes_are_drawn(
-    run: Run, two: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_nodes_are_drawn(run: Run, two: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     made(run("prepare", two[0], "-o", tmp_path / "out", *FEW, "--json"))
     with Image.open(tmp_path / "out" / "nodes.png") as drawn:
         assert min(drawn.size) > 100
 
 
-def test_parts_need_labels_and_use_them(
-    run: Run, two: tuple[Path, Path], sphere: Shape, tmp_path: Path
-) -> None:
+def test_parts_need_labels_and_use_them(run: Run, two: tuple[Path, Path], sphere: Shape, tmp_path: Path) -> None:
     np.save(tmp_path / "labels.npy", (sphere.verts[:, 2] > 0).astype(int))
     words = ("prepare", two[0], "-o", tmp_path / "out", "--strategy", "parts", *FEW)
     assert run(*words).status == 1
@@ -139,9 +131,7 @@ def test_shapes_that_are_not_registered_are_prepared_all_the_same(
 def test_the_template_of_a_folder_can_be_chosen(run: Run, folder: Path, tmp_path: Path) -> None:
     hashes = [
         made(run("prepare", folder, "-o", tmp_path / f"out{n}", *FEW, "--json", *words))["template_hash"]
-        for n, words in enumerate(
-            [(), ("--template", folder / "egg0.ply"), ("--template", folder / "egg2.ply")]
-        )
+        for n, words in enumerate([(), ("--template", folder / "egg0.ply"), ("--template", folder / "egg2.ply")])
     ]
     assert hashes[0] == hashes[1] != hashes[2]
 
@@ -169,12 +159,7 @@ def test_options_of_the_nodes_reach_them(run: Run, two: tuple[Path, Path], tmp_p
     ],
 )
 def test_what_cannot_be_is_told(
-    run: Run,
-    two: tuple[Path, Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    words: list[str],
-    told: str,
+    run: Run, two: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], told: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("empty").mkdir()

@@ -31,13 +31,7 @@ class Recorder:
 
     def train_model(self, *given: Any) -> Path:
         template, source, output, recipe, facts, resume, report = given
-        told = {
-            "template": template.name,
-            "source": source,
-            "output": output,
-            "recipe": recipe,
-            "resume": resume,
-        }
+        told = {"template": template.name, "source": source, "output": output, "recipe": recipe, "resume": resume}
         self.called = told | vars(facts)
         report(StepReport(1, 2, 1e-3, 4.0, {"total": 0.5}))
         report(StepReport(2, 2, 1e-3, 8.0, {"total": 0.25}, 0.0321))
@@ -198,9 +192,7 @@ def test_what_cannot_be_is_told(
     assert stub.called == {}
 
 
-def test_the_losses_as_a_picture(
-    run: Run, stub: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_losses_as_a_picture(run: Run, stub: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from meshmatch.render import charts
 
     drawn: dict[str, Any] = {}
@@ -212,12 +204,7 @@ def test_the_losses_as_a_picture(
     picture = tmp_path / "mine" / "losses.png"  # in the folder that is made first
     answer = run("train", "-o", tmp_path / "mine", "--picture", picture, "--json")
     assert answer.status == 0, answer.err
-    assert drawn == {
-        "path": picture,
-        "steps": [1, 2],
-        "terms": {"total": [0.5, 0.25]},
-        "validation": {2: 0.0321},
-    }
+    assert drawn == {"path": picture, "steps": [1, 2], "terms": {"total": [0.5, 0.25]}, "validation": {2: 0.0321}}
     assert f"drew {picture}" in answer.err
     assert json.loads(answer.out)["picture"] == str(picture)
     drawn.clear()

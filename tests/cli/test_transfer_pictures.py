@@ -83,9 +83,7 @@ def test_labels_and_those_left_blank(run: Run, pair: Path, drawn: Drawn, to: str
     assert legend.names == ("0", "1", "none")
     here, there = drawn.panels
     assert here.sharp
-    assert np.asarray(here.colors)[load_shape("a.ply").verts[:, 2] > 0] == pytest.approx(
-        label_colors([1] * 73)
-    )
+    assert np.asarray(here.colors)[load_shape("a.ply").verts[:, 2] > 0] == pytest.approx(label_colors([1] * 73))
     found = np.asarray(there.colors if to == "vertices" else there.face_colors)
     labels = np.load("out.npy")
     assert (found[labels == 9] == UNKNOWN).all()

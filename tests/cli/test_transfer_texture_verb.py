@@ -53,9 +53,7 @@ def pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def call(
-    *more: str | Path, target: str = "b.ply", out: str = "out.glb", map: str | None = "ab.npz"
-) -> list[str]:
+def call(*more: str | Path, target: str = "b.ply", out: str = "out.glb", map: str | None = "ab.npz") -> list[str]:
     words = ["transfer-texture", "a.glb", target, "-o", out, *([] if map is None else ["--map", map])]
     return [*words, *SMALL, *map_str(more)]
 
@@ -135,10 +133,7 @@ def test_the_targets_own_coordinates_are_used_replaced_or_demanded(run: Run, pai
         assert json.loads(answer.out)["uv"] == "own"
         shape = load_shape("out.glb")
         np.testing.assert_allclose(load_appearance("out.glb", shape).uv, own, atol=1e-6)
-    assert (
-        json.loads(well(run(*call("--uv", "new", "--json", target="b.glb", map="ab2.npz"))).out)["uv"]
-        == "new"
-    )
+    assert json.loads(well(run(*call("--uv", "new", "--json", target="b.glb", map="ab2.npz"))).out)["uv"] == "new"
 
 
 def test_overlapping_coordinates_are_replaced_with_a_note(run: Run, pair: Path) -> None:
@@ -304,9 +299,7 @@ def wild_coordinates() -> None:
         (wild_coordinates, "texture coordinates of 1 faces are out of range"),
     ],
 )
-def test_sources_that_cannot_be_used(
-    run: Run, pair: Path, no_fit: None, spoil: Callable[[], None], words: str
-) -> None:
+def test_sources_that_cannot_be_used(run: Run, pair: Path, no_fit: None, spoil: Callable[[], None], words: str) -> None:
     spoil()
     before = {path.name for path in pair.iterdir()}
     refused(run(*call(map=None)), words, pair, before)
@@ -336,9 +329,7 @@ def test_a_missing_image_beside_an_obj(run: Run, pair: Path, no_fit: None) -> No
         (("--model", "nobody"), "nobody"),
     ],
 )
-def test_choices_that_cannot_be(
-    run: Run, pair: Path, no_fit: None, words: tuple[str, ...], what: str
-) -> None:
+def test_choices_that_cannot_be(run: Run, pair: Path, no_fit: None, words: tuple[str, ...], what: str) -> None:
     refused(run(*call(*words, map=None)), what, pair, {path.name for path in pair.iterdir()})
 
 
@@ -368,9 +359,7 @@ def test_the_companions_of_an_obj_replace_no_input(run: Run, pair: Path, no_fit:
 @pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
 def test_a_folder_that_may_not_be_written(run: Run, pair: Path, no_fit: None) -> None:
     (pair / "locked").mkdir(mode=0o500)
-    refused(
-        run(*call(out="locked/out.glb", map=None)), "cannot write", pair, {p.name for p in pair.iterdir()}
-    )
+    refused(run(*call(out="locked/out.glb", map=None)), "cannot write", pair, {p.name for p in pair.iterdir()})
 
 
 def test_a_companion_that_cannot_be_written_stops_all(run: Run, pair: Path, no_fit: None) -> None:

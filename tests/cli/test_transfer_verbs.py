@@ -110,9 +110,7 @@ def test_values_of_a_finer_copy(run: Run, pair: Path) -> None:
 
 
 def test_values_by_csv_and_in_a_ply(run: Run, pair: Path) -> None:
-    Path("heat.csv").write_text(
-        "heat\n" + "".join(f"{z}\n" for z in load_shape("a.ply").verts[:, 2].tolist())
-    )
+    Path("heat.csv").write_text("heat\n" + "".join(f"{z}\n" for z in load_shape("a.ply").verts[:, 2].tolist()))
     well(run(*call("transfer-color", "--values", "heat.csv", out="v.csv")))
     rows = list(csv.reader(Path("v.csv").read_text().splitlines()))
     assert rows[0] == ["vertex", "heat"]
@@ -131,9 +129,7 @@ def doubtful(pair: Path) -> np.ndarray:
 
 
 def test_blank_values(run: Run, pair: Path, doubtful: np.ndarray) -> None:
-    answer = well(
-        run(*call("transfer-color", "--values", "values.npy", "--blank", "nan", "--json", out="v.npy"))
-    )
+    answer = well(run(*call("transfer-color", "--values", "values.npy", "--blank", "nan", "--json", out="v.npy")))
     found = np.isnan(np.load("v.npy")).all(axis=1)
     assert found[doubtful].all()
     assert not found[load_shape("b.ply").verts[:, 0] < 0].any()
@@ -193,9 +189,7 @@ def test_labels_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
         assert b"property int label" in Path(out).read_bytes()
         return
     else:
-        found = np.array(
-            [line.split(",")[-1] for line in Path(out).read_text().splitlines() if line != "vertex,label"]
-        )
+        found = np.array([line.split(",")[-1] for line in Path(out).read_text().splitlines() if line != "vertex,label"])
         found = found.astype(int)
     clear = np.abs(height) > 0.2
     assert np.array_equal(found[clear], (height > 0).astype(int)[clear])
@@ -338,9 +332,7 @@ def test_landmarks_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
 
 def test_unsure_landmarks_are_named(run: Run, pair: Path, doubtful: np.ndarray) -> None:
     right = int(load_shape("a.ply").verts[:, 0].argmax())
-    Path("marks.csv").write_text(
-        f"name,vertex\nleft,{load_shape('a.ply').verts[:, 0].argmin()}\nright,{right}\n"
-    )
+    Path("marks.csv").write_text(f"name,vertex\nleft,{load_shape('a.ply').verts[:, 0].argmin()}\nright,{right}\n")
     answer = well(run(*call("transfer-landmarks", "--quiet")))
     assert answer.err == "warning: landmark right is uncertain: its confidence is 0.01\n"
     Path("marks.csv").write_text("vertex\n" + f"{right}\n" * 15)
@@ -440,11 +432,7 @@ def nothing(folder: Path) -> None:
 
 WRONG: dict[str, tuple[list[str | Path], Callable[[Path], object], str]] = {
     "no colours": (call("transfer-color"), plain, "a.ply has no vertex colours"),
-    "colours as stl": (
-        call("transfer-color", out="c.stl"),
-        nothing,
-        "'.stl' is not a format for vertex colours",
-    ),
+    "colours as stl": (call("transfer-color", out="c.stl"), nothing, "'.stl' is not a format for vertex colours"),
     "values as glb": (
         call("transfer-color", "--values", "values.npy", out="c.glb"),
         nothing,
@@ -473,11 +461,7 @@ WRONG: dict[str, tuple[list[str | Path], Callable[[Path], object], str]] = {
     "no labels": (call("transfer-labels", "--labels", "gone.npy"), nothing, "there is no file gone.npy"),
     "both labels": (call("transfer-labels", "--blank", "0", "--fill"), nothing, "contradict each other"),
     "weights as fbx": (call("transfer-weights", out="w.fbx"), nothing, "not a format for skin weights"),
-    "other weights": (
-        call("transfer-weights", "--weights", "values.npy"),
-        nothing,
-        "not read from '.npy' files",
-    ),
+    "other weights": (call("transfer-weights", "--weights", "values.npy"), nothing, "not read from '.npy' files"),
     "landmarks as txt": (call("transfer-landmarks", out="l.txt"), nothing, "not a format for landmarks"),
     "landmarks of another": (
         call("transfer-landmarks"),
@@ -492,11 +476,7 @@ WRONG: dict[str, tuple[list[str | Path], Callable[[Path], object], str]] = {
     ),
     "over the source": (call("transfer-color", out="a.ply"), nothing, "is an input of this command"),
     "over the weights": (call("transfer-weights", out="weights.npz"), nothing, "is an input of this command"),
-    "over the landmarks": (
-        call("transfer-landmarks", out="marks.csv"),
-        nothing,
-        "is an input of this command",
-    ),
+    "over the landmarks": (call("transfer-landmarks", out="marks.csv"), nothing, "is an input of this command"),
     "no folder": (call("transfer-color", out="no/c.ply"), nothing, "there is no folder no"),
     "no source": (call("transfer-color"), missing("a.ply"), "there is no file a.ply"),
     "no target": (call("transfer-color"), missing("b.ply"), "there is no file b.ply"),

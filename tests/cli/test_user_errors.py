@@ -69,11 +69,7 @@ BAD_FILES = {
     "missing": ("bad.ply", None, "there is no file"),
     "0 bytes": ("bad.ply", lambda path: path.write_bytes(b""), "0 bytes"),
     "not a mesh": ("bad.ply", lambda path: write_text(path, "Dear Sir or Madam,\n"), "is not a ply file"),
-    "a picture called obj": (
-        "bad.obj",
-        lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0"),
-        "is not an obj file",
-    ),
+    "a picture called obj": ("bad.obj", lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0"), "is not an obj file"),
     "unknown kind": ("bad.docx", lambda path: write_text(path, "x"), "unsupported file format"),
     "no suffix": ("bad", lambda path: write_text(path, "x"), "no suffix"),
     "truncated ply": ("bad.ply", truncated_ply, "fewer vertex rows than the 100"),
@@ -122,9 +118,7 @@ def test_bad_files(run: Run, two: tuple[Path, Path], tmp_path: Path, kind: str, 
     check(run(*words), told, tmp_path, before)
 
 
-def test_a_few_bad_vertices_are_no_error(
-    run: Run, two: tuple[Path, Path], tmp_path: Path, sphere: Shape
-) -> None:
+def test_a_few_bad_vertices_are_no_error(run: Run, two: tuple[Path, Path], tmp_path: Path, sphere: Shape) -> None:
     """A NaN vertex and a stray triangle are repaired: the work goes on to the fit."""
     verts = np.concatenate([sphere.verts, 9.0 + np.eye(3) / 1000, np.zeros((1, 3))])
     faces = np.concatenate([sphere.faces, [[642, 643, 644]]])
@@ -144,9 +138,7 @@ def test_a_mistyped_file_is_guessed(run: Run, two: tuple[Path, Path], tmp_path: 
 
 @pytest.mark.parametrize("name", ["humna", "../human", "Human", "", "human/", "/no/such/folder"])
 @pytest.mark.parametrize("verb", ["match", "register"])
-def test_models_that_do_not_exist(
-    run: Run, two: tuple[Path, Path], tmp_path: Path, name: str, verb: str
-) -> None:
+def test_models_that_do_not_exist(run: Run, two: tuple[Path, Path], tmp_path: Path, name: str, verb: str) -> None:
     before = sorted(os.listdir(tmp_path))
     output = tmp_path / ("map.npy" if verb == "match" else "fitted.ply")
     answer = run(verb, *two[: 2 if verb == "match" else 1], "-o", output, "--model", name)
@@ -203,9 +195,7 @@ def test_a_folder_that_refuses_files(
         ("1.5 2\n", "pairs.txt"),
     ],
 )
-def test_landmarks_that_are_none(
-    run: Run, two: tuple[Path, Path], tmp_path: Path, text: str, told: str
-) -> None:
+def test_landmarks_that_are_none(run: Run, two: tuple[Path, Path], tmp_path: Path, text: str, told: str) -> None:
     (tmp_path / "pairs.txt").write_text(text)
     before = sorted(os.listdir(tmp_path))
     answer = run("match", *two, "-o", tmp_path / "map.npy", "--landmarks", tmp_path / "pairs.txt")
@@ -214,10 +204,7 @@ def test_landmarks_that_are_none(
 
 def test_both_axes_the_same(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
     before = sorted(os.listdir(tmp_path))
-    for words in (
-        ("match", *two, "-o", tmp_path / "map.npy"),
-        ("register", two[0], "-o", tmp_path / "f.ply"),
-    ):
+    for words in (("match", *two, "-o", tmp_path / "map.npy"), ("register", two[0], "-o", tmp_path / "f.ply")):
         answer = run(*words, "--up", "y", "--front", "-y")
         check(answer, "lie along one axis", tmp_path, before)
 

@@ -31,9 +31,7 @@ def words_of(path: Path) -> dict[str, Any]:
 
 
 def nearest(a: Shape, b: Shape, **words: Any) -> VertexMap:
-    return VertexMap.between(
-        a, b, np.linalg.norm(a.verts[:, None] - b.verts[None], axis=2).argmin(axis=1), **words
-    )
+    return VertexMap.between(a, b, np.linalg.norm(a.verts[:, None] - b.verts[None], axis=2).argmin(axis=1), **words)
 
 
 @pytest.fixture
@@ -227,9 +225,7 @@ def test_an_input_is_never_overwritten(run: Run, known: tuple[Path, Path, Path])
     assert page.read_bytes() == known[2].read_bytes()
 
 
-def test_a_mistyped_model_is_told_before_the_work(
-    run: Run, two: tuple[Path, Path], stub: FakeMatching
-) -> None:
+def test_a_mistyped_model_is_told_before_the_work(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     answer = run("view", *two, "-o", two[0].with_name("page.html"), "--model", "humna")
     assert answer.status == 1
     assert "did you mean human?" in answer.err

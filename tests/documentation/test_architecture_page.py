@@ -48,22 +48,12 @@ def test_the_road_of_a_match_is_as_told() -> None:
 
 
 def test_every_file_and_folder_that_the_page_names_exists() -> None:
-    paths = {
-        path
-        for path in re.findall(r"`((?:[\w.-]+/)+(?:[\w.-]+)?)`", PAGE)
-        if not path.startswith("meshmatch/_")
-    }
+    paths = {path for path in re.findall(r"`((?:[\w.-]+/)+(?:[\w.-]+)?)`", PAGE) if not path.startswith("meshmatch/_")}
     assert len(paths) > 20
-    assert [
-        path for path in paths if not ((ROOT / path).exists() or (ROOT / "meshmatch" / path).exists())
-    ] == []
+    assert [path for path in paths if not ((ROOT / path).exists() or (ROOT / "meshmatch" / path).exists())] == []
 
 
 def test_every_package_has_its_line() -> None:
     told = set(re.findall(r"`(\w+)/?`", "".join(re.findall(r"^\| (`.*?) \|", PAGE, re.MULTILINE))))
-    there = {
-        path.stem
-        for path in (ROOT / "meshmatch").iterdir()
-        if path.suffix in (".py", "") and path.name[0] != "_"
-    }
+    there = {path.stem for path in (ROOT / "meshmatch").iterdir() if path.suffix in (".py", "") and path.name[0] != "_"}
     assert {name for name in there if name != "py"} <= told

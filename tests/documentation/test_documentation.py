@@ -16,9 +16,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 def anchors(text: str) -> set[str]:
     """What links to headings of a page are called."""
-    headings = re.findall(
-        r"^#+ (.*)$", re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL), re.MULTILINE
-    )
+    headings = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
@@ -36,9 +34,7 @@ def dead_links(text: str, page: Path) -> list[str]:
 
 def test_links_and_pictures_lead_somewhere() -> None:
     pages = [*PAGES, ROOT / ".github" / "CONTRIBUTING.md"]
-    assert [
-        f"{page.name}: {dead}" for page in pages for dead in dead_links(page.read_text("utf-8"), page)
-    ] == []
+    assert [f"{page.name}: {dead}" for page in pages for dead in dead_links(page.read_text("utf-8"), page)] == []
 
 
 def test_a_dead_link_is_noticed(tmp_path: Path) -> None:
@@ -66,9 +62,7 @@ def test_the_page_does_not_depend_on_the_terminal(monkeypatch: pytest.MonkeyPatc
     assert reference.reference() == page
 
 
-def test_the_check_of_the_page_fails_on_a_stale_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_check_of_the_page_fails_on_a_stale_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert reference.main(["--check", str(tmp_path)]) == 1
     assert reference.main([str(tmp_path)]) == 0
     assert reference.main(["--check", str(tmp_path)]) == 0

@@ -45,9 +45,7 @@ def subjects_of(small: Path, name: str, cache: Path, measure: Measure = QUICK):
     bench = load_set(name, small)
     names = chosen_names(bench, measure)
     frames = [sqrt_area_frame(bench.shape(each)) for each in names]
-    return bench, [
-        subject(bench, each, frame, measure, cache) for each, frame in zip(names, frames, strict=True)
-    ]
+    return bench, [subject(bench, each, frame, measure, cache) for each, frame in zip(names, frames, strict=True)]
 
 
 def test_a_template_that_lies_on_the_shapes_makes_no_error(small: Path, tmp_path: Path) -> None:

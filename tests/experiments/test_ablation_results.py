@@ -14,9 +14,7 @@ def time(cpu: float) -> dict[str, Any]:
     return {"cpu_ms": cpu, "ms": 2 * cpu, "device": "cpu"}
 
 
-def known(
-    held_out: dict[Run, float], errors: dict[tuple[Run, str], float] | None = None, **more: Any
-) -> Known:
+def known(held_out: dict[Run, float], errors: dict[tuple[Run, str], float] | None = None, **more: Any) -> Known:
     trained = {run: {"held_out_cm": value, "steps": 7, "rule": "parts"} for run, value in held_out.items()}
     by_method = {(run, "scape", how): {"mean_cm": value} for (run, how), value in (errors or {}).items()}
     return Known(trained, by_method, more.get("times", {}), more.get("memory", {}))
@@ -69,9 +67,7 @@ def test_costs_are_told_by_their_ratios() -> None:
     assert held["vol+arap+Z slows an iteration of mls by less than one of pointwise"] is True
     assert held["an iteration of mls takes at most 2 times as long with vol+arap+Z"] is True
     assert held["an iteration of rbf takes at most 2 times as long with vol+arap+Z"] is False
-    assert (
-        held["with vol+arap+Z an iteration of pointwise takes at least 3 times as long as one of mls"] is True
-    )
+    assert held["with vol+arap+Z an iteration of pointwise takes at least 3 times as long as one of mls"] is True
 
 
 def test_seeds_are_joined() -> None:
@@ -90,9 +86,7 @@ def test_tables_show_what_is_there() -> None:
     }
     trained[replace(BASE, nodes=2700, radius=0.5)] = {"skipped": "no nodes"}
     del trained[runs[3]]
-    errors = {
-        (run, "scape-pcn", "code"): {"mean_cm": 50.0 + k, "median_cm": 30.0 + k} for k, run in enumerate(runs)
-    }
+    errors = {(run, "scape-pcn", "code"): {"mean_cm": 50.0 + k, "median_cm": 30.0 + k} for k, run in enumerate(runs)}
     errors[BASE, "scape-pcn", "nodes"] = {"mean_cm": 44.44}
     times = {run.name: time(123.4) for run in runs[:9]}
     found = Known(trained, errors, times, {"base": {"megabytes": 77.7}})

@@ -11,25 +11,8 @@ from torch.utils.flop_counter import flop_registry
 from meshmatch.errors import TemplateError
 from meshmatch.experiments import ablation_training
 from meshmatch.experiments.ablation_setting import SCANS, Setting, pool_of
-from meshmatch.experiments.ablation_training import (
-    built,
-    fewer,
-    is_trained,
-    memory,
-    new_network,
-    timed,
-    train_run,
-)
-from meshmatch.experiments.ablation_views import (
-    BASE,
-    CODED,
-    CONSTRAINTS,
-    TABLE4,
-    VIEWS,
-    Run,
-    all_runs,
-    methods_of,
-)
+from meshmatch.experiments.ablation_training import built, fewer, is_trained, memory, new_network, timed, train_run
+from meshmatch.experiments.ablation_views import BASE, CODED, CONSTRAINTS, TABLE4, VIEWS, Run, all_runs, methods_of
 from meshmatch.fields.choice import FIELDS, FieldName
 from meshmatch.models.registry import load_model
 from meshmatch.training.setup import build_loss_points
@@ -185,9 +168,7 @@ def test_longer_training_is_better(setting: Setting, tmp_path: Path, monkeypatch
     assert long < short - 0.03
 
 
-def test_a_number_of_steps_is_a_budget_too(
-    setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_number_of_steps_is_a_budget_too(setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = pool_of(setting, "T", 2)
     monkeypatch.setattr(ablation_training, "pool_of", lambda *_: small)
     first, again = (train_run(BASE, setting, tmp_path / name, steps=7) for name in ("a", "b"))

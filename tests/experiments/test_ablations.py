@@ -6,11 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from meshmatch.experiments import (
-    ablation_errors,
-    ablation_training,
-    ablations,
-)
+from meshmatch.experiments import ablation_errors, ablation_training, ablations
 from meshmatch.experiments.ablation_errors import Measure
 from meshmatch.experiments.ablations import main
 from meshmatch.fitting.fit_config import FitConfig
@@ -130,16 +126,7 @@ def test_table_4_has_costs_without_training(
 def test_repeated_views_have_two_seeds(
     places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = [
-        "--output",
-        str(tmp_path),
-        "--folder",
-        str(places / "prepared"),
-        "--minutes",
-        "1e-6",
-        "--sets",
-        "",
-    ]
+    words = ["--output", str(tmp_path), "--folder", str(places / "prepared"), "--minutes", "1e-6", "--sets", ""]
     words += ["--seeds", "2", "--rounds", "0", "--views", "table5,figure6", "--repeated", "figure6"]
     assert main(words) == 0
     assert calls["train_run"] == 6 + 2

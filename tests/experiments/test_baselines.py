@@ -151,9 +151,7 @@ def test_the_command(
     assert (tmp_path / "kept" / "baselines.png").stat().st_size > 1000
 
 
-def test_a_part_says_so_and_is_not_taken_for_another(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_part_says_so_and_is_not_taken_for_another(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*words, "--sets", "faust", "--limit-pairs", "2"]) == 0
     text, _ = answer(capsys)
     assert "2 of 6" in text and "Not all pairs were measured" in text

@@ -74,11 +74,7 @@ def test_a_bug_is_not_a_failed_pair(small: Path, kept: Path, monkeypatch: pytest
 
 
 def test_the_command(
-    small: Path,
-    kept: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    small: Path, kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(command.OurMethod, "fit", lambda self, shape: Oracle().fit(shape))
     monkeypatch.setattr(command.OurMethod, "map", lambda self, *pair: Oracle().map(*pair))
@@ -87,11 +83,7 @@ def test_the_command(
     assert main([*words, "--save-maps", str(saved), "--curve", str(curve)]) == 0
     lines = capsys.readouterr().out.strip().splitlines()
     record = json.loads(lines[-1])
-    assert {name: part["pairs"] for name, part in record["sets"].items()} == {
-        "shrec19": 3,
-        "scape": 2,
-        "faust": 6,
-    }
+    assert {name: part["pairs"] for name, part in record["sets"].items()} == {"shrec19": 3, "scape": 2, "faust": 6}
     assert all(part["mean_cm"] == 0 for part in record["sets"].values())
     assert (record["options"]["refine"], record["options"]["seed"]) == ("none", 3)
     assert record["threads"] == record["jobs"] == 1
@@ -99,9 +91,7 @@ def test_the_command(
     assert all(words in "".join(lines[:-1]) for words in ("shrec19", "same subject", "Dijkstra"))
     assert curve.stat().st_size > 1000
     # The saved maps give the same numbers.
-    assert (
-        main(["--data", str(small), "--cache", str(kept), "--maps", str(saved), "--sets", "faust,scape"]) == 0
-    )
+    assert main(["--data", str(small), "--cache", str(kept), "--maps", str(saved), "--sets", "faust,scape"]) == 0
     again = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
     assert again["sets"]["faust"]["mean_cm"] == 0
     assert list(again["sets"]) == ["faust", "scape"]

@@ -87,9 +87,7 @@ def test_errors_of_keypoints_by_hand(cube: Shape) -> None:
     index = np.arange(8)
     index[3] = 2  # an edge away: 1 / sqrt(3) of the diagonal
     sure = np.array([0.9, 0.8, 0.7, 0.1, 0, 0, 0, 0])
-    found = segments.keypoint_errors(
-        shapes, points, {("a", "b"): VertexMap("a", "b", index, confidence=sure)}
-    )
+    found = segments.keypoint_errors(shapes, points, {("a", "b"): VertexMap("a", "b", index, confidence=sure)})
     assert found["mean"] == pytest.approx(1 / np.sqrt(3) / 4, abs=1e-3)
     assert (found["median"], found["arrived"], found["confidence_auc"]) == (0.0, 0.75, 1.0)
     assert (found["confidence_right"], found["confidence_wrong"]) == pytest.approx((0.8, 0.1))
@@ -150,17 +148,12 @@ def test_the_ends_of_legs_are_measured_in_the_best_of_a_squares_numberings() -> 
     def measured(order: list[int]) -> dict[str, float]:
         index = np.array([*order, *(4 + k for k in order)])
         maps = mapped({("a", "b"): index})
-        return keypoint_parts.leg_errors(
-            {"a": table, "b": table}, {"a": keypoints, "b": keypoints}, maps, 0.1
-        )
+        return keypoint_parts.leg_errors({"a": table, "b": table}, {"a": keypoints, "b": keypoints}, maps, 0.1)
 
     for order in ([0, 1, 2, 3], [1, 2, 3, 0], [3, 2, 1, 0], [0, 3, 2, 1]):
         assert measured(order) == {"legs_mean": 0, "legs_arrived": 1}, order
     # Two neighbours are exchanged: no numbering of a square suits more than two of the four legs.
-    assert measured([1, 0, 2, 3]) == {
-        "legs_mean": pytest.approx(0.5 / np.sqrt(3), abs=1e-4),
-        "legs_arrived": 0.5,
-    }
+    assert measured([1, 0, 2, 3]) == {"legs_mean": pytest.approx(0.5 / np.sqrt(3), abs=1e-4), "legs_arrived": 0.5}
 
 
 def test_shapes_are_stood_alike() -> None:
@@ -204,9 +197,7 @@ def balls(folder: Path, ending: str, count: int = 2) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for n in range(count):
         save_shape(folder / f"{n}.ply", Shape(ball.verts * [1, 1.2 + 0.1 * n, 1.5], ball.faces))
-        truth = (
-            np.arange(0, 160, 20) if "key" in ending else np.stack([np.arange(162), np.arange(162) % 2], 1)
-        )
+        truth = np.arange(0, 160, 20) if "key" in ending else np.stack([np.arange(162), np.arange(162) % 2], 1)
         np.save(folder / f"{n}{ending}", truth)
 
 
@@ -280,11 +271,7 @@ def test_segments_from_end_to_end(
 
 
 def test_kinds_of_animals_and_their_errors_by_hand(cube: Shape) -> None:
-    assert [animals.kind_of(name) for name in ("fox-05", "Davis_cow_00000", "timthumb")] == [
-        "dog",
-        "cow",
-        "other",
-    ]
+    assert [animals.kind_of(name) for name in ("fox-05", "Davis_cow_00000", "timthumb")] == ["dog", "cow", "other"]
     shapes = {"wolf": cube, "dog": cube, "x": cube}
     truth = {name: np.arange(8) for name in shapes}
     right, wrong = np.arange(8), np.arange(8)

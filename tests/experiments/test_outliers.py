@@ -27,9 +27,7 @@ class Known:
         return VertexMap.between(source, target, index, confidence=np.where(outlier, 0.1, 0.9))
 
 
-def test_outliers_count(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_outliers_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     points = np.zeros((3, P, 3), np.float32)
     points[:, :, 0] = 0.2 * np.arange(P)  # meters: neighbors are 20 cm apart
     np.save(tmp_path / outliers.FILE, points)

@@ -20,8 +20,7 @@ from tests.experiments.small_bench import build, truth
 def test_a_camera_sees_what_faces_it_and_is_not_hidden() -> None:
     ball = icosphere(3)
     behind = Shape(
-        np.concatenate([ball.verts, ball.verts * 0.5 - [0, 0, 4.0]]),
-        np.concatenate([ball.faces, ball.faces + ball.V]),
+        np.concatenate([ball.verts, ball.verts * 0.5 - [0, 0, 4.0]]), np.concatenate([ball.faces, ball.faces + ball.V])
     )
     centers = behind.verts[behind.faces].mean(axis=1)
     seen = seen_faces(behind, centers, np.array([0.0, 0.0, 1.0]))

@@ -134,9 +134,7 @@ def test_the_command_on_bodies_and_a_set(
     assert drawn == [(2, model.card.seed, 4)]
     assert record["steps"] == {"nodes": 10, "code": 3}
     rows = record["rows"]
-    assert [(row["set"], row["method"]) for row in rows] == [
-        (n, m) for n in ("bodies", "scape") for m in METHODS
-    ]
+    assert [(row["set"], row["method"]) for row in rows] == [(n, m) for n in ("bodies", "scape") for m in METHODS]
     for code, nodes in ((rows[1], rows[2]), (rows[4], rows[5])):
         assert nodes["times_as_fast"] == pytest.approx(code["cpu"] / nodes["cpu"])
         assert nodes["met"] == (nodes["times_as_fast"] >= 50 and nodes["error_cm"] < code["error_cm"])

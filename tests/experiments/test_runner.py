@@ -31,9 +31,7 @@ def main(count: int, seed: Seed = 0) -> Report:
     if count == 13:
         raise InputError("thirteen [shapes]", "take another number")
     record = {"rows": ROWS, "path": Path("x"), "array": np.arange(count)}
-    return Report(
-        record, [table("A table", ROWS, {"set": "set", "mean": "mean:.2f", "part": "share:.0%"})], ["done"]
-    )
+    return Report(record, [table("A table", ROWS, {"set": "set", "mean": "mean:.2f", "part": "share:.0%"})], ["done"])
 
 
 def test_a_command_prints_tables_notes_and_one_line_last(capsys: pytest.CaptureFixture[str]) -> None:

@@ -197,9 +197,7 @@ def test_a_missing_folder_or_truth_is_told(tmp_path: Path) -> None:
 
 
 def test_the_real_sets_have_the_protocols_pairs(bench: Path) -> None:
-    counts = {
-        name: (len(found.shapes), len(found.pairs)) for name in SET_NAMES for found in [load_set(name, bench)]
-    }
+    counts = {name: (len(found.shapes), len(found.pairs)) for name in SET_NAMES for found in [load_set(name, bench)]}
     assert counts["shrec19"][1] == len((bench / "shrec19" / "pairs.txt").read_text().split()) // 2
     assert counts["scape"] == (20, 380)
     assert counts["faust"] == (30, 870)
@@ -223,9 +221,7 @@ def test_truth_of_the_real_sets_is_a_map_of_the_surface(bench: Path) -> None:
         landmark[found.landmarks(a)] = np.arange(len(found.landmarks(a)))
         corners = landmark[one.faces]
         placed = other.verts[found.landmarks(b)[corners[(corners >= 0).all(axis=1)]]]
-        longest = np.linalg.norm(placed - np.roll(placed, 1, axis=1), axis=2).max(axis=1) / np.sqrt(
-            other.area
-        )
+        longest = np.linalg.norm(placed - np.roll(placed, 1, axis=1), axis=2).max(axis=1) / np.sqrt(other.area)
         assert np.median(longest) * CM_PER_UNIT < 5
         normals = np.cross(placed[:, 1] - placed[:, 0], placed[:, 2] - placed[:, 0])
         nearest = cKDTree(other.verts).query(placed[:, 0])[1]

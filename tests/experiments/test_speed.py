@@ -41,10 +41,7 @@ def test_a_triangle_in_four() -> None:
 
 def test_a_split_surface_is_the_same_surface(torus: Shape) -> None:
     finer = split(torus)
-    assert (finer.V, finer.F) == (
-        torus.V + 3 * torus.F // 2,
-        4 * torus.F,
-    )  # a closed one: an edge for 2/3 of a face
+    assert (finer.V, finer.F) == (torus.V + 3 * torus.F // 2, 4 * torus.F)  # a closed one: an edge for 2/3 of a face
     assert finer.area == pytest.approx(torus.area)
     assert np.array_equal(finer.verts[: torus.V], torus.verts)
     assert not repair(finer).notes
@@ -136,9 +133,7 @@ def test_the_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
     assert all(word in table for word in ("easy", "hard", "True", "False"))
 
 
-def test_a_case_that_breaks_is_told(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_case_that_breaks_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(speed, "CASES", {"broken": Case(("dance",), 1.0)})
     assert main(["--cases", "broken", "--runs", "1"]) == 1
     assert "ended with 2" in " ".join(capsys.readouterr().err.split())

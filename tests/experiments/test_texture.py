@@ -36,9 +36,7 @@ def test_colours_at_points_of_a_square() -> None:
     np.testing.assert_allclose(found, [[1, 0, 0], [0, 1, 0], [0, 0, 1]], atol=1e-6)
 
 
-def test_a_body_to_itself(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_body_to_itself(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(texture, "POINTS", 2000)
     words = ["--cases", "itself,spot", "--size", "512", "--samples", "1", "--threads", "1", "--no-clock"]
     assert main([*words, "--data", str(tmp_path), "--keep", str(tmp_path / "kept")]) == 0
@@ -49,10 +47,7 @@ def test_a_body_to_itself(
     # half of the sample's own texels: blurred, but the same
     assert 0 < found["there_mean"] < found["back_mean"] < 12
     assert found["there_psnr"] > 20
-    assert sorted(file.name for file in (tmp_path / "kept").iterdir()) == [
-        "itself-back.glb",
-        "itself-there.glb",
-    ]
+    assert sorted(file.name for file in (tmp_path / "kept").iterdir()) == ["itself-back.glb", "itself-there.glb"]
 
 
 def test_the_clock_reads_a_whole_command(

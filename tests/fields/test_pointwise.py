@@ -39,9 +39,7 @@ def test_rows_hold_a_code_of_any_length() -> None:
         assert not turn.any()
 
 
-def test_the_decoder_is_the_textbooks(
-    decoder: PointDecoder, points: torch.Tensor, codes: torch.Tensor
-) -> None:
+def test_the_decoder_is_the_textbooks(decoder: PointDecoder, points: torch.Tensor, codes: torch.Tensor) -> None:
     """[x, code] through one MLP, a point at a time."""
     moved = decoder.displacement(points.expand(2, -1, -1), codes)
     first = torch.cat([decoder.from_point.weight, decoder.from_code.weight], 1)

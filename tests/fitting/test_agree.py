@@ -107,9 +107,7 @@ def fit_of(system: NodeSystem, vectors: np.ndarray, verdict: str = "good") -> Fi
     points = system.moved(vectors)
     frame = Frame(2.0, TURNS[1], np.array([1.0, 2.0, 3.0]))
     none = np.zeros(len(points))
-    return Fit(
-        "egg", frame, points, vectors, system.verts, system.faces, 0.02, none, verdict, (), "+y", "+z", 0.0, 0
-    )
+    return Fit("egg", frame, points, vectors, system.verts, system.faces, 0.02, none, verdict, (), "+y", "+z", 0.0, 0)
 
 
 def test_fits_agree_in_their_own_frames(system: NodeSystem, model: TrainedModel) -> None:
@@ -122,9 +120,7 @@ def test_fits_agree_in_their_own_frames(system: NodeSystem, model: TrainedModel)
     assert after < before
     for fit in agreed:
         assert np.allclose(fit.points, system.moved(fit.vectors))
-        assert (
-            0 < fit.vertex_distance.max() < 0.2
-        )  # of the egg's vertices from the template's, in the core frame
+        assert 0 < fit.vertex_distance.max() < 0.2  # of the egg's vertices from the template's, in the core frame
         assert (fit.verdict, fit.residual) == ("good", 0.02)
 
 

@@ -64,9 +64,7 @@ def fit_of(model: TrainedModel, vectors: np.ndarray, frame: Frame | None = None)
 
 @pytest.fixture(scope="module")
 def three(model: TrainedModel) -> list[Fit]:
-    return [
-        fit_of(model, bent(model, degrees, grow)) for degrees, grow in ((100, 1.0), (20, 1.1), (-90, 1.2))
-    ]
+    return [fit_of(model, bent(model, degrees, grow)) for degrees, grow in ((100, 1.0), (20, 1.1), (-90, 1.2))]
 
 
 def test_two_rotations_turn_at_constant_speed_and_on() -> None:
@@ -150,9 +148,7 @@ def test_the_fits_are_met_exactly(model: TrainedModel, three: list[Fit], way: An
         assert blend.deviation(time, fit.vectors).volume < 1e-12
 
 
-def test_what_codes_leave_over_turns_with_the_part(
-    model: TrainedModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_codes_leave_over_turns_with_the_part(model: TrainedModel, monkeypatch: pytest.MonkeyPatch) -> None:
     """Codes that turn the whole, fits with the same small difference as seen from it: half way it is that still."""
     nodes = model.template.nodes
     own = 0.02 * np.sin(7 * nodes[:, [1, 2, 0]])
@@ -188,9 +184,7 @@ def test_three_times_one_way_is_smooth_and_straight_on_beyond(model: TrainedMode
     assert np.abs(end[0] - 2 * end[1] + end[2]).max() < 0.01 * step**2 + 1e-12  # no bend at the ends either
     beyond = [blend.weights(1 + k) for k in (0.0, 0.1, 0.2)]
     assert np.allclose(beyond[0] - 2 * beyond[1] + beyond[2], 0)
-    assert np.allclose(
-        (beyond[1] - beyond[0]) / 0.1, (end[0] - end[1]) / step, atol=1e-3
-    )  # at the same speed
+    assert np.allclose((beyond[1] - beyond[0]) / 0.1, (end[0] - end[1]) / step, atol=1e-3)  # at the same speed
     assert np.allclose(Blend(model, three[:2]).weights(1.2), [-0.2, 1.2])
 
 
@@ -266,9 +260,7 @@ def test_deviation_counts_from_the_stretch_that_the_fits_have(model: TrainedMode
         ({"other": True}, "another template"),
     ],
 )
-def test_what_cannot_be_blended(
-    model: TrainedModel, three: list[Fit], change: dict[str, Any], words: str
-) -> None:
+def test_what_cannot_be_blended(model: TrainedModel, three: list[Fit], change: dict[str, Any], words: str) -> None:
     fits = three[: change.get("fits", 3)]
     if change.get("other"):
         fits = [*fits[:2], replace(fits[2], template_hash="0" * 16)]

@@ -107,9 +107,7 @@ def test_interpretations_that_say_the_same_are_averaged_and_others_are_not(syste
     assert averaged(system, far, near) is far
 
 
-def test_of_a_rough_cloud_positions_alone_are_scorerd_and_squares(
-    system: NodeSystem, scan: OrientedPoints
-) -> None:
+def test_of_a_rough_cloud_positions_alone_are_scorerd_and_squares(system: NodeSystem, scan: OrientedPoints) -> None:
     shifted = replace(still(system), vectors=np.full((system.K, 3), [0.02, 0, 0]))
     apart = np.linalg.norm(system.verts[:, None] + [0.02, 0, 0] - scan.points, axis=2)
     wanted = np.sqrt(0.5 * np.square(apart.min(1)).mean() + 0.5 * np.square(apart.min(0)).mean())

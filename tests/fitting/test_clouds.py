@@ -31,9 +31,7 @@ def cloud_of(system: NodeSystem, P: int, noise: float = 0.0, strays: int = 0) ->
     """Points of the resting egg with normals as a cloud estimates them; outliers come last."""
     rng = np.random.default_rng(0)
     points = sample_surface(Shape(system.verts, system.faces), P, rng).points
-    points = np.concatenate(
-        [points + noise * rng.standard_normal(points.shape), rng.uniform(-1, 1, (strays, 3))]
-    )
+    points = np.concatenate([points + noise * rng.standard_normal(points.shape), rng.uniform(-1, 1, (strays, 3))])
     return OrientedPoints(points, Shape(points, np.empty((0, 3), np.int64)).vertex_normals)
 
 
@@ -89,10 +87,7 @@ def test_what_is_far_is_told_where_the_template_lies(system: NodeSystem) -> None
     turn, center = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([0.4, -0.3, 0.2])
     moved = OrientedPoints(scan.points @ turn.T + center, scan.normals @ turn.T)
     left = []
-    for cloud, rest in (
-        (scan, Candidate(STILL, none, 0.0)),
-        (moved, Candidate(RigidPose(turn, center), none, 0.0)),
-    ):
+    for cloud, rest in ((scan, Candidate(STILL, none, 0.0)), (moved, Candidate(RigidPose(turn, center), none, 0.0))):
         left.append(estimate_scale(system, cloud, rest, lambda part, start, rest=rest: rest)[1])
     assert len(left[0].points) < 840
     assert np.allclose(left[1].points, left[0].points @ turn.T + center)
@@ -115,9 +110,7 @@ def test_a_lost_limb_is_not_dropped(system: NodeSystem) -> None:
     """Far from the template, but as dense as a surface is."""
     scan = cloud_of(system, 800)
     limb = scan.points[:400] * 0.3 + [2.0, 0, 0]
-    both = OrientedPoints(
-        np.concatenate([scan.points, limb]), np.concatenate([scan.normals, scan.normals[:400]])
-    )
+    both = OrientedPoints(np.concatenate([scan.points, limb]), np.concatenate([scan.normals, scan.normals[:400]]))
     rest = Candidate(STILL, np.zeros((system.K, 3)), 0.0)
     assert len(estimate_scale(system, both, rest, lambda part, start: rest)[1].points) == 1200
 
@@ -152,10 +145,7 @@ def test_noise_has_a_limit(system: NodeSystem) -> None:
 def test_the_verdict_is_of_what_is_not_explained(system: NodeSystem) -> None:
     scan = cloud_of(system, 2000)
     assert judge(0.04, scan, system.verts)[0] == "poor"
-    assert (
-        judge(0.04, scan, system.verts, allowance=0.035)[0]
-        == judge(GOOD_RESIDUAL * 0.5, scan, system.verts)[0]
-    )
+    assert judge(0.04, scan, system.verts, allowance=0.035)[0] == judge(GOOD_RESIDUAL * 0.5, scan, system.verts)[0]
     assert judge(0.02, scan, system.verts, allowance=0.03)[0] == judge(0.0, scan, system.verts)[0]
 
 
@@ -192,8 +182,7 @@ def test_fits_of_rough_clouds_are_suited_to_them(system: NodeSystem, monkeypatch
     rng = np.random.default_rng(0)
     points = sample_surface(Shape(system.verts, system.faces), 900, rng).points
     clouds = [
-        Shape(points + size * rng.standard_normal(points.shape), np.empty((0, 3), np.int64))
-        for size in (0.0, 0.04)
+        Shape(points + size * rng.standard_normal(points.shape), np.empty((0, 3), np.int64)) for size in (0.0, 0.04)
     ]
     asked: list[float] = []
     paired: list[int] = []

@@ -34,12 +34,7 @@ from tests.fitting.eggs import bent_egg, egg_model, gentle_vectors, scan_of
 from tests.training.small import NETWORK, SCAN, egg_template, small_data, small_network, small_points
 
 QUICK = FitConfig(
-    samples=600,
-    coarse_samples=200,
-    copies=4,
-    hypotheses=1,
-    careful=1,
-    latent=LatentRefineConfig(steps=6, points=100),
+    samples=600, coarse_samples=200, copies=4, hypotheses=1, careful=1, latent=LatentRefineConfig(steps=6, points=100)
 )
 
 
@@ -68,13 +63,7 @@ def test_it_learns(field: str) -> None:
     model = small_network(egg, config_of(field))
     points = small_points(egg, model=model)
     config = TrainConfig(
-        steps=40,
-        shapes=4,
-        scans_per_shape=2,
-        rate=3e-3,
-        warm_up=3,
-        workers=0,
-        loss=CorrespondenceLoss(robust=True),
+        steps=40, shapes=4, scans_per_shape=2, rate=3e-3, warm_up=3, workers=0, loss=CorrespondenceLoss(robust=True)
     )
     data = small_data(egg, model, length=40)
     held_out = small_data(egg, model, seed=7)[0]
@@ -139,9 +128,7 @@ def test_it_is_laid_on_a_shape_and_refined(model: TrainedModel) -> None:
     else:  # there are no nodes: the code is refined
         assert np.array_equal(fits["nodes"].vectors, fits["latent"].vectors)
     high = dense_shape(model, fits["nodes"])
-    assert np.allclose(
-        high.verts, fits["nodes"].points_in_file, atol=1e-4
-    )  # one resolution: the same vertices
+    assert np.allclose(high.verts, fits["nodes"].points_in_file, atol=1e-4)  # one resolution: the same vertices
 
 
 def test_the_dense_system_is_the_sparse_one(rbf: TrainedModel) -> None:
@@ -155,10 +142,7 @@ def test_the_dense_system_is_the_sparse_one(rbf: TrainedModel) -> None:
     H = A @ A.transpose(0, 2, 1)
     weights = H[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     pulls, targets = rng.standard_normal((shape.V, 3)), rng.standard_normal((50, 3, 3))
-    found = [
-        system.solve(weights, pulls, 0.1, targets, 1e-3, np.zeros((system.K, 3)))
-        for system in (sparse, dense)
-    ]
+    found = [system.solve(weights, pulls, 0.1, targets, 1e-3, np.zeros((system.K, 3))) for system in (sparse, dense)]
     assert np.allclose(*found, rtol=1e-6, atol=1e-8)
 
 

@@ -33,9 +33,7 @@ def energy(
     return PaperEnergy(model, scan, config, np.random.default_rng(0)).value(vectors)
 
 
-def search(
-    model: TrainedModel, scan: OrientedPoints, config: LatentRefineConfig = CONFIG, **more
-) -> np.ndarray:
+def search(model: TrainedModel, scan: OrientedPoints, config: LatentRefineConfig = CONFIG, **more) -> np.ndarray:
     return refine_code(model, scan, config, np.random.default_rng(0), **more)
 
 
@@ -75,12 +73,7 @@ def test_the_same_draw_gives_the_same_answer_and_the_network_stays_as_it_is(
 
 def test_progress_is_told(model: TrainedModel, scan: OrientedPoints) -> None:
     shares: list[float] = []
-    search(
-        model,
-        scan,
-        replace(CONFIG, steps=25),
-        progress=Progress(lambda stage, name, share: shares.append(share)),
-    )
+    search(model, scan, replace(CONFIG, steps=25), progress=Progress(lambda stage, name, share: shares.append(share)))
     assert shares == [0.04, 0.84, 1.0]
 
 

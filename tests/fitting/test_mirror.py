@@ -34,9 +34,7 @@ def mirror(human: TrainedModel) -> Mirror:
 
 def test_a_body_has_a_mirror_and_what_is_not_symmetric_has_none(human: TrainedModel) -> None:
     template = human.template
-    shifted = replace(
-        template, dense=Shape(template.dense.verts + np.array([0.03, 0, 0]), template.dense.faces)
-    )
+    shifted = replace(template, dense=Shape(template.dense.verts + np.array([0.03, 0, 0]), template.dense.faces))
     assert mirror_of(replace(human, template=shifted)) is None
 
 

@@ -32,9 +32,7 @@ def scan(model: TrainedModel) -> OrientedPoints:
     return scan_of(model.template.shape, 300)
 
 
-def test_the_residual_is_that_of_a_plain_loop(
-    system: NodeSystem, scan: OrientedPoints, model: TrainedModel
-) -> None:
+def test_the_residual_is_that_of_a_plain_loop(system: NodeSystem, scan: OrientedPoints, model: TrainedModel) -> None:
     vectors = gentle_vectors(model)
     moved = system.moved(vectors)
     ours, theirs = with_normals(moved, system.normals(moved)), with_normals(scan.points, scan.normals)
@@ -44,15 +42,11 @@ def test_the_residual_is_that_of_a_plain_loop(
         assert two_way_residual(system, scan, vectors, stride=1, cap=cap) == pytest.approx(wanted)
     own = OrientedPoints(moved, system.normals(moved))
     assert two_way_residual(system, own, vectors) == 0
-    assert two_way_residual(system, OrientedPoints(scan.points + 9, scan.normals), vectors) == pytest.approx(
-        0.1
-    )
+    assert two_way_residual(system, OrientedPoints(scan.points + 9, scan.normals), vectors) == pytest.approx(0.1)
 
 
 def test_predictions_are_means_of_seeded_draws(model: TrainedModel, scan: OrientedPoints) -> None:
-    one, again, other = (
-        Predictor.of(model, np.random.default_rng(k)).predict(scan, 3, 100) for k in (0, 0, 1)
-    )
+    one, again, other = (Predictor.of(model, np.random.default_rng(k)).predict(scan, 3, 100) for k in (0, 0, 1))
     assert np.array_equal(one, again)
     assert not np.array_equal(one, other)
     rng = np.random.default_rng(0)
@@ -66,17 +60,14 @@ def test_predictions_are_means_of_seeded_draws(model: TrainedModel, scan: Orient
     assert all_of_it.shape == (model.template.K, 3)
 
 
-def test_laying_on_again_moves_the_frame_to_where_the_core_went(
-    model: TrainedModel, system: NodeSystem
-) -> None:
+def test_laying_on_again_moves_the_frame_to_where_the_core_went(model: TrainedModel, system: NodeSystem) -> None:
     scan = scan_of(bent_egg(model), 300)
     scan = OrientedPoints(scan.points / 5, scan.normals)
     core = model.template.core
     R, c = Rotation.from_rotvec([0.1, 0.4, 0]).as_matrix(), np.array([0.1, 0, 0])
     pose = RigidPose(R, c)
     first, second = (
-        Predictor.of(model, np.random.default_rng(0)).fit(scan, pose, rounds=rounds, draws=1)
-        for rounds in (1, 2)
+        Predictor.of(model, np.random.default_rng(0)).fit(scan, pose, rounds=rounds, draws=1) for rounds in (1, 2)
     )
     assert first.pose is pose
     assert np.linalg.det(second.pose.rotation) == pytest.approx(1)
@@ -103,9 +94,7 @@ def test_without_a_tilt_every_reading_is_the_networks_own(
             assert np.allclose(each.vectors, plain, atol=1e-5) == (degrees == 0)
 
 
-def test_a_tilted_reading_is_turned_back(
-    model: TrainedModel, system: NodeSystem, scan: OrientedPoints
-) -> None:
+def test_a_tilted_reading_is_turned_back(model: TrainedModel, system: NodeSystem, scan: OrientedPoints) -> None:
     """A network that follows every turn reads the same from every frame."""
     nodes = torch.from_numpy(model.template.nodes).float()
     first = torch.from_numpy(scan.points[:200]).float()
@@ -116,9 +105,7 @@ def test_a_tilted_reading_is_turned_back(
 
         def follow(self, points: torch.Tensor) -> np.ndarray:
             # the points are the first ones, turned and in another order: their moments tell the turn
-            U, _, Vh = torch.linalg.svd(
-                _moment(points[0]).double() @ torch.linalg.inv(_moment(first).double())
-            )
+            U, _, Vh = torch.linalg.svd(_moment(points[0]).double() @ torch.linalg.inv(_moment(first).double()))
             return (((U @ Vh).float() @ nodes.T).T - nodes).double().numpy()
 
         def rotate_rows(self, vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -149,11 +136,7 @@ def test_residuals_and_predictions_follow_the_weights_of_samples(
         one_way_residual(system, scan.rows(half), vectors, 1)
     )
     everywhere = replace(scan, weights=np.full(len(scan.points), 0.3))
-    assert two_way_residual(system, everywhere, vectors) == pytest.approx(
-        two_way_residual(system, scan, vectors)
-    )
+    assert two_way_residual(system, everywhere, vectors) == pytest.approx(two_way_residual(system, scan, vectors))
     moved = replace(masked, points=np.where(half[:, None], scan.points, scan.points + 9))
-    first, second = (
-        Predictor.of(model, np.random.default_rng(0)).predict(each, 1, 300) for each in (masked, moved)
-    )
+    first, second = (Predictor.of(model, np.random.default_rng(0)).predict(each, 1, 300) for each in (masked, moved))
     assert np.array_equal(first, second)

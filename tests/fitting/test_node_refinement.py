@@ -7,13 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.network_fit import two_way_residual
-from meshmatch.fitting.nodes import (
-    NodeRefineConfig,
-    nearest_rotations,
-    pair_terms,
-    refine_nodes,
-    robust_weight,
-)
+from meshmatch.fitting.nodes import NodeRefineConfig, nearest_rotations, pair_terms, refine_nodes, robust_weight
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.oriented import PAIR_WEIGHT, OrientedPoints, with_normals
 from meshmatch.geometry.triangles import vertex_areas
@@ -193,9 +187,7 @@ def test_each_step_lowers_the_energy_that_it_is_given(
     assert energies[0][1] < energies[0][0]
 
 
-def test_turning_everything_turns_the_answer(
-    system: NodeSystem, scan: OrientedPoints, model: TrainedModel
-) -> None:
+def test_turning_everything_turns_the_answer(system: NodeSystem, scan: OrientedPoints, model: TrainedModel) -> None:
     Q = Rotation.from_rotvec([0.3, -0.9, 0.4]).as_matrix()
     turned = OrientedPoints(scan.points @ Q.T, scan.normals @ Q.T)
     nodes = model.template.nodes
@@ -224,9 +216,7 @@ def test_landmarks_are_met_and_the_rest_stays_on_the_surface(
     assert off_surface(system, held, truth).mean() < 0.01
 
 
-def test_of_a_part_only_what_is_near_it_is_pulled(
-    system: NodeSystem, scan: OrientedPoints, truth: np.ndarray
-) -> None:
+def test_of_a_part_only_what_is_near_it_is_pulled(system: NodeSystem, scan: OrientedPoints, truth: np.ndarray) -> None:
     upper = scan.points[:, 1] > 0
     half, scale = OrientedPoints(scan.points[upper], scan.normals[upper]), 0.03
     moved = system.moved(truth)
@@ -235,9 +225,7 @@ def test_of_a_part_only_what_is_near_it_is_pulled(
     never = far & (moved[:, 1] < -0.2)  # nor do points of the half ask for these
     assert never.sum() > 20
     config = replace(CONFIG, normal_cosine=-1.0)
-    whole, part = (
-        pair_terms(system, half, truth, scale, config, one_sided)[0] for one_sided in (False, True)
-    )
+    whole, part = (pair_terms(system, half, truth, scale, config, one_sided)[0] for one_sided in (False, True))
     assert (whole[never] != 0).any(1).all()
     assert (part[never] == 0).all()
     assert np.array_equal(part[~far], whole[~far])
@@ -249,9 +237,7 @@ def test_no_steps_change_nothing(system: NodeSystem, scan: OrientedPoints) -> No
     )
 
 
-def test_samples_of_weight_zero_do_not_pull(
-    system: NodeSystem, scan: OrientedPoints, truth: np.ndarray
-) -> None:
+def test_samples_of_weight_zero_do_not_pull(system: NodeSystem, scan: OrientedPoints, truth: np.ndarray) -> None:
     """Half of the egg is shown too large: the template follows if it is trusted, and is held by its prior if not."""
     top = scan.points[:, 1] > 0
     lifted = OrientedPoints(scan.points + 0.03 * top[:, None] * scan.normals, scan.normals)

@@ -50,9 +50,7 @@ def test_turned_copies_are_rotations_of_one_seed_and_begin_as_they_are() -> None
     assert not np.allclose(turns[1:], turned_copies(12, 4)[1:])
 
 
-def test_asking_about_turned_copies_is_turning_the_points_and_asking(
-    model: TrainedModel, points: np.ndarray
-) -> None:
+def test_asking_about_turned_copies_is_turning_the_points_and_asking(model: TrainedModel, points: np.ndarray) -> None:
     turns = turned_copies(5, 0)
     R, t = ask_aligner(model.network, points, turns)
     aligner = model.network.aligner

@@ -46,9 +46,7 @@ def test_strays_are_left_out_and_surface_is_not(system: NodeSystem) -> None:
     points = sample_surface(surface, 900, np.random.default_rng(0)).points
     away = np.random.default_rng(1).standard_normal((40, 3))
     strays = away / np.linalg.norm(away, axis=1)[:, None] * np.linspace(0.6, 0.9, 40)[:, None]
-    kept = {
-        tuple(point) for point in without_outliers(Shape(np.concatenate([points, strays]), NO_FACES)).verts
-    }
+    kept = {tuple(point) for point in without_outliers(Shape(np.concatenate([points, strays]), NO_FACES)).verts}
     assert sum(tuple(point) in kept for point in strays) < 15
     assert sum(tuple(point) in kept for point in points) > 0.97 * len(points)
     assert without_outliers(surface) is surface
@@ -103,9 +101,7 @@ def test_residuals_and_tears_ignore_a_side_that_is_not_known(system: NodeSystem)
     for residual in (two_way_residual, one_way_residual):
         right = residual(system, scan, still)
         assert residual(system, flipped, still) > 2 * right
-        assert residual(
-            system, OrientedPoints(scan.points, -scan.normals, signed=False), still
-        ) == pytest.approx(right)
+        assert residual(system, OrientedPoints(scan.points, -scan.normals, signed=False), still) == pytest.approx(right)
     unsure = OrientedPoints(scan.points, -scan.normals, signed=False)
     right, wrong, turned = (
         CandidateScorer(system, each).discontinuous_share(each, still) for each in (scan, flipped, unsure)
@@ -170,8 +166,6 @@ def test_what_is_no_cloud_is_refused_in_one_line(points: np.ndarray, message: st
 def test_a_point_at_the_end_of_the_world_is_a_stray() -> None:
     points = body(600)
     far = np.concatenate([points, [[1e30, 0.0, 0.0], [0.0, -1e15, 0.0]]])
-    here, there = (
-        register(Shape(cloud, NO_FACES), config=FitConfig(refine="none")) for cloud in (points, far)
-    )
+    here, there = (register(Shape(cloud, NO_FACES), config=FitConfig(refine="none")) for cloud in (points, far))
     assert there.verdict == here.verdict != "poor"
     assert np.linalg.norm(here.points_in_file - there.points_in_file, axis=1).mean() < 4  # centimetres

@@ -63,9 +63,7 @@ def test_what_is_not_visible_is_not_held_against_a_part() -> None:
     assert "taken for a part" in reasons[0]
     assert judge(0.05, scan, system.verts, partial=True)[0] == "poor"
     whole = OrientedPoints(samples.points, samples.normals)
-    assert one_way_residual(system, scan, still) == pytest.approx(
-        one_way_residual(system, whole, still), rel=0.1
-    )
+    assert one_way_residual(system, scan, still) == pytest.approx(one_way_residual(system, whole, still), rel=0.1)
 
 
 def side_of(body: Shape, direction: np.ndarray) -> tuple[Shape, np.ndarray]:
@@ -118,9 +116,7 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
     far, near = (RigidPose(np.eye(3), np.array([away, 0.0, 0.0])) for away in (5.0, 0.0))
     asked: set[tuple[int, int, bool]] = set()
 
-    def frames(
-        model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool
-    ) -> list[RigidPose]:
+    def frames(model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool) -> list[RigidPose]:
         asked.add((config.copies, config.hypotheses, wide))
         return [near if wide == wide_is_better else far]
 

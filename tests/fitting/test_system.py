@@ -109,9 +109,7 @@ def test_what_holds_already_is_left_alone(system: NodeSystem, model: TrainedMode
     assert np.allclose(problem.solve(system), problem.current, atol=1e-10)
 
 
-def test_an_affine_motion_of_the_nodes_moves_the_template_by_it(
-    system: NodeSystem, model: TrainedModel
-) -> None:
+def test_an_affine_motion_of_the_nodes_moves_the_template_by_it(system: NodeSystem, model: TrainedModel) -> None:
     rng = np.random.default_rng(0)
     A, t = np.eye(3) + 0.3 * rng.normal(size=(3, 3)), rng.normal(size=3)
     nodes = model.template.nodes

@@ -32,9 +32,7 @@ def test_frame_laws(scale: float) -> None:
     np.testing.assert_allclose(frame.apply(frame.undo(points)), points, rtol=0, atol=1e-12 * max(scale, 1))
     composed = frame.compose(other)
     np.testing.assert_allclose(composed.apply(points), other.apply(frame.apply(points)), atol=1e-10)
-    np.testing.assert_allclose(
-        composed.undo(points), frame.undo(other.undo(points)), rtol=1e-9, atol=1e-9 * scale
-    )
+    np.testing.assert_allclose(composed.undo(points), frame.undo(other.undo(points)), rtol=1e-9, atol=1e-9 * scale)
     same = frame.compose(Frame.identity())
     np.testing.assert_allclose(same.apply(points), frame.apply(points), atol=1e-12)
     np.testing.assert_array_equal(Frame.identity().apply(points), points)

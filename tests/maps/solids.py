@@ -29,11 +29,6 @@ def bumpy_sphere(rows: int = 24, columns: int = 40, name: str = "bumpy") -> Shap
         faces.append([len(verts) - 2, k, right])
         faces.append([len(verts) - 1, (rows - 2) * columns + right, (rows - 2) * columns + k])
         for r in range(rows - 2):
-            a, b, c, d = (
-                r * columns + k,
-                r * columns + right,
-                (r + 1) * columns + k,
-                (r + 1) * columns + right,
-            )
+            a, b, c, d = (r * columns + k, r * columns + right, (r + 1) * columns + k, (r + 1) * columns + right)
             faces += [[a, c, d], [a, d, b]]
     return Shape(verts, np.array(faces), name)

@@ -38,9 +38,7 @@ def test_where_a_fit_moved_it_is_not_believed() -> None:
         assert np.allclose(found.confidence[high], np.exp(-((moved / 0.05) ** 2)), atol=1e-6)
         assert np.allclose(found.confidence[~high], 1)
         assert np.array_equal(found.index, sure.index)
-    assert np.array_equal(
-        build_map(part, fit, part, fit, before_agreement=(fit, fit)).confidence, sure.confidence
-    )
+    assert np.array_equal(build_map(part, fit, part, fit, before_agreement=(fit, fit)).confidence, sure.confidence)
 
 
 def test_both_fits_count_where_the_source_lies() -> None:

@@ -55,9 +55,7 @@ def test_coverage_by_hand() -> None:
     assert (everything.vertices, everything.area) == (1.0, pytest.approx(1.0))
     one = coverage(np.ones(100, int), sheet)
     assert one.vertices == pytest.approx(1 / 6)
-    assert one.area == pytest.approx(
-        1 / 4
-    )  # three of the four triangles touch it, a third of each is its own
+    assert one.area == pytest.approx(1 / 4)  # three of the four triangles touch it, a third of each is its own
 
 
 def test_distortion_is_0_for_an_isometry_and_grows() -> None:
@@ -99,7 +97,5 @@ def test_distortion_is_a_mean_over_pairs() -> None:
     shape = bumpy_sphere(6, 7)
     geodesics = GeodesicDistances(shape)
     distances = geodesics.rows(np.arange(shape.V))
-    found = distortion(
-        np.zeros(shape.V, int), geodesics, geodesics, np.random.default_rng(0), samples=shape.V
-    )
+    found = distortion(np.zeros(shape.V, int), geodesics, geodesics, np.random.default_rng(0), samples=shape.V)
     assert found == pytest.approx(distances.sum() / (shape.V * (shape.V - 1)))

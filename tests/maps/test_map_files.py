@@ -16,11 +16,7 @@ from meshmatch.shapes import Shape
 from meshmatch.shapes.files import save_shape
 from tests.maps.test_vertex_map import A, B, C, random_map
 
-CARRIES = {
-    ".npy": ("index",),
-    ".txt": ("index",),
-    ".csv": ("index", "face", "barycentric", "confidence"),
-}
+CARRIES = {".npy": ("index",), ".txt": ("index",), ".csv": ("index", "face", "barycentric", "confidence")}
 EVERYTHING = (
     *("index", "face", "barycentric", "confidence", "source", "target", "verdict", "reasons"),
     *("source_vertices", "target_vertices", "source_hash", "target_hash"),
@@ -58,11 +54,7 @@ def test_the_shapes_fill_in_what_the_file_leaves_out(tmp_path: Path, suffix: str
     m = random_map(A, B, 6)
     save_map(tmp_path / f"map{suffix}", m)
     found = load_map(tmp_path / f"map{suffix}", A, B)
-    same(
-        found,
-        m,
-        ("index", "source", "target", "source_vertices", "target_vertices", "source_hash", "target_hash"),
-    )
+    same(found, m, ("index", "source", "target", "source_vertices", "target_vertices", "source_hash", "target_hash"))
 
 
 @pytest.mark.parametrize("suffix", MAP_SUFFIXES)
@@ -92,9 +84,7 @@ def test_maps_of_other_programs(tmp_path: Path) -> None:
     np.save(tmp_path / "column.npy", np.array(expected, dtype=np.uint16)[:, None])
     savemat(tmp_path / "double.mat", {"index": np.array(expected, dtype=float)})
     (tmp_path / "spaces.txt").write_text("# from somewhere\n2\n0\n\n1\n")
-    (tmp_path / "excel.csv").write_text(
-        "﻿source_vertex, target_vertex\r\n0,2\r\n1,0\r\n2,1\r\n", encoding="utf-8"
-    )
+    (tmp_path / "excel.csv").write_text("﻿source_vertex, target_vertex\r\n0,2\r\n1,0\r\n2,1\r\n", encoding="utf-8")
     (tmp_path / "list.json").write_text("[2, 0, 1]")
     np.savez(tmp_path / "short.npz", index=np.array(expected))
     for path in sorted(tmp_path.iterdir()):
@@ -165,10 +155,7 @@ def test_missing_files_folders_and_suffixes(tmp_path: Path) -> None:
     (tmp_path / "folder.npy").mkdir()
     with pytest.raises(InputError, match="not a file"):
         load_map(tmp_path / "folder.npy")
-    for call in (
-        lambda: load_map(tmp_path / "a.xls"),
-        lambda: save_map(tmp_path / "a", VertexMap.identity(A)),
-    ):
+    for call in (lambda: load_map(tmp_path / "a.xls"), lambda: save_map(tmp_path / "a", VertexMap.identity(A))):
         with pytest.raises(OptionError, match="not a format for maps") as caught:
             call()
         assert ".npz" in caught.value.hint
@@ -179,9 +166,7 @@ def test_missing_files_folders_and_suffixes(tmp_path: Path) -> None:
 def test_a_map_of_another_source_or_target(tmp_path: Path) -> None:
     path = tmp_path / "map.npy"
     np.save(path, np.zeros(7, dtype=int))
-    with pytest.raises(
-        InputError, match=r"map\.npy was made for another source: a mesh of 7 vertices, but a has 12"
-    ):
+    with pytest.raises(InputError, match=r"map\.npy was made for another source: a mesh of 7 vertices, but a has 12"):
         load_map(path, A, B)
     np.save(path, np.full(A.V, B.V + 5))
     with pytest.raises(InputError, match=r"map\.npy: .* only 16"):

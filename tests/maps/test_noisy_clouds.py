@@ -66,9 +66,7 @@ def test_of_two_points_as_near_the_better_known_one_is_chosen() -> None:
     """Between two plates a point may belong to either: it stands back behind one that lies on its plate."""
     low, high = plate(), plate(height=0.1)
     points = np.concatenate([low.points, high.points])
-    fit = replace(
-        low, points=points, resting=points, faces=np.concatenate([low.faces, high.faces + len(low.points)])
-    )
+    fit = replace(low, points=points, resting=points, faces=np.concatenate([low.faces, high.faces + len(low.points)]))
     cloud = Shape(np.array([[0.5, 0.52, 0.05], [0.5, 0.45, 0.0]]), NO_FACES)
     sought = np.array([[0.5, 0.5, 0.02]])
     found = most_likely_points(cloud, fit, 0.02, sought, sought)

@@ -22,9 +22,7 @@ def test_a_thin_wall_has_two_sides() -> None:
     """Points in the wall, nearer to the side below: those that face up belong to the side above."""
     sheet = grid(10, 10, 0.1)
     above = sheet.verts + np.array([0, 0, 0.01])
-    wall = Shape(
-        np.concatenate([sheet.verts, above]), np.concatenate([sheet.faces[:, ::-1], sheet.faces + sheet.V])
-    )
+    wall = Shape(np.concatenate([sheet.verts, above]), np.concatenate([sheet.faces[:, ::-1], sheet.faces + sheet.V]))
     points = sheet.verts + np.array([0, 0, 0.004])
     up = np.tile([0.0, 0, 1], (sheet.V, 1))
     surface = Surface(wall.verts, wall.faces, wall.vertex_normals)

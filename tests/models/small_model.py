@@ -32,10 +32,7 @@ def small_card(**changes: Any) -> ModelCard:
         seed=1,
         steps=3,
         training_minutes=0.25,
-        metrics={
-            "validation": {"distance": 0.5},
-            "scape": {"none": {"mean_cm": 4.0}, "nodes": {"mean_cm": 2}},
-        },
+        metrics={"validation": {"distance": 0.5}, "scape": {"none": {"mean_cm": 4.0}, "nodes": {"mean_cm": 2}}},
         weights_sha256="ab" * 32,
         created="2026-01-31",
         description="Größe: none",

@@ -9,15 +9,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import ModelError
-from meshmatch.models.card import (
-    MAX_BYTES,
-    ModelCard,
-    card_from_json,
-    card_to_json,
-    check_name,
-    read_card,
-    write_card,
-)
+from meshmatch.models.card import MAX_BYTES, ModelCard, card_from_json, card_to_json, check_name, read_card, write_card
 
 from .small_model import small_card
 
@@ -129,9 +121,7 @@ def test_a_card_of_the_first_schema_is_read_as_it_was_meant() -> None:
     assert card == small_card()
     with pytest.raises(ModelError, match="missing entries: frame, stiffness"):
         card_from_json(json.dumps(words | {"schema": 3}))
-    with pytest.raises(
-        ModelError, match="missing entries: stiffness"
-    ):  # a frame is no sign of the first schema
+    with pytest.raises(ModelError, match="missing entries: stiffness"):  # a frame is no sign of the first schema
         card_from_json(json.dumps(words | {"frame": {"orientation": "none", "scale": "area"}}))
 
 

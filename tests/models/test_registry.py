@@ -62,9 +62,7 @@ def test_environment_moves_the_user_folder(tmp_path: Path, monkeypatch: pytest.M
     assert tmp_path not in user_folder().parents
 
 
-def test_a_model_is_found_by_name_or_by_folder(
-    blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_is_found_by_name_or_by_folder(blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert locate_model("human") == tmp_path / "built-in" / "human"
     assert locate_model(str(blob)) == blob
     assert locate_model(blob) == blob
@@ -85,9 +83,7 @@ def test_a_mistyped_name_is_told_its_neighbours() -> None:
     assert "there are: human" in caught.value.hint
 
 
-@pytest.mark.parametrize(
-    "name", ["../somewhere/blob", "..", ".", "a/../../b", "/etc", "\\..\\x", "~root", ""]
-)
+@pytest.mark.parametrize("name", ["../somewhere/blob", "..", ".", "a/../../b", "/etc", "\\..\\x", "~root", ""])
 def test_names_cannot_leave_the_registry(name: str, blob: Path) -> None:
     with pytest.raises(ModelError):
         get_entry(name)
@@ -145,8 +141,7 @@ def test_another_template_is_refused(blob: Path) -> None:
     with pytest.raises(ModelError, match="trained with another template"):
         verify_model(blob)
     write_card(
-        small_card(**_true(blob) | {"field": {"kernel": "smooth", "radius": 0.5, "nodes": 7}}),
-        blob / "card.json",
+        small_card(**_true(blob) | {"field": {"kernel": "smooth", "radius": 0.5, "nodes": 7}}), blob / "card.json"
     )
     with pytest.raises(ModelError, match="trained with another template"):
         verify_model(blob)
@@ -219,9 +214,7 @@ def test_only_the_three_files_are_copied(blob: Path) -> None:
     assert len(os.listdir(add_model(blob).folder)) == 3
 
 
-def test_a_registry_that_cannot_be_written_is_told(
-    blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_registry_that_cannot_be_written_is_told(blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("MESHMATCH_HOME", str(tmp_path / "file"))
     with pytest.raises(OutputError, match="cannot write") as caught:
@@ -229,9 +222,7 @@ def test_a_registry_that_cannot_be_written_is_told(
     assert "MESHMATCH_HOME" in caught.value.hint
 
 
-def test_a_model_that_changes_while_it_is_copied_is_refused(
-    blob: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_that_changes_while_it_is_copied_is_refused(blob: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy = registry.shutil.copyfile
 
     def swap(source: Path, target: Path) -> None:

@@ -19,12 +19,7 @@ SWITCHES = (
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),  # WebGL without a graphics card
 )
 DESKTOP = {"viewport": {"width": 1280, "height": 800}}
-PHONE = {
-    "viewport": {"width": 390, "height": 844},
-    "device_scale_factor": 2,
-    "has_touch": True,
-    "is_mobile": True,
-}
+PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "has_touch": True, "is_mobile": True}
 
 
 def chromium() -> str:
@@ -65,9 +60,7 @@ class Opened:
 def browser() -> Iterator[Any]:
     """Chromium, with nothing of anybody's in it."""
     program = chromium()
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="playwright drives the browser (extra dev)"
-    )
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser (extra dev)")
     with playwright.sync_playwright() as driver:
         running = driver.chromium.launch(executable_path=program, args=list(SWITCHES))
         yield running

@@ -22,11 +22,7 @@ class Pair:
 
 
 def stirred(
-    shape: Shape,
-    name: str = "stirred",
-    verdict: str = "good",
-    reasons: tuple[str, ...] = (),
-    lean: float = 0.0,
+    shape: Shape, name: str = "stirred", verdict: str = "good", reasons: tuple[str, ...] = (), lean: float = 0.0
 ) -> Pair:
     """A shape, and the same one larger, elsewhere, z instead of y up, its vertices in another order; leaning to
     one side by so much of its height.
@@ -46,6 +42,4 @@ def stirred(
 def bump(sphere: Shape) -> Shape:
     """A sphere that has no symmetry: a nose at +z, longer than wide."""
     nose = np.exp(-8 * ((sphere.verts - [0.2, 0.3, 0.9]) ** 2).sum(axis=1))
-    return Shape(
-        sphere.verts * np.array([0.8, 1.5, 0.6]) * (1 + 0.5 * nose)[:, None], sphere.faces, "egg.ply"
-    )
+    return Shape(sphere.verts * np.array([0.8, 1.5, 0.6]) * (1 + 0.5 * nose)[:, None], sphere.faces, "egg.ply")

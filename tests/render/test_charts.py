@@ -22,9 +22,7 @@ def spots(path: Path, number: int, left: float = 0.0, top: float = 0.15, right: 
         pixels = np.asarray(image.convert("RGB"), int)
     wanted = [int(COLORS[number][k : k + 2], 16) for k in (1, 3, 5)]
     rows, columns = np.nonzero(np.abs(pixels - wanted).max(2) < 16)
-    inside = (
-        (rows > top * len(pixels)) & (columns > left * pixels.shape[1]) & (columns < right * pixels.shape[1])
-    )
+    inside = (rows > top * len(pixels)) & (columns > left * pixels.shape[1]) & (columns < right * pixels.shape[1])
     return np.stack([columns, len(pixels) - rows], 1)[inside]
 
 
@@ -42,11 +40,7 @@ def test_values_and_places_are_where_they_should_be(tmp_path: Path) -> None:
 
 def test_places_by_ratio_and_zero_at_the_left(tmp_path: Path) -> None:
     def share(log: bool, x: tuple[float, float, float]) -> float:
-        lines = {
-            "ends": Line((x[0], x[2]), (5, 5)),
-            "between": Line((x[1],), (5,)),
-            "roof": Line((x[1],), (9,)),
-        }
+        lines = {"ends": Line((x[0], x[2]), (5, 5)), "between": Line((x[1],), (5,)), "roof": Line((x[1],), (9,))}
         draw_lines([Chart("steps", lines, (), log)], tmp_path / "b.png", "cm")
         ends, between = (spots(tmp_path / "b.png", k, right=1.0)[:, 0] for k in (0, 1))
         return float((between.mean() - ends.min()) / np.ptp(ends))
@@ -149,9 +143,7 @@ def test_long_and_strange_names_stay_in_the_picture(tmp_path: Path) -> None:
     words = ["x" * 300, "$name$ " * 40, "漢字 \n é \x00"]
     draw_bars({words[0]: [Bar(word, 1.0, words[1], True) for word in words]}, tmp_path / "a.png", words[2])
     line = Line((1, 2), (1, 2))
-    draw_lines(
-        [Chart(words[0], dict.fromkeys(words, line), marks={1: words[0]})], tmp_path / "b.png", words[1]
-    )
+    draw_lines([Chart(words[0], dict.fromkeys(words, line), marks={1: words[0]})], tmp_path / "b.png", words[1])
     for name in ("a.png", "b.png"):
         with Image.open(tmp_path / name) as image:
             pixels = np.asarray(image.convert("RGB"), int)
@@ -159,9 +151,7 @@ def test_long_and_strange_names_stay_in_the_picture(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
-def test_the_same_numbers_give_the_same_file(
-    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_same_numbers_give_the_same_file(tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch) -> None:
     chart = Chart("steps", {"a": Line((1, 2), (1, 2), (0.1, 0.1))})
     import matplotlib
 

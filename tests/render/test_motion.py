@@ -31,8 +31,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     data = zlib.decompress(base64.b64decode(re.findall(r'id="packed">(.*?)</script>', text, re.S)[0]))
     kinds = {"Uint8Array": "u1", "Int8Array": "i1", "Uint16Array": "<u2", "Uint32Array": "<u4"}
     return words, {
-        row["name"]: np.frombuffer(data, kinds[row["kind"]], row["length"], row["start"])
-        for row in words["arrays"]
+        row["name"]: np.frombuffer(data, kinds[row["kind"]], row["length"], row["start"]) for row in words["arrays"]
     }
 
 
@@ -40,9 +39,7 @@ def test_every_frame_is_in_the_page(tmp_path: Path, make_sphere: Callable[[int],
     ball, path = make_sphere(1), tmp_path / "a.html"
     frames = grown(ball, 1.0, 2.0, 0.5)
     turn = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-    size = write_motion(
-        path, frames, TIMES, rotation=turn, met={0.0: "a </script>", 9.0: "never"}, title="a & b"
-    )
+    size = write_motion(path, frames, TIMES, rotation=turn, met={0.0: "a </script>", 9.0: "never"}, title="a & b")
     assert size == path.stat().st_size
     words, arrays = read(path)
     assert (words["times"], words["met"]) == (list(TIMES), [[0.0, "a </script>"]])
@@ -89,9 +86,7 @@ def test_what_is_no_motion(tmp_path: Path, make_sphere: Callable[[int], Shape], 
         frames = frames[:1]
     times = (0.0, 0.0) if wrong == "times" else (0.0, 1.0)[: len(frames)]
     with pytest.raises(OptionError):
-        write_motion(
-            tmp_path / ("a.txt" if wrong == "suffix" else "a.html"), frames, times, rotation=np.eye(3)
-        )
+        write_motion(tmp_path / ("a.txt" if wrong == "suffix" else "a.html"), frames, times, rotation=np.eye(3))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -103,13 +98,13 @@ def height(path: Path) -> int:
 
 def test_the_slider_moves_it(tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
     path = tmp_path / "a.html"
-    write_motion(
-        path, grown(make_sphere(3), 1, 2, 1, colors=True), TIMES, rotation=np.eye(3), met={0.5: "tall"}
-    )
+    write_motion(path, grown(make_sphere(3), 1, 2, 1, colors=True), TIMES, rotation=np.eye(3), met={0.5: "tall"})
     with browser() as running, opened(running, path) as seen:
         small = height(seen.picture(tmp_path / "0.png"))
         assert seen.page.inner_text("#names") == "tall"
-        slider = "([t]) => { const s = document.getElementById('time'); s.value = t; s.dispatchEvent(new Event('input')) }"
+        slider = (
+            "([t]) => { const s = document.getElementById('time'); s.value = t; s.dispatchEvent(new Event('input')) }"
+        )
         seen.page.evaluate(slider, [0.5])
         tall = height(seen.picture(tmp_path / "1.png"))
         assert tall == pytest.approx(2 * small, rel=0.06)

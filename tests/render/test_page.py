@@ -32,9 +32,7 @@ DTYPES = {
     "Uint32Array": np.uint32,
     "Float32Array": np.float32,
 }
-HOSTILE = (
-    "</script><script>alert(1)</script ><script /x><!--<script <!--packed--><b a='\"'>&amp;\u2028\u202e.ply"
-)
+HOSTILE = "</script><script>alert(1)</script ><script /x><!--<script <!--packed--><b a='\"'>&amp;\u2028\u202e.ply"
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +84,7 @@ class Page(HTMLParser):
 def test_unknown_confidence_is_not_certainty(
     tmp_path: Path, cube: Shape, verdict: str, confidence: float, known: bool
 ) -> None:
-    found = VertexMap.between(
-        cube, cube, np.arange(8), confidence=np.full(8, confidence, np.float32), verdict=verdict
-    )
+    found = VertexMap.between(cube, cube, np.arange(8), confidence=np.full(8, confidence, np.float32), verdict=verdict)
     words = page_of(tmp_path / "page.html", Pair(cube, cube, found, found)).words
     assert words["confidence"] == ([confidence, confidence] if known else None)
 
@@ -164,9 +160,7 @@ def test_nothing_is_loaded_from_elsewhere(tmp_path: Path, pair: Pair) -> None:
 def test_the_policy_knows_every_script_and_forbids_the_rest(tmp_path: Path, pair: Pair) -> None:
     page = page_of(tmp_path / "page.html", pair)
     (policy,) = (
-        attrs["content"]
-        for attrs, _ in page.all("meta")
-        if attrs.get("http-equiv") == "Content-Security-Policy"
+        attrs["content"] for attrs, _ in page.all("meta") if attrs.get("http-equiv") == "Content-Security-Policy"
     )
     rules = {rule.split()[0]: rule.split()[1:] for rule in str(policy).split(";")}
     assert rules["default-src"] == rules["base-uri"] == rules["form-action"] == ["'none'"]
@@ -175,9 +169,7 @@ def test_the_policy_knows_every_script_and_forbids_the_rest(tmp_path: Path, pair
     programs = [text for attrs, text in page.all("script") if "type" not in attrs]
     assert rules["script-src"] == [sha256(text) for text in programs]
     assert rules["style-src"] == [sha256(text) for _, text in page.all("style")]
-    assert not any(
-        name.startswith("on") or name == "style" for _, attrs, _ in page.elements for name in attrs
-    )
+    assert not any(name.startswith("on") or name == "style" for _, attrs, _ in page.elements for name in attrs)
 
 
 def sha256(text: str) -> str:
@@ -191,29 +183,17 @@ def test_the_scripts_that_ship_cannot_end_their_element() -> None:
     assert {f"{name}.js" for name in (*page._SCRIPTS, "three.min")} <= {path.name for path in scripts}
     for path in scripts:
         text = path.read_text(encoding="utf-8")
-        for forbidden in (
-            "</script",
-            "<script",
-            "<!--",
-            "innerHTML",
-            "eval(",
-            "new Function",
-            "document.write",
-        ):
+        for forbidden in ("</script", "<script", "<!--", "innerHTML", "eval(", "new Function", "document.write"):
             assert forbidden not in text, (path.name, forbidden)
 
 
 def test_names_cannot_break_out(tmp_path: Path, pair: Pair) -> None:
     plain = page_of(tmp_path / "plain.html", pair)
-    there = VertexMap.between(
-        pair.source, pair.target, pair.there.index, verdict="poor", reasons=(f"{HOSTILE}: far",)
-    )
+    there = VertexMap.between(pair.source, pair.target, pair.there.index, verdict="poor", reasons=(f"{HOSTILE}: far",))
     hostile = Pair(pair.source, pair.target, there, pair.back)
     page = page_of(tmp_path / "page.html", hostile, names=(HOSTILE, "<!--title-->"))
     assert [tag for tag, *_ in page.elements] == [tag for tag, *_ in plain.elements]
-    shown = HOSTILE.replace("\u2028", "\ufffd").replace(
-        "\u202e", "\ufffd"
-    )  # which end lines and turn words round
+    shown = HOSTILE.replace("\u2028", "\ufffd").replace("\u202e", "\ufffd")  # which end lines and turn words round
     assert page.words["source"]["name"] == shown
     assert page.words["target"]["name"] == "<!--title-->"
     assert page.words["reasons"] == [f"{shown}: far"]
@@ -248,9 +228,7 @@ def test_a_vertex_without_a_position_is_not_drawn(tmp_path: Path, cube: Shape) -
     broken = Shape(cube.verts, cube.faces, "broken", None, invalid)
     arrays = page_of(
         tmp_path / "page.html",
-        Pair(
-            broken, cube, VertexMap.between(broken, cube, range(8)), VertexMap.between(cube, broken, range(8))
-        ),
+        Pair(broken, cube, VertexMap.between(broken, cube, range(8)), VertexMap.between(cube, broken, range(8))),
     ).arrays
     assert 3 not in arrays["source.face"]
     assert len(arrays["source.face"]) == 3 * (~(cube.faces == 3).any(axis=1)).sum()
@@ -361,9 +339,7 @@ def test_half_a_shape_is_drawn_in_the_scale_of_the_whole(tmp_path: Path, pair: P
     faces = new[pair.target.faces]
     half = Shape(pair.target.verts[kept], faces[(faces >= 0).all(axis=1)], "half")
     back = VertexMap.between(half, pair.source, pair.back.index[kept])
-    near = np.linalg.norm(pair.target.verts[pair.there.index][:, None] - half.verts[None], axis=2).argmin(
-        axis=1
-    )
+    near = np.linalg.norm(pair.target.verts[pair.there.index][:, None] - half.verts[None], axis=2).argmin(axis=1)
     there = VertexMap.between(pair.source, half, near, confidence=upper[pair.there.index].astype(np.float32))
     words = page_of(tmp_path / "page.html", Pair(pair.source, half, there, back)).words
     assert words["source"]["size"] == 1.0
@@ -393,9 +369,7 @@ def look_of(shape: Shape, pixels: np.ndarray | None, **material: Any) -> Appeara
     low = shape.bounds[0]
     uv = ((shape.verts - low) / np.ptp(shape.verts, axis=0))[:, [0, 2]][shape.faces]
     which = (np.arange(shape.F) % 2).astype(np.int64)
-    return Appearance(
-        (Material("image", pixels, **material), Material("red", factor=(1.0, 0, 0, 1))), which, uv
-    )
+    return Appearance((Material("image", pixels, **material), Material("red", factor=(1.0, 0, 0, 1))), which, uv)
 
 
 def test_a_texture_keeps_its_corners_and_its_image(tmp_path: Path, cube: Shape) -> None:

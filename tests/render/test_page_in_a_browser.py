@@ -199,9 +199,7 @@ def saturation(pixels: np.ndarray) -> float:
     return float(np.quantile(spread, 0.95) / 255)
 
 
-def test_a_turned_shape_stays_in_its_panel(
-    running: Any, make_sphere: Callable[[int], Shape], tmp_path: Path
-) -> None:
+def test_a_turned_shape_stays_in_its_panel(running: Any, make_sphere: Callable[[int], Shape], tmp_path: Path) -> None:
     ball = make_sphere(2)
     wide = stirred(Shape(ball.verts * (2.0, 2.0, 0.3), ball.faces, "wide"))
     write_page(tmp_path / "page.html", wide.source, wide.target, wide.there, wide.back)
@@ -230,9 +228,7 @@ def test_a_vertex_can_be_typed(running: Any, file: Path, pair: Pair) -> None:
         for wrong in ("162", "-1", "1e3", "nose"):
             field.fill(wrong)
             field.press("Enter")
-            assert view.page.locator("#status").inner_text() == (
-                "\u2068stirred.ply\u2069 has the vertices 0 to 161."
-            )
+            assert view.page.locator("#status").inner_text() == ("\u2068stirred.ply\u2069 has the vertices 0 to 161.")
         field.fill("")
         field.press("Enter")
         assert view.settled()["shown"] is None
@@ -293,9 +289,7 @@ def test_a_finger_taps_on_a_phone(running: Any, file: Path, pair: Pair, artefact
 
 def test_the_network_is_forbidden(running: Any, file: Path) -> None:
     with opened(running, file) as view:
-        refused = view.page.evaluate(
-            "fetch('https://example.org/').then(() => 'went through', error => error.name)"
-        )
+        refused = view.page.evaluate("fetch('https://example.org/').then(() => 'went through', error => error.name)")
         assert refused == "TypeError"
         assert any("Content Security Policy" in line for line in view.said)
         view.said.clear()

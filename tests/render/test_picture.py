@@ -234,8 +234,7 @@ def test_a_vertex_without_a_position_is_not_drawn(tmp_path: Path) -> None:
     assert np.array_equal(something(draw(tmp_path, (broken, None))), something(whole))
     colors = np.tile(RED, (12, 1))
     assert np.array_equal(
-        draw(tmp_path, Panel(broken, face_colors=[*colors, BLUE])),
-        draw(tmp_path, Panel(shape, face_colors=colors)),
+        draw(tmp_path, Panel(broken, face_colors=[*colors, BLUE])), draw(tmp_path, Panel(shape, face_colors=colors))
     )
     dots = Shape(verts, np.zeros((0, 3), int), invalid=np.arange(9) == 8)
     assert np.array_equal(
@@ -297,9 +296,7 @@ def test_a_shape_laid_over_another_tints_it_where_it_is_in_front(tmp_path: Path)
     assert np.array_equal(under[10:86, 10:86], bare[10:86, 10:86])
 
 
-def test_shapes_stand_in_a_row_on_one_ground_with_their_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shapes_stand_in_a_row_on_one_ground_with_their_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     low, high = box((1, 0.5, 1)), box((1, 1, 1))
     look = replace(SMALL, size=(240, 100))
     bare = something(draw(tmp_path, (low, None), (high, None), look=look))
@@ -342,8 +339,7 @@ def test_the_ground_has_a_shadow_beside_the_shape_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("background", "corner"),
-    [("white", (255, 255, 255)), ("dark", (24, 26, 31)), ("#10A0ff", (16, 160, 255))],
+    ("background", "corner"), [("white", (255, 255, 255)), ("dark", (24, 26, 31)), ("#10A0ff", (16, 160, 255))]
 )
 def test_backgrounds(tmp_path: Path, background: str, corner: tuple[int, int, int]) -> None:
     shape = box((1, 1, 1))

@@ -18,9 +18,7 @@ def surface(verts: object, faces: object, color: np.ndarray = GREY) -> Surface:
     return mesh_surface(points, corners, FacePaint(np.tile(color, (len(corners), 1))))
 
 
-def square(
-    side: float, z: float = 0.0, color: np.ndarray = GREY, at: tuple[float, float] = (0, 0)
-) -> Surface:
+def square(side: float, z: float = 0.0, color: np.ndarray = GREY, at: tuple[float, float] = (0, 0)) -> Surface:
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side / 2 + np.array(at)
     return surface(np.column_stack([corners, np.full(4, z)]), [[0, 1, 2], [0, 2, 3]], color)
 
@@ -62,8 +60,7 @@ def test_the_outline_of_a_ball() -> None:
 @pytest.mark.parametrize("slope", [0.02, 0.1, 0.5])
 def test_an_edge_of_any_slope_has_no_steps(slope: float) -> None:
     image = draw(
-        Scene([surface([[-1, -1, 0], [1, -1, 0], [1, slope, 0], [-1, -slope, 0]], [[0, 1, 2], [0, 2, 3]])]),
-        WINDOW,
+        Scene([surface([[-1, -1, 0], [1, -1, 0], [1, slope, 0], [-1, -slope, 0]], [[0, 1, 2], [0, 2, 3]])]), WINDOW
     )
     height = image.alpha.sum(axis=0)
     wanted = 35 + slope * (np.arange(90) + 0.5 - 45)
@@ -132,9 +129,7 @@ def test_light_that_nothing_blocks_is_whole_and_a_lid_takes_it() -> None:
 
 
 def test_a_shadow_is_soft_and_has_no_noise() -> None:
-    wall = surface(
-        [[-0.02, -0.9, 0], [-0.02, 0.9, 0], [-0.02, 0.9, 0.5], [-0.02, -0.9, 0.5]], [[0, 1, 2], [0, 2, 3]]
-    )
+    wall = surface([[-0.02, -0.9, 0], [-0.02, 0.9, 0], [-0.02, 0.9, 0.5], [-0.02, -0.9, 0.5]], [[0, 1, 2], [0, 2, 3]])
     image = draw(Scene([square(2.0), wall]), WINDOW)
     row = image.light[35, 50:, 0]
     assert row[0] < 0.8 * row[-1]
@@ -194,9 +189,7 @@ def test_the_nearest_corner_gives_a_sharp_colour() -> None:
 def test_holes_of_a_texture_show_what_is_behind() -> None:
     class Holed:
         def at(self, faces: np.ndarray, weights: np.ndarray, footprint: float) -> np.ndarray:
-            return np.column_stack(
-                [np.tile([1.0, 0, 0], (len(faces), 1)), np.where(weights[:, 1] > 0.5, 0.0, 1.0)]
-            )
+            return np.column_stack([np.tile([1.0, 0, 0], (len(faces), 1)), np.where(weights[:, 1] > 0.5, 0.0, 1.0)])
 
     triangle = np.array([[-0.4, -0.3, 0.2], [0.4, -0.3, 0.2], [-0.4, 0.3, 0.2]])
     holed = mesh_surface(triangle, np.array([[0, 1, 2]]), Holed())

@@ -19,9 +19,7 @@ def pair(make_sphere: Callable[[int], Shape]) -> Pair:
     found = stirred(bump(make_sphere(3)))
     sure = {"confidence": np.ones(found.source.V, np.float32)}
     there = VertexMap.between(found.source, found.target, found.there.index, **sure)
-    return Pair(
-        found.source, found.target, there, VertexMap.between(found.target, found.source, found.back.index)
-    )
+    return Pair(found.source, found.target, there, VertexMap.between(found.target, found.source, found.back.index))
 
 
 def height(shape: Shape) -> np.ndarray:
@@ -62,12 +60,7 @@ def test_the_wearers_own_coordinates_are_used(pair: Pair, textured: Appearance) 
     assert first is not None
     own = first.worn[1].uv[:, :, ::-1]  # an atlas, but another one
     again = share_look(
-        (pair.source, pair.target),
-        (textured, None),
-        pair.there,
-        pair.back,
-        coordinates=(None, own),
-        workers=2,
+        (pair.source, pair.target), (textured, None), pair.there, pair.back, coordinates=(None, own), workers=2
     )
     assert again is not None
     assert np.allclose(again.worn[1].uv, own)

@@ -29,9 +29,7 @@ def weights_at(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return face, np.array(weights)
 
 
-def look(
-    *materials: Material, which: tuple[int, int] = (0, 0), colors: np.ndarray | None = None
-) -> Appearance:
+def look(*materials: Material, which: tuple[int, int] = (0, 0), colors: np.ndarray | None = None) -> Appearance:
     return Appearance(materials, np.array(which), UV[FACES], colors)
 
 

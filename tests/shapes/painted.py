@@ -17,9 +17,7 @@ FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
 def quarters(size: int = 2) -> np.ndarray:
     """A picture of four flat quarters: red, green over blue, white."""
-    four = np.array(
-        [[[255, 0, 0, 255], [0, 255, 0, 255]], [[0, 0, 255, 255], [255, 255, 255, 255]]], np.uint8
-    )
+    four = np.array([[[255, 0, 0, 255], [0, 255, 0, 255]], [[0, 0, 255, 255], [255, 255, 255, 255]]], np.uint8)
     return four.repeat(size // 2, axis=0).repeat(size // 2, axis=1)
 
 

@@ -50,9 +50,7 @@ def test_where_every_turn_fits_the_given_one_is_taken(sphere: Shape) -> None:
     best, *others = align(ball, other, "rigid", keep=3)
     assert np.degrees(Rotation.from_matrix(best.pose.rotation).magnitude()) < 10
     assert len(others) == 2
-    assert (
-        min(turn.residual for turn in others) < 1.1 * best.residual
-    )  # chance alone would have chosen one of these
+    assert min(turn.residual for turn in others) < 1.1 * best.residual  # chance alone would have chosen one of these
 
 
 def test_several_answers_are_different_turns(pear: OrientedPoints) -> None:

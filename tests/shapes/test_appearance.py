@@ -167,9 +167,7 @@ def test_a_named_image_replaces_those_of_the_file(tmp_path: Path) -> None:
 
 
 def test_trimesh_reads_the_same_coordinates_and_images(tmp_path: Path) -> None:
-    write_gltf(
-        tmp_path / "a.glb", images=[encoded(quarters(8))], primitives=[{"material": 0, "uv": UV * 0.75}]
-    )
+    write_gltf(tmp_path / "a.glb", images=[encoded(quarters(8))], primitives=[{"material": 0, "uv": UV * 0.75}])
     found = look(tmp_path / "a.glb")
     (other,) = trimesh.load_scene(tmp_path / "a.glb").geometry.values()
     theirs = other.visual.uv * (1, -1) + (0, 1)  # v up
@@ -204,9 +202,7 @@ def test_polygons_negative_numbers_and_faces_without_coordinates(tmp_path: Path)
     text = "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0 0\nvt 1 1\nusemtl a # first\n"
     text += "f -4/-3 -3/-2 -2/-1 -1/-1\nvt 0 1\nusemtl b\nf 1/1/1 2/2/1 3/4/1\nf 1 2 3\nusemtl a\nf 1//1 2//1 3//1\n"
     (tmp_path / "a.obj").write_text(text)
-    (tmp_path / "m.mtl").write_text(
-        "newmtl a\nmap_Kd p.png\nnewmtl b\nKd 1 0.5 0\nnewmtl unused\nmap_Kd gone.png"
-    )
+    (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd p.png\nnewmtl b\nKd 1 0.5 0\nnewmtl unused\nmap_Kd gone.png")
     (tmp_path / "p.png").write_bytes(encoded(quarters()))
     shape, found = load_shape(tmp_path / "a.obj"), look(tmp_path / "a.obj")
     assert shape.F == len(found.material) == 5
@@ -332,9 +328,7 @@ def test_damaged_and_foreign_images(tmp_path: Path) -> None:
         assert word in refused(tmp_path / "a.obj", tmp_path / "b.png").message
 
 
-def test_a_huge_image_is_refused_before_it_is_unpacked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_huge_image_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_square_obj(tmp_path / "a.obj", mtl=None)
     (tmp_path / "b.png").write_bytes(encoded(quarters(64)))
     monkeypatch.setattr(images, "MAX_PIXELS", 64 * 63)

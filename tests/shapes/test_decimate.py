@@ -16,9 +16,7 @@ from meshmatch.shapes.shape import Shape
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1750.0])
 @pytest.mark.parametrize("quality", ["fast", "meshlab"])
-def test_closed_mesh_stays_closed_and_near(
-    make_sphere: Callable[[int], Shape], scale: float, quality: str
-) -> None:
+def test_closed_mesh_stays_closed_and_near(make_sphere: Callable[[int], Shape], scale: float, quality: str) -> None:
     if quality == "meshlab":
         pytest.importorskip("pymeshlab", exc_type=ImportError)
     ball = make_sphere(4)

@@ -34,22 +34,13 @@ XYZ = [f"property float {axis}" for axis in "xyz"]
     ("content", "words"),
     [
         (ply("element vertex 3"), "no x, y and z"),
-        (
-            ply("element vertex 3", "property list uchar float x", *XYZ[1:]),
-            "declares x of the element vertex as lists",
-        ),
-        (
-            ply("element vertex 3", *XYZ, "property list uchar uchar red"),
-            "red of the element vertex as lists",
-        ),
+        (ply("element vertex 3", "property list uchar float x", *XYZ[1:]), "declares x of the element vertex as lists"),
+        (ply("element vertex 3", *XYZ, "property list uchar uchar red"), "red of the element vertex as lists"),
         (
             ply("element vertex 3", *XYZ, "element face 1", "property int vertex_indices"),
             "vertex_indices of the element face as numbers",
         ),
-        (
-            ply("element vertex 3", *XYZ, "element tristrips 1", "property int strip"),
-            "strip of the element",
-        ),
+        (ply("element vertex 3", *XYZ, "element tristrips 1", "property int strip"), "strip of the element"),
     ],
 )
 def test_ply_lists_where_numbers_belong(tmp_path: Path, content: bytes, words: str) -> None:

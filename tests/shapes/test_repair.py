@@ -280,9 +280,7 @@ def test_invalid_vertices_are_dropped_and_answered_by_a_neighbour(sphere: Shape)
     for vertex in (7, 100):
         ring = np.unique(sphere.faces[(sphere.faces == vertex).any(axis=1)])
         assert done.kept_vertex[done.original_to_repaired[vertex]] in ring[ring != vertex]
-    assert (
-        done.kept_vertex[done.original_to_repaired[sphere.V]] == sphere.V - 1
-    )  # nearest in the file's order
+    assert done.kept_vertex[done.original_to_repaired[sphere.V]] == sphere.V - 1  # nearest in the file's order
 
 
 def test_invalid_vertex_without_a_face_is_answered_in_file_order(cube: Shape) -> None:

@@ -89,9 +89,7 @@ end_header
     for k, (x, y, z) in enumerate(CORNERS):
         body += struct.pack("<BdddBB", 255, x, y, z, k, 51) + struct.pack(f"<B{k}h", k, *range(k))
     for k, face in enumerate(QUAD_AND_TRIANGLE):
-        body += (
-            struct.pack("<B3I", 3, *face) + struct.pack(f"<H{2 * k}f", 2 * k, *[0.5] * (2 * k)) + b"\1\0\0\0"
-        )
+        body += struct.pack("<B3I", 3, *face) + struct.pack(f"<H{2 * k}f", 2 * k, *[0.5] * (2 * k)) + b"\1\0\0\0"
     shape = load(tmp_path, "a.ply", header.encode() + body + b"\0\0\0\0")
     check(shape)
     assert shape.colors is not None
@@ -264,9 +262,7 @@ def gltf(folder: Path, name: str, document: dict, *arrays: np.ndarray) -> Shape:
     for k, array in enumerate(arrays):
         wide = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}[1 if array.ndim == 1 else array.shape[1]]
         views.append({"buffer": 0, "byteOffset": len(body), "byteLength": array.nbytes})
-        accessors.append(
-            {"bufferView": k, "componentType": kinds[array.dtype.name], "count": len(array), "type": wide}
-        )
+        accessors.append({"bufferView": k, "componentType": kinds[array.dtype.name], "count": len(array), "type": wide})
         body += array.tobytes() + b"\0" * (-array.nbytes % 4)
     document = {"asset": {"version": "2.0"}, "bufferViews": views, "accessors": accessors, **document}
     (folder / "data.bin").write_bytes(body)
@@ -336,14 +332,7 @@ def test_gltf_colours_sparse_and_strided_data(tmp_path: Path) -> None:
     rows[:, :3] = TRIANGLE
     document = {
         "nodes": [{"mesh": 0}],
-        "meshes": [
-            {
-                "primitives": [
-                    {"attributes": {"POSITION": 0, "COLOR_0": 1}},
-                    {"attributes": {"POSITION": 2}},
-                ]
-            }
-        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}}, {"attributes": {"POSITION": 2}}]}],
         "bufferViews": [
             {"buffer": 0, "byteOffset": 0, "byteLength": 48, "byteStride": 16},
             {"buffer": 0, "byteOffset": 48, "byteLength": 12},
@@ -590,9 +579,7 @@ def test_npy_header_that_claims_a_billion_points(tmp_path: Path) -> None:
 
 
 def test_some_nan_vertices_keep_their_place(tmp_path: Path) -> None:
-    shape = load(
-        tmp_path, "a.obj", "v 0 0 0\nv 2 0 0\nv nan 0 0\nv 0 inf 0\nv 1 1 1e99\nv 4 3 0\nf 1 2 6\nf 1 2 3\n"
-    )
+    shape = load(tmp_path, "a.obj", "v 0 0 0\nv 2 0 0\nv nan 0 0\nv 0 inf 0\nv 1 1 1e99\nv 4 3 0\nf 1 2 6\nf 1 2 3\n")
     assert shape.V == 6
     np.testing.assert_array_equal(shape.invalid, [False, False, True, True, True, False])
     np.testing.assert_allclose(shape.verts[2:5], [[2, 1, 0]] * 3)  # the middle of the others
@@ -659,9 +646,7 @@ def test_textured_cow_keeps_its_v_lines(bench: Path) -> None:
 def test_game_characters_keep_every_vertex(bench: Path, name: str) -> None:
     data = (bench / "textured" / name).read_bytes()
     document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    primitives = [
-        p for n in document["nodes"] if "mesh" in n for p in document["meshes"][n["mesh"]]["primitives"]
-    ]
+    primitives = [p for n in document["nodes"] if "mesh" in n for p in document["meshes"][n["mesh"]]["primitives"]]
     accessors = document["accessors"]
     shape = load_shape(bench / "textured" / name)
     V = sum(accessors[p["attributes"]["POSITION"]]["count"] for p in primitives)

@@ -95,9 +95,7 @@ def test_the_meaning_of_alpha_is_written(tmp_path: Path, alpha: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
-def test_trimesh_sees_the_same_colours(
-    tmp_path: Path, ball: tuple[Textured, np.ndarray], suffix: str
-) -> None:
+def test_trimesh_sees_the_same_colours(tmp_path: Path, ball: tuple[Textured, np.ndarray], suffix: str) -> None:
     """The second implementation: its own reader, its own weights, its own look-up of the picture."""
     mesh, image = ball
     image[..., 3] = 255

@@ -122,9 +122,7 @@ def test_geodesic_rejection_keeps_a_node_off_the_other_plate() -> None:
     assert touching_both("geodesic") == 0
 
 
-def test_a_rejection_that_leaves_nothing_becomes_milder_or_names_the_vertices(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_rejection_that_leaves_nothing_becomes_milder_or_names_the_vertices(monkeypatch: pytest.MonkeyPatch) -> None:
     fold, config = two_plates(0.1), NodeConfig(strategy="geodesic", K=60, radius=0.2, depth=0.0)
     assert badly_held(fold.verts, choose_nodes(fold, config), 0.2) == []
     monkeypatch.setattr("meshmatch.templates.nodes._GEODESIC_SHARES", (0.2,))
@@ -154,8 +152,7 @@ def test_an_edge_graph_by_hand() -> None:
 
 def test_spectral_clusters_tell_two_parts_apart(sphere: Shape) -> None:
     two = Shape(
-        np.concatenate([sphere.verts, sphere.verts + 5]),
-        np.concatenate([sphere.faces, sphere.faces + sphere.V]),
+        np.concatenate([sphere.verts, sphere.verts + 5]), np.concatenate([sphere.faces, sphere.faces + sphere.V])
     )
     labels = spectral_clusters(two, 2, np.random.default_rng(0))
     assert set(labels[: sphere.V]) != set(labels[sphere.V :])
@@ -179,9 +176,7 @@ def test_farthest_points_in_any_dimension_by_hand() -> None:
 
 
 def test_vertices_out_of_reach_are_named(ring: Shape) -> None:
-    with pytest.raises(
-        TemplateError, match=r"\d+ vertices have fewer than four .* \(vertices \d+, "
-    ) as caught:
+    with pytest.raises(TemplateError, match=r"\d+ vertices have fewer than four .* \(vertices \d+, ") as caught:
         choose_nodes(ring, NodeConfig(strategy="uniform", K=20, radius=0.02))
     assert "radius" in caught.value.hint
     named = [int(word) for word in caught.value.message.split("(vertices ")[1].split(", ")[:5]]

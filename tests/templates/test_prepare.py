@@ -43,9 +43,7 @@ def folder(tmp_path: Path, sphere: Shape) -> Path:
 
 def test_registered_shapes_keep_their_correspondence(folder: Path, sphere: Shape, tmp_path: Path) -> None:
     seen: list[float] = []
-    made = prepared(
-        folder, tmp_path / "out", FEW, faces=600, progress=lambda _stage, _name, share: seen.append(share)
-    )
+    made = prepared(folder, tmp_path / "out", FEW, faces=600, progress=lambda _stage, _name, share: seen.append(share))
     template = load_template(tmp_path / "out" / "template.safetensors")
     assert template.hash == made.template.hash
     assert template.name == "eggs"
@@ -85,9 +83,7 @@ def test_files_of_one_stem_do_not_overwrite_each_other(folder: Path, torus: Shap
     assert files == ["egg0.obj.ply", "egg0.ply.ply", "egg1.ply", "egg2.ply"]
 
 
-def test_shapes_of_another_connectivity_are_not_registered(
-    folder: Path, sphere: Shape, tmp_path: Path
-) -> None:
+def test_shapes_of_another_connectivity_are_not_registered(folder: Path, sphere: Shape, tmp_path: Path) -> None:
     save_shape(folder / "odd.ply", Shape(egg(sphere, 1), sphere.faces[:, [1, 2, 0]]))
     made = prepared(folder, tmp_path / "out", FEW, align="none")
     assert made.shapes.shape == (0, 642, 3)

@@ -17,12 +17,7 @@ from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, Prepared, prepare
 from meshmatch.templates.registered import is_registered
 from meshmatch.templates.template import load_template
-from meshmatch.templates.unregistered import (
-    medoid,
-    read_samples,
-    template_radius,
-    unit_frame,
-)
+from meshmatch.templates.unregistered import medoid, read_samples, template_radius, unit_frame
 from tests.conftest import icosphere
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.35)
@@ -79,11 +74,7 @@ def test_the_typical_shape_is_the_middle_one() -> None:
     assert medoid(shapes, "none", "area", 0) in (1, 2, 3)
     lonely = [repair(pear(2, stretch)) for stretch in (2.0, 1.0, 1.02, 0.98)]
     assert medoid(lonely, "none", "area", 0) != 0
-    clouds = [
-        repair(Shape(pear(3).verts, NONE)),
-        repair(pear(2, 0.7)),
-        repair(Shape(pear(3, 1.1).verts, NONE)),
-    ]
+    clouds = [repair(Shape(pear(3).verts, NONE)), repair(pear(2, 0.7)), repair(Shape(pear(3, 1.1).verts, NONE))]
     assert medoid(clouds, "none", "area", 0) == 1  # a mesh, if there is one
 
 
@@ -111,8 +102,7 @@ def test_nodes_of_a_cloud_scatter_around_it(tmp_path: Path) -> None:
             save_shape(tmp_path / f"in{n}" / f"{k}.ply", Shape(ball.verts * (1 + k), faces))
     radius = np.sqrt(1 / (4 * np.pi))
     below, around = (
-        np.linalg.norm(prepared(tmp_path / f"in{n}", tmp_path / "out", FEW).template.nodes, axis=1)
-        for n in (0, 1)
+        np.linalg.norm(prepared(tmp_path / f"in{n}", tmp_path / "out", FEW).template.nodes, axis=1) for n in (0, 1)
     )
     assert below.max() < radius * 1.01
     assert 0.2 < (around > radius).mean() < 0.95

@@ -22,9 +22,7 @@ NETWORK = NetworkConfig(
 # The paper's choices, but narrow.
 POINTS = NetworkConfig(encoder="point", decoder="node", code=16, width=32, align_basis=0, corrections=0)
 SCAN = ScanConfig(points=96, noise=0.012, outliers=0, partial=0)
-UPRIGHT = ScanConfig(
-    points=96, noise=0, holes=0, outliers=0, partial=0, density=0, bumps=0, scale=0, upright=True
-)
+UPRIGHT = ScanConfig(points=96, noise=0, holes=0, outliers=0, partial=0, density=0, bumps=0, scale=0, upright=True)
 
 
 def egg_template() -> Template:

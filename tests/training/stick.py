@@ -33,9 +33,7 @@ _SIDE = [
         (f"finger{n}-{k}", f"finger{n}-{k - 1}" if k > 1 else "wrist", tuple(at))
         for n in range(1, 6)
         for k in (1, 2, 3)
-        for at in [
-            np.array([0.5, 1.05, 0.2 - 0.02 * n]) + (k - 1) * np.array([0.01, -0.025, 0.02 - 0.004 * k])
-        ]
+        for at in [np.array([0.5, 1.05, 0.2 - 0.02 * n]) + (k - 1) * np.array([0.01, -0.025, 0.02 - 0.004 * k])]
     ),
     ("eye", "head", (0.03, 1.66, 0.11)),
 ]

@@ -98,9 +98,7 @@ def test_forward_kinematics_by_hand() -> None:
     assert torch.allclose(world[0, 1] @ hand + offset[0, 1], torch.tensor([-1.0, 1, 0]), atol=1e-6)
     elbow = torch.tensor([1.0, 0, 0])
     for joint in (0, 1):  # both bones agree on where the elbow is
-        assert torch.allclose(
-            world[0, joint] @ elbow + offset[0, joint], torch.tensor([0.0, 1, 0]), atol=1e-6
-        )
+        assert torch.allclose(world[0, joint] @ elbow + offset[0, joint], torch.tensor([0.0, 1, 0]), atol=1e-6)
     # half of each bone's motion: linear blending
     weights = torch.tensor([[0.5, 0.5]])
     blended = Rig(arm.rest, heads, weights, arm.parents, arm.names, arm.faces)
@@ -144,9 +142,7 @@ def test_the_first_free_pose_wins_and_else_the_least_bad(rig: Rig, monkeypatch: 
     depths = torch.tensor([[0.0, 0.5, 0.3], [0.0, 0.01, 0.2], [0.0, 0.0, 0.4]])  # try, body
     monkeypatch.setattr("meshmatch.training.poses.penetration", lambda *_: depths.flatten())
     world, _ = sample_free_pose(rig, heads, seeded(), tries=3)
-    every = forward_kinematics(rig, heads.repeat(3, 1, 1), sample_pose(rig, heads.repeat(3, 1, 1), seeded()))[
-        0
-    ]
+    every = forward_kinematics(rig, heads.repeat(3, 1, 1), sample_pose(rig, heads.repeat(3, 1, 1), seeded()))[0]
     picked = [int((every == body).flatten(1).all(1).nonzero()[0]) for body in world]
     assert picked == [0, 3 + 1, 3 + 2]
 
@@ -209,9 +205,7 @@ def test_joints_bend_the_way_they_do(rig: Rig) -> None:
     posed = Posed(rig, 1500)
     for upper, middle, end in (("upperarm01", "lowerarm01", "wrist"), ("upperleg01", "lowerleg01", "foot")):
         for side in (".L", ".R"):
-            bend = degrees_between(
-                posed[middle + side] - posed[upper + side], posed[end + side] - posed[middle + side]
-            )
+            bend = degrees_between(posed[middle + side] - posed[upper + side], posed[end + side] - posed[middle + side])
             assert bend.max() < 170
             assert bend.max() > 120
     # a knee bends backwards: in the thigh's own axes the shin never points forward
@@ -333,9 +327,7 @@ def test_a_template_of_the_rig(rig: Rig) -> None:
     from meshmatch.templates.nodes import NodeConfig
 
     keep = np.arange(rig.rest.shape[1])
-    template = human_template(
-        rig, "T", NodeConfig(strategy="uniform", K=300, radius=0.6), (keep, rig.faces.numpy())
-    )
+    template = human_template(rig, "T", NodeConfig(strategy="uniform", K=300, radius=0.6), (keep, rig.faces.numpy()))
     assert (template.name, template.pose) == ("human-T", "T")
     assert template.shape.area == pytest.approx(1)
     core = {template.label_names[label] for label in template.labels[template.core]}

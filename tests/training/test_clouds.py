@@ -12,13 +12,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 from meshmatch.templates.unregistered import ShapeSamples
 from meshmatch.training.chamfer import ChamferLoss, chamfer, robust, surface_error
-from meshmatch.training.clouds import (
-    Augmentation,
-    CloudDataset,
-    build_lattice,
-    deformed_normals,
-    deformed_source,
-)
+from meshmatch.training.clouds import Augmentation, CloudDataset, build_lattice, deformed_normals, deformed_source
 from meshmatch.training.loop import TrainConfig, Trainer
 from meshmatch.training.recipes import Recipe
 from meshmatch.training.scans import ScanConfig
@@ -159,9 +153,7 @@ def test_the_robust_function() -> None:
     assert further - far < 0.01 * far  # what is far away pulls no harder
 
 
-def test_known_points_are_pulled_to_their_places(
-    eggs: ShapeSamples, template: Template, data: CloudDataset
-) -> None:
+def test_known_points_are_pulled_to_their_places(eggs: ShapeSamples, template: Template, data: CloudDataset) -> None:
     model = build_cloud_deformer(template, data, SMALL.network, SMALL.kernel, 0).eval()
     points = build_surface_points(template, "smooth", model, eggs.template_landmarks, 60)
     batch = data[0]

@@ -42,9 +42,7 @@ def still(egg: Template, scan: ScanConfig) -> BatchDataset:
     """Batches of the template itself, in another unit and place, with readers that show what they see."""
     rest = torch.from_numpy(np.array(egg.shape.verts)).float()
     seen = Seen(torch.zeros(2, 3), 4, 0, 9)
-    data = build_dataset(
-        egg, lambda count, _: (7 * rest + 2).expand(count, -1, -1), small_network(egg), scan, 3, 2, 0
-    )
+    data = build_dataset(egg, lambda count, _: (7 * rest + 2).expand(count, -1, -1), small_network(egg), scan, 3, 2, 0)
     return replace(data, encoder=seen, aligner=seen)
 
 

@@ -21,25 +21,10 @@ from meshmatch.training.datasets import Batch, BatchDataset
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer, learning_rate
 from meshmatch.training.losses import CorrespondenceLoss
 from meshmatch.training.scans import ScanConfig
-from tests.training.small import (
-    NETWORK,
-    POINTS,
-    SCAN,
-    UPRIGHT,
-    egg_template,
-    small_data,
-    small_network,
-    small_points,
-)
+from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template, small_data, small_network, small_points
 
 CONFIG = TrainConfig(
-    steps=10,
-    shapes=4,
-    scans_per_shape=2,
-    warm_up=3,
-    decay=0.5,
-    workers=0,
-    loss=CorrespondenceLoss(robust=True),
+    steps=10, shapes=4, scans_per_shape=2, warm_up=3, decay=0.5, workers=0, loss=CorrespondenceLoss(robust=True)
 )
 
 
@@ -48,9 +33,7 @@ def egg() -> Template:
     return egg_template()
 
 
-def trainer(
-    egg: Template, config: TrainConfig, network: NetworkConfig = NETWORK, scan: ScanConfig = SCAN
-) -> Trainer:
+def trainer(egg: Template, config: TrainConfig, network: NetworkConfig = NETWORK, scan: ScanConfig = SCAN) -> Trainer:
     return Trainer(small_network(egg, network, scan), small_points(egg), config)
 
 
@@ -123,9 +106,7 @@ def test_a_little_training_lowers_the_loss(egg: Template, bf16: bool) -> None:
     seen: list[StepReport] = []
     run.run(small_data(egg, run.model, length=80), None, seen.append, every=10)
     first, last = seen[0].terms, seen[-1].terms
-    assert (
-        last["total"] < 0.95 * first["total"]
-    )  # mostly the aligner's, and an egg looks alike from many sides
+    assert last["total"] < 0.95 * first["total"]  # mostly the aligner's, and an egg looks alike from many sides
     assert last["error_code"] < 0.8 * first["error_code"]
     assert last["error_corrected"] < 0.7 * first["error_corrected"]
     assert [now.step for now in seen] == [10, 20, 30, 40, 50, 60, 70, 80]
@@ -143,9 +124,7 @@ def test_reports_are_means_over_what_they_cover(egg: Template) -> None:
     assert [now.step for now in three] == [3, 5]
     for now, covered in zip(three, (one[:3], one[3:]), strict=True):
         for name, value in now.terms.items():
-            assert value == pytest.approx(
-                sum(other.terms[name] for other in covered) / len(covered), rel=1e-4
-            )
+            assert value == pytest.approx(sum(other.terms[name] for other in covered) / len(covered), rel=1e-4)
 
 
 def test_the_rate_by_hand() -> None:

@@ -92,9 +92,7 @@ def test_loss_points_are_the_field(egg: Template, points: LossPoints) -> None:
     vectors = 0.1 * torch.randn(2, egg.K, 3, generator=torch.Generator().manual_seed(0))
     moved = field.displacement(vectors) + torch.from_numpy(egg.shape.verts[at]).float()
     assert torch.allclose(points.moved(vectors), moved, atol=1e-6)
-    assert torch.allclose(
-        points.deformation_gradient(vectors), field.deformation_gradient(vectors), atol=1e-4
-    )
+    assert torch.allclose(points.deformation_gradient(vectors), field.deformation_gradient(vectors), atol=1e-4)
 
 
 def test_the_kernel_reaches_the_loss(egg: Template, points: LossPoints) -> None:
@@ -120,9 +118,7 @@ def test_blends_come_from_the_generator(egg: Template, points: LossPoints) -> No
     model = small_network(egg)
     torch.nn.init.normal_(model.decoder.network[-1].weight, std=0.3)  # a fresh one hardly moves anything
     batch = small_data(egg, model)[0]
-    a, b, c = (
-        terms(model, batch, points, CorrespondenceLoss(blend=1.0), seed)["blend"] for seed in (0, 0, 1)
-    )
+    a, b, c = (terms(model, batch, points, CorrespondenceLoss(blend=1.0), seed)["blend"] for seed in (0, 0, 1))
     assert a == b != c
 
 
@@ -130,9 +126,7 @@ def test_blends_are_of_different_shapes(egg: Template, points: LossPoints) -> No
     """Two scans of each of three shapes, codes that name the shape: no blend is of one shape alone."""
     model = small_network(egg, POINTS, UPRIGHT)
     batch = small_data(egg, model, UPRIGHT)[0]
-    batch = replace(
-        batch, points=batch.points[:1].expand(6, -1, -1), targets=batch.targets[:1].expand(6, -1, -1)
-    )
+    batch = replace(batch, points=batch.points[:1].expand(6, -1, -1), targets=batch.targets[:1].expand(6, -1, -1))
     seen: list[torch.Tensor] = []
 
     class Names(torch.nn.Module):

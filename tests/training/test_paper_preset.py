@@ -34,9 +34,7 @@ def eggs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     egg = egg_template().shape
     rng = np.random.default_rng(0)
     for n in range(4):
-        save_shape(
-            folder / f"egg{n}.ply", Shape(egg.verts @ (np.eye(3) + 0.1 * rng.normal(size=(3, 3))), egg.faces)
-        )
+        save_shape(folder / f"egg{n}.ply", Shape(egg.verts @ (np.eye(3) + 0.1 * rng.normal(size=(3, 3))), egg.faces))
     return folder
 
 
@@ -50,12 +48,7 @@ def model(eggs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def narrow() -> recipes.Recipe:
         chosen = plain()
-        same = (
-            chosen.network.encoder,
-            chosen.network.decoder,
-            chosen.network.align_basis,
-            chosen.network.corrections,
-        )
+        same = (chosen.network.encoder, chosen.network.decoder, chosen.network.align_basis, chosen.network.corrections)
         assert same == (POINTS.encoder, POINTS.decoder, POINTS.align_basis, POINTS.corrections)
         train = replace(chosen.train, shapes=6, rate=5e-3, warm_up=5)
         return replace(chosen, network=POINTS, scan=replace(chosen.scan, points=96), train=train)
@@ -101,9 +94,7 @@ def test_its_fits_are_moved_with_the_papers_kernel(loaded: TrainedModel, eggs: P
 def test_match_uses_it(model: Path, eggs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "map.npy"
     files = eggs / "egg0.ply", eggs / "egg1.ply"
-    assert (
-        main([str(word) for word in ("match", *files, "-o", output, "--model", model, "--json", "-q")]) == 0
-    )
+    assert main([str(word) for word in ("match", *files, "-o", output, "--model", model, "--json", "-q")]) == 0
     record = json.loads(capsys.readouterr().out)
     assert record["model"] == str(model)
     assert all(fit["residual"] < 0.04 for fit in record["fits"])  # 0.09 before the refinement
@@ -112,9 +103,7 @@ def test_match_uses_it(model: Path, eggs: Path, tmp_path: Path, capsys: pytest.C
     assert len(np.unique(index)) > 50
 
 
-def test_register_uses_it_in_full_resolution(
-    model: Path, eggs: Path, loaded: TrainedModel, tmp_path: Path
-) -> None:
+def test_register_uses_it_in_full_resolution(model: Path, eggs: Path, loaded: TrainedModel, tmp_path: Path) -> None:
     files = [tmp_path / "low.ply", tmp_path / "high.ply"]
     for path, more in zip(files, ([], ["--dense"]), strict=True):
         words = ["-o", str(path), "--model", str(model), "--threads", "1", "-q", *more]

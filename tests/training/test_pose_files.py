@@ -58,9 +58,7 @@ def test_every_format_reads_the_same(tmp_path: Path, suffix: str) -> None:
 
 def test_a_table_may_leave_out_what_rests_and_mix_its_rows(tmp_path: Path) -> None:
     path = tmp_path / "poses.csv"
-    path.write_text(
-        "\ufeffpose, joint, x, y, z\r\nsit,head,0,1,0\r\n\r\nwave,wrist.L,0.5,0,0\r\nsit,wrist.L,0,0,2\r\n"
-    )
+    path.write_text("\ufeffpose, joint, x, y, z\r\nsit,head,0,1,0\r\n\r\nwave,wrist.L,0.5,0,0\r\nsit,wrist.L,0,0,2\r\n")
     found = load_poses(path)
     assert found.joints == ("head", "wrist.L")
     assert found.vectors.tolist() == [[[0, 1, 0], [0, 0, 2]], [[0, 0, 0], [0.5, 0, 0]]]
@@ -115,9 +113,7 @@ def test_the_share_is_kept_and_the_others_stand_as_without(rig: Rig) -> None:
     assert 0.4 < faces_back.float().mean() < 0.6
 
 
-def test_a_joint_that_the_body_lacks_is_told_with_its_neighbours(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_joint_that_the_body_lacks_is_told_with_its_neighbours(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     poses = GivenPoses(("lowerarm1.L",), np.zeros((1, 1, 3)))
     with pytest.raises(InputError, match=r"no joint 'lowerarm1\.L'") as caught:
         poses.columns(rig)
@@ -243,9 +239,7 @@ def test_a_promise_of_terabytes_is_not_believed(tmp_path: Path, monkeypatch: pyt
         load_poses(path)
 
 
-def test_a_table_of_strangers_does_not_grow_to_its_square(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_table_of_strangers_does_not_grow_to_its_square(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pose_files, "MAX_VECTORS", 100)
     path = tmp_path / "bad.csv"
     path.write_text("pose,joint,x,y,z\n" + "".join(f"{k},joint{k},0,0,0\n" for k in range(11)))

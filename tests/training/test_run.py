@@ -26,9 +26,7 @@ from meshmatch.training.train import CardFacts, train, train_model
 from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template, small_data, small_network
 from tests.training.stick import stick_figure
 
-SMALL = Recipe(
-    NETWORK, TrainConfig(steps=4, shapes=4, scans_per_shape=1, workers=0, warm_up=1), SCAN, "smooth"
-)
+SMALL = Recipe(NETWORK, TrainConfig(steps=4, shapes=4, scans_per_shape=1, workers=0, warm_up=1), SCAN, "smooth")
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +54,7 @@ def trained(prepared: Path, output: Path, chosen: Recipe = SMALL, **more) -> Pat
 
 
 @pytest.mark.parametrize(
-    "chosen",
-    [SMALL, replace(SMALL, network=POINTS, scan=UPRIGHT, kernel="cubic")],
-    ids=["default", "paper"],
+    "chosen", [SMALL, replace(SMALL, network=POINTS, scan=UPRIGHT, kernel="cubic")], ids=["default", "paper"]
 )
 def test_a_folder_becomes_a_model(prepared: Path, tmp_path: Path, chosen: Recipe) -> None:
     seen: list[StepReport] = []
@@ -89,9 +85,7 @@ def test_batches_are_drawn_on_the_cpu_wherever_the_model_is() -> None:
     assert torch.equal(data[0].align_features, there.align_features)
 
 
-def test_a_training_begun_from_a_model_goes_on_without_being_told_of_it(
-    prepared: Path, tmp_path: Path
-) -> None:
+def test_a_training_begun_from_a_model_goes_on_without_being_told_of_it(prepared: Path, tmp_path: Path) -> None:
     """The basis of the encoder is the model's, and reads the rest of the batches too."""
     other = replace(SMALL, train=replace(SMALL.train, seed=5))
     start = load_model(trained(prepared, tmp_path / "start", other))
@@ -216,9 +210,7 @@ def test_unseen_bodies_are_of_people_that_the_training_never_drew(monkeypatch: p
 
     monkeypatch.setattr(bodies, "human_source", source)
     egg = egg_template()
-    drawn = [
-        bodies.unseen_bodies(egg, 2, trained, seed) for trained, seed in ((0, 0), (0, 1), (7, 0), (0, 0))
-    ]
+    drawn = [bodies.unseen_bodies(egg, 2, trained, seed) for trained, seed in ((0, 0), (0, 1), (7, 0), (0, 0))]
     assert [seed for _, seed in asked] == [1, 2, 8, 1]
     assert all(identities < 4096 for identities, _ in asked)
     assert drawn[0].shape == (2, 5, 3)

@@ -68,12 +68,7 @@ def test_two_processes_train_one_model(prepared: Path, tmp_path: Path) -> None:
     output = tmp_path / "model"
     launcher = ["-m", "torch.distributed.run", "--nproc-per-node=2", "--standalone"]
     words = ["train", "--shapes", prepared, "-o", output, "--steps", "3", "--json"]
-    outside = {
-        "PYTHONPATH": str(ROOT),
-        "KEPT": str(tmp_path),
-        "CUDA_VISIBLE_DEVICES": "",
-        "OMP_NUM_THREADS": "1",
-    }
+    outside = {"PYTHONPATH": str(ROOT), "KEPT": str(tmp_path), "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, *launcher, str(script), *map(str, words)],
         capture_output=True, text=True, env=os.environ | outside, cwd=tmp_path, timeout=300,

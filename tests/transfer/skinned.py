@@ -34,9 +34,7 @@ def write_skinned_glb(path: Path, wide: bool = False) -> None:
     views, data = [], b""
     for k, array in enumerate(arrays):
         kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
-        accessors.append(
-            {"bufferView": k, "count": len(array), "componentType": kinds[array.dtype.name], "type": kind}
-        )
+        accessors.append({"bufferView": k, "count": len(array), "componentType": kinds[array.dtype.name], "type": kind})
         views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
         data += array.tobytes() + b"\0" * (-array.nbytes % 4)
     accessors[6]["normalized"] = True

@@ -98,17 +98,13 @@ def test_one_colour_stays_one_colour_whatever_the_map(sphere: Shape, torus: Shap
 # Against the slow way
 
 
-def by_hand(
-    source: Shape, look: Appearance, target: Shape, back: VertexMap, uv: np.ndarray, size: int
-) -> dict:
+def by_hand(source: Shape, look: Appearance, target: Shape, back: VertexMap, uv: np.ndarray, size: int) -> dict:
     """Linear colours of the texels whose triangle's corners lie on one face or next to it, one by one."""
     image = look.materials[0].image
     assert image is not None
     places = source.verts[back.index]
     inside = back.face >= 0
-    places[inside] = np.einsum(
-        "nk,nkd->nd", back.barycentric[inside], source.verts[source.faces[back.face[inside]]]
-    )
+    places[inside] = np.einsum("nk,nkd->nd", back.barycentric[inside], source.verts[source.faces[back.face[inside]]])
     found = faces_on(uv * size, size)[0]
     out = {}
     for row, column in np.argwhere(found >= 0)[::7].tolist():
@@ -277,9 +273,7 @@ def test_materials_that_share_an_image_share_what_is_known_of_it() -> None:
     """Each half of the picture lies under another material: neither may take the other's for background."""
     image = quarters(32)
     two = (Material("a", image), Material("b", image, factor=(1.0, 1.0, 1.0, 1.0)))
-    found = worn(
-        SQUARE, Appearance(two, np.array([0, 1]), OWN), SQUARE, uv=OWN, choices=replace(SMALL, samples=1)
-    )
+    found = worn(SQUARE, Appearance(two, np.array([0, 1]), OWN), SQUARE, uv=OWN, choices=replace(SMALL, samples=1))
     np.testing.assert_array_equal(found.image, image)
 
 
@@ -288,9 +282,7 @@ def test_a_tiled_picture(wrap: str) -> None:
     """Coordinates from -1 to 1: four times the quarters, by the rule of the sampler."""
     image = quarters(8)
     uv = OWN * 2.0 - 1.0
-    found = worn(
-        SQUARE, wearing(image, uv, wrap=(wrap, wrap)), SQUARE, uv=OWN, choices=replace(SMALL, samples=1)
-    )
+    found = worn(SQUARE, wearing(image, uv, wrap=(wrap, wrap)), SQUARE, uv=OWN, choices=replace(SMALL, samples=1))
     red, green, blue, white = (tuple(image[y, x, :3].tolist()) for y, x in ((0, 0), (0, 7), (7, 0), (7, 7)))
     want = {
         "repeat": [[red, green, red, green], [blue, white, blue, white]] * 2,
@@ -426,12 +418,7 @@ def torn_case() -> tuple[Shape, VertexMap, np.ndarray]:
     n = 12
     grid = np.stack(np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1)), -1).reshape(-1, 2)
     number = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
-    a, b, c, d = (
-        number[:-1, :-1].ravel(),
-        number[:-1, 1:].ravel(),
-        number[1:, 1:].ravel(),
-        number[1:, :-1].ravel(),
-    )
+    a, b, c, d = (number[:-1, :-1].ravel(), number[:-1, 1:].ravel(), number[1:, 1:].ravel(), number[1:, :-1].ravel())
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     target = Shape(np.column_stack([grid, np.zeros(len(grid))]), faces, "sheet")
     left = grid[:, 0] < 0.5
@@ -517,9 +504,7 @@ def test_fine_detail_becomes_a_mean_at_a_sparse_point() -> None:
 
 def test_a_corner_without_a_place_takes_its_faces_along() -> None:
     verts = np.concatenate([CORNERS, [[9.0, 9, 9]]])
-    target = Shape(
-        verts, np.concatenate([FACES, [[0, 4, 1]]]), "nan", invalid=np.array([0, 0, 0, 0, 1], bool)
-    )
+    target = Shape(verts, np.concatenate([FACES, [[0, 4, 1]]]), "nan", invalid=np.array([0, 0, 0, 0, 1], bool))
     uv = np.concatenate([OWN, np.zeros((1, 3, 2))])
     back = VertexMap.between(target, SQUARE, [0, 1, 2, 3, 0])
     made = transfer_texture(SQUARE, wearing(noise(32)), target, back, Atlas(uv, True), SMALL)

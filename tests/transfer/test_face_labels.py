@@ -51,10 +51,7 @@ def test_a_large_face_asks_its_inside() -> None:
     verts = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
     faces = np.concatenate(
-        [
-            np.stack([corner, corner + n + 1, corner + n + 2], 1),
-            np.stack([corner, corner + n + 2, corner + 1], 1),
-        ]
+        [np.stack([corner, corner + n + 1, corner + n + 2], 1), np.stack([corner, corner + n + 2, corner + 1], 1)]
     )
     sheet = Shape(verts, faces, "sheet")
     ends = np.array([0, n * (n + 1), (n + 1) ** 2 - 1])
@@ -110,6 +107,4 @@ def test_what_has_no_label_stays_without(on_faces: bool) -> None:
 
 def test_confidence_of_faces() -> None:
     confidence = COARSE.verts[:, 0] / 2 + 0.5
-    assert np.allclose(
-        mean_of_corners(confidence, COARSE), COARSE.verts[COARSE.faces, 0].mean(axis=1) / 2 + 0.5
-    )
+    assert np.allclose(mean_of_corners(confidence, COARSE), COARSE.verts[COARSE.faces, 0].mean(axis=1) / 2 + 0.5)

@@ -115,10 +115,7 @@ def slabs(gap: float) -> Shape:
     flat = np.stack([x.ravel(), y.ravel(), np.zeros(n * n)], axis=1)
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     up = np.concatenate(
-        [
-            np.stack([corner, corner + n, corner + n + 1], 1),
-            np.stack([corner, corner + n + 1, corner + 1], 1),
-        ]
+        [np.stack([corner, corner + n, corner + n + 1], 1), np.stack([corner, corner + n + 1, corner + 1], 1)]
     )
     verts = np.concatenate([flat + np.array([0, 0, gap]), flat])
     return Shape(verts, np.concatenate([up, up[:, ::-1] + n * n]), "slabs")
@@ -151,9 +148,7 @@ def test_small_pieces_on_the_wrong_sheet_ask_their_neighbours() -> None:
     flat = source.verts * [1, 1, 0.01]
     flat[40, 2] = 0.0
     target = Shape(flat, source.faces, "touching")
-    back = invert_map(
-        VertexMap.between(source, target, index, confidence=np.full(source.V, 0.99)), source, target
-    )
+    back = invert_map(VertexMap.between(source, target, index, confidence=np.full(source.V, 0.99)), source, target)
     assert ((back.index < half) == (index < half)).all()
 
 
@@ -217,9 +212,7 @@ def test_two_poses_of_one_mesh_are_told_apart_by_their_hashes() -> None:
 
 def test_a_map_made_for_another_mesh_names_both() -> None:
     other = Shape(COARSE.verts * 2, COARSE.faces, "other.ply")
-    with pytest.raises(
-        InputError, match=rf"another source: coarse\.ply .*{COARSE.hash}.*other\.ply is {other.hash}"
-    ):
+    with pytest.raises(InputError, match=rf"another source: coarse\.ply .*{COARSE.hash}.*other\.ply is {other.hash}"):
         FORWARD.for_shapes(other, FINE, "m.npz")
     moved = Shape(FINE.verts + 1, FINE.faces, "moved.ply")
     with pytest.raises(InputError, match=r"another target: fine\.ply .*moved\.ply is"):

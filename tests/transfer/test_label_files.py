@@ -11,16 +11,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.palette import UNKNOWN, label_colors
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.label_files import (
-    LABEL_SUFFIXES,
-    Label,
-    Labels,
-    On,
-    labels_of,
-    load_labels,
-    named,
-    save_labels,
-)
+from meshmatch.transfer.label_files import LABEL_SUFFIXES, Label, Labels, On, labels_of, load_labels, named, save_labels
 from tests.conftest import icosphere
 
 SHAPE = icosphere(1)  # 42 vertices, 80 faces
@@ -161,18 +152,10 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "not there": ("a.npy", lambda path: None, "there is no file"),
     "a folder": ("a.npy", lambda path: path.mkdir(), "is a folder"),
     "empty": ("a.txt", lambda path: path.touch(), "is empty"),
-    "wrong length": (
-        "a.npy",
-        lambda path: np.save(path, np.arange(41)),
-        "41 labels, but sphere1 has 42 vert",
-    ),
+    "wrong length": ("a.npy", lambda path: np.save(path, np.arange(41)), "41 labels, but sphere1 has 42 vert"),
     "a table": ("a.npy", lambda path: np.save(path, np.eye(42)), r"array of \(42, 42\)"),
     "damaged": ("a.npy", lambda path: path.write_bytes(b"\x93NUMPY"), "does not hold arrays"),
-    "objects": (
-        "a.npy",
-        lambda path: np.save(path, np.array([None] * 42), allow_pickle=True),
-        "Python objects",
-    ),
+    "objects": ("a.npy", lambda path: np.save(path, np.array([None] * 42), allow_pickle=True), "Python objects"),
     "broken numbers": ("a.npy", lambda path: np.save(path, np.linspace(0, 1, 42)), "is not a label"),
     "no label at all": ("a.json", lambda path: path.write_text(json.dumps([None] * 42)), "no label at all"),
     "no json": ("a.json", lambda path: path.write_text("[1,"), "can be read"),
@@ -233,9 +216,7 @@ def test_a_suffix_that_cannot_hold_labels_is_refused(tmp_path: Path) -> None:
     assert load_labels(tmp_path / "l.npy", SHAPE).names == (2**40,)
 
 
-@pytest.mark.parametrize(
-    ("suffix", "fine"), [(".npy", False), (".ply", False), (".csv", True), (".json", True)]
-)
+@pytest.mark.parametrize(("suffix", "fine"), [(".npy", False), (".ply", False), (".csv", True), (".json", True)])
 def test_labels_of_more_than_64_bits(tmp_path: Path, suffix: str, fine: bool) -> None:
     huge = 99999999999999999999999
     (tmp_path / "a.txt").write_text(f"{huge}\n" * SHAPE.V)

@@ -130,9 +130,7 @@ def test_the_files_say_everything(tmp_path: Path) -> None:
     save_landmarks(tmp_path / "l.json", given)
     record = json.loads((tmp_path / "l.json").read_text(encoding="utf-8"))
     assert record["format"] == "meshmatch landmarks 1"
-    assert set(record["landmarks"][3]) == {
-        *("name", "vertex", "position", "face", "barycentric", "confidence")
-    }
+    assert set(record["landmarks"][3]) == {*("name", "vertex", "position", "face", "barycentric", "confidence")}
     assert record["landmarks"][3]["confidence"] == 0.1
     save_landmarks(tmp_path / "l.pp", given)
     text = (tmp_path / "l.pp").read_text(encoding="utf-8")
@@ -211,11 +209,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
         write('[{"name": "nose", "face": 80, "barycentric": [1, 0, 0]}]'),
         "in face 80, but sphere1 has 80 faces",
     ),
-    "weights": (
-        "a.json",
-        write('[{"name": "nose", "face": 8, "barycentric": [1, 1, 0]}]'),
-        "do not sum to 1",
-    ),
+    "weights": ("a.json", write('[{"name": "nose", "face": 8, "barycentric": [1, 1, 0]}]'), "do not sum to 1"),
     "far away": ("a.csv", write("name,x,y,z\nnose,100,0,0\n"), "lies 9.* away from sphere1"),
     "no position": ("a.csv", write("name,x,y,z\nnose,nan,0,0\n"), "nose has no position"),
     "infinite": ("a.csv", write("name,x,y,z\nnose,1e999,0,0\n"), "nose has no position"),

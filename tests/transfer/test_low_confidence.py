@@ -48,10 +48,7 @@ def test_the_nearest_known_one_along_the_graph() -> None:
 
 
 def test_what_is_out_of_reach_stays() -> None:
-    two = Shape(
-        np.concatenate([SHEET.verts, SHEET.verts + 100]),
-        np.concatenate([SHEET.faces, SHEET.faces + SHEET.V]),
-    )
+    two = Shape(np.concatenate([SHEET.verts, SHEET.verts + 100]), np.concatenate([SHEET.faces, SHEET.faces + SHEET.V]))
     known = np.arange(two.V) < 5
     out, filled = diffuse(vertex_graph(two), known, np.arange(two.V, dtype=float)[:, None])
     assert filled.sum() == SHEET.V - 5

@@ -32,9 +32,7 @@ def test_points_anywhere_find_their_closest_point(reach: float) -> None:
     assert np.array_equal(places.vertex, heaviest)
 
 
-def test_more_points_than_one_portion_are_each_answered(
-    monkeypatch: pytest.MonkeyPatch, sphere: Shape
-) -> None:
+def test_more_points_than_one_portion_are_each_answered(monkeypatch: pytest.MonkeyPatch, sphere: Shape) -> None:
     points = np.random.default_rng(2).normal(size=(500, 3))
     whole = own_image(sphere).query(points)
     monkeypatch.setattr("meshmatch.transfer.mapped_mesh._CHUNK", 37)
@@ -56,9 +54,7 @@ def test_a_little_doubt_moves_nothing_but_a_guess_gives_way() -> None:
     shape = icosphere(2)
     confidence = np.ones(shape.V)
     confidence[0] = 0.7
-    places = MappedMesh(
-        VertexMap.between(shape, shape, np.arange(shape.V), confidence=confidence), shape, shape
-    )
+    places = MappedMesh(VertexMap.between(shape, shape, np.arange(shape.V), confidence=confidence), shape, shape)
     assert places.query(shape.verts[:1]).vertex[0] == 0
     # A guess lies exactly here, and a sure vertex very near.
     index = np.arange(shape.V)
@@ -137,8 +133,6 @@ def test_the_only_vertex_with_a_place_is_found_though_all_its_faces_are_broken(s
     broken = Shape(np.zeros((42, 3)), icosphere(1).faces, "broken", None, np.arange(42) > 0)
     huge = Shape(1e30 * sphere.verts, sphere.faces, "huge")
     for target in (sphere, huge):
-        found = MappedMesh(VertexMap.between(broken, target, np.arange(42)), broken, target).query(
-            target.verts
-        )
+        found = MappedMesh(VertexMap.between(broken, target, np.arange(42)), broken, target).query(target.verts)
         assert (found.vertex == 0).all()
         assert (found.face == -1).all()

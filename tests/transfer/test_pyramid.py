@@ -66,9 +66,7 @@ def test_no_mip_level_of_a_filled_image_shows_the_background() -> None:
     known = np.zeros((64, 64), bool)
     for x, y in rng.integers(0, 56, (6, 2)):
         known[y : y + 7, x : x + 5] = True
-    pixels[known] = np.concatenate(
-        [rng.integers(180, 256, (known.sum(), 3)), np.full((known.sum(), 1), 255)], 1
-    )
+    pixels[known] = np.concatenate([rng.integers(180, 256, (known.sum(), 3)), np.full((known.sum(), 1), 255)], 1)
     darkest = [level.min() for level in means(pixels)[:4]]
     assert max(darkest) < 0.1  # that is: unfilled it would show
     fill(pixels, known.astype(np.float32))
@@ -121,12 +119,8 @@ def test_wrapping_against_the_slow_way() -> None:
         row = list(range(size))
         there_and_back = row + row[::-1]
         np.testing.assert_array_equal(wrapped(index, size, "repeat"), [row[i % size] for i in index])
-        np.testing.assert_array_equal(
-            wrapped(index, size, "mirror"), [there_and_back[i % (2 * size)] for i in index]
-        )
-        np.testing.assert_array_equal(
-            wrapped(index, size, "clamp"), [row[min(max(i, 0), size - 1)] for i in index]
-        )
+        np.testing.assert_array_equal(wrapped(index, size, "mirror"), [there_and_back[i % (2 * size)] for i in index])
+        np.testing.assert_array_equal(wrapped(index, size, "clamp"), [row[min(max(i, 0), size - 1)] for i in index])
 
 
 def test_a_wide_step_sees_the_mean() -> None:
@@ -164,6 +158,4 @@ def test_texels_off_the_surface_do_not_count() -> None:
     known = image[..., 3] > 0
     pyramid = Pyramid.of(Material(image=image), known)
     for footprint in (0.0, 2.0, 16.0):
-        np.testing.assert_allclose(
-            look(pyramid, 0.5, 0.5, footprint)[:3], np.array([200, 150, 100]) / 255, atol=1e-4
-        )
+        np.testing.assert_allclose(look(pyramid, 0.5, 0.5, footprint)[:3], np.array([200, 150, 100]) / 255, atol=1e-4)

@@ -9,9 +9,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.surface_walk import PointWalker, SurfaceWalker, duals, walker_of
 
 
-def walked(
-    walker: SurfaceWalker, points: np.ndarray, start: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def walked(walker: SurfaceWalker, points: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Faces, places in the walker's units and distances of (N, 3) points in these units."""
     face, weights, distance = walker.closest(points.T.astype(np.float32), start.astype(np.int32))
     np.testing.assert_allclose(weights.sum(axis=0), 1, atol=1e-5)
@@ -80,9 +78,7 @@ def test_sliding_does_not_change_sheets() -> None:
     points = (np.array([[0.2, 0.3, 0.08], [0.7, 0.6, 0.08]]) - walker.center) / walker.unit
     face, places, _ = walked(walker, points, np.array([1, 1]))
     assert set(face.tolist()) <= {0, 1}  # the upper sheet is nearer
-    np.testing.assert_allclose(
-        places * walker.unit + walker.center, [[0.2, 0.3, 0], [0.7, 0.6, 0]], atol=1e-6
-    )
+    np.testing.assert_allclose(places * walker.unit + walker.center, [[0.2, 0.3, 0], [0.7, 0.6, 0]], atol=1e-6)
 
 
 def test_seams_in_the_file_are_no_edges(cube: Shape) -> None:

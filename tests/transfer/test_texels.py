@@ -65,9 +65,7 @@ def test_parts_give_the_same_as_the_whole(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_triangles_without_area_hold_nothing() -> None:
-    flat = np.array(
-        [[[1, 1], [3, 3], [5, 5]], [[2, 2], [2, 2], [2, 2]], [[0, 2.5], [4, 2.5], [2, 2.5]]], float
-    )
+    flat = np.array([[[1, 1], [3, 3], [5, 5]], [[2, 2], [2, 2], [2, 2]], [[0, 2.5], [4, 2.5], [2, 2.5]]], float)
     assert spans(flat).texels == 0
     np.testing.assert_array_equal(rows_of(SQUARE), [4, 4])
 

@@ -53,9 +53,7 @@ class Looks:
         return found
 
 
-def dress(
-    look: Appearance, shape: Shape, part: Drawn
-) -> tuple[dict[str, NDArray[Any]], dict[str, Any] | None]:
+def dress(look: Appearance, shape: Shape, part: Drawn) -> tuple[dict[str, NDArray[Any]], dict[str, Any] | None]:
     """Arrays and words of a look on what is drawn of a shape.
 
     A skin where there is an image and the triangles are the file's own; else ``paint`` (N, 3), a colour for each

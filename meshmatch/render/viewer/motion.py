@@ -87,11 +87,7 @@ def write_motion(
         "title": plain_text(title),
         "note": part.note or f"{first.V:,} vertices",
         "times": [round(float(time), 9) for time in times],
-        "met": [
-            [float(time), plain_text(name)]
-            for time, name in (met or {}).items()
-            if times[0] <= time <= times[-1]
-        ],
+        "met": [[float(time), plain_text(name)] for time, name in (met or {}).items() if times[0] <= time <= times[-1]],
         "cloud": len(faces) == 0,
         "low": (-extent / edge / 2).round(6).tolist(),
         "extent": (extent / edge).round(6).tolist(),

@@ -12,13 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.arrays import Floats
 
-_KINDS = {
-    "u1": "Uint8Array",
-    "i1": "Int8Array",
-    "u2": "Uint16Array",
-    "u4": "Uint32Array",
-    "f4": "Float32Array",
-}
+_KINDS = {"u1": "Uint8Array", "i1": "Int8Array", "u2": "Uint16Array", "u4": "Uint32Array", "f4": "Float32Array"}
 
 
 def pack(arrays: Mapping[str, NDArray[Any]]) -> tuple[list[dict[str, Any]], str]:

@@ -109,9 +109,7 @@ def write_page(
     words |= {
         "verdict": there.verdict,
         "reasons": [plain_text(reason) for reason in there.reasons],
-        "confidence": [round(float(found.confidence.mean()), 4) for found in maps]
-        if _is_known(there)
-        else None,
+        "confidence": [round(float(found.confidence.mean()), 4) for found in maps] if _is_known(there) else None,
         "ramp": Scale(0.0, 1.0, reverse=True).colors(np.linspace(0, 1, 9)).round(4).tolist(),
         "version": __version__,
         "arrays": table,

@@ -45,10 +45,7 @@ class Box:
 
 
 def boxes(
-    shapes: tuple[Shape, Shape],
-    drawn: tuple[Drawn, Drawn],
-    there: VertexMap,
-    rotations: tuple[Floats, Floats],
+    shapes: tuple[Shape, Shape], drawn: tuple[Drawn, Drawn], there: VertexMap, rotations: tuple[Floats, Floats]
 ) -> tuple[Box, Box]:
     """A cube for each of two shapes, in one scale as far as the map can tell."""
     cubes = [_cube(part, rotation) for part, rotation in zip(drawn, rotations, strict=True)]
@@ -96,10 +93,7 @@ def relative_size(source: Shape, target: Shape, there: VertexMap) -> float:
 
 
 def upright(
-    source: Shape,
-    target: Shape,
-    there: VertexMap,
-    given: tuple[Floats | None, Floats | None] = (None, None),
+    source: Shape, target: Shape, there: VertexMap, given: tuple[Floats | None, Floats | None] = (None, None)
 ) -> tuple[Floats, Floats]:
     """Rotations (3, 3) of both shapes to y up, z front.
 

@@ -62,9 +62,7 @@ def _carried(
         except InputError:  # no surface to speak of, or none that can be unwrapped
             pass
         else:
-            material = Material(
-                "", baked.image, wrap=("clamp", "clamp"), alpha=baked.alpha, cutoff=baked.cutoff
-            )
+            material = Material("", baked.image, wrap=("clamp", "clamp"), alpha=baked.alpha, cutoff=baked.cutoff)
             return Appearance((material,), np.zeros(wearer.F, np.int64), atlas.uv)
     colors = colors_of_vertices(owner, look, wearer, back)
     return Appearance((Material(),), np.zeros(wearer.F, np.int64), np.zeros((wearer.F, 3, 2)), colors)

@@ -90,9 +90,7 @@ def _group(material: Material, start: int, count: int, image: int | None) -> dic
 
 def _shrink(images: list[Pixels]) -> float:
     """By how much every image is made smaller so that all of them stay within `MOST_PIXELS`."""
-    sizes = [
-        min(1.0, LARGEST / max(image.shape[:2])) ** 2 * image.shape[0] * image.shape[1] for image in images
-    ]
+    sizes = [min(1.0, LARGEST / max(image.shape[:2])) ** 2 * image.shape[0] * image.shape[1] for image in images]
     return min(1.0, float(np.sqrt(MOST_PIXELS / max(sum(sizes), 1.0))))
 
 

@@ -37,9 +37,7 @@ NO_FACES = np.empty((0, 3), np.int64)
 
 def damaged(name: str, what: str) -> InputError:
     """The error for a file that does not hold what it promises."""
-    return InputError(
-        f"{name}: {what[:300]}", "the file is damaged or was cut short; export or download it again"
-    )
+    return InputError(f"{name}: {what[:300]}", "the file is damaged or was cut short; export or download it again")
 
 
 def fan(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
@@ -53,6 +51,4 @@ def fan(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
     triangles = np.maximum(sizes - 2, 0)
     first = np.repeat(starts, triangles)
     step = np.arange(len(first)) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    return np.stack([corners[first], corners[first + step + 1], corners[first + step + 2]], axis=1).reshape(
-        -1, 3
-    )
+    return np.stack([corners[first], corners[first + step + 1], corners[first + step + 2]], axis=1).reshape(-1, 3)

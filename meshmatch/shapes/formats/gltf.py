@@ -53,9 +53,7 @@ class Document:
         if data[:4] == b"glTF":
             data = self._chunks(data)
         elif path.suffix.lower() == ".glb":
-            raise InputError(
-                f"{self.name} is not a glb file: it does not begin with 'glTF'", "does the suffix fit?"
-            )
+            raise InputError(f"{self.name} is not a glb file: it does not begin with 'glTF'", "does the suffix fit?")
         try:
             self.json = json.loads(data)
         except ValueError as error:
@@ -66,9 +64,7 @@ class Document:
             raise InputError(f"{self.name} is not glTF version 2", "export it as glTF 2.0")
         for extension in self.json.get("extensionsRequired", []):
             if extension in _COMPRESSED:
-                raise InputError(
-                    f"{self.name} is compressed ({extension})", "export it without mesh compression"
-                )
+                raise InputError(f"{self.name} is compressed ({extension})", "export it without mesh compression")
         self.nodes = self.json.get("nodes", [])
         self.buffers: dict[int, bytes] = {}
         self.world: dict[int, Floats] = {}
@@ -79,9 +75,7 @@ class Document:
         if version != 2:
             raise InputError(f"{self.name} is glb version {version}", "export it as glTF 2.0")
         if length > len(data) or 20 + size > len(data):
-            raise damaged(
-                self.name, f"it should be {max(length, 20 + size)} bytes long, but is only {len(data)}"
-            )
+            raise damaged(self.name, f"it should be {max(length, 20 + size)} bytes long, but is only {len(data)}")
         rest = data[20 + size :]
         if rest[4:8] == b"BIN\0":
             self.body = rest[8 : 8 + int.from_bytes(rest[:4], "little")]
@@ -128,9 +122,7 @@ class Document:
         if scenes:
             roots = scenes[self.json.get("scene", 0)].get("nodes", [])
         else:
-            roots = sorted(
-                set(range(len(self.nodes))) - {c for n in self.nodes for c in n.get("children", [])}
-            )
+            roots = sorted(set(range(len(self.nodes))) - {c for n in self.nodes for c in n.get("children", [])})
         order: list[int] = []
         stack = [(node, np.eye(4)) for node in reversed(roots)]
         while stack:
@@ -146,9 +138,7 @@ class Document:
     def _placed(self, node: dict[str, Any], number: int, primitive: dict[str, Any]) -> Floats:
         """(V, 3) positions in the scene."""
         attributes = primitive["attributes"]
-        own = np.hstack(
-            [self.accessor(attributes["POSITION"]), np.ones((self.count(attributes["POSITION"]), 1))]
-        )
+        own = np.hstack([self.accessor(attributes["POSITION"]), np.ones((self.count(attributes["POSITION"]), 1))])
         if "skin" not in node or "JOINTS_0" not in attributes:
             return np.asarray(own @ self.world[number].T)[:, :3]
         skin = self.json["skins"][node["skin"]]
@@ -162,13 +152,11 @@ class Document:
                 weight = weights[:, column : column + 1]
                 moved += weight * np.einsum("vij,vj->vi", bones[joints[:, column].astype(np.int64)], own)
                 total += weight
-        return np.asarray(
-            np.where(total > 0, moved / np.where(total > 0, total, 1.0), own @ self.world[number].T)
-        )[:, :3]
+        return np.asarray(np.where(total > 0, moved / np.where(total > 0, total, 1.0), own @ self.world[number].T))[
+            :, :3
+        ]
 
-    def influences(
-        self, primitive: dict[str, Any]
-    ) -> Iterator[tuple[Float[Floats, "V 4"], Float[Floats, "V 4"]]]:
+    def influences(self, primitive: dict[str, Any]) -> Iterator[tuple[Float[Floats, "V 4"], Float[Floats, "V 4"]]]:
         """Numbers of joints and their weights for each vertex, four at a time."""
         attributes = primitive["attributes"]
         for k in range(8):
@@ -231,17 +219,13 @@ class Document:
                 np.dtype(_COMPONENTS[where["componentType"]]),
             )  # fmt: skip
             values = values.copy()
-            values[rows[:, 0]] = self._view(
-                views[what["bufferView"]], what.get("byteOffset", 0), many, width, kind
-            )
+            values[rows[:, 0]] = self._view(views[what["bufferView"]], what.get("byteOffset", 0), many, width, kind)
         out = values.astype(np.float64)
         if accessor.get("normalized") and not whole and kind.kind in "iu":
             out = np.maximum(out / np.iinfo(kind).max, -1.0)
         return out
 
-    def _view(
-        self, view: dict[str, Any], offset: int, count: int, width: int, kind: np.dtype[Any]
-    ) -> NDArray[Any]:
+    def _view(self, view: dict[str, Any], offset: int, count: int, width: int, kind: np.dtype[Any]) -> NDArray[Any]:
         data = self._buffer(view["buffer"])
         start = view.get("byteOffset", 0) + offset
         row = width * kind.itemsize
@@ -272,15 +256,12 @@ class Document:
         file = beside(self.path.parent, unquote(uri))
         if file is None:
             raise InputError(
-                f"{self.name} needs the file {uri[:200]}, which is not in its folder",
-                "copy it beside the gltf",
+                f"{self.name} needs the file {uri[:200]}, which is not in its folder", "copy it beside the gltf"
             )
         return read_bytes(file)
 
 
-def joined_colors(
-    colors: list[Float[Floats, "_ 4"] | None], counts: list[int]
-) -> Float[Floats, "V 4"] | None:
+def joined_colors(colors: list[Float[Floats, "_ 4"] | None], counts: list[int]) -> Float[Floats, "V 4"] | None:
     """Colours of primitives one after the other, white for those without; None if none has any."""
     if all(color is None for color in colors):
         return None

@@ -91,11 +91,7 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
     material: dict[str, Any] = {
         "name": name,
         "doubleSided": True,
-        "pbrMetallicRoughness": {
-            "baseColorTexture": {"index": 0},
-            "metallicFactor": 0.0,
-            "roughnessFactor": 1.0,
-        },
+        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0},
     }
     if mesh.alpha != "opaque":
         material["alphaMode"] = mesh.alpha.upper()

@@ -77,9 +77,7 @@ def _skin(document: Document) -> Skin:
                 row, column = np.nonzero(np.isfinite(amount) & (amount > 0))
                 used = numbers[row, column]
                 if not ((used >= 0) & (used < len(own))).all():
-                    raise ValueError(
-                        f"a vertex refers to a joint that is not among the {len(own)} of its skin"
-                    )
+                    raise ValueError(f"a vertex refers to a joint that is not among the {len(own)} of its skin")
                 vertices.append(seen + row)
                 joints.append(own[used.astype(np.int64)])
                 weights.append(amount[row, column])
@@ -93,9 +91,7 @@ def _skin(document: Document) -> Skin:
                 weights.append(np.ones(V))
         seen += V
     if not vertices:
-        raise InputError(
-            f"{document.name} has a skin that moves no vertex", "was it exported with its weights?"
-        )
+        raise InputError(f"{document.name} has a skin that moves no vertex", "was it exported with its weights?")
     labels = [document.nodes[node].get("name") or f"joint {node}" for node in nodes]
     names = _apart([plain_text(str(label)) for label in labels])
     return Skin(seen, np.concatenate(vertices), np.concatenate(joints), np.concatenate(weights), names)

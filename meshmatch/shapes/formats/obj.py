@@ -27,9 +27,7 @@ def read(path: Path, data: bytes) -> Raw:
     (text, vertex_lines), *faces_found = lines_of(data, b"v", b"f", b"fo")
     faces_text, face_lines = with_old(faces_found)
     if len(vertex_lines) == 0:
-        raise InputError(
-            f"{name} holds no vertices: it has no 'v' lines", "is it a mesh or a point cloud at all?"
-        )
+        raise InputError(f"{name} holds no vertices: it has no 'v' lines", "is it a mesh or a point cloud at all?")
     counts = words_per_line(text)
     if len(counts) < len(vertex_lines) or counts.min() < 3:
         raise damaged(name, "a vertex has fewer than 3 coordinates")

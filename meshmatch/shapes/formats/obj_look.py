@@ -25,9 +25,7 @@ from meshmatch.shapes.srgb import to_linear
 # How many numbers follow an option of a map; up to three where it is None.
 _OPTIONS = {
     **dict.fromkeys(("-o", "-s", "-t"), None),
-    **dict.fromkeys(
-        ("-blendu", "-blendv", "-cc", "-clamp", "-bm", "-boost", "-texres", "-imfchan", "-type"), 1
-    ),
+    **dict.fromkeys(("-blendu", "-blendv", "-cc", "-clamp", "-bm", "-boost", "-texres", "-imfchan", "-type"), 1),
     "-mm": 2,
 }
 
@@ -53,9 +51,7 @@ class _Entry:
     folder: Path = field(default_factory=Path)
 
 
-def read_look(
-    path: Path, data: bytes, shape: Shape, reader: ImageReader, picture: Pixels | None
-) -> Appearance:
+def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
     """Materials and texture coordinates, face by face in the order of `obj.read`; `picture` replaces all images."""
     data = joined_lines(data)
     named, libraries = (_words(*found) for found in lines_of(data, b"usemtl", b"mtllib"))
@@ -248,8 +244,7 @@ class _Material:
         file = _beside(self.entry.folder, wanted.file)
         if file is None:
             raise InputError(
-                f"{self.path.name} needs the image {wanted.file[:200]} of its material {self.name}, "
-                "which is not there",
+                f"{self.path.name} needs the image {wanted.file[:200]} of its material {self.name}, which is not there",
                 f"copy it to {self.entry.folder}, or name another with --image",
             )
         return self.reader.decode(read_bytes(file), file.name)

@@ -19,9 +19,7 @@ def read(path: Path, data: bytes) -> Raw:
     text = re.sub(rb"#[^\n]*", b"", data).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     header = _HEADER.match(text)
     if not header:
-        raise InputError(
-            f"{name} is not an off file: it does not begin with 'OFF'", "does the suffix fit the content?"
-        )
+        raise InputError(f"{name} is not an off file: it does not begin with 'OFF'", "does the suffix fit the content?")
     kind = header.group(1) or header.group(2) or b""
     body = text[header.end() :]
     if body.lstrip()[:6] == b"BINARY":
@@ -35,9 +33,7 @@ def read(path: Path, data: bytes) -> Raw:
         raise damaged(name, f"it promises {V} vertices and {F} faces, but is only {len(data)} bytes long")
     counts = words_per_line(body)
     if len(counts) < V + F:
-        raise damaged(
-            name, f"it promises {V} vertices and {F} faces, but has only {len(counts)} lines of them"
-        )
+        raise damaged(name, f"it promises {V} vertices and {F} faces, but has only {len(counts)} lines of them")
     if V and counts[:V].min() < 3:
         raise damaged(name, "a vertex has fewer than 3 coordinates")
     values = numbers(name, body)
@@ -49,9 +45,7 @@ def read(path: Path, data: bytes) -> Raw:
     if b"C" in kind and V and widths.min() >= at + 3:
         channels = np.nan_to_num(columns(rows, widths, at, min(at + 4, int(widths.min()))))
         colors = np.ones((V, 4))
-        colors[:, : channels.shape[1]] = np.clip(
-            channels / (255.0 if (channels > 1).any() else 1.0), 0.0, 1.0
-        )
+        colors[:, : channels.shape[1]] = np.clip(channels / (255.0 if (channels > 1).any() else 1.0), 0.0, 1.0)
     if F == 0:
         return Raw(verts, NO_FACES, colors)
     lines = counts[V : V + F]

@@ -43,9 +43,7 @@ def read(path: Path, data: bytes) -> Raw:
         table = body.element(element)
         if element.name == "vertex":
             if not {"x", "y", "z"} <= set(table):
-                raise InputError(
-                    f"{name}: the vertices have no x, y and z", "is it a mesh or a point cloud at all?"
-                )
+                raise InputError(f"{name}: the vertices have no x, y and z", "is it a mesh or a point cloud at all?")
             verts = np.stack([table[axis].values.astype(np.float64) for axis in "xyz"], axis=1)
             colors = _colors(table)
         elif element.name == "face":
@@ -115,9 +113,7 @@ def _further(columns: Mapping[str, NDArray[Any]] | None) -> tuple[list[Any], lis
     """Fields of a table, and lines of a header, for further properties."""
     fields, lines = [], []
     for label, values in (columns or {}).items():
-        kind, word = {"uint8": ("u1", "uchar"), "int32": ("<i4", "int")}.get(
-            values.dtype.name, ("<f8", "double")
-        )
+        kind, word = {"uint8": ("u1", "uchar"), "int32": ("<i4", "int")}.get(values.dtype.name, ("<f8", "double"))
         fields.append((label, kind))
         lines.append(f"property {word} {label}")
     return fields, lines
@@ -126,18 +122,14 @@ def _further(columns: Mapping[str, NDArray[Any]] | None) -> tuple[list[Any], lis
 def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int]:
     """Byte order (None: text), elements, and where the body starts."""
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
-        raise InputError(
-            f"{name} is not a ply file: it does not begin with 'ply'", "does the suffix fit the content?"
-        )
+        raise InputError(f"{name} is not a ply file: it does not begin with 'ply'", "does the suffix fit the content?")
     end = _END.search(data)
     if not end:
         raise damaged(name, "the header has no end")
     order: str | None = ""
     elements: list[Element] = []
     try:
-        for line in (
-            data[: end.start()].decode("latin-1").replace("\r\n", "\n").replace("\r", "\n").split("\n")
-        ):
+        for line in data[: end.start()].decode("latin-1").replace("\r\n", "\n").replace("\r", "\n").split("\n"):
             match line.split():
                 case ["format", kind, *_]:
                     order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}[kind]

@@ -57,18 +57,13 @@ class Body:
         self._check(element, self.at + element.count * sum(kind.itemsize for kind in kinds))
         if element.count == 0:
             nothing = np.empty(0, np.int64)
-            return {
-                p.name: (nothing, nothing) if p.count_kind else Column(nothing, p.kind)
-                for p in element.properties
-            }
+            return {p.name: (nothing, nothing) if p.count_kind else Column(nothing, p.kind) for p in element.properties}
         table = self._equal_rows(element)
         return table if table is not None else self._walk(element)
 
     def _check(self, element: Element, end: int) -> None:
         if element.count < 0 or end > len(self.data):
-            raise damaged(
-                self.name, f"fewer {element.name} rows than the {element.count} that its header promises"
-            )
+            raise damaged(self.name, f"fewer {element.name} rows than the {element.count} that its header promises")
 
     def _dtype(self, kind: str) -> np.dtype[Any]:
         return np.dtype("f8" if self.text else self.order + kind)

@@ -39,8 +39,7 @@ def read_npy(path: Path, data: bytes) -> Raw:
         raise InputError(f"{name} does not hold an array of numbers", "save points as an (N, 3) array")
     if array.ndim != 2 or array.shape[1] not in (3, 6):
         raise InputError(
-            f"{name} holds an array of {array.shape}, not a point cloud",
-            "points are an array of (N, 3), or (N, 6)",
+            f"{name} holds an array of {array.shape}, not a point cloud", "points are an array of (N, 3), or (N, 6)"
         )
     return Raw(np.array(array[:, :3], np.float64), NO_FACES)
 

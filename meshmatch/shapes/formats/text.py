@@ -36,9 +36,7 @@ def numbers(name: str, text: bytes) -> Float[Floats, " N"]:
             values.append(float(word))
         except ValueError:
             if b"nan" not in word.lower() and b"#" not in word:  # 1.#QNAN, -nan(ind)
-                raise damaged(
-                    name, f"found {word[:20].decode(errors='replace')!r} where a number should be"
-                ) from None
+                raise damaged(name, f"found {word[:20].decode(errors='replace')!r} where a number should be") from None
             values.append(np.nan)
     return np.array(values)
 
