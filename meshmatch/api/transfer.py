@@ -22,8 +22,7 @@ from meshmatch.transfer.attributes import pull_labels, pull_values, pull_weights
 from meshmatch.transfer.directions import pull_directions
 from meshmatch.transfer.face_labels import mean_of_corners, pull_face_labels
 from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, named
-from meshmatch.transfer.landmark_files import load_landmarks
-from meshmatch.transfer.landmarks import Landmarks, at_points, at_vertices, push_landmarks
+from meshmatch.transfer.landmarks import Landmarks, at_points, at_vertices, load_landmarks, push_landmarks
 from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels, replace_low_values, replace_low_weights
 from meshmatch.transfer.weight_files import SkinWeights, load_weights, weights_of
 

@@ -42,7 +42,7 @@ def transfer_landmarks(
     from meshmatch.api.results import ConfidenceRule
     from meshmatch.api.transfer import transfer_landmarks as transferred
     from meshmatch.shapes.files import load_shape
-    from meshmatch.transfer.landmark_files import check_landmarks_suffix, load_landmarks, save_landmarks
+    from meshmatch.transfer.landmarks import check_landmarks_suffix, load_landmarks, save_landmarks
 
     transfer = transfer_options.Transfer(source, target, maps, run, Console(run.quiet))
     console = transfer.console

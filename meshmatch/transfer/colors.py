@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,17 +16,14 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.srgb import to_linear, to_srgb
 from meshmatch.transfer.value_files import Values, parse_blank, save_values
 
-CHANNELS = ("red", "green", "blue", "alpha")
 _SHAPES, _TABLES = (".ply", ".glb", ".obj", ".off"), (".npy", ".csv")
+check_suffix = partial(table_files.check_suffix, suffixes=(*_SHAPES, *_TABLES), what="vertex colours")
 
 
 def light_of(shape: Shape, colors: ArrayLike | None = None) -> Float[Floats, "V 4"]:
     """Light of the vertices of a shape, from its own colours or from others (V, 3 or 4) as screens show them.
 
-    Raises
-    ------
-    InputError
-        It has no vertex colours; or not one for each vertex, within 0..1.
+    `InputError` if it has no vertex colours; or not one for each vertex, within 0..1.
     """
     if colors is None:
         if shape.colors is None:
@@ -54,9 +52,10 @@ def light(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
     return np.concatenate([to_linear(colors[..., :3]), colors[..., 3:]], axis=-1)
 
 
-def check_suffix(path: Path) -> None:
-    """Refuse a suffix that cannot hold vertex colours (`OptionError`)."""
-    table_files.check_suffix(path, (*_SHAPES, *_TABLES), "vertex colours")
+def seen(amounts: Float[Floats, "V 4"]) -> Float[Floats, "V 4"]:
+    """Colours as screens show them (sRGB, 0..1) of light; nan is black."""
+    amounts = np.clip(np.nan_to_num(amounts), 0.0, 1.0)
+    return np.concatenate([to_srgb(amounts[:, :3]), amounts[:, 3:]], axis=1)
 
 
 def parse_color(text: str | None) -> tuple[float, float, float, float] | None:
@@ -67,16 +66,9 @@ def parse_color(text: str | None) -> tuple[float, float, float, float] | None:
     return red, green, blue, alpha
 
 
-def seen(amounts: Float[Floats, "V 4"]) -> Float[Floats, "V 4"]:
-    """Colours as screens show them (sRGB, 0..1) of light; nan is black."""
-    amounts = np.clip(np.nan_to_num(amounts), 0.0, 1.0)
-    return np.concatenate([to_srgb(amounts[:, :3]), amounts[:, 3:]], axis=1)
-
-
 def save(path: Path, shape: Shape, colors: Float[Floats, "V 4"]) -> None:
     """Write `shape` with vertex colours as screens show them; or the colours alone."""
-    check_suffix(path)
-    if path.suffix.lower() in _TABLES:
-        save_values(path, Values(colors, CHANNELS), shape)
-        return
-    save_shape(path, Shape(shape.verts, shape.faces, shape.name, colors, shape.invalid))
+    if check_suffix(path) in _TABLES:
+        save_values(path, Values(colors, ("red", "green", "blue", "alpha")), shape)
+    else:
+        save_shape(path, Shape(shape.verts, shape.faces, shape.name, colors, shape.invalid))

@@ -1,188 +1,320 @@
-"""Landmarks are pushed forward: from their places on the source to exact places on the target."""
+"""Landmarks, named points on a shape: pushed forward along a map, read from files and written.
+
+=====  =======================================================================================
+.csv   a row each: name,vertex,x,y,z,face,w0,w1,w2,confidence
+.json  ``{"landmarks": [{"name": ..., "vertex": ..., "position": [...], ...}, ...]}``
+.pp    MeshLab's picked points: names and positions
+=====  =======================================================================================
+
+Read is whatever says where a landmark is: a vertex; or a face with weights; or a position, which then stands for
+the nearest point of the surface. Also a plain list of vertices, .txt or .npy.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
+from meshmatch.maps import table_files
 from meshmatch.maps.map_checks import corners_of
+from meshmatch.maps.pairs import load_points
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.outputs import plain_text
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals
 
 # A landmark this far from the surface, in diagonals of the shape, belongs to another shape.
 _ELSEWHERE = 0.25
+LANDMARK_SUFFIXES = (".csv", ".json", ".pp")
+check_landmarks_suffix = partial(table_files.check_suffix, suffixes=LANDMARK_SUFFIXES, what="landmarks")
+_COLUMNS = ("name", "vertex", "x", "y", "z", "face", "w0", "w1", "w2", "confidence")
+_PLACES = ({"vertex"}, {"x", "y", "z"}, {"face", "w0", "w1", "w2"})
+# Name, kind and place of one as a file has it: a "vertex", a "face" with three weights, or a "position".
+_Entry = tuple[str, str, Any]
+_HINT = "a row each: name,vertex or name,x,y,z; or MeshLab's .pp, or .json"
 
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Named points on a shape.
-
-    Parameters
-    ----------
-    names : (N,) tuple of str
-    points : (N, 3) float64
-        In the shape's own frame and unit.
-    vertex : (N,) int64
-        The vertex itself, or the heaviest corner of the face.
-    face : (N,) int64
-        -1 where the point is the vertex itself (always on a cloud).
-    barycentric : (N, 3) float64
-        Weights of the face's corners; (1, 0, 0) where the face is -1.
-    confidence : (N,) float64
-        0 (a guess) to 1 (certain).
-    """
+    """Named points on a shape, in its own frame and unit."""
 
     names: tuple[str, ...]
     points: Float[Floats, "N 3"]
-    vertex: Int[Ints, " N"]
-    face: Int[Ints, " N"]
-    barycentric: Float[Floats, "N 3"]
-    confidence: Float[Floats, " N"]
-
-    def rows(self, rows: Ints) -> Landmarks:
-        """Some of them, in this order."""
-        names = tuple(self.names[k] for k in rows.tolist())
-        face, weights, confidence = self.face[rows], self.barycentric[rows], self.confidence[rows]
-        return Landmarks(names, self.points[rows], self.vertex[rows], face, weights, confidence)
+    vertex: Int[Ints, " N"]  # the vertex itself, or the heaviest corner of the face
+    face: Int[Ints, " N"]  # -1 where the point is the vertex itself (always on a cloud)
+    barycentric: Float[Floats, "N 3"]  # weights of the face's corners; (1, 0, 0) where the face is -1
+    confidence: Float[Floats, " N"]  # 0 (a guess) to 1 (certain)
 
 
 def at_vertices(shape: Shape, vertex: Int[Ints, " N"], names: tuple[str, ...] = ()) -> Landmarks:
-    """Landmarks that are vertices (N,) of `shape`.
-
-    Raises
-    ------
-    InputError
-        A vertex that the shape does not have.
-    """
+    """Landmarks that are vertices (N,) of `shape`; `InputError` for one that it does not have."""
     vertex = np.asarray(vertex, np.int64)
-    names = names or _numbered(len(vertex))
-    bad = np.flatnonzero((vertex < 0) | (vertex >= shape.V))
-    if len(bad):
-        raise InputError(
-            f"landmark {names[bad[0]]} is vertex {vertex[bad[0]]}, but {shape.name or 'the source'} has "
-            f"{shape.V} vertices",
-            "vertices are counted from 0; are they landmarks of the source?",
-        )
+    _refuse(
+        (vertex < 0) | (vertex >= shape.V),
+        names,
+        lambda k: f" is vertex {vertex[k]}, but {shape.name or 'the source'} has {shape.V} vertices",
+        "vertices are counted from 0; are they landmarks of the source?",
+    )
     N = len(vertex)
-    weights = np.tile([1.0, 0.0, 0.0], (N, 1))
-    return Landmarks(names, shape.verts[vertex], vertex, np.full(N, -1), weights, np.ones(N))
+    return _on_surface(shape, names, vertex, np.full(N, -1), np.tile([1.0, 0.0, 0.0], (N, 1)))
 
 
 def at_points(
     shape: Shape, points: Float[Floats, "N 3"], names: tuple[str, ...] = ()
 ) -> tuple[Landmarks, Float[Floats, " N"]]:
-    """Landmarks at the points of a surface (or cloud) nearest to points (N, 3) of its frame.
+    """Landmarks at the points of a surface (or cloud) nearest to points of its frame, and how far these are from it.
 
-    Returns
-    -------
-    landmarks : Landmarks
-    distance : (N,) float64
-        From each given point to the surface.
-
-    Raises
-    ------
-    InputError
-        A point is not finite, or lies far from the shape.
+    `InputError` if a point is not finite, or lies far from the shape.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
-    names = names or _numbered(len(points))
-    bad = np.flatnonzero(~(np.abs(points) < 1e60).all(axis=1))
-    if len(bad):
-        raise InputError(f"landmark {names[bad[0]]} has no position: {points[bad[0]].tolist()}")
+    usable = (np.abs(points) < 1e60).all(axis=1)
+    _refuse(~usable, names, lambda k: f" has no position: {points[k].tolist()}")
     places = MappedMesh.of(shape).query(points)
-    far = np.flatnonzero(places.distance > _ELSEWHERE * max(shape.diagonal, 1e-30))
-    if len(far):
-        raise InputError(
-            f"landmark {names[far[0]]} lies {places.distance[far[0]]:.4g} away from "
-            f"{shape.name or 'the source'}, whose size is {shape.diagonal:.4g}",
-            "landmarks must be in the frame and unit of the source's file",
-        )
-    found = _on_surface(shape, names, places.vertex, places.face, places.barycentric, np.ones(len(points)))
-    return found, places.distance
+    _refuse(
+        places.distance > _ELSEWHERE * max(shape.diagonal, 1e-30),
+        names,
+        lambda k: (
+            f" lies {places.distance[k]:.4g} away from {shape.name or 'the source'}, whose size is {shape.diagonal:.4g}"
+        ),
+        "landmarks must be in the frame and unit of the source's file",
+    )
+    return _on_surface(shape, names, places.vertex, places.face, places.barycentric), places.distance
 
 
 def at_faces(
     shape: Shape, face: Int[Ints, " N"], barycentric: Float[Floats, "N 3"], names: tuple[str, ...] = ()
 ) -> Landmarks:
-    """Landmarks in faces (N,), by the weights (N, 3) of their corners.
+    """Landmarks in faces, by the weights of their corners.
 
-    Raises
-    ------
-    InputError
-        A face that the shape does not have, or weights that do not sum to 1.
+    `InputError` for a face that the shape does not have, or weights that do not sum to 1.
     """
     face, weights = np.asarray(face, np.int64), np.asarray(barycentric, np.float64).reshape(-1, 3)
-    names = names or _numbered(len(face))
-    bad = np.flatnonzero((face < 0) | (face >= shape.F))
-    if len(bad):
-        raise InputError(
-            f"landmark {names[bad[0]]} is in face {face[bad[0]]}, but {shape.name or 'the source'} has {shape.F} faces",
-            "faces are counted from 0; are they landmarks of the source?",
-        )
-    bad = np.flatnonzero(~((weights >= -1e-9).all(axis=1) & (np.abs(weights.sum(axis=1) - 1.0) < 1e-4)))
-    if len(bad):
-        raise InputError(
-            f"landmark {names[bad[0]]}: its weights {weights[bad[0]].tolist()} do not sum to 1",
-            "the weights of a face's corners are 0 or more",
-        )
+    _refuse(
+        (face < 0) | (face >= shape.F),
+        names,
+        lambda k: f" is in face {face[k]}, but {shape.name or 'the source'} has {shape.F} faces",
+        "faces are counted from 0; are they landmarks of the source?",
+    )
+    _refuse(
+        ~((weights >= -1e-9).all(axis=1) & (np.abs(weights.sum(axis=1) - 1.0) < 1e-4)),
+        names,
+        lambda k: f": its weights {weights[k].tolist()} do not sum to 1",
+        "the weights of a face's corners are 0 or more",
+    )
     weights = np.clip(weights, 0.0, None)
     weights /= weights.sum(axis=1, keepdims=True)
-    vertex = shape.faces[face, weights.argmax(axis=1)]
-    return _on_surface(shape, names, vertex, face, weights, np.ones(len(face)))
+    return _on_surface(shape, names, shape.faces[face, weights.argmax(axis=1)], face, weights)
 
 
-def joined(parts: list[Landmarks]) -> Landmarks:
-    """Landmarks of one shape, one after the other."""
-    arrays: list[NDArray] = [
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("points", "vertex", "face", "barycentric", "confidence")
-    ]
-    return Landmarks(tuple(name for part in parts for name in part.names), *arrays)
+def _refuse(bad: ArrayLike, names: tuple[str, ...], why: Callable[[int], str], hint: str = "") -> None:
+    """`InputError` with the name of the first bad landmark, if there is one."""
+    for k in np.flatnonzero(bad)[:1].tolist():
+        raise InputError(f"landmark {names[k] if names else k}{why(k)}", hint)
+
+
+def _on_surface(
+    shape: Shape, names: tuple[str, ...], vertex: Ints, face: Ints, weights: Floats, confidence: Floats | None = None
+) -> Landmarks:
+    """Landmarks at these places, named by number unless they have names."""
+    points = interpolate(shape.verts, corners_of(shape.faces, face, vertex), weights)
+    names = names or tuple(str(k) for k in range(len(vertex)))
+    return Landmarks(names, points, vertex, face, weights, np.ones(len(vertex)) if confidence is None else confidence)
+
+
+def joined(parts: Sequence[Landmarks], order: Ints | None = None) -> Landmarks:
+    """Landmarks of one shape, one after the other; then put into an order."""
+    names = [name for part in parts for name in part.names]
+    order = np.arange(len(names)) if order is None else order
+    fields = ("points", "vertex", "face", "barycentric", "confidence")
+    arrays = [np.concatenate([getattr(part, field) for part in parts])[order] for field in fields]
+    return Landmarks(tuple(names[k] for k in order.tolist()), *arrays)
 
 
 def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: Landmarks) -> Landmarks:
-    """Landmarks of the source on the target, exactly on its surface.
+    """Landmarks of the source on the target, exactly on its surface; `forward` is a map from source to target.
 
     A vertex goes where the map puts it. A point of a face goes to the surface nearest to the mean of where its
     corners go; where the map is discontinuous there, with its heaviest corner.
-
-    Parameters
-    ----------
-    forward : VertexMap
-        From source to target.
     """
     at = landmarks.vertex
-    vertex, face = forward.index[at].copy(), forward.face[at].copy()
-    weights = forward.barycentric[at].copy()
+    vertex, face, weights = forward.index[at], forward.face[at], forward.barycentric[at]
     confidence = forward.confidence[at].astype(np.float64)
-    points = forward.points(target)
     inside = np.flatnonzero((landmarks.face >= 0) & (landmarks.barycentric.max(axis=1) < 1.0 - 1e-9))
     if len(inside):
-        discontinuous = discontinuous_faces(forward, source, target)
-        inside = inside[~discontinuous[landmarks.face[inside]]]
+        inside = inside[~discontinuous_faces(forward, source, target)[landmarks.face[inside]]]
     if len(inside):
         corners = source.faces[landmarks.face[inside]]
         share = landmarks.barycentric[inside]
-        mean = interpolate(points, corners, share)
         facing = interpolate(known_normals(target), forward.index[corners], share)
-        places = MappedMesh.of(target).query(mean, facing)
+        places = MappedMesh.of(target).query(interpolate(forward.points(target), corners, share), facing)
         vertex[inside], face[inside], weights[inside] = places.vertex, places.face, places.barycentric
         confidence[inside] = np.einsum("nk,nk->n", share, forward.confidence[corners])
     return _on_surface(target, landmarks.names, vertex, face, weights, np.clip(confidence, 0, 1))
 
 
-def _on_surface(
-    shape: Shape, names: tuple[str, ...], vertex: Ints, face: Ints, weights: Floats, confidence: Floats
-) -> Landmarks:
-    points = interpolate(shape.verts, corners_of(shape.faces, face, vertex), weights)
-    return Landmarks(names, points, vertex, face, weights, confidence)
+def load_landmarks(path: str | Path, shape: Shape) -> tuple[Landmarks, float]:
+    """Read landmarks of `shape`, in the order of the file; and the largest distance from a position to the surface.
+
+    `InputError` if the file is missing or damaged, holds no landmark, or one that is not on `shape`.
+    """
+    readers: dict[str, Callable[[Path], tuple[Landmarks, float]]] = {
+        ".csv": lambda path: _on_shape(_read_csv(path), shape),
+        ".json": lambda path: _on_shape(_read_json(path), shape),
+        ".pp": lambda path: _on_shape(_read_pp(path), shape),
+        ".txt": lambda path: (at_vertices(shape, load_points(path)), 0.0),
+        ".npy": lambda path: (at_vertices(shape, load_points(path)), 0.0),
+    }
+    return table_files.read_by_suffix(path, readers, "landmarks", _HINT)
 
 
-def _numbered(count: int) -> tuple[str, ...]:
-    return tuple(str(k) for k in range(count))
+def _on_shape(entries: Sequence[_Entry], shape: Shape) -> tuple[Landmarks, float]:
+    """Landmarks in the order of the entries; and the largest distance of a position from the surface."""
+    if not entries:
+        raise InputError("it holds no landmark")
+    parts: list[Landmarks] = []
+    rows: list[int] = []
+    largest = 0.0
+    for kind in ("vertex", "face", "position"):
+        own = [(k, name, place) for k, (name, its, place) in enumerate(entries) if its == kind]
+        if not own:
+            continue
+        numbers, names, places = zip(*own, strict=True)
+        rows += numbers
+        if kind == "vertex":
+            parts.append(at_vertices(shape, np.array(places), names))
+        elif kind == "face":
+            face, weights = (np.array(each) for each in zip(*places, strict=True))
+            parts.append(at_faces(shape, face, weights, names))
+        else:
+            found, distance = at_points(shape, np.array(places), names)
+            parts.append(found)
+            largest = float(distance.max())
+    return joined(parts, np.argsort(rows)), largest
+
+
+def _read_csv(path: Path) -> list[_Entry]:
+    rows = [row for row in table_files.read_rows(path) if not row[0].startswith("#")]
+    if not rows:
+        return []
+    head = [cell.lower() for cell in rows[0]]
+    if any(place <= set(head) for place in _PLACES):
+        rows = rows[1:]
+    else:
+        width = len(head)
+        if width not in (1, 2, 3, 4) or (width == 2 and head[0].lstrip("-").isdigit()):
+            raise InputError("its first row names no columns")
+        head = {1: ["vertex"], 2: ["name", "vertex"], 3: ["x", "y", "z"], 4: ["name", "x", "y", "z"]}[width]
+    entries = []
+    for number, row in enumerate(rows):
+        if len(row) != len(head):
+            raise InputError(f"row {number} has {len(row)} cells, not {len(head)}")
+        cell = dict(zip(head, row, strict=True))
+        record: dict[str, Any] = {"name": cell.get("name")}
+        # The most exact of what a row has: a face with weights, then a vertex, then a position.
+        if cell.get("face", "") not in ("", "-1") and {"w0", "w1", "w2"} <= set(cell):
+            record["face"] = int(cell["face"])
+            record["barycentric"] = [float(cell[name]) for name in ("w0", "w1", "w2")]
+        elif cell.get("vertex", "") != "":
+            record["vertex"] = int(cell["vertex"])
+        else:
+            record["position"] = [float(cell.get(axis, "nan")) for axis in "xyz"]
+        entries.append(_entry(record, number))
+    return entries
+
+
+def _read_json(path: Path) -> list[_Entry]:
+    record = table_files.read_json(path)
+    if isinstance(record, dict) and isinstance(record.get("landmarks"), list | dict):
+        record = record["landmarks"]
+    if not isinstance(record, list | dict):
+        raise InputError("it holds no list of landmarks")
+    entries = []
+    for number, item in enumerate(record):
+        name, value = (item, record[item]) if isinstance(record, dict) else (str(number), item)
+        if not isinstance(value, dict):
+            value = {"vertex" if isinstance(value, int) else "position": value}
+        named = {"name": name, **value} if isinstance(record, dict) else value
+        entries.append(_entry(named, number))
+    return entries
+
+
+def _entry(record: dict[str, Any], number: int) -> _Entry:
+    words = "".join(c if c.isprintable() else " " for c in str(record.get("name") or number))
+    name = plain_text(" ".join(words.split()))
+    face, weights = record.get("face"), record.get("barycentric")
+    if face is not None and face != -1 and weights is not None:
+        return name, "face", (_whole(face, name), _three(weights, name))
+    if record.get("vertex") is not None:
+        return name, "vertex", _whole(record["vertex"], name)
+    if record.get("position") is not None:
+        return name, "position", _three(record["position"], name)
+    raise InputError(f"landmark {name} has no place")
+
+
+def _whole(value: Any, name: str) -> int:
+    if isinstance(value, bool) or int(value) != value or abs(int(value)) >= 2**62:
+        raise InputError(f"landmark {name}: {str(value)[:40]} is not the number of a vertex or face")
+    return int(value)
+
+
+def _three(values: Any, name: str) -> list[float]:
+    if not isinstance(values, list) or len(values) != 3:
+        raise InputError(f"landmark {name}: three numbers are needed, not {str(values)[:40]}")
+    return [float(value) for value in values]
+
+
+def _read_pp(path: Path) -> list[_Entry]:
+    data = path.read_bytes()
+    if b"<!ENTITY" in data:
+        raise InputError("it defines XML entities, which a file of picked points has no use for")
+    try:
+        root = ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        raise InputError(f"it is not XML: {error}") from error
+    if root.tag != "PickedPoints":
+        raise InputError(f"it is not a file of MeshLab's picked points: its root is '{root.tag}'")
+    entries: list[_Entry] = []
+    for point in root.iter("point"):
+        if point.get("active", "1") != "0":  # else a name of a template that nobody has placed
+            position = [float(point.get(axis, "nan")) for axis in "xyz"]
+            entries.append(_entry({"name": point.get("name"), "position": position}, len(entries)))
+    return entries
+
+
+def save_landmarks(path: Path, landmarks: Landmarks) -> None:
+    """Write landmarks; `OptionError` if the suffix is not one of `LANDMARK_SUFFIXES`."""
+    suffix = check_landmarks_suffix(path)
+    columns = (landmarks.vertex, landmarks.points, landmarks.face, landmarks.barycentric)
+    rows = list(
+        zip(
+            landmarks.names,
+            *(column.tolist() for column in columns),
+            table_files.short_floats(landmarks.confidence),
+            strict=True,
+        )
+    )
+    if suffix == ".csv":
+        cells = ([name, vertex, *xyz, face, *weights, sure] for name, vertex, xyz, face, weights, sure in rows)
+        table_files.write_rows(path, _COLUMNS, cells)
+    elif suffix == ".json":
+        keys = ("name", "vertex", "position", "face", "barycentric", "confidence")
+        records = [dict(zip(keys, row, strict=True)) for row in rows]
+        table_files.write_json(path, {"format": "meshmatch landmarks 1", "landmarks": records}, indent=1)
+    else:
+        root = ElementTree.Element("PickedPoints")
+        for name, _, (x, y, z), *_ in rows:
+            place = {"x": repr(x), "y": repr(y), "z": repr(z), "name": name, "active": "1"}
+            ElementTree.SubElement(root, "point", place)
+        ElementTree.indent(root, " ")
+        text = ElementTree.tostring(root, encoding="unicode")
+        path.write_text(f"<!DOCTYPE PickedPoints>\n{text}\n", encoding="utf-8")

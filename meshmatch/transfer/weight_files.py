@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,72 +23,58 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array, issparse
 
 from meshmatch.errors import InputError
-from meshmatch.maps.table_files import check_suffix, read_by_suffix, read_json, short_floats, write_json, write_npz
+from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.array_files import read_npz
 from meshmatch.shapes.shape import Shape
 
 WEIGHT_SUFFIXES = (".npz", ".json")
+check_weights_suffix = partial(table_files.check_suffix, suffixes=WEIGHT_SUFFIXES, what="skin weights")
 _FORMAT = "meshmatch skin weights 1"
-_KEYS = ("format", "names", "joints", "weights")
 _HINT = "arrays 'joints' (V, N) and 'weights' (V, N), or 'weights' (V, J) alone; 'names' (J,)"
 _MAX_JOINTS = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class SkinWeights:
-    """How much each joint moves each vertex.
+    """How much each joint moves each vertex."""
 
-    Parameters
-    ----------
-    matrix : (V, J) sparse
-        Not negative. Rows sum to 1, or to 0 for a vertex that nothing moves.
-    names : (J,) tuple of str
-    """
-
-    matrix: csr_array
-    names: tuple[str, ...]
+    matrix: csr_array  # (V, J), not negative; rows sum to 1, or to 0 for a vertex that nothing moves
+    names: tuple[str, ...]  # of the joints
 
 
 def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
     """Read skin weights of the vertices of `shape`, from .npz, .json, .glb or .gltf.
 
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, holds no weights, or not those of `shape`.
+    `InputError` if the file is missing or damaged, holds no weights, or not those of `shape`.
     """
     readers = {
-        ".npz": lambda path: _from_record(read_npz(path, _KEYS)),
-        ".json": lambda path: _from_record(read_json(path)),
+        ".npz": lambda path: _from_record(read_npz(path, ("format", "names", "joints", "weights"))),
+        ".json": lambda path: _from_record(table_files.read_json(path)),
         ".glb": _read_gltf,
         ".gltf": _read_gltf,
     }
-    found = read_by_suffix(path, readers, "skin weights", _HINT)
-    return _normalized(Path(path).name, found, shape)
+    matrix, names = table_files.read_by_suffix(path, readers, "skin weights", _HINT)
+    return SkinWeights(_normalized(Path(path).name, matrix, shape), names)
 
 
 def weights_of(matrix: csr_array | ArrayLike, shape: Shape) -> SkinWeights:
     """Skin weights of the vertices of `shape` from a table (V, J), dense or sparse; joints are named by number.
 
-    Raises
-    ------
-    InputError
-        Not numbers, not a row for each vertex, or negative.
+    `InputError` if these are not numbers, not a row for each vertex, or negative.
     """
     sparse = csr_array(matrix if issparse(matrix) else _table("weights", matrix, np.float64), dtype=np.float64)
-    names = tuple(str(joint) for joint in range(sparse.shape[1]))
-    return _normalized("the array", SkinWeights(sparse, names), shape)
+    return SkinWeights(_normalized("the array", sparse, shape), tuple(str(joint) for joint in range(sparse.shape[1])))
 
 
-def _read_gltf(path: Path) -> SkinWeights:
+def _read_gltf(path: Path) -> tuple[csr_array, tuple[str, ...]]:
     from meshmatch.shapes.formats.gltf_skin import read_skin
 
     skin = read_skin(path, path.read_bytes())
-    return SkinWeights(csr_array((skin.weight, (skin.vertex, skin.joint)), (skin.V, len(skin.names))), skin.names)
+    return csr_array((skin.weight, (skin.vertex, skin.joint)), (skin.V, len(skin.names))), skin.names
 
 
-def _from_record(record: Any) -> SkinWeights:
+def _from_record(record: Any) -> tuple[csr_array, tuple[str, ...]]:
     if not isinstance(record, Mapping) or "weights" not in record:
         raise InputError("there is no 'weights' in it")
     weights = _table("weights", record["weights"], np.float64)
@@ -100,14 +87,14 @@ def _from_record(record: Any) -> SkinWeights:
     if joints is None:
         if weights.shape[1] != len(names):
             raise InputError(f"there are {weights.shape[1]} columns for {len(names)} names")
-        return SkinWeights(csr_array(weights), names)
+        return csr_array(weights), names
     if joints.shape != weights.shape:
         raise InputError(f"'joints' is an array of {joints.shape}, but 'weights' of {weights.shape}")
     row, column = np.nonzero(weights)
     used = joints[row, column]
     if len(used) and not 0 <= used.min() <= used.max() < len(names):
         raise InputError(f"it names joint {used.max()}, but there are {len(names)}", "they count from 0")
-    return SkinWeights(csr_array((weights[row, column], (row, used)), (len(weights), len(names))), names)
+    return csr_array((weights[row, column], (row, used)), (len(weights), len(names))), names
 
 
 def _table(key: str, values: ArrayLike, kind: type) -> np.ndarray:
@@ -123,9 +110,8 @@ def _table(key: str, values: ArrayLike, kind: type) -> np.ndarray:
     return array.astype(kind)
 
 
-def _normalized(name: str, weights: SkinWeights, shape: Shape) -> SkinWeights:
-    """Checked to be of `shape`, and with rows that sum to 1."""
-    matrix = weights.matrix
+def _normalized(name: str, matrix: csr_array, shape: Shape) -> csr_array:
+    """Weights (V, J) checked to be of `shape`, and with rows that sum to 1."""
     if matrix.shape[0] != shape.V:
         raise InputError(
             f"{name} has weights of {matrix.shape[0]} vertices, but {shape.name or 'the source'} has {shape.V}",
@@ -140,22 +126,11 @@ def _normalized(name: str, weights: SkinWeights, shape: Shape) -> SkinWeights:
     scale = np.where(total > 0, 1.0 / np.where(total > 0, total, 1.0), 0.0)
     matrix = csr_array(matrix * scale[:, None])
     matrix.eliminate_zeros()
-    return SkinWeights(matrix, weights.names)
-
-
-def check_weights_suffix(path: Path) -> str:
-    """The suffix, if it is one of `WEIGHT_SUFFIXES`; `OptionError` otherwise."""
-    return check_suffix(path, WEIGHT_SUFFIXES, "skin weights")
+    return matrix
 
 
 def save_weights(path: Path, weights: SkinWeights) -> None:
-    """Write skin weights; see the module for the format.
-
-    Raises
-    ------
-    OptionError
-        The suffix is not one of `WEIGHT_SUFFIXES`.
-    """
+    """Write skin weights; `OptionError` if the suffix is not one of `WEIGHT_SUFFIXES`."""
     suffix = check_weights_suffix(path)
     matrix = csr_array(weights.matrix)
     V = matrix.shape[0]
@@ -168,7 +143,7 @@ def save_weights(path: Path, weights: SkinWeights) -> None:
     shares[rows[order], place] = matrix.data[order]
     if suffix == ".npz":
         names = np.array(weights.names, np.str_)
-        write_npz(path, {"format": _FORMAT, "names": names, "joints": joints, "weights": shares})
+        table_files.write_npz(path, {"format": _FORMAT, "names": names, "joints": joints, "weights": shares})
     else:
         record = {"format": _FORMAT, "names": weights.names, "joints": joints.tolist()}
-        write_json(path, record | {"weights": short_floats(shares)})
+        table_files.write_json(path, record | {"weights": table_files.short_floats(shares)})

@@ -11,8 +11,17 @@ import pytest
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.landmark_files import LANDMARK_SUFFIXES, load_landmarks, save_landmarks
-from meshmatch.transfer.landmarks import Landmarks, at_faces, at_points, at_vertices, joined, push_landmarks
+from meshmatch.transfer.landmarks import (
+    LANDMARK_SUFFIXES,
+    Landmarks,
+    at_faces,
+    at_points,
+    at_vertices,
+    joined,
+    load_landmarks,
+    push_landmarks,
+    save_landmarks,
+)
 from tests.conftest import icosphere
 from tests.transfer.known import split
 
