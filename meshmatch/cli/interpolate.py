@@ -164,16 +164,16 @@ def _write_page(path: Path, result: "Interpolation", met: dict[float, str]) -> N
 
 
 def _plot(path: Path, result: "Interpolation", met: dict[float, str]) -> None:
-    from meshmatch.render.charts import Chart, Line, draw_lines
+    from meshmatch.render.charts import draw_lines
 
     times = [step.time for step in result.steps]
     marks = {time: name for time, name in met.items() if times[0] <= time <= times[-1]}
     lines = {
-        "volume: |det F - det S|": Line(times, [step.deviation.volume for step in result.steps]),
-        "rigidity: |F'F - S'S|": Line(times, [step.deviation.arap for step in result.steps]),
+        "volume: |det F - det S|": (times, [step.deviation.volume for step in result.steps]),
+        "rigidity: |F'F - S'S|": (times, [step.deviation.arap for step in result.steps]),
     }
     xlabel = "time (S is the stretch that the shapes themselves have)"
-    draw_lines([Chart(xlabel, lines, marks=marks)], path, "mean deviation over the surface")
+    draw_lines(lines, path, xlabel, "mean deviation over the surface", marks)
 
 
 def _tell(console: Console, result: "Interpolation", files: list[Path], asked: str) -> None:

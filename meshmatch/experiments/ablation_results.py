@@ -24,10 +24,10 @@ from meshmatch.experiments.ablation_views import (
     Known,
     View,
 )
+from meshmatch.experiments.charts import Bar, Chart, Line, draw_bars, draw_lines
 from meshmatch.experiments.runner import table
 from meshmatch.fields.choice import FIELDS, has_nodes
 from meshmatch.outputs import make_folder
-from meshmatch.render.charts import Bar, Chart, Line, draw_bars, draw_lines
 
 _AXIS = "mean error, cm (1.9 square meters of skin)"
 

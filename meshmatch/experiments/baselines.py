@@ -33,13 +33,13 @@ from typer import Option
 from meshmatch.experiments import runner
 from meshmatch.experiments.baseline_methods import Coded, Registration, ZoomOut
 from meshmatch.experiments.bench import INCOMPLETE, Method, OurMethod, run_set
+from meshmatch.experiments.charts import Bar, draw_bars
 from meshmatch.experiments.sets import ALL_SETS, SET_NAMES, BenchSet, load_set
 from meshmatch.fitting.fit_config import Refine
 from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.models.registry import find_model
 from meshmatch.outputs import make_folder
-from meshmatch.render.charts import Bar, draw_bars
 
 NAMES = ("rigid", "zoomout", "nricp", "meshmonk", "coded", "transmatch", "ours")
 COLUMNS = {
