@@ -269,7 +269,7 @@ def test_pymeshlab_is_known_by_one_module_and_only_when_asked() -> None:
         for each in imports(tree)
         if each.name.split(".")[0] == "pymeshlab"
     }
-    assert found == {("meshmatch.shapes.pymeshlab_filters", False)}
+    assert found == {("meshmatch.shapes.decimate", False)}
 
 
 def bare(requirements: Iterable[str]) -> set[str]:

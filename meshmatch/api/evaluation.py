@@ -13,7 +13,7 @@ from meshmatch.errors import InputError
 from meshmatch.maps.evaluate import Evaluation, evaluate_map
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.convert import ShapeLike, as_shape
+from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.threads import thread_limit
 
 

@@ -24,8 +24,7 @@ from meshmatch.maps.template_footpoints import in_core_frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes.convert import ShapeLike, as_shapes
-from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.files import ShapeLike, as_shapes, save_shape
 from meshmatch.shapes.shape import Floats, Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.surface_binding import SurfaceBinding

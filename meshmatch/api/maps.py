@@ -10,7 +10,7 @@ from meshmatch.api.results import MapPair, MatchResult, pair_of_map
 from meshmatch.errors import InputError
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.convert import ShapeLike, as_shape
+from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.shape import Shape
 
 if TYPE_CHECKING:

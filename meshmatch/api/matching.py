@@ -23,7 +23,7 @@ from meshmatch.fitting.landmarks import fits_with_landmarks, landmark_places
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes.convert import ShapeLike, as_shape, as_shapes
+from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit

@@ -29,9 +29,9 @@ from meshmatch.render.facing import facing
 from meshmatch.render.picture import Look
 from meshmatch.render.viewer import Looks, levelled, share_look, write_page
 from meshmatch.shapes.appearance import Appearance
-from meshmatch.shapes.appearance_files import find_appearance, load_coordinates
-from meshmatch.shapes.convert import ShapeLike, as_shape, as_shapes
+from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import find_appearance, load_coordinates
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.label_files import Labels, labels_of
 

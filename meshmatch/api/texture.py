@@ -12,11 +12,10 @@ from meshmatch.api.results import MapPair
 from meshmatch.errors import InputError, OptionError
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.appearance import Appearance, vertex_colors_alone
-from meshmatch.shapes.appearance_files import load_appearance, load_coordinates
-from meshmatch.shapes.convert import ShapeLike, as_shape
-from meshmatch.shapes.formats.textured import Textured
+from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import save_textured
+from meshmatch.shapes.textured_files import load_appearance, load_coordinates, save_textured
 from meshmatch.threads import thread_limit
 from meshmatch.transfer import texture as baking
 from meshmatch.transfer.bake import Baked, BakeOptions

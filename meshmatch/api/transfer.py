@@ -14,7 +14,7 @@ from meshmatch.api.results import ConfidenceRule, Transferred
 from meshmatch.arrays import Float, Floats, as_numbers
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.convert import ShapeLike, as_shape
+from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer import colors as vertex_colors

@@ -49,8 +49,7 @@ def _reader(file: Path) -> Callable[[Path], Record]:
 def _is_list(file: Path) -> bool:
     """A .npy of one axis is a map, one of two is a cloud."""
     from meshmatch.errors import InputError
-    from meshmatch.shapes.array_files import read_npy
-    from meshmatch.shapes.paths import existing
+    from meshmatch.shapes.input_files import existing, read_npy
 
     try:
         return read_npy(existing(file, "")).ndim == 1
@@ -61,8 +60,8 @@ def _is_list(file: Path) -> bool:
 def _shape(file: Path) -> Record:
     from meshmatch.geometry.topology import edges_of, face_parts
     from meshmatch.shapes.files import load_shape
+    from meshmatch.shapes.normalise import guess_unit, long_axis
     from meshmatch.shapes.repair import repair
-    from meshmatch.shapes.unit_heuristics import guess_unit, long_axis
 
     shape = load_shape(file)
     record: Record = {

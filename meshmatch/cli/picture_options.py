@@ -165,8 +165,8 @@ class Subject:
 
 def load_subject(path: Path, options: PictureOptions) -> Subject:
     """Read a shape, or a template by its file or name, or that of a model."""
-    from meshmatch.shapes.appearance_files import find_appearance
     from meshmatch.shapes.files import load_shape
+    from meshmatch.shapes.textured_files import find_appearance
 
     template = _template(path)
     if template is not None:

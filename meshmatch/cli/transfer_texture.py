@@ -72,9 +72,14 @@ def transfer_texture(
     """
     from meshmatch.api.texture import transfer_texture as transferred
     from meshmatch.api.transfer import transfer_colors
-    from meshmatch.shapes.appearance_files import find_appearance, load_appearance
     from meshmatch.shapes.files import load_shape
-    from meshmatch.shapes.textured_files import TexturedFiles, check_textured, files_of
+    from meshmatch.shapes.textured_files import (
+        check_textured,
+        files_of,
+        find_appearance,
+        load_appearance,
+        write_textured,
+    )
     from meshmatch.transfer import colors
     from meshmatch.transfer.bake import BakeOptions
     from meshmatch.transfer.texture import check_bake_options
@@ -104,7 +109,7 @@ def transfer_texture(
         else:
             with transfer.console.progress() as report:
                 made = transferred(a, target, transfer, uv=uv, options=baking, look=look, progress=report)
-            TexturedFiles(output, tuple(temporary)).write(made.mesh, made.baked.image)
+            write_textured(output, temporary, made.mesh, made.baked.image)
             record, pair = _tell_baked(transfer.console, made, rule, size), made.maps
     what = "with vertex colours" if painted else f"with a texture of {size} x {size}"
     transfer.console.say(f"wrote {' '.join(str(file) for file in files)}: {transfer.names[1]} {what}")

@@ -36,15 +36,14 @@ from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.appearance import Appearance, Material
-from meshmatch.shapes.appearance_files import load_appearance
+from meshmatch.shapes.colors import to_srgb
+from meshmatch.shapes.debris import seams
 from meshmatch.shapes.decimate import decimate
-from meshmatch.shapes.duplicates import seams
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import to_srgb
-from meshmatch.shapes.textured_files import save_textured
+from meshmatch.shapes.textured_files import load_appearance, save_textured
 from meshmatch.templates.location import bundled_folder
 from meshmatch.threads import set_threads
 from meshmatch.transfer.bake import BakeOptions

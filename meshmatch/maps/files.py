@@ -26,8 +26,8 @@ from meshmatch.maps.mat_file import read_mat
 from meshmatch.maps.table_files import check_numbered, read_by_suffix, short_floats
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.array_files import read_npy, read_npz
-from meshmatch.shapes.convert import ShapeLike, as_shape
+from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.input_files import read_npy, read_npz
 
 CSV_COLUMNS = ("source_vertex", "target_vertex", "face", "w0", "w1", "w2", "confidence")
 _ARRAYS = ("index", "face", "barycentric", "confidence")

@@ -13,7 +13,7 @@ import numpy as np
 
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.array_files import read_npy
+from meshmatch.shapes.input_files import read_npy
 
 _PAIRS = "one pair a line: a vertex of the source, then a vertex of the target, counted from 0"
 _POINTS = "one vertex a line, counted from 0"

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.paths import existing
+from meshmatch.shapes.input_files import existing
 
 T = TypeVar("T")
 # What a damaged file raises in the readers of the standard library and NumPy.

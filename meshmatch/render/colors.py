@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.shapes.palette import oklab_to_linear
+from meshmatch.shapes.colors import oklab_to_linear, to_linear, to_srgb
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import to_linear, to_srgb
 
 __all__ = ["CLAY", "oklab_to_linear", "position_colors", "to_linear", "to_srgb"]
 

@@ -24,8 +24,8 @@ from meshmatch.render.legend import Legend
 from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import UNKNOWN, Scale, label_colors, label_swatches
 from meshmatch.shapes.appearance import Appearance
+from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import to_srgb
 from meshmatch.templates.template import Template
 from meshmatch.transfer.attributes import pull_values
 from meshmatch.transfer.inverse_map import invert_map

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.render.colors import oklab_to_linear, to_srgb
-from meshmatch.shapes.palette import UNKNOWN, label_colors
+from meshmatch.shapes.colors import UNKNOWN, label_colors
 
 __all__ = ["UNKNOWN", "Scale", "Swatches", "label_colors", "label_swatches", "nice_step"]
 

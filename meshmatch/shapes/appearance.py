@@ -6,20 +6,31 @@ for it. Faces and vertices are those of `load_shape`, in the same order.
 
 from __future__ import annotations
 
+import struct
+import warnings
+import zlib
 from dataclasses import dataclass
+from io import BytesIO
 from typing import Literal
 
 import numpy as np
+from PIL import Image
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints, UInts8
 from meshmatch.errors import InputError
-from meshmatch.shapes.images import Pixels
+from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import to_linear
 
+Pixels = UInts8
 Wrap = Literal["repeat", "clamp", "mirror"]
 Alpha = Literal["opaque", "mask", "blend"]
 _FURTHEST_UV = 1e6
+MAX_PIXELS = 8192 * 8192
+"""Of one image. Pillow's own alarm stands a little higher."""
+MAX_ALL_PIXELS = 2 * MAX_PIXELS
+"""Of all images of one shape together."""
+_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")
+_DAMAGE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, TypeError, IndexError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +70,14 @@ class Appearance:
 
     Parameters
     ----------
-    materials : tuple of Material
+    materials
         At least one.
-    material : (F,) int64
-        Material of each face.
-    uv : (F, 3, 2) float64
+    material
+        Of each face.
+    uv
         Texture coordinates of each corner: u to the right, v *down*, as in glTF; zeros where a material has no
         image. Transforms that the file asks for are applied.
-    colors : (V, 4) float64, optional
+    colors
         Linear colour and alpha of each vertex, to be multiplied.
 
     Raises
@@ -82,10 +93,11 @@ class Appearance:
 
     def __post_init__(self) -> None:
         pictured = np.array([m.image is not None for m in self.materials])[self.material]
-        if not (np.abs(self.uv[pictured]) < _FURTHEST_UV).all():
-            bad = int(np.count_nonzero(~(np.abs(self.uv[pictured]) < _FURTHEST_UV).all(axis=(1, 2))))
+        fine = (np.abs(self.uv[pictured]) < _FURTHEST_UV).all(axis=(1, 2))
+        if not fine.all():
             raise InputError(
-                f"the texture coordinates of {bad} faces are out of range (not a number, or over a million)",
+                f"the texture coordinates of {len(fine) - int(fine.sum())} faces are out of range (not a number, or over "
+                "a million)",
                 "unwrap the source again, or export it again",
             )
 
@@ -116,3 +128,57 @@ def no_coordinates(name: str) -> InputError:
         f"{name} has no texture coordinates: an image cannot be laid on it",
         "unwrap it, or leave out --image and use its vertex colours",
     )
+
+
+class ImageReader:
+    """Decodes the images of one shape, and counts their pixels: a small file can promise gigabytes."""
+
+    def __init__(self) -> None:
+        self.left = MAX_ALL_PIXELS
+
+    def decode(self, data: bytes, label: str) -> Pixels:
+        """(H, W, 4) red, green, blue, alpha of the bytes of a png, jpeg, webp, bmp, tga or tiff, top row first.
+
+        `InputError` if it is no image of these, damaged, or too large.
+        """
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the bomb is judged here; other warnings are of metadata
+                with Image.open(BytesIO(data), formats=_FORMATS) as image:
+                    size = f"{image.width} x {image.height} pixels"
+                    if image.width * image.height > MAX_PIXELS:
+                        raise _too_large(label, size)
+                    self.left -= image.width * image.height
+                    if self.left < 0:
+                        raise _too_large(label, f"{size}, and the others before it nearly as many")
+                    return _rgba(image)
+        except Image.DecompressionBombError as error:
+            raise _too_large(label, "over 179 million pixels") from error
+        except Image.UnidentifiedImageError as error:
+            raise InputError(f"{label} cannot be read as an image", "save it as png or jpg") from error
+        except _DAMAGE as error:
+            what = (str(error) or type(error).__name__).strip().splitlines()[0][:80]
+            raise InputError(f"{label} is a damaged image ({what})", "export it or copy it again") from error
+
+
+def _rgba(image: Image.Image) -> Pixels:
+    if image.mode.startswith("I") or image.mode == "F":  # 16 bits of grey, which Pillow would cut off
+        grey = np.asarray(image).astype(np.float64)
+        most = 65535.0 if image.mode.startswith("I") else 1.0
+        byte = np.round(255 * np.clip(np.nan_to_num(grey) / most, 0, 1)).astype(np.uint8)
+        return np.stack([byte, byte, byte, np.full_like(byte, 255)], axis=-1)
+    return np.array(image.convert("RGBA"))
+
+
+def _too_large(label: str, what: str) -> InputError:
+    side = int(MAX_PIXELS**0.5)
+    return InputError(f"{label} is too large: {what}", f"make it smaller: at most {side} x {side} pixels")
+
+
+def png_bytes(pixels: Pixels) -> bytes:
+    """A PNG of (H, W, 4) pixels; without alpha if that is 255 everywhere."""
+    opaque = bool((pixels[..., 3] == 255).all())
+    image = Image.fromarray(np.ascontiguousarray(pixels[..., :3]) if opaque else pixels)
+    out = BytesIO()
+    image.save(out, format="PNG", compress_level=4)  # 6 takes twice as long for 3 % less
+    return out.getvalue()

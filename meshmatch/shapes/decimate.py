@@ -1,4 +1,8 @@
-"""Fewer triangles, nearly the same surface."""
+"""Fewer triangles, nearly the same surface. The one door to pymeshlab, which is under the GPL and optional: nothing on
+the main path comes to it.
+"""
+
+from __future__ import annotations
 
 from typing import Literal
 
@@ -7,13 +11,13 @@ import numpy as np
 from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.topology import edges_of, is_watertight
-from meshmatch.shapes.pymeshlab_filters import collapse_edges
 from meshmatch.shapes.shape import Shape
 
 Quality = Literal["fast", "meshlab"]
 _AGGRESSIVENESS = (3.0, 4.0, 2.5, 5.0)
 """To try in turn. On closed bodies 3 kept the mesh closed with the least error where 7, the library's own choice, did
 not; but it can stop short of the target, which higher ones reach."""
+_COLLAPSE = "meshing_decimation_quadric_edge_collapse"
 
 
 def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
@@ -26,8 +30,6 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
 
     Parameters
     ----------
-    shape : Shape
-        A mesh.
     faces : int
         How many triangles to aim at, at least 4. Borders and closedness can keep it from getting there.
     quality : "fast" or "meshlab"
@@ -50,20 +52,27 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
         return shape
     # centered and of size 1: the library compares with fixed tolerances
     center, size = shape.bounds.mean(axis=0), shape.diagonal or 1.0
-    collapse = collapse_edges if quality == "meshlab" else _fast
-    small_verts, small_faces = collapse((shape.verts - center) / size, shape.faces, faces)
-    return _shape(shape, small_verts * size + center, small_faces)
+    collapse = _by_pymeshlab if quality == "meshlab" else _fast
+    verts, corners = collapse((shape.verts - center) / size, shape.faces, faces)
+    verts = verts * size + center
+    used, corner = np.unique(corners, return_inverse=True)
+    colors = None
+    if shape.colors is not None:
+        from scipy.spatial import cKDTree
+
+        colors = shape.colors[cKDTree(shape.verts).query(verts[used])[1]]
+    return Shape(verts[used], corner.reshape(-1, 3), shape.name, colors)
 
 
 def _fast(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
     import fast_simplification
 
     closed = is_watertight(faces)
-    corners = faces.astype(np.int32)
     best: tuple[tuple[int, int], Floats, Ints] | None = None
     for aggressiveness in _AGGRESSIVENESS:
-        small = fast_simplification.simplify(verts, corners, target_count=target, agg=aggressiveness)
-        new_faces = _whole(np.asarray(small[1], np.int64))
+        small = fast_simplification.simplify(verts, faces.astype(np.int32), target_count=target, agg=aggressiveness)
+        new_faces = np.asarray(small[1], np.int64)
+        new_faces = new_faces[(new_faces != np.roll(new_faces, 1, axis=1)).all(axis=1)]  # no vertex is named twice
         if len(new_faces) == 0:
             continue
         faults = sum(edges_of(new_faces).counts) if closed else 0
@@ -75,19 +84,30 @@ def _fast(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
     return (verts, faces) if best is None else best[1:]
 
 
-def _whole(faces: Ints) -> Ints:
-    """Without faces that name a vertex twice."""
-    a, b, c = faces.T
-    return faces[(a != b) & (b != c) & (c != a)]
+def _by_pymeshlab(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
+    """With planar quadrics: well-shaped triangles, topology kept.
 
-
-def _shape(shape: Shape, verts: Floats, faces: Ints) -> Shape:
-    used = np.unique(faces)
-    new = np.full(len(verts), -1, np.int64)
-    new[used] = np.arange(len(used))
-    colors = None
-    if shape.colors is not None:
-        from scipy.spatial import cKDTree
-
-        colors = shape.colors[cKDTree(shape.verts).query(verts[used])[1]]
-    return Shape(verts[used], new[faces], shape.name, colors)
+    Its filters sit in plugins. Without Debian's libopengl0 some of them are silently missing; without libgl1 the
+    import fails.
+    """
+    try:
+        import pymeshlab
+    except ModuleNotFoundError as error:
+        raise OptionError(
+            "this choice needs pymeshlab, which is not installed",
+            "pip install pymeshlab (it is under the GPL), or choose fast",
+        ) from error
+    except ImportError as error:
+        raise OptionError(
+            f"pymeshlab cannot start ({str(error)[:100]})", "on Debian: apt-get install libgl1 libopengl0"
+        ) from error
+    if not hasattr(pymeshlab.MeshSet, _COLLAPSE):
+        raise OptionError(f"pymeshlab lacks its filter {_COLLAPSE}", "on Debian: apt-get install libopengl0")
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(np.array(verts), np.array(faces, np.int32)))
+    meshes.meshing_decimation_quadric_edge_collapse(
+        targetfacenum=int(target), qualitythr=0.5, planarquadric=True, preservetopology=True, preservenormal=True
+    )
+    mesh = meshes.current_mesh()
+    mesh.compact()
+    return np.array(mesh.vertex_matrix(), np.float64), np.array(mesh.face_matrix(), np.int64)

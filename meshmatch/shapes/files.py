@@ -1,42 +1,47 @@
-"""Shapes from files and to files: one function each way, the format by suffix.
+"""Shapes from what users hold (files, arrays, meshes of other libraries), and to files; the format by suffix.
 
-Every vertex that the file lists stays, in the file's order, because a map has to answer for each of them:
-nothing is merged, split or dropped here (see `meshmatch.shapes.repair` for that). Polygons become fans of
-triangles.
+Every vertex that a file lists stays, in the file's order, because a map has to answer for each of them: nothing is
+merged, split or dropped here (see `meshmatch.shapes.repair` for that). Polygons become fans of triangles.
 """
 
-from collections.abc import Callable
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import plain_text, replace_on_success
-from meshmatch.shapes.formats import Raw, gltf, gltf_out, obj, off, ply, points, stl
-from meshmatch.shapes.paths import existing, read_bytes
+from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, plain, ply
+from meshmatch.shapes.input_files import existing, read_bytes
 from meshmatch.shapes.shape import Shape
 
 _READERS: dict[str, Callable[[Path, bytes], Raw]] = {
     ".ply": ply.read,
     ".obj": obj.read,
-    ".off": off.read,
-    ".stl": stl.read,
+    ".off": plain.read_off,
+    ".stl": plain.read_stl,
     ".glb": gltf.read,
     ".gltf": gltf.read,
-    ".xyz": points.read_xyz,
-    ".npy": points.read_npy,
+    ".xyz": plain.read_xyz,
+    ".npy": plain.read_points,
 }
 _WRITERS: dict[str, Callable[[Path, Shape], None]] = {
     ".ply": ply.write,
     ".obj": obj.write,
-    ".off": off.write,
-    ".stl": stl.write,
+    ".off": plain.write_off,
+    ".stl": plain.write_stl,
     ".glb": gltf_out.write,
-    ".xyz": points.write_xyz,
-    ".npy": points.write_npy,
+    ".xyz": plain.write_xyz,
+    ".npy": plain.write_points,
 }
 SUFFIXES = tuple(_READERS)
 """The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf."""
+_HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
 
 
 def load_shape(path: str | Path) -> Shape:
@@ -55,9 +60,8 @@ def load_shape(path: str | Path) -> Shape:
     path = existing(Path(path), suffixes=SUFFIXES)
     suffix = path.suffix.lower()
     if suffix not in _READERS:
-        raise InputError(
-            f"{path.name}: unsupported file format {suffix or '(no suffix)'}", f"meshmatch reads {', '.join(SUFFIXES)}"
-        )
+        unknown = f"{path.name}: unsupported file format {suffix or '(no suffix)'}"
+        raise InputError(unknown, f"meshmatch reads {', '.join(SUFFIXES)}")
     data = read_bytes(path)
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
         raw = _READERS[suffix](path, data)
@@ -94,3 +98,80 @@ def save_shape(path: str | Path, shape: Shape) -> None:
         raise OptionError(f"a {suffix} file cannot hold faces", "choose .ply, .obj, .off, .stl or .glb")
     with replace_on_success(path) as temporary:
         _WRITERS[suffix](temporary, shape)
+
+
+@runtime_checkable
+class HasVertices(Protocol):
+    """A mesh or a point cloud of another library: ``vertices`` (V, 3) and, for a mesh, ``faces`` (F, 3)."""
+
+    @property
+    def vertices(self) -> ArrayLike: ...
+
+
+ShapeLike: TypeAlias = Shape | str | Path | NDArray[np.generic] | tuple[ArrayLike, ArrayLike] | HasVertices
+"""A shape; its file; points (N, 3); vertices and faces, ((V, 3), (F, 3)); or an object with ``vertices``."""
+
+
+def as_shape(source: ShapeLike, name: str = "") -> Shape:
+    """The shape that is meant: a `Shape` as it is, a file read, everything else copied.
+
+    Parameters
+    ----------
+    source
+        See `ShapeLike`. Of an object, ``vertices`` are taken and, unless it is a cloud, ``faces`` (trimesh) or
+        ``triangles`` (Open3D); and vertex colours of a `trimesh.Trimesh`.
+    name : str
+        For messages, where the source has no name of its own.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or the source is none of these.
+    """
+    if isinstance(source, Shape):
+        return source
+    if isinstance(source, str | os.PathLike):
+        return load_shape(os.fspath(source))
+    if isinstance(source, HasVertices):
+        faces = getattr(source, "faces", getattr(source, "triangles", None))
+        return _from_arrays(source.vertices, faces, name, _trimesh_colors(source))
+    if isinstance(source, tuple | list) and len(source) == 2 and _is_table(source[0]):
+        return _from_arrays(source[0], source[1], name)
+    if hasattr(source, "__array__") or isinstance(source, tuple | list):
+        return _from_arrays(source, None, name)
+    raise InputError(f"cannot make a shape of {type(source).__name__}", _HINT)
+
+
+def as_shapes(sources: Sequence[ShapeLike]) -> list[Shape]:
+    """The shapes that are meant, see `as_shape`; `InputError` also for a single shape instead of a list."""
+    if isinstance(sources, str | os.PathLike | Shape | HasVertices) or not isinstance(sources, Iterable):
+        raise InputError(f"expected a list of shapes, not {type(sources).__name__}", "write [shape]")
+    if isinstance(sources, tuple) and len(sources) == 2 and np.asarray(sources[1]).dtype.kind in "iu":
+        raise InputError("expected a list of shapes, not one mesh", "write [(vertices, faces)]")
+    return [as_shape(source) for source in sources]
+
+
+def _is_table(values: Any) -> bool:
+    try:
+        return np.ndim(values) == 2
+    except ValueError:  # rows of different lengths
+        return False
+
+
+def _from_arrays(verts: Any, faces: Any, name: str, colors: Any = None) -> Shape:
+    try:
+        verts = np.array(verts, np.float64)
+        faces = NO_FACES if faces is None else np.asarray(faces)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name or 'the shape'}: not an array of numbers ({error})", _HINT) from error
+    if verts.ndim != 2 or verts.shape[1] != 3:
+        raise InputError(f"{name or 'the shape'}: vertices must be an array of (V, 3), not {verts.shape}", _HINT)
+    return Shape.with_invalid(verts, faces, name, colors)
+
+
+def _trimesh_colors(mesh: Any) -> Any:
+    visual: Any = getattr(mesh, "visual", None)
+    if getattr(visual, "kind", None) != "vertex":
+        return None
+    colors = np.asarray(visual.vertex_colors, np.float64)
+    return colors / 255.0 if len(colors) else None  # a trimesh.PointCloud without colours has an empty table

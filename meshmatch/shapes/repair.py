@@ -6,16 +6,17 @@ Only what is safe is done: nothing is moved, no hole is closed, no face is inven
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.topology import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
-from meshmatch.shapes.duplicates import duplicate_faces, flat_faces, seams
+from meshmatch.shapes.debris import duplicate_faces, find_parts, flat_faces, seams
 from meshmatch.shapes.orientation import turn_faces
-from meshmatch.shapes.parts import find_parts
 from meshmatch.shapes.shape import Shape
 
 
@@ -25,21 +26,21 @@ class Repaired:
 
     Parameters
     ----------
-    shape : Shape
+    shape
         All its vertices are valid and, in a mesh, used by a face.
-    original_to_repaired : (V_original,) int64
+    original_to_repaired
         The repaired vertex that stands for each original one: itself, its twin at the same position, or if it
         was dropped the nearest one. The nearest to a vertex without a position is a valid corner of one of
         its faces, or if there is none the nearest in the file's order.
-    kept_vertex : (V,) int64
+    kept_vertex
         The original vertex that each repaired one is; increasing.
-    notes : tuple of str
+    notes
         What was found and done, a line each; empty for a shape that was fine.
-    original : Shape
+    original
         The shape that this one came from.
-    kept_face : (F,) int64
+    kept_face
         The original face that each repaired one is; its corners may be turned, or stand for twins.
-    far_parts : int
+    far_parts
         Big parts that lie far from the largest one: perhaps two objects in one file. They are kept.
     """
 
@@ -54,7 +55,7 @@ class Repaired:
     def original_face(
         self, face: Int[Ints, " N"], weights: Float[Floats, "N 3"]
     ) -> tuple[Int[Ints, " N"], Float[Floats, "N 3"]]:
-        """Repaired faces (N,) and weights (N, 3) of their corners, numbered and ordered as originally."""
+        """Repaired faces and weights of their corners, numbered and ordered as originally."""
         theirs = self.kept_face[face]
         corners = self.original_to_repaired[self.original.faces[theirs]]  # N 3
         same = corners[:, :, None] == self.shape.faces[face][:, None, :]  # N original repaired
@@ -68,25 +69,24 @@ def repair(shape: Shape) -> Repaired:
     position are merged if they lie on an open edge (texture seams of obj and glTF files, every corner of an
     stl; two layers that merely touch stay apart); faces without area; faces that occur twice (both of them,
     where they are a flap of no volume on a closed surface); outlier parts (see
-    `meshmatch.shapes.parts.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the
+    `meshmatch.shapes.debris.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the
     shape is made of small parts, and only those far from the rest are outliers); vertices that no face uses.
     Then faces are turned so that neighbours agree and the shape is not inside out. Open and non-manifold
     edges are counted, not mended. Of a cloud: points without a position, double ones, and outliers far from all
     others.
 
-    Raises
-    ------
-    InputError
-        Nothing is left: no face of a mesh has any area.
+    `InputError` if nothing is left: no face of a mesh has any area.
     """
-    return _repair_cloud(shape) if shape.is_cloud else _repair_mesh(shape)
-
-
-def _repair_cloud(shape: Shape) -> Repaired:
     notes: list[str] = []
-    valid = _valid(shape, notes)
-    twin = same_rows(shape.verts)
-    twin[~valid] = np.flatnonzero(~valid)
+    valid = np.ones(shape.V, bool) if shape.invalid is None else ~shape.invalid
+    if not valid.any():
+        raise InputError(f"{shape.name or 'the shape'}: no vertex has a position (all NaN)", "export it again")
+    _note(notes, shape.V - int(valid.sum()), "vertex", "without a position (NaN) dropped")
+    return (_repair_cloud if shape.is_cloud else _repair_mesh)(shape, valid, notes)
+
+
+def _repair_cloud(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
+    twin = np.where(valid, same_rows(shape.verts), np.arange(shape.V))
     kept = valid & (twin == np.arange(shape.V))
     _note(notes, int(valid.sum() - kept.sum()), "point", "merged with another at the same position")
     chosen = np.flatnonzero(kept)
@@ -96,45 +96,31 @@ def _repair_cloud(shape: Shape) -> Repaired:
     return _result(shape, kept, twin, shape.faces, np.arange(shape.F), valid, notes)
 
 
-def _repair_mesh(shape: Shape) -> Repaired:
-    notes: list[str] = []
-    valid = _valid(shape, notes)
-    faces, cross, which = shape.faces, shape.face_vectors, np.arange(shape.F)
-    if not valid.all():
-        fine = valid[faces].all(axis=1)
-        _note(notes, int((~fine).sum()), "face", "at such vertices dropped")
-        faces, cross, which = faces[fine], cross[fine], which[fine]
-    twin = seams(shape.verts, faces)
-    twin[~valid] = np.flatnonzero(~valid)
+def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
+    bad = np.asarray((~valid)[shape.faces].any(axis=1))
+    _note(notes, int(bad.sum()), "face", "at such vertices dropped")
+    faces, cross, which = _without(bad, shape.faces, shape.face_vectors, np.arange(shape.F))
+    twin = np.where(valid, seams(shape.verts, faces), np.arange(shape.V))
     doubles = int((twin != np.arange(shape.V)).sum())
     if doubles:
         _note(notes, doubles, "vertex", "merged with another at the same position")
         faces = twin[faces]
     flat = flat_faces(shape.verts, faces, cross, shape.diagonal)
-    if flat.any():
-        _note(notes, int(flat.sum()), "face", "without area dropped")
-        faces, cross, which = faces[~flat], cross[~flat], which[~flat]
+    _note(notes, int(flat.sum()), "face", "without area dropped")
+    faces, cross, which = _without(flat, faces, cross, which)
     double = duplicate_faces(faces)
-    if double.any():
-        _note(notes, int(double.sum()), "face", "dropped that occurred twice")
-        faces, cross, which = faces[~double], cross[~double], which[~double]
+    _note(notes, int(double.sum()), "face", "dropped that occurred twice")
+    faces, cross, which = _without(double, faces, cross, which)
     if len(faces) == 0:
         raise InputError(f"{shape.name or 'the shape'} has no face with any area", "is it a mesh at all?")
-    found = find_parts(shape.verts, faces, cross)
-    outlier = found.outlier
-    if outlier.any():
-        what = f"dropped ({outlier.sum():,} {'face' if outlier.sum() == 1 else 'faces'})"
-        _note(notes, found.outlier_parts, "outlier part", what)
-        faces, cross, which = faces[~outlier], cross[~outlier], which[~outlier]
-    if found.kept > 1:
-        _note(notes, found.kept, "separate part", "kept")
-    verb = "lies" if found.far == 1 else "lie"
-    what = f"of these {verb} far from the rest, {found.far_share:.0%} of the area: two objects in one file?"
-    _note(notes, found.far, "part", what)
-    kept = np.zeros(shape.V, bool)
-    kept[faces.ravel()] = True
-    touched = np.zeros(shape.V, bool)
-    touched[shape.faces.ravel()] = True
+    outlier, outlier_parts, parts, far, far_share = find_parts(shape.verts, faces, cross)
+    what = f"dropped ({outlier.sum():,} {'face' if outlier.sum() == 1 else 'faces'})"
+    _note(notes, outlier_parts, "outlier part", what)
+    faces, cross, which = _without(outlier, faces, cross, which)
+    _note(notes, parts if parts > 1 else 0, "separate part", "kept")
+    what = f"of these {'lies' if far == 1 else 'lie'} far from the rest, {far_share:.0%} of the area"
+    _note(notes, far, "part", f"{what}: two objects in one file?")
+    kept, touched = (np.bincount(each.ravel(), minlength=shape.V) > 0 for each in (faces, shape.faces))
     _note(notes, int((valid & ~touched).sum()), "vertex", "that no face uses dropped")
     edges = edges_of(faces)
     faces, turned = turn_faces(shape.verts, faces, cross, edges)
@@ -145,7 +131,17 @@ def _repair_mesh(shape: Shape) -> Repaired:
     border, crowded = edges.counts
     _note(notes, border, "open edge", "(the surface has holes or a border)")
     _note(notes, crowded, "non-manifold edge", "(more than two faces meet there), left as they are")
-    return _result(shape, kept, twin, faces, which, valid, notes, found.far)
+    return _result(shape, kept, twin, faces, which, valid, notes, far)
+
+
+def _without(bad: Bools, *arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    return tuple(array[~bad] for array in arrays) if bad.any() else arrays
+
+
+def _note(notes: list[str], count: int, noun: str, what: str) -> None:
+    if count:
+        plural = {"vertex": "vertices"}.get(noun, noun + "s")
+        notes.append(f"{count:,} {noun if count == 1 else plural} {what}")
 
 
 def _result(
@@ -162,17 +158,14 @@ def _result(
     new[chosen] = np.arange(len(chosen))
     colors = None if shape.colors is None else shape.colors[chosen]
     repaired = Shape(shape.verts[chosen], new[faces], shape.name, colors)
-    stands = twin.copy()
-    if not valid.all():
-        stands = twin[_valid_neighbour(shape, valid)]
+    stands = twin if valid.all() else twin[_valid_neighbour(shape, valid)]
     answer = new[stands]
     lost = np.flatnonzero(answer < 0)
     if len(lost):
         from scipy.spatial import cKDTree
 
-        answer[lost] = cKDTree(repaired.verts, compact_nodes=False, balanced_tree=False).query(
-            shape.verts[stands[lost]]
-        )[1]
+        tree = cKDTree(repaired.verts, compact_nodes=False, balanced_tree=False)
+        answer[lost] = tree.query(shape.verts[stands[lost]])[1]
     return Repaired(repaired, answer, chosen, tuple(notes), shape, which, far_parts)
 
 
@@ -190,19 +183,3 @@ def _valid_neighbour(shape: Shape, valid: Bools) -> Ints:
             helps = ~valid[a] & valid[b]
             stands[a[helps]] = b[helps]
     return stands
-
-
-def _valid(shape: Shape, notes: list[str]) -> Bools:
-    if shape.invalid is None:
-        return np.ones(shape.V, bool)
-    count = int(shape.invalid.sum())
-    if count == shape.V:
-        raise InputError(f"{shape.name or 'the shape'}: no vertex has a position (all NaN)", "export it again")
-    _note(notes, count, "vertex", "without a position (NaN) dropped")
-    return ~shape.invalid
-
-
-def _note(notes: list[str], count: int, noun: str, what: str) -> None:
-    if count:
-        plural = {"vertex": "vertices"}.get(noun, noun + "s")
-        notes.append(f"{count:,} {noun if count == 1 else plural} {what}")

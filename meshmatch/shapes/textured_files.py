@@ -1,48 +1,100 @@
-"""Textured meshes to files: one glb, or an obj with its mtl and png. All appear whole, or none does."""
+"""Appearances from files: materials and images of glb, gltf and obj, vertex colours of all others; and textured meshes
+to files: one glb, or an obj with its mtl and png. All of these appear whole, or none does.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
-from meshmatch.errors import OptionError
+import numpy as np
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.formats import gltf_out, obj_out
-from meshmatch.shapes.formats.textured import Textured
-from meshmatch.shapes.images import Pixels, png_bytes
+from meshmatch.shapes.appearance import (
+    Appearance,
+    ImageReader,
+    Pixels,
+    no_coordinates,
+    png_bytes,
+    vertex_colors_alone,
+)  # fmt: skip
+from meshmatch.shapes.formats import Textured, gltf_attributes, gltf_out, obj, obj_look
+from meshmatch.shapes.input_files import read_bytes
+from meshmatch.shapes.shape import Shape
 
 TEXTURED_SUFFIXES = (".glb", ".obj")
 
 
+def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = None) -> Appearance:
+    """What a file says about the look of its surface.
+
+    glb and gltf: materials with base colour image and factor, samplers, texture transforms, vertex colours.
+    obj: its mtl with Kd, map_Kd, d and map_d, beside it. Everything else: vertex colours.
+
+    Parameters
+    ----------
+    shape : Shape
+        What `load_shape` made of the same file.
+    image : str or Path, optional
+        A picture that takes the place of those that the file names, or that it fails to name.
+
+    Raises
+    ------
+    InputError
+        An image or material file is missing, damaged, too large, or outside the file's folder; there are no
+        texture coordinates for `image`; or the file has no look at all.
+    """
+    found = find_appearance(path, shape, image)
+    if found is None:
+        raise InputError(
+            f"{Path(path).name} has no texture and no vertex colours: there is nothing to transfer",
+            "name a picture for its texture coordinates with --image, or export it with its materials",
+        )
+    return found
+
+
+def find_appearance(path: str | Path, shape: Shape, image: str | Path | None = None) -> Appearance | None:
+    """As `load_appearance`, but None where the file has no look at all."""
+    path = Path(path)
+    suffix, reader = path.suffix.lower(), ImageReader()
+    picture = None if image is None else reader.decode(read_bytes(Path(image)), Path(image).name)
+    with np.errstate(invalid="ignore", over="ignore"):  # coordinates are judged by the appearance
+        if suffix in (".glb", ".gltf"):
+            found = gltf_attributes.read_look(path, read_bytes(path), reader, picture)
+        elif suffix == ".obj":
+            found = obj_look.read_look(path, read_bytes(path), shape, reader, picture)
+        elif picture is not None:
+            raise no_coordinates(path.name)
+        else:
+            found = vertex_colors_alone(shape)
+    if len(found.material) != shape.F or (found.colors is not None and len(found.colors) != shape.V):
+        raise _another_file(path, shape)
+    return None if found.plain else found
+
+
+def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] | None:
+    """Texture coordinates of every corner, v down, whatever the materials say; None where a face has none.
+
+    `shape` is what `load_shape` made of the same file; `InputError` if that is damaged.
+    """
+    path = Path(path)
+    reader = {".glb": gltf_attributes, ".gltf": gltf_attributes, ".obj": obj_look}.get(path.suffix.lower())
+    found = None if reader is None else reader.read_coordinates(path, read_bytes(path))
+    if found is not None and len(found) != shape.F:
+        raise _another_file(path, shape)
+    return found if shape.F else None
+
+
+def _another_file(path: Path, shape: Shape) -> InputError:
+    return InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
+
+
 def files_of(path: Path) -> list[Path]:
     """What will be written for an output: an obj has two companions."""
-    if path.suffix.lower() != ".obj":
-        return [path]
-    return [path, path.with_suffix(".mtl"), path.with_suffix(".png")]
-
-
-@dataclass(frozen=True)
-class TexturedFiles:
-    """Places claimed for the files of one textured mesh."""
-
-    path: Path
-    temporary: tuple[Path, ...]
-
-    def write(self, mesh: Textured, image: Pixels) -> None:
-        """Write everything; the files get their names when the claim ends well."""
-        png = png_bytes(image)
-        name = self.path.stem
-        if len(self.temporary) == 1:
-            gltf_out.write_textured(self.temporary[0], name, mesh, png)
-            return
-        obj, mtl, picture = self.temporary
-        files = files_of(self.path)
-        material = "_".join(name.split()) or "texture"
-        obj_out.write_textured(obj, mesh, files[1].name, material)
-        obj_out.write_material(mtl, material, files[2].name, mesh)
-        picture.write_bytes(png)
+    return [path, *(path.with_suffix(end) for end in (".mtl", ".png") if path.suffix.lower() == ".obj")]
 
 
 def check_textured(path: Path, colored: tuple[str, ...] = ()) -> None:
@@ -55,25 +107,25 @@ def check_textured(path: Path, colored: tuple[str, ...] = ()) -> None:
         )
 
 
-@contextmanager
-def claim_textured(path: str | Path) -> Iterator[TexturedFiles]:
-    """Claim the places of a textured mesh before the work; nothing appears unless the block ends well.
+def write_textured(path: Path, places: Sequence[Path], mesh: Textured, image: Pixels) -> None:
+    """Write the `files_of` an output where they wait to get their names."""
+    png, name = png_bytes(image), path.stem
+    if len(places) == 1:
+        gltf_out.write_textured(places[0], name, mesh, png)
+        return
+    files, material = files_of(path), "_".join(name.split()) or "texture"
+    obj.write_textured(places[0], mesh, files[1].name, material)
+    obj.write_material(places[1], material, files[2].name, mesh)
+    places[2].write_bytes(png)
 
-    Raises
-    ------
-    OptionError
-        The suffix is neither .glb nor .obj.
-    OutputError
-        A file cannot be written.
+
+def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:
+    """Write a mesh that wears `image` (H, W, 4) as glb, or as obj with an mtl and a png of the same name.
+
+    `OptionError` if the suffix is neither .glb nor .obj, `OutputError` if a file cannot be written.
     """
     path = Path(path)
     check_textured(path)
     with ExitStack() as claims:  # the obj, which names the others, is claimed first and so renamed last
-        temporary = tuple(claims.enter_context(replace_on_success(file)) for file in files_of(path))
-        yield TexturedFiles(path, temporary)
-
-
-def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:
-    """Write a mesh that wears `image` (H, W, 4) as glb, or as obj with an mtl and a png of the same name."""
-    with claim_textured(path) as files:
-        files.write(mesh, image)
+        places = [claims.enter_context(replace_on_success(file)) for file in files_of(path)]
+        write_textured(path, places, mesh, image)

@@ -10,7 +10,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
-from meshmatch.shapes.array_files import read_npy
+from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.repair import Repaired
 
 

@@ -11,8 +11,8 @@ from meshmatch.arrays import Int, Ints
 from meshmatch.errors import TemplateError
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.sampling import triangulate_cloud
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.triangulate import triangulate_cloud
 from meshmatch.templates.nodes import NodeConfig, choose_nodes
 from meshmatch.templates.template import Template
 

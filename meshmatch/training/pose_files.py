@@ -20,7 +20,7 @@ import torch
 
 from meshmatch.arrays import Float, Floats32
 from meshmatch.errors import InputError, OptionError
-from meshmatch.shapes.array_files import read_npz
+from meshmatch.shapes.input_files import read_npz
 from meshmatch.training.rig import Rig
 from meshmatch.training.rotations import rotation_from_vector
 from meshmatch.training.skeleton import forward_kinematics

@@ -15,10 +15,9 @@ import numpy as np
 
 from meshmatch.arrays import Bools, Float, Floats, Floats32, Ints, Ints32
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.appearance import Alpha
-from meshmatch.shapes.images import Pixels
+from meshmatch.shapes.appearance import Alpha, Pixels
+from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import bytes_of
 from meshmatch.transfer.material_sampler import MaterialSampler
 from meshmatch.transfer.pyramid import fill
 from meshmatch.transfer.surface_walk import SurfaceWalker

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps import table_files
+from meshmatch.shapes.colors import to_linear, to_srgb
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import to_linear, to_srgb
 from meshmatch.transfer.value_files import Values, parse_blank, save_values
 
 _SHAPES, _TABLES = (".ply", ".glb", ".obj", ".off"), (".npy", ".csv")

@@ -26,8 +26,8 @@ from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.array_files import read_npy
-from meshmatch.shapes.palette import label_colors
+from meshmatch.shapes.colors import label_colors
+from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.shape import Shape
 
 On = Literal["vertices", "faces"]

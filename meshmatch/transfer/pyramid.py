@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Bools, Floats32, Ints, Ints32, UInts8
-from meshmatch.shapes.appearance import Material, Wrap
-from meshmatch.shapes.images import Pixels
-from meshmatch.shapes.srgb import LINEAR_OF_BYTE, bytes_of
+from meshmatch.shapes.appearance import Material, Pixels, Wrap
+from meshmatch.shapes.colors import LINEAR_OF_BYTE, bytes_of
 
 _ROWS = 256  # at a time
 

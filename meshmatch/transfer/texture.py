@@ -12,7 +12,7 @@ from meshmatch.arrays import Floats
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance
-from meshmatch.shapes.formats.textured import Textured
+from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.bake import Baked, BakeOptions, bake
 from meshmatch.transfer.material_sampler import MaterialSampler

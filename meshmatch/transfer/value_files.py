@@ -20,7 +20,7 @@ import numpy as np
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps import table_files
-from meshmatch.shapes.array_files import read_npy
+from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.shape import Shape
 
 VALUE_SUFFIXES = (".npy", ".csv", ".ply")

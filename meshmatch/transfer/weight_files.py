@@ -25,7 +25,7 @@ from scipy.sparse import csr_array, issparse
 from meshmatch.errors import InputError
 from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.array_files import read_npz
+from meshmatch.shapes.input_files import read_npz
 from meshmatch.shapes.shape import Shape
 
 WEIGHT_SUFFIXES = (".npz", ".json")
@@ -68,10 +68,9 @@ def weights_of(matrix: csr_array | ArrayLike, shape: Shape) -> SkinWeights:
 
 
 def _read_gltf(path: Path) -> tuple[csr_array, tuple[str, ...]]:
-    from meshmatch.shapes.formats.gltf_skin import read_skin
+    from meshmatch.shapes.formats.gltf_attributes import read_skin
 
-    skin = read_skin(path, path.read_bytes())
-    return csr_array((skin.weight, (skin.vertex, skin.joint)), (skin.V, len(skin.names))), skin.names
+    return read_skin(path, path.read_bytes())
 
 
 def _from_record(record: Any) -> tuple[csr_array, tuple[str, ...]]:

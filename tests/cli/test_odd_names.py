@@ -12,9 +12,9 @@ from PIL import Image
 
 from meshmatch.errors import OutputError
 from meshmatch.outputs import folder_on_success, replace_on_success
-from meshmatch.shapes.appearance_files import load_appearance
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import load_appearance
 from tests.cli.conftest import Run
 
 BAD = os.fsdecode(b"b\xff.ply")

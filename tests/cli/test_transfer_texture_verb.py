@@ -12,13 +12,11 @@ import pytest
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes import textured_files
-from meshmatch.shapes.appearance import Appearance
-from meshmatch.shapes.appearance_files import load_appearance
+from meshmatch.shapes.appearance import Appearance, png_bytes
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats.textured import Textured
-from meshmatch.shapes.images import png_bytes
+from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import save_textured
+from meshmatch.shapes.textured_files import load_appearance, save_textured
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.texels import faces_on
 from meshmatch.transfer.unwrap import unwrapped

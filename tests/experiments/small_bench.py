@@ -8,7 +8,8 @@ import numpy as np
 
 from meshmatch.errors import InputError
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes import Shape, save_shape
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Shape
 from tests.maps.solids import bumpy_sphere
 
 BODY = bumpy_sphere(8, 10)

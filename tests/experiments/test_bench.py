@@ -9,7 +9,7 @@ import pytest
 from meshmatch.experiments import bench as command
 from meshmatch.experiments.bench import main, run_set, save_maps
 from meshmatch.experiments.sets import load_set
-from meshmatch.shapes import Shape
+from meshmatch.shapes.shape import Shape
 from tests.experiments.small_bench import BODY, Oracle, build, truth
 
 

@@ -12,7 +12,7 @@ from meshmatch.experiments.scores import TruthDistances, area_under_curve, evalu
 from meshmatch.experiments.sets import SET_NAMES, BenchSet, load_folder, load_set
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors, map_errors
 from meshmatch.maps.geodesics import GeodesicDistances
-from meshmatch.shapes import save_shape
+from meshmatch.shapes.files import save_shape
 from tests.experiments.small_bench import BODY, build, truth
 
 

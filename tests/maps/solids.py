@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from meshmatch.shapes import Shape
+from meshmatch.shapes.shape import Shape
 
 
 def grid(rows: int, columns: int, step: float = 1.0, name: str = "grid") -> Shape:

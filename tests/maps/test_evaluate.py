@@ -7,7 +7,7 @@ from meshmatch.errors import InputError
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors, coverage, distortion, evaluate_map, map_errors
 from meshmatch.maps.geodesics import GeodesicDistances
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes import Shape
+from meshmatch.shapes.shape import Shape
 from tests.maps.solids import bumpy_sphere, grid
 
 

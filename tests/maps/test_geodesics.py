@@ -6,7 +6,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from meshmatch.errors import InputError
 from meshmatch.maps.geodesics import GeodesicDistances, diagonal_arcs, edge_arcs, surface_graph
-from meshmatch.shapes import Shape
+from meshmatch.shapes.shape import Shape
 from tests.maps.solids import bumpy_sphere, grid
 
 

@@ -12,8 +12,8 @@ from meshmatch.errors import InputError, OptionError, OutputError
 from meshmatch.maps import MAP_SUFFIXES, files
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes import Shape
 from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Shape
 from tests.maps.test_vertex_map import A, B, C, random_map
 
 CARRIES = {".npy": ("index",), ".txt": ("index",), ".csv": ("index", "face", "barycentric", "confidence")}

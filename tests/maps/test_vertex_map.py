@@ -5,7 +5,7 @@ import pytest
 
 from meshmatch.errors import InputError
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes import Shape
+from meshmatch.shapes.shape import Shape
 from tests.maps.solids import bumpy_sphere, grid
 
 

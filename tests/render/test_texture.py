@@ -9,8 +9,8 @@ from meshmatch.render.scene import Scene
 from meshmatch.render.surface import mesh_surface
 from meshmatch.render.texture import TexturePaint
 from meshmatch.shapes.appearance import Appearance, Material
+from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import to_linear
 from tests.shapes.painted import CORNERS, FACES, UV, quarters
 
 SQUARE = Shape(CORNERS, FACES, "square")

@@ -8,13 +8,13 @@ import pytest
 import trimesh
 
 from meshmatch.errors import InputError
-from meshmatch.shapes import images
+from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Appearance
-from meshmatch.shapes.appearance_files import load_appearance
+from meshmatch.shapes.colors import LINEAR_OF_BYTE, bytes_of, to_linear, to_srgb
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats.text import second_index
+from meshmatch.shapes.formats.obj_look import second_index
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import LINEAR_OF_BYTE, bytes_of, to_linear, to_srgb
+from meshmatch.shapes.textured_files import load_appearance
 from tests.shapes.painted import CORNERS, FACES, UV, encoded, quarters, write_gltf, write_square_obj
 
 
@@ -331,13 +331,13 @@ def test_damaged_and_foreign_images(tmp_path: Path) -> None:
 def test_a_huge_image_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_square_obj(tmp_path / "a.obj", mtl=None)
     (tmp_path / "b.png").write_bytes(encoded(quarters(64)))
-    monkeypatch.setattr(images, "MAX_PIXELS", 64 * 63)
-    monkeypatch.setattr(images, "_rgba", lambda image: pytest.fail("it was unpacked"))
+    monkeypatch.setattr(appearance, "MAX_PIXELS", 64 * 63)
+    monkeypatch.setattr(appearance, "_rgba", lambda image: pytest.fail("it was unpacked"))
     assert "too large: 64 x 64" in refused(tmp_path / "a.obj", tmp_path / "b.png").message
 
 
 def test_many_large_images_are_refused_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(images, "MAX_ALL_PIXELS", 64 * 64 + 1)
+    monkeypatch.setattr(appearance, "MAX_ALL_PIXELS", 64 * 64 + 1)
     two = [encoded(quarters(64)), encoded(quarters(2))]
     write_gltf(tmp_path / "a.glb", images=two, primitives=[{"material": 0}, {"material": 1}])
     assert "too large" in refused(tmp_path / "a.glb").message

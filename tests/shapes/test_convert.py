@@ -11,8 +11,7 @@ import pytest
 import trimesh
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.convert import as_shape
-from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.files import as_shape, save_shape
 from meshmatch.shapes.shape import Shape
 
 

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.shapes import Shape, load_shape, save_shape
-from meshmatch.shapes.appearance_files import find_appearance
-from meshmatch.shapes.array_files import read_npy
+from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats import gltf
-from meshmatch.shapes.formats.gltf_skin import read_skin
+from meshmatch.shapes.formats.gltf_attributes import read_skin
+from meshmatch.shapes.input_files import read_npy
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import find_appearance
 from tests.transfer.skinned import write_skinned_glb
 
 
@@ -157,7 +158,7 @@ def test_gltf_nodes_that_stand_nowhere(tmp_path: Path, key: str, value: float) -
 def test_a_skin_that_names_a_joint_it_does_not_have(tmp_path: Path) -> None:
     """Joints as floats, of which one is below 0: counted from the end it would be another joint."""
     path = broken(tmp_path, (("accessors", 2, "componentType"), 5122))
-    assert len(read_skin(path, path.read_bytes()).joint) == 8
+    assert len(read_skin(path, path.read_bytes())[0].data) == 8
     path = broken(tmp_path, (("skins", 0, "joints"), [1]))
     with pytest.raises(InputError, match="not among the 1"):
         read_skin(path, path.read_bytes())

@@ -11,13 +11,13 @@ from meshmatch.errors import OptionError, OutputError
 from meshmatch.geometry.topology import same_rows
 from meshmatch.geometry.triangles import closest_on_triangles
 from meshmatch.shapes import textured_files
-from meshmatch.shapes.appearance_files import load_appearance, load_coordinates
+from meshmatch.shapes.appearance import png_bytes
+from meshmatch.shapes.colors import LINEAR_OF_BYTE
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats.textured import Textured, split_at_seams
-from meshmatch.shapes.images import png_bytes
+from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats.gltf_out import split_at_seams
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import LINEAR_OF_BYTE
-from meshmatch.shapes.textured_files import claim_textured, files_of, save_textured
+from meshmatch.shapes.textured_files import files_of, load_appearance, load_coordinates, save_textured
 from meshmatch.transfer.pyramid import Pyramid
 from tests.shapes.painted import CORNERS, FACES, UV, quarters
 
@@ -149,7 +149,7 @@ def test_all_files_appear_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(textured_files.obj_out, "write_material", full)
+        patch.setattr(textured_files.obj, "write_material", full)
         with pytest.raises(OutputError):
             save_textured(tmp_path / "a.obj", mesh, quarters())
     assert [file.name for file in tmp_path.iterdir()] == ["a.mtl"]
@@ -160,10 +160,11 @@ def test_all_files_appear_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_places_that_cannot_be_claimed(tmp_path: Path) -> None:
     (tmp_path / "a.png").mkdir()
-    with pytest.raises(OutputError, match=r"a\.png"), claim_textured(tmp_path / "a.obj"):
-        pytest.fail("it was claimed")
-    with pytest.raises(OptionError, match="cannot write a texture"), claim_textured(tmp_path / "a.stl"):
-        pytest.fail("it was claimed")
+    mesh = Textured(CORNERS, FACES, UV[FACES])
+    with pytest.raises(OutputError, match=r"a\.png"):
+        save_textured(tmp_path / "a.obj", mesh, quarters())
+    with pytest.raises(OptionError, match="cannot write a texture"):
+        save_textured(tmp_path / "a.stl", mesh, quarters())
     assert [file.name for file in tmp_path.iterdir()] == ["a.png"]
 
 

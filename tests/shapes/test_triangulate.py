@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.sampling import sample_surface, triangulate_cloud
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.triangulate import triangulate_cloud
 
 NONE = np.empty((0, 3), np.int64)
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from meshmatch.errors import InputError, OptionError
-from meshmatch.shapes import array_files
+from meshmatch.shapes import input_files
 from meshmatch.training import bodies, pose_files
 from meshmatch.training.bodies import sample_bodies
 from meshmatch.training.pose_files import GivenPoses, load_poses
@@ -230,7 +230,7 @@ def test_a_promise_of_terabytes_is_not_believed(tmp_path: Path, monkeypatch: pyt
         load_poses(path)
     path.write_bytes(archive(joints=NAMES, rotations=npy(np.zeros((4000, 3, 3)))))  # small on disk
     assert load_poses(path).P == 4000
-    monkeypatch.setattr(array_files, "LARGEST", 200_000)
+    monkeypatch.setattr(input_files, "LARGEST", 200_000)
     with pytest.raises(InputError, match=r"rotations\.npy promises 288000 bytes"):
         load_poses(path)
     monkeypatch.setattr(pose_files, "MAX_BYTES", 2000)

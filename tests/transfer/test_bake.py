@@ -11,8 +11,8 @@ from meshmatch.geometry.triangles import closest_on_triangles
 from meshmatch.maps.surface import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance, Material
+from meshmatch.shapes.colors import bytes_of, to_linear, to_srgb
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import bytes_of, to_linear, to_srgb
 from meshmatch.transfer import texel_locator
 from meshmatch.transfer.bake import Baked, BakeOptions
 from meshmatch.transfer.texels import faces_on

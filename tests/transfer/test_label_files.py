@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.shapes.colors import UNKNOWN, label_colors
 from meshmatch.shapes.files import load_shape
-from meshmatch.shapes.palette import UNKNOWN, label_colors
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.label_files import LABEL_SUFFIXES, Label, Labels, On, labels_of, load_labels, named, save_labels
 from tests.conftest import icosphere

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.shapes.appearance import Material, Wrap
-from meshmatch.shapes.srgb import LINEAR_OF_BYTE, to_linear, to_srgb
+from meshmatch.shapes.colors import LINEAR_OF_BYTE, to_linear, to_srgb
 from meshmatch.transfer.pyramid import Pyramid, fill, wrapped
 from tests.shapes.painted import quarters
 

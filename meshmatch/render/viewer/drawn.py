@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Floats, Ints
+from meshmatch.shapes.debris import seams
 from meshmatch.shapes.decimate import decimate
-from meshmatch.shapes.duplicates import seams
 from meshmatch.shapes.shape import Shape
 
 MOST = 150_000

@@ -13,8 +13,8 @@ from meshmatch.render.viewer.drawn import Drawn
 from meshmatch.render.viewer.packing import to_bytes
 from meshmatch.render.viewer.skins import make_skin
 from meshmatch.shapes.appearance import Appearance
+from meshmatch.shapes.colors import LINEAR_OF_BYTE, to_srgb
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import LINEAR_OF_BYTE, to_srgb
 
 SideName = Literal["source", "target"]
 

@@ -17,7 +17,7 @@ from meshmatch.render.colors import CLAY
 from meshmatch.render.viewer.drawn import MOST, draw
 from meshmatch.render.viewer.packing import pack, small_integers, to_bytes, to_shorts, to_signed_bytes
 from meshmatch.render.viewer.page import assemble, check_page, plain_text
-from meshmatch.shapes.duplicates import seams
+from meshmatch.shapes.debris import seams
 from meshmatch.shapes.shape import Shape
 
 MOST_PLACES = 4_000_000

@@ -13,9 +13,8 @@ from PIL import Image
 from meshmatch.arrays import Ints
 from meshmatch.geometry.topology import same_rows
 from meshmatch.render.viewer.packing import small_integers, to_bytes
-from meshmatch.shapes.appearance import Appearance, Material
-from meshmatch.shapes.images import Pixels, png_bytes
-from meshmatch.shapes.srgb import to_srgb
+from meshmatch.shapes.appearance import Appearance, Material, Pixels, png_bytes
+from meshmatch.shapes.colors import to_srgb
 
 LARGEST = 2048
 """Pixels along an image's longer side; a larger one is made smaller."""

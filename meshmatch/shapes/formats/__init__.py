@@ -1,4 +1,4 @@
-"""One module per file format: bytes to plain arrays, and a `Shape` to bytes.
+"""Files of shapes: bytes to plain arrays, and a `Shape` to bytes. Here is what the readers of several formats share.
 
 A map answers for every vertex of a file, so readers keep them all, in order, and never allocate what a header merely
 promises. STL goes through trimesh. The other readers are our own, because of what trimesh 5.2 does (measured):
@@ -15,24 +15,55 @@ glb to 8 bits of linear light, too few for dark ones. Ours keep every bit of ply
 
 from __future__ import annotations
 
+import re
+import warnings
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 
+NO_FACES = np.empty((0, 3), np.int64)
+NO_MESH = "is it a mesh or a point cloud at all?"
+WRONG_SUFFIX = "does the suffix fit the content?"
+_SPACE = np.zeros(256, bool)
+_SPACE[[9, 10, 11, 12, 13, 32]] = True
+
 
 @dataclass(frozen=True, eq=False)
 class Raw:
-    """What a file says, unchecked: positions (V, 3), maybe NaN; faces (F, 3), sRGB colours (V, 4) in 0..1."""
+    """What a file says, unchecked: positions, maybe NaN; faces; sRGB colours and alpha in 0..1."""
 
     verts: Float[Floats, "V 3"]
     faces: Int[Ints, "F 3"]
     colors: Float[Floats, "V 4"] | None = None
 
 
-NO_FACES = np.empty((0, 3), np.int64)
+@dataclass(frozen=True, eq=False)
+class Textured:
+    """A mesh that wears one image, ready to be written.
+
+    Parameters
+    ----------
+    verts, faces
+        In the unit of the file.
+    uv
+        Of each corner: u to the right, v down.
+    cutoff
+        The threshold of "mask".
+    wrap
+        What lies outside 0..1.
+    """
+
+    verts: Float[Floats, "V 3"]
+    faces: Int[Ints, "F 3"]
+    uv: Float[Floats, "F 3 2"]
+    alpha: Literal["opaque", "mask", "blend"] = "opaque"
+    cutoff: float = 0.5
+    wrap: Literal["clamp", "repeat"] = "clamp"
 
 
 def damaged(name: str, what: str) -> InputError:
@@ -40,15 +71,107 @@ def damaged(name: str, what: str) -> InputError:
     return InputError(f"{name}: {what[:300]}", "the file is damaged or was cut short; export or download it again")
 
 
+def runs(starts: Int[Ints, " N"], sizes: Int[Ints, " N"], step: int = 1) -> Int[Ints, " M"]:
+    """start, start + step, ... of every run, one run after the other."""
+    within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return np.repeat(starts, sizes) + step * within
+
+
 def fan(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
-    """Triangles (F, 3) of polygons: `corners` one polygon after the other, `sizes` how many each has.
+    """Triangles of polygons: `corners` one polygon after the other, `sizes` how many each has.
 
     A polygon a b c d ... becomes a b c, a c d, ...; one of fewer than 3 corners becomes nothing.
     """
     if len(sizes) and (sizes == 3).all():
         return corners.reshape(-1, 3)
-    starts = np.cumsum(sizes) - sizes
-    triangles = np.maximum(sizes - 2, 0)
-    first = np.repeat(starts, triangles)
-    step = np.arange(len(first)) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    return np.stack([corners[first], corners[first + step + 1], corners[first + step + 2]], axis=1).reshape(-1, 3)
+    starts, triangles = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
+    second = runs(starts + 1, triangles)
+    return np.stack([corners[np.repeat(starts, triangles)], corners[second], corners[second + 1]], axis=1)
+
+
+def indices(name: str, values: NDArray[Any]) -> Ints:
+    """Numbers of vertices, or `InputError`: floats are what text files are read as."""
+    if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():
+        raise damaged(name, "a face refers to a vertex that is not a number")
+    return values.astype(np.int64)
+
+
+def painted(channels: Float[Floats, "V C"]) -> Float[Floats, "V 4"]:
+    """Colours of 3 or 4 channels, which count to 255 if one is above 1, else to 1."""
+    channels = np.nan_to_num(channels)
+    colors = np.ones((len(channels), 4))
+    colors[:, : channels.shape[1]] = np.clip(channels / (255.0 if (channels > 1).any() else 1.0), 0.0, 1.0)
+    return colors
+
+
+def without_comments(text: bytes) -> bytes:
+    return re.sub(rb"#[^\n]*", b"", text) if b"#" in text else text
+
+
+def numbers(name: str, text: bytes) -> Float[Floats, " N"]:
+    """All the whitespace-separated numbers of a text, fast, nan and inf included; `InputError` for other words."""
+    if not text.strip():
+        return np.empty(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # how fromstring says that it met a word
+        try:
+            return np.fromstring(text, dtype=np.float64, sep=" ")
+        except (DeprecationWarning, ValueError):
+            pass
+    values = []
+    for word in text.split():
+        try:
+            values.append(float(word))
+        except ValueError:
+            if b"nan" not in word.lower() and b"#" not in word:  # 1.#QNAN, -nan(ind)
+                raise damaged(name, f"found {word[:20].decode(errors='replace')!r} where a number should be") from None
+            values.append(np.nan)
+    return np.array(values)
+
+
+def words_per_line(text: bytes) -> Int[Ints, " lines"]:
+    """How many words each non-blank line of a text has."""
+    if not text:
+        return np.empty(0, np.int64)
+    characters = np.frombuffer(text, np.uint8)
+    space = _SPACE[characters]
+    begins = ~space
+    begins[1:] &= space[:-1]
+    before = np.searchsorted(np.flatnonzero(begins), np.flatnonzero(characters == 10))
+    counts = np.diff(before, prepend=0, append=np.count_nonzero(begins))
+    return counts[counts > 0].astype(np.int64)
+
+
+def columns(
+    values: Float[Floats, " words"], counts: Int[Ints, " lines"], first: int, last: int
+) -> Float[Floats, "lines width"]:
+    """Columns `first` to `last` (excluded) of lines of unequal length: flat values, and words per line."""
+    if len(counts) and (counts == counts[0]).all():
+        return values.reshape(len(counts), -1)[:, first:last]
+    starts = np.cumsum(counts) - counts
+    return values[starts[:, None] + np.arange(first, last)]
+
+
+def lines_of(text: bytes, *words: bytes) -> list[tuple[bytes, Ints]]:
+    """For each of the given first words: its lines without that word, and which lines of the text they are.
+
+    Spaces in front of the word are allowed.
+    """
+    characters = np.frombuffer(text + b"\n", np.uint8)
+    ends = np.flatnonzero(characters == 10)
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    if ((characters[starts] == 32) | (characters[starts] == 9)).any():
+        return lines_of(re.sub(rb"^[ \t]+", b"", text, flags=re.MULTILINE), *words)
+    lengths = np.diff(ends, prepend=-1)
+    out = []
+    for word in words:
+        chosen = lengths > len(word) + 1
+        for k, letter in enumerate(word):
+            chosen &= characters[np.minimum(starts + k, ends)] == letter
+        chosen &= _SPACE[characters[np.minimum(starts + len(word), ends)]]
+        kept = characters[np.repeat(chosen, lengths)]
+        first = np.cumsum(lengths[chosen]) - lengths[chosen]
+        for k in range(len(word)):
+            kept[first + k] = 32
+        out.append((kept.tobytes(), np.flatnonzero(chosen)))
+    return out

@@ -2,7 +2,8 @@
 
 Specification: Khronos glTF 2.0. A skinned mesh stands as its joints stand in the file (sections 3.7.3 and
 5.28), so that it fits whatever hangs from the same joints. Animations and morph targets are ignored; materials
-are read by `meshmatch.shapes.formats.gltf_look`, files written by `meshmatch.shapes.formats.gltf_out`.
+and weights are read by `meshmatch.shapes.formats.gltf_attributes`, files written by
+`meshmatch.shapes.formats.gltf_out`.
 """
 
 from __future__ import annotations
@@ -10,9 +11,9 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
@@ -20,9 +21,9 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import NO_FACES, Raw, damaged
-from meshmatch.shapes.paths import beside, read_bytes
-from meshmatch.shapes.srgb import to_srgb
+from meshmatch.shapes.colors import to_srgb
+from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, damaged
+from meshmatch.shapes.input_files import beside, read_bytes
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -32,16 +33,20 @@ MOST_CORNERS = 30_000_000
 """Vertices of a scene, and corners of its faces: about 2 GB while it is read. One mesh may stand in a scene a thousand
 times, so that a small file can promise any number.
 """
-NONSENSE = (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError, OverflowError)
-"""What a description that is not as it should be can cause."""
+Found = TypeVar("Found")
 
 
 def read(path: Path, data: bytes) -> Raw:
     """All triangles and points of the scene, one primitive after the other, parents before children."""
+    return understood(path, data, "scene makes", Document.scene)
+
+
+def understood(path: Path, data: bytes, what: str, reader: Callable[[Document], Found]) -> Found:
+    """What a reader makes of a file; `InputError` for what a description that is not as it should be can cause."""
     try:
-        return Document(path, data).scene()
-    except NONSENSE as error:
-        raise damaged(path.name, f"its scene makes no sense ({type(error).__name__}: {error})") from error
+        return reader(Document(path, data))
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
+        raise damaged(path.name, f"its {what} no sense ({type(error).__name__}: {error})") from error
 
 
 class Document:
@@ -59,7 +64,7 @@ class Document:
         except ValueError as error:
             raise damaged(self.name, "its description is not JSON") from error
         if not isinstance(self.json, dict) or "asset" not in self.json:
-            raise InputError(f"{self.name} is not a glTF file", "does the suffix fit the content?")
+            raise InputError(f"{self.name} is not a glTF file", WRONG_SUFFIX)
         if str(self.json["asset"].get("version", "")).split(".")[0] != "2":
             raise InputError(f"{self.name} is not glTF version 2", "export it as glTF 2.0")
         for extension in self.json.get("extensionsRequired", []):
@@ -83,9 +88,9 @@ class Document:
 
     def scene(self) -> Raw:
         verts: list[Floats] = []
-        faces: list[Ints] = []
+        faces: list[Ints] = [NO_FACES]
         colors: list[Floats | None] = []
-        total = 0
+        total = seen = 0
         for node, primitive in self.primitives():
             total += self.count(primitive["attributes"]["POSITION"])
             total += self.count(primitive["indices"]) if "indices" in primitive else 0
@@ -94,19 +99,20 @@ class Document:
                     f"the scene of {self.name} has over {MOST_CORNERS} vertices and corners of faces",
                     "export it with fewer copies of its meshes",
                 )
-            own = self._placed(self.nodes[node], node, primitive)
+            own = self._placed(node, primitive)
             triangles = self.triangles(primitive, len(own))
             if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
                 raise damaged(self.name, f"a face refers to vertex {int(triangles.max())} of {len(own)}")
-            faces.append(triangles + sum(map(len, verts)))
+            faces.append(triangles + seen)
             verts.append(own)
             colors.append(self.colors(primitive))
+            seen += len(own)
         if not verts:
             raise InputError(f"{self.name} holds no triangles and no points", "is there a mesh in its scene?")
         painted = joined_colors(colors, [len(own) for own in verts])
         if painted is not None:
             painted[:, :3] = to_srgb(painted[:, :3])
-        return Raw(np.vstack(verts), np.vstack([NO_FACES, *faces]), painted)
+        return Raw(np.vstack(verts), np.vstack(faces), painted)
 
     def primitives(self) -> Iterator[tuple[int, dict[str, Any]]]:
         """Node and primitive of all that is drawn but lines, in the order of `scene`."""
@@ -135,12 +141,13 @@ class Document:
             stack += [(child, self.world[node]) for child in reversed(self.nodes[node].get("children", []))]
         return order
 
-    def _placed(self, node: dict[str, Any], number: int, primitive: dict[str, Any]) -> Floats:
+    def _placed(self, number: int, primitive: dict[str, Any]) -> Floats:
         """(V, 3) positions in the scene."""
-        attributes = primitive["attributes"]
+        node, attributes = self.nodes[number], primitive["attributes"]
         own = np.hstack([self.accessor(attributes["POSITION"]), np.ones((self.count(attributes["POSITION"]), 1))])
+        hanging = np.asarray(own @ self.world[number].T)[:, :3]
         if "skin" not in node or "JOINTS_0" not in attributes:
-            return np.asarray(own @ self.world[number].T)[:, :3]
+            return hanging
         skin = self.json["skins"][node["skin"]]
         bones = np.stack([self.world[joint] for joint in skin["joints"]])
         if "inverseBindMatrices" in skin:
@@ -152,9 +159,7 @@ class Document:
                 weight = weights[:, column : column + 1]
                 moved += weight * np.einsum("vij,vj->vi", bones[joints[:, column].astype(np.int64)], own)
                 total += weight
-        return np.asarray(np.where(total > 0, moved / np.where(total > 0, total, 1.0), own @ self.world[number].T))[
-            :, :3
-        ]
+        return np.where(total > 0, moved[:, :3] / np.where(total > 0, total, 1.0), hanging)
 
     def influences(self, primitive: dict[str, Any]) -> Iterator[tuple[Float[Floats, "V 4"], Float[Floats, "V 4"]]]:
         """Numbers of joints and their weights for each vertex, four at a time."""
@@ -202,8 +207,7 @@ class Document:
         count, width = int(accessor["count"]), _WIDTHS[accessor["type"]]
         kind = np.dtype(_COMPONENTS[accessor["componentType"]])
         if "bufferView" in accessor:
-            view = self.json["bufferViews"][accessor["bufferView"]]
-            values = self._view(view, accessor.get("byteOffset", 0), count, width, kind)
+            values = self._view(accessor, count, width, kind)
         else:  # zeros, then filled sparsely
             bound = sum(len(self._buffer(k)) for k in range(len(self.json.get("buffers", []))))
             if not 0 <= count <= max(bound, 1):
@@ -211,21 +215,18 @@ class Document:
             values = np.zeros((count, width), kind)
         if "sparse" in accessor:
             sparse = accessor["sparse"]
-            many = int(sparse["count"])
-            where, what = sparse["indices"], sparse["values"]
-            views = self.json["bufferViews"]
-            rows = self._view(
-                views[where["bufferView"]], where.get("byteOffset", 0), many, 1,
-                np.dtype(_COMPONENTS[where["componentType"]]),
-            )  # fmt: skip
+            where, many = sparse["indices"], int(sparse["count"])
+            rows = self._view(where, many, 1, np.dtype(_COMPONENTS[where["componentType"]]))
             values = values.copy()
-            values[rows[:, 0]] = self._view(views[what["bufferView"]], what.get("byteOffset", 0), many, width, kind)
+            values[rows[:, 0]] = self._view(sparse["values"], many, width, kind)
         out = values.astype(np.float64)
         if accessor.get("normalized") and not whole and kind.kind in "iu":
             out = np.maximum(out / np.iinfo(kind).max, -1.0)
         return out
 
-    def _view(self, view: dict[str, Any], offset: int, count: int, width: int, kind: np.dtype[Any]) -> NDArray[Any]:
+    def _view(self, entry: dict[str, Any], count: int, width: int, kind: np.dtype[Any]) -> NDArray[Any]:
+        """(count, width) values from the place in a buffer view that an entry names."""
+        view, offset = self.json["bufferViews"][entry["bufferView"]], entry.get("byteOffset", 0)
         data = self._buffer(view["buffer"])
         start = view.get("byteOffset", 0) + offset
         row = width * kind.itemsize
@@ -237,8 +238,8 @@ class Document:
 
     def view_bytes(self, number: int) -> bytes:
         """All bytes of a buffer view, as an image has them."""
-        view = self.json["bufferViews"][number]
-        return self._view(view, 0, int(view["byteLength"]), 1, np.dtype("u1")).tobytes()
+        size = int(self.json["bufferViews"][number]["byteLength"])
+        return self._view({"bufferView": number}, size, 1, np.dtype("u1")).tobytes()
 
     def _buffer(self, number: int) -> bytes:
         if number not in self.buffers:
@@ -255,9 +256,8 @@ class Document:
                 raise damaged(self.name, "its embedded data is not base64") from error
         file = beside(self.path.parent, unquote(uri))
         if file is None:
-            raise InputError(
-                f"{self.name} needs the file {uri[:200]}, which is not in its folder", "copy it beside the gltf"
-            )
+            missing = f"{self.name} needs the file {uri[:200]}, which is not in its folder"
+            raise InputError(missing, "copy it beside the gltf")
         return read_bytes(file)
 
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.topology import same_rows
 from meshmatch.geometry.triangles import dot, vertex_normals
-from meshmatch.shapes.formats.textured import Textured, split_at_seams
+from meshmatch.shapes.colors import to_linear
+from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.srgb import to_linear
 
 _POINTS, _TRIANGLES = 0, 4
 _FLOAT, _UNSIGNED = 5126, 5125
@@ -67,7 +67,7 @@ def write(path: Path, shape: Shape) -> None:
     primitive: dict[str, Any] = {"attributes": attributes, "mode": _POINTS if shape.is_cloud else _TRIANGLES}
     if not shape.is_cloud:
         primitive["indices"] = buffer.array(shape.faces.astype("<u4").reshape(-1), "SCALAR", _INDICES)
-    path.write_bytes(_glb(shape.name, primitive, buffer, {}))
+    _write(path, shape.name, primitive, buffer, {})
 
 
 def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
@@ -104,7 +104,7 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
         "images": [{"bufferView": image, "mimeType": "image/png", "name": name}],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPS, **wrap}],
     }
-    path.write_bytes(_glb(name, primitive, buffer, look))
+    _write(path, name, primitive, buffer, look)
 
 
 def smooth_normals(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Float[Floats, "V 3"]:
@@ -119,7 +119,29 @@ def smooth_normals(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Floa
     return normals
 
 
-def _glb(name: str, primitive: dict[str, Any], buffer: _Buffer, rest: dict[str, Any]) -> bytes:
+def split_at_seams(mesh: Textured) -> tuple[Int[Ints, " N"], Float[Floats, "N 2"], Int[Ints, "F 3"]]:
+    """Vertices with one pair of coordinates each: which vertex of the mesh each is, coordinates, and faces over them.
+
+    The first V are those of the mesh in their order (zero coordinates where no face uses one); then come the copies
+    that seams need. Coordinates that are one 32-bit float are one.
+    """
+    V = len(mesh.verts)
+    corner = mesh.faces.reshape(-1)
+    pairs = np.ascontiguousarray(mesh.uv.reshape(-1, 2).astype("<f4") + np.float32(0))  # no -0
+    order = np.lexsort((pairs[:, 1], pairs[:, 0], corner))
+    fresh_vertex = np.diff(corner[order], prepend=-1) != 0
+    fresh = fresh_vertex.copy()
+    fresh[1:] |= (pairs[order][1:] != pairs[order][:-1]).any(axis=1)
+    copies = fresh & ~fresh_vertex
+    number = np.where(fresh_vertex, corner[order], V - 1 + np.cumsum(copies))
+    new = np.empty(len(corner), np.int64)
+    new[order] = number[fresh][np.cumsum(fresh) - 1]
+    uv = np.zeros((V + int(copies.sum()), 2), np.float64)
+    uv[new] = pairs
+    return np.concatenate([np.arange(V), corner[order][copies]]), uv, new.reshape(-1, 3)
+
+
+def _write(path: Path, name: str, primitive: dict[str, Any], buffer: _Buffer, rest: dict[str, Any]) -> None:
     document = {
         "asset": {"version": "2.0", "generator": "meshmatch"},
         "scene": 0,
@@ -134,4 +156,4 @@ def _glb(name: str, primitive: dict[str, Any], buffer: _Buffer, rest: dict[str, 
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     head = b"glTF" + np.array([2, 28 + len(text) + buffer.at, len(text)], "<u4").tobytes() + b"JSON"
-    return b"".join([head, text, np.array([buffer.at], "<u4").tobytes(), b"BIN\0", *buffer.parts])
+    path.write_bytes(b"".join([head, text, np.array([buffer.at], "<u4").tobytes(), b"BIN\0", *buffer.parts]))

@@ -1,5 +1,5 @@
-"""Wavefront OBJ: positions and faces. Texture and normal indices are ignored, so seams split nothing; what lies on
-the faces is read by `meshmatch.shapes.formats.obj_look`.
+"""Wavefront OBJ: positions and faces, and textured meshes to be written. Texture and normal indices are ignored when a
+shape is read, so seams split nothing; what lies on the faces is read by `meshmatch.shapes.formats.obj_look`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,20 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import NO_FACES, Raw, damaged, fan
-from meshmatch.shapes.formats.text import columns, first_index, lines_of, numbers, words_per_line
+from meshmatch.shapes.formats import (
+    NO_MESH,
+    WRONG_SUFFIX,
+    Raw,
+    Textured,
+    columns,
+    damaged,
+    fan,
+    lines_of,
+    numbers,
+    painted,
+    without_comments,
+    words_per_line,
+)  # fmt: skip
 from meshmatch.shapes.shape import Shape
 
 
@@ -20,24 +32,22 @@ def read(path: Path, data: bytes) -> Raw:
     """One vertex per ``v`` line, in their order; with colours where six numbers are given."""
     name = path.name
     if b"\0" in data[:4096]:
-        raise InputError(f"{name} is not an obj file: it is binary", "does the suffix fit the content?")
-    data = joined_lines(data)
-    if b"#" in data:
-        data = re.sub(rb"#[^\n]*", b"", data)
-    (text, vertex_lines), *faces_found = lines_of(data, b"v", b"f", b"fo")
-    faces_text, face_lines = with_old(faces_found)
+        raise InputError(f"{name} is not an obj file: it is binary", WRONG_SUFFIX)
+    text, vertex_lines, faces_text, sizes, face_lines = entries_and_faces(name, joined_lines(data), b"v")
     if len(vertex_lines) == 0:
-        raise InputError(f"{name} holds no vertices: it has no 'v' lines", "is it a mesh or a point cloud at all?")
+        raise InputError(f"{name} holds no vertices: it has no 'v' lines", NO_MESH)
     counts = words_per_line(text)
     if len(counts) < len(vertex_lines) or counts.min() < 3:
         raise damaged(name, "a vertex has fewer than 3 coordinates")
     values = numbers(name, text)
-    colors = None
-    if counts.min() >= 6:
-        colors = np.ones((len(counts), 4))
-        colors[:, :3] = _channels(columns(values, counts, 3, 6))
-    faces = _faces(name, faces_text, face_lines, vertex_lines)
-    return Raw(columns(values, counts, 0, 3), faces, colors)
+    if b"/" in faces_text:
+        faces_text = re.sub(rb"/\S*", b"", faces_text)  # position/texture/normal: the first alone
+    corners = numbers(name, faces_text)
+    if (corners == 0).any():
+        raise damaged(name, "a face refers to vertex 0, but obj files count from 1")
+    corner = from_one(name, "vertex", corners, vertex_lines, np.repeat(face_lines, sizes)) - 1
+    colors = painted(columns(values, counts, 3, 6)) if counts.min() >= 6 else None
+    return Raw(columns(values, counts, 0, 3), fan(corner, sizes), colors)
 
 
 def joined_lines(data: bytes) -> bytes:
@@ -47,36 +57,18 @@ def joined_lines(data: bytes) -> bytes:
     return re.sub(rb"\\\r?\n", b" ", data) if b"\\" in data else data
 
 
-def with_old(found: list[tuple[bytes, Ints]]) -> tuple[bytes, Ints]:
-    """Lines of faces, those of the old spelling ``fo`` last."""
-    (text, lines), (old, old_lines) = found
-    return (text + b"\n" + old, np.concatenate([lines, old_lines])) if len(old_lines) else (text, lines)
+def entries_and_faces(name: str, data: bytes, word: bytes) -> tuple[bytes, Ints, bytes, Ints, Ints]:
+    """Text and lines of the entries that begin with a word; text, sizes and lines of faces.
 
-
-def write(path: Path, shape: Shape) -> None:
-    """Positions with every digit that they have."""
-    verts = shape.verts_or_nan
-    if shape.colors is None:
-        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in verts.tolist()]
-    else:
-        rows = np.hstack([verts, shape.colors[:, :3]]).tolist()
-        lines = [f"v {x!r} {y!r} {z!r} {r!r} {g!r} {b!r}" for x, y, z, r, g, b in rows]
-    lines += [f"f {a} {b} {c}" for a, b, c in (shape.faces + 1).tolist()]
-    path.write_text("\n".join(["# meshmatch", *lines, ""]))
-
-
-def _faces(name: str, text: bytes, lines: Ints, vertex_lines: Ints) -> Ints:
-    if b"/" in text:
-        text = first_index(text)  # position/texture/normal: the first alone
-    sizes = words_per_line(text)
+    Faces of the old spelling ``fo`` come last.
+    """
+    (text, listed), (faces, lines), (old, old_lines) = lines_of(without_comments(data), word, b"f", b"fo")
+    if len(old_lines):
+        faces, lines = faces + b"\n" + old, np.concatenate([lines, old_lines])
+    sizes = words_per_line(faces)
     if len(sizes) < len(lines):
         raise damaged(name, "a face has no corners")
-    values = numbers(name, text)
-    if len(values) == 0:
-        return NO_FACES
-    if (values == 0).any():
-        raise damaged(name, "a face refers to vertex 0, but obj files count from 1")
-    return fan(from_one(name, "vertex", values, vertex_lines, np.repeat(lines, sizes)) - 1, sizes)
+    return text, listed, faces, sizes, lines
 
 
 def from_one(
@@ -86,12 +78,10 @@ def from_one(
 
     Parameters
     ----------
-    values : (N,)
+    values
         As the faces have them; 0 stays 0.
-    listed : (M,)
-        The lines of the entries.
-    lines : (N,)
-        The line of the face of each value.
+    listed, lines
+        The lines of the entries, and of the face of each value.
     """
     if not (np.abs(values) < 2**53).all() or (values != np.trunc(values)).any():
         raise damaged(name, f"a face refers to a {what} that is not a whole number")
@@ -105,6 +95,32 @@ def from_one(
     return index
 
 
-def _channels(values: Floats) -> Floats:
-    values = np.nan_to_num(values)
-    return np.clip(values / (255.0 if (values > 1).any() else 1.0), 0.0, 1.0)
+def write(path: Path, shape: Shape) -> None:
+    """Positions with every digit that they have."""
+    verts = shape.verts_or_nan
+    rows = verts if shape.colors is None else np.hstack([verts, shape.colors[:, :3]])
+    lines = ["v " + " ".join(map(repr, row)) for row in rows.tolist()]
+    _write(path, [*lines, *(f"f {a} {b} {c}" for a, b, c in (shape.faces + 1).tolist())])
+
+
+def write_textured(path: Path, mesh: Textured, mtl: str, material: str) -> None:
+    """Vertices and faces exactly as they are, texture coordinates listed apart: seams split nothing.
+
+    `mtl` is the name of the material file beside it, `material` that of the only material in it.
+    """
+    unique, index = np.unique(mesh.uv.reshape(-1, 2).astype("<f4"), axis=0, return_inverse=True)
+    lines = [f"mtllib {mtl}", *(f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.verts.tolist())]
+    lines += [f"vt {u!r} {1.0 - v!r}" for u, v in unique.astype(np.float64).round(8).tolist()]
+    table = np.stack([mesh.faces, index.reshape(-1, 3)], axis=2).reshape(-1, 6) + 1
+    faces = [f"f {a}/{p} {b}/{q} {c}/{r}" for a, p, b, q, c, r in table.tolist()]
+    _write(path, [*lines, f"usemtl {material}", *faces])
+
+
+def write_material(path: Path, material: str, image: str, mesh: Textured) -> None:
+    """The mtl: plain paint in the colours of the image. No options of maps: not every reader knows them."""
+    paint = [f"newmtl {material}", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {image}"]
+    _write(path, paint if mesh.alpha == "opaque" else [*paint, f"map_d {image}"])
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    path.write_text("\n".join(["# meshmatch", *lines, ""]), encoding="utf-8", errors="surrogateescape")

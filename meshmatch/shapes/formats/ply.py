@@ -1,19 +1,19 @@
-"""Stanford PLY, text and binary of either byte order."""
+"""Stanford PLY, text and binary of either byte order: rows are read all at once where they are equally long."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Floats, Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import NO_FACES, Raw, damaged, fan
-from meshmatch.shapes.formats.ply_body import Body, Element, Property
+from meshmatch.shapes.formats import NO_FACES, NO_MESH, WRONG_SUFFIX, Raw, damaged, fan, indices, numbers, runs
 from meshmatch.shapes.shape import Shape
 
 _TYPES = {
@@ -23,37 +23,52 @@ _TYPES = {
 }  # fmt: skip
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 _END = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:\r\n|[\r\n]|\Z)")
-_NUMBERS = ("x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a")
+_CHANNELS = ("red", "green", "blue", "alpha")
+_NUMBERS = ("x", "y", "z", *_CHANNELS, "r", "g", "b", "a")
+
+
+@dataclass
+class _Property:
+    name: str
+    kind: str
+    count_kind: str | None = None  # set for a list
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    properties: list[_Property] = field(default_factory=list)
 
 
 def read(path: Path, data: bytes) -> Raw:
-    """Vertices, faces and vertex colours of a ply file."""
+    """Vertices, faces (polygons or strips) and vertex colours."""
     name = path.name
     order, elements, start = _header(name, data)
     known = [element.name for element in elements]
     if "vertex" not in known:
-        raise InputError(f"{name}: the header declares no vertices", "is it a mesh or a point cloud at all?")
+        raise InputError(f"{name}: the header declares no vertices", NO_MESH)
     wanted = [k for k, element in enumerate(elements) if element.name in ("vertex", "face", "tristrips")]
-    body = Body(name, data, start, order)
+    body = _Body(name, data, start, order)
     verts, faces, colors = None, NO_FACES, None
     for element in elements[: max(wanted) + 1]:
         if not element.properties:
             continue  # rows of nothing, however many
         _check_kinds(name, element)
         table = body.element(element)
-        if element.name == "vertex":
-            if not {"x", "y", "z"} <= set(table):
-                raise InputError(f"{name}: the vertices have no x, y and z", "is it a mesh or a point cloud at all?")
-            verts = np.stack([table[axis].values.astype(np.float64) for axis in "xyz"], axis=1)
-            colors = _colors(table)
+        if element.name == "vertex" and {"x", "y", "z"} <= set(table):
+            verts = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+            colors = _colors(table, {p.name: p.kind for p in element.properties})
+        elif element.name == "vertex":
+            verts = None
+            break
         elif element.name == "face":
             lists = next((table[key] for key in _FACE_LISTS if key in table), None)
-            if lists is not None:
-                faces = fan(*lists)
+            faces = faces if lists is None else fan(*lists)
         elif element.name == "tristrips":
             faces = _strips(table[element.properties[0].name][0])
     if verts is None:
-        raise InputError(f"{name}: the vertices have no x, y and z", "is it a mesh or a point cloud at all?")
+        raise InputError(f"{name}: the vertices have no x, y and z", NO_MESH)
     return Raw(verts, faces, colors)
 
 
@@ -73,84 +88,68 @@ def write(
     comments : sequence of str
         Lines for the header.
     """
-    verts = shape.verts
     with np.errstate(over="ignore"):  # what is too large for a float is not equal to it
-        single = bool((verts.astype(np.float32) == verts).all())
-    real, kind = ("float", "<f4") if single else ("double", "<f8")
-    fields = [("x", kind), ("y", kind), ("z", kind)]
+        single = bool((shape.verts.astype(np.float32) == shape.verts).all())
     header = ["ply", "format binary_little_endian 1.0", "comment meshmatch"]
     header += [f"comment {' '.join(comment.split())}" for comment in comments]
     header += [f"element vertex {shape.V}"]
-    header += [f"property {real} {axis}" for axis in "xyz"]
+    kind, word = ("<f4", "float") if single else ("<f8", "double")
+    header += [f"property {word} {axis}" for axis in "xyz"]
+    table: dict[str, NDArray[Any]] = dict(zip("xyz", shape.verts_or_nan.T, strict=True))
     if shape.colors is not None:
-        fields += [(channel, "u1") for channel in ("red", "green", "blue", "alpha")]
-        header += [f"property uchar {channel}" for channel in ("red", "green", "blue", "alpha")]
-    more_fields, more_header = _further(vertex)
-    table = np.zeros(shape.V, dtype=fields + more_fields)
-    header += more_header
-    for label, values in (vertex or {}).items():
-        table[label] = values
-    for axis, values in zip("xyz", shape.verts_or_nan.T, strict=True):
-        table[axis] = values
-    if shape.colors is not None:
-        for channel, values in zip(("red", "green", "blue", "alpha"), shape.colors.T, strict=True):
-            table[channel] = np.rint(np.clip(values, 0, 1) * 255)
-    chunks = [table.tobytes()]
+        table |= zip(_CHANNELS, np.rint(np.clip(shape.colors.T, 0, 1) * 255).astype(np.uint8), strict=True)
+    body = _rows(table | dict(vertex or {}), shape.V, [(axis, kind) for axis in "xyz"], header)
     if not shape.is_cloud:
         header += [f"element face {shape.F}", "property list uchar int vertex_indices"]
-        more_fields, more_header = _further(face)
-        header += more_header
-        rows = np.empty(shape.F, dtype=[("n", "u1"), ("corners", "<i4", (3,)), *more_fields])
-        for label, values in (face or {}).items():
-            rows[label] = values
-        rows["n"] = 3
-        rows["corners"] = shape.faces
-        chunks.append(rows.tobytes())
-    path.write_bytes("\n".join([*header, "end_header\n"]).encode() + b"".join(chunks))
+        lists = {"n": np.full(shape.F, 3), "corners": shape.faces}
+        body += _rows(lists | dict(face or {}), shape.F, [("n", "u1"), ("corners", "<i4", (3,))], header)
+    path.write_bytes("\n".join([*header, "end_header\n"]).encode() + body)
 
 
-def _further(columns: Mapping[str, NDArray[Any]] | None) -> tuple[list[Any], list[str]]:
-    """Fields of a table, and lines of a header, for further properties."""
-    fields, lines = [], []
-    for label, values in (columns or {}).items():
-        kind, word = {"uint8": ("u1", "uchar"), "int32": ("<i4", "int")}.get(values.dtype.name, ("<f8", "double"))
+def _rows(table: dict[str, NDArray[Any]], count: int, fields: list[Any], header: list[str]) -> bytes:
+    """The rows of a table; its columns that have no field yet get one, and a line in the header."""
+    for label in list(table)[len(fields) :]:
+        kinds = {"uint8": ("u1", "uchar"), "int32": ("<i4", "int")}
+        kind, word = kinds.get(table[label].dtype.name, ("<f8", "double"))
         fields.append((label, kind))
-        lines.append(f"property {word} {label}")
-    return fields, lines
+        header.append(f"property {word} {label}")
+    rows = np.empty(count, fields)
+    for label, values in table.items():
+        rows[label] = values
+    return rows.tobytes()
 
 
-def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int]:
+def _header(name: str, data: bytes) -> tuple[str | None, list[_Element], int]:
     """Byte order (None: text), elements, and where the body starts."""
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
-        raise InputError(f"{name} is not a ply file: it does not begin with 'ply'", "does the suffix fit the content?")
+        raise InputError(f"{name} is not a ply file: it does not begin with 'ply'", WRONG_SUFFIX)
     end = _END.search(data)
     if not end:
         raise damaged(name, "the header has no end")
     order: str | None = ""
-    elements: list[Element] = []
+    elements: list[_Element] = []
     try:
         for line in data[: end.start()].decode("latin-1").replace("\r\n", "\n").replace("\r", "\n").split("\n"):
             match line.split():
                 case ["format", kind, *_]:
                     order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}[kind]
                 case ["element", element, count, *_]:
-                    elements.append(Element(element, int(count)))
+                    elements.append(_Element(element, int(count)))
                 case ["property", "list", count_kind, kind, label, *_] if _TYPES[count_kind][0] != "f":
-                    elements[-1].properties.append(Property(label, _TYPES[kind], _TYPES[count_kind]))
+                    elements[-1].properties.append(_Property(label, _TYPES[kind], _TYPES[count_kind]))
                 case ["property", kind, label, *_]:
-                    elements[-1].properties.append(Property(label, _TYPES[kind]))
+                    elements[-1].properties.append(_Property(label, _TYPES[kind]))
     except (KeyError, ValueError, IndexError) as error:
         raise damaged(name, f"the header line {line.strip()[:60]!r} makes no sense") from error
     if order == "":
         raise damaged(name, "the header declares no format")
     for each in elements:
-        names = [p.name for p in each.properties]
-        if len(set(names)) < len(names):
+        if len({p.name for p in each.properties}) < len(each.properties):
             raise damaged(name, f"its header declares a property of the element {each.name} twice")
     return order, elements, end.end()
 
 
-def _check_kinds(name: str, element: Element) -> None:
+def _check_kinds(name: str, element: _Element) -> None:
     """Refuse a list where a number is needed, and the other way round."""
     for place, p in enumerate(element.properties):
         lists = {"face": p.name in _FACE_LISTS, "tristrips": place == 0}.get(element.name, False)
@@ -170,17 +169,113 @@ def _strips(lists: Ints) -> Ints:
     return faces[(a >= 0) & (b >= 0) & (c >= 0)]
 
 
-def _colors(table: dict[str, Any]) -> Floats | None:
+def _colors(table: dict[str, Any], kinds: dict[str, str]) -> Floats | None:
     names = next((n for n in (("red", "green", "blue"), ("r", "g", "b")) if set(n) <= set(table)), None)
     if names is None:
         return None
-    alpha = next((a for a in ("alpha", "a") if a in table), None)
-    channels = [table[c] for c in names] + ([table[alpha]] if alpha else [])
-    out = np.ones((len(channels[0].values), 4))
-    for k, channel in enumerate(channels):
-        values = channel.values.astype(np.float64)
-        largest = {"u2": 65535.0}.get(channel.kind, 255.0)
-        if channel.kind[0] == "f" and not (values > 1).any():
+    out = np.ones((len(table[names[0]]), 4))
+    for k, name in enumerate([*names, *[a for a in ("alpha", "a") if a in table][:1]]):
+        values = table[name].astype(np.float64)
+        largest = {"u2": 65535.0}.get(kinds[name], 255.0)
+        if kinds[name][0] == "f" and not (values > 1).any():
             largest = 1.0
         out[:, k] = np.clip(np.nan_to_num(values) / largest, 0.0, 1.0)
     return out
+
+
+class _Body:
+    """The bytes behind the header, read one element after the other.
+
+    A text body (``order`` is None) becomes float64 numbers first, and is then read as a binary one of these.
+    """
+
+    def __init__(self, name: str, data: bytes, start: int, order: str | None) -> None:
+        self.name, self.at, self.order, self.text = name, start, order or "=", order is None
+        self.data: Any = data
+        if self.text:
+            self.data, self.at = numbers(name, data[start:]).view(np.uint8).data, 0
+
+    def element(self, element: _Element) -> dict[str, Any]:
+        """By property: its numbers, or, of lists, all their items and the size of each."""
+        kinds = [self._dtype(p.count_kind or p.kind) for p in element.properties]
+        self._check(element, self.at + element.count * sum(kind.itemsize for kind in kinds))
+        if element.count == 0:
+            nothing = np.empty(0, np.int64)
+            return {p.name: (nothing, nothing) if p.count_kind else nothing for p in element.properties}
+        table = self._equal_rows(element)
+        return table if table is not None else self._walk(element)
+
+    def _check(self, element: _Element, end: int) -> None:
+        if element.count < 0 or end > len(self.data):
+            raise damaged(self.name, f"fewer {element.name} rows than the {element.count} that its header promises")
+
+    def _dtype(self, kind: str) -> np.dtype[Any]:
+        return np.dtype("f8" if self.text else self.order + kind)
+
+    def _equal_rows(self, element: _Element) -> dict[str, Any] | None:
+        """All rows as long as the first one: a structured array over the bytes, nothing copied. None if they differ."""
+        fields: list[Any] = []
+        at = self.at
+        for k, p in enumerate(element.properties):
+            size = 1
+            if p.count_kind:
+                size = self._count(at, p.count_kind)
+                at += self._dtype(p.count_kind).itemsize
+                fields.append((f"n{k}", self._dtype(p.count_kind)))
+            at += size * self._dtype(p.kind).itemsize
+            if at > len(self.data):
+                return None
+            fields.append((f"v{k}", self._dtype(p.kind), (size,) if p.count_kind else ()))
+        end = self.at + (at - self.at) * element.count
+        if end > len(self.data):
+            return None
+        rows = np.frombuffer(self.data, np.dtype(fields), element.count, self.at)
+        out: dict[str, Any] = {}
+        for k, p in enumerate(element.properties):
+            out[p.name] = rows[f"v{k}"]
+            if p.count_kind:
+                sizes = rows[f"n{k}"]
+                if (sizes != sizes[0]).any() or sizes[0] < 0:
+                    return None
+                out[p.name] = indices(self.name, rows[f"v{k}"]).ravel(), indices(self.name, sizes)
+        self.at = end
+        return out
+
+    def _walk(self, element: _Element) -> dict[str, Any]:
+        places: list[list[int]] = [[] for _ in element.properties]
+        sizes = [self._dtype(p.kind).itemsize for p in element.properties]
+        steps = list(zip(element.properties, places, sizes, strict=True))
+        at = self.at
+        for _ in range(element.count):
+            for p, where, item in steps:
+                where.append(at)
+                if p.count_kind:
+                    at += self._dtype(p.count_kind).itemsize + self._count(at, p.count_kind) * item
+                else:
+                    at += item
+            self._check(element, at)
+        self.at = at
+        out: dict[str, Any] = {}
+        for p, where, item in steps:
+            starts = np.array(where, np.int64)
+            if p.count_kind:
+                counts = np.maximum(indices(self.name, self._gather(starts, p.count_kind)), 0)
+                items = runs(starts + self._dtype(p.count_kind).itemsize, counts, item)
+                out[p.name] = indices(self.name, self._gather(items, p.kind)), counts
+            else:
+                out[p.name] = self._gather(starts, p.kind)
+        return out
+
+    def _count(self, at: int, kind: str) -> int:
+        """The size of the list at a place; 0 behind the end, and for one that is negative or not a number."""
+        if kind == "u1" and not self.text:  # by far the most frequent
+            return int(self.data[at]) if at < len(self.data) else 0
+        if at + self._dtype(kind).itemsize > len(self.data):
+            return 0
+        value = np.frombuffer(self.data, self._dtype(kind), 1, at)[0]
+        return int(value) if 0 < value < 2**53 else 0
+
+    def _gather(self, starts: Int[Ints, " N"], kind: str) -> NDArray[Any]:
+        dtype = self._dtype(kind)
+        raw = np.frombuffer(self.data, np.uint8)[starts[:, None] + np.arange(dtype.itemsize)]
+        return np.ascontiguousarray(raw).view(dtype)[:, 0]

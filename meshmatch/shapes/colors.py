@@ -1,4 +1,4 @@
-"""Colours as files write them (sRGB), and the light that they stand for, in which averages are taken.
+"""Colours: as files write them (sRGB), the light that they stand for, in which averages are taken, and those of labels.
 
 IEC 61966-2-1. Half black and half white seen from afar is 188 of 255, not 128: so colours are mixed as light.
 """
@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 
 from meshmatch.arrays import Float, Floats, Floats32, UInt8, UInts8
 
+UNKNOWN = (0.62, 0.64, 0.67)
+"""What has no value."""
 _STEPS = 1 << 14  # of the table of `bytes_of`
 
 
@@ -36,3 +38,31 @@ def bytes_of(linear: Float[Floats32, ...]) -> UInt8[UInts8, ...]:
     """The nearest byte of an image for amounts of light in 0..1, of any shape; what lies outside is clipped."""
     root = np.sqrt(np.clip(linear, 0.0, 1.0, dtype=np.float32))
     return _BYTE_OF_ROOT.take((root * np.float32(_STEPS) + np.float32(0.5)).astype(np.int32))
+
+
+_ROOTS_OF_OKLAB = np.array(
+    [[1.0, 1.0, 1.0], [0.3963377774, -0.1055613458, -0.0894841775], [0.2158037573, -0.0638541728, -1.291485548]]
+)
+_LIGHT_OF_CUBES = np.array(
+    [
+        [4.0767416621, -1.2684380046, -0.0041960863],
+        [-3.3077115913, 2.6097574011, -0.7034186147],
+        [0.2309699292, -0.3413193965, 1.7076147010],
+    ]
+)
+
+
+def oklab_to_linear(lab: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
+    """Light of colours in Oklab, where equal steps look equal (Ottosson 2020)."""
+    return np.asarray((lab @ _ROOTS_OF_OKLAB) ** 3 @ _LIGHT_OF_CUBES)
+
+
+def label_colors(labels: ArrayLike) -> Float[Floats, "N 3"]:
+    """Written colours of labels (N,): the same for the same label always, and neighbours far apart."""
+    number = np.asarray(labels, dtype=np.int64)
+    # Hue by the golden angle; three rings of lightness, so that many labels stay apart.
+    hue = np.radians(28.0 + 137.50776 * (number % 1000))
+    light = np.array([0.68, 0.80, 0.55])[number % 3]
+    chroma = np.array([0.145, 0.115, 0.12])[number % 3]
+    lab = np.stack([light, chroma * np.cos(hue), chroma * np.sin(hue)], axis=-1)
+    return np.where((number >= 0)[..., None], to_srgb(oklab_to_linear(lab)), UNKNOWN)

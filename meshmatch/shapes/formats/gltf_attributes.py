@@ -1,0 +1,194 @@
+"""What a glTF scene says of its vertices besides their places: how they look, and which joint moves which.
+
+Specification: Khronos glTF 2.0, sections 3.7.3, 3.8 and 3.9; KHR_texture_transform,
+KHR_materials_pbrSpecularGlossiness (its diffuse part) and EXT_texture_webp. Metal, roughness, normals and light are
+ignored. Vertices and faces are those of `meshmatch.shapes.formats.gltf.read`, in the same order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import chain, count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.errors import InputError
+from meshmatch.outputs import plain_text
+from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap, no_coordinates
+from meshmatch.shapes.formats import damaged
+from meshmatch.shapes.formats.gltf import Document, joined_colors, understood
+
+_WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+_ALPHAS: dict[str, Alpha] = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
+_NEAREST = 9728
+
+
+def read_look(path: Path, data: bytes, reader: ImageReader, picture: Pixels | None) -> Appearance:
+    """Materials and texture coordinates; `picture` replaces all images."""
+    return understood(path, data, "materials make", lambda document: _Look(document, reader, picture).scene())
+
+
+def read_coordinates(path: Path, data: bytes) -> Float[Floats, "F 3 2"] | None:
+    """First texture coordinates of all faces; None where a part has none."""
+    return understood(path, data, "texture coordinates make", _coordinates)
+
+
+def read_skin(path: Path, data: bytes) -> tuple[csr_array, tuple[str, ...]]:
+    """Skin weights (vertices, joints) that are above 0, as the file has them, and the joints' names, none twice.
+
+    The joints of all skins are one list, in the file's order of nodes. A mesh that no skin moves but that hangs
+    from a joint, such as a sword from a hand, goes with that joint. `InputError` if the file is damaged or has no skin.
+    """
+    return understood(path, data, "skin makes", _skin)
+
+
+def _coordinates(document: Document) -> Floats | None:
+    parts = [np.empty((0, 3, 2))]
+    for _, primitive in document.primitives():
+        attributes = primitive["attributes"]
+        faces = document.triangles(primitive, document.count(attributes["POSITION"]))
+        if len(faces) and "TEXCOORD_0" not in attributes:
+            return None
+        if len(faces):
+            parts.append(document.accessor(attributes["TEXCOORD_0"])[faces])
+    return np.concatenate(parts)
+
+
+class _Look:
+    def __init__(self, document: Document, reader: ImageReader, picture: Pixels | None) -> None:
+        self.document, self.json, self.reader, self.picture = document, document.json, reader, picture
+        self.images: dict[int, Pixels] = {}
+        self.materials: dict[tuple[int, bool], Material] = {}
+
+    def scene(self) -> Appearance:
+        uvs: list[Floats] = [np.empty((0, 3, 2))]
+        kinds: list[Ints] = [np.empty(0, np.int64)]
+        colors: list[Floats | None] = []
+        counts: list[int] = []
+        for _, primitive in self.document.primitives():
+            counts.append(self.document.count(primitive["attributes"]["POSITION"]))
+            colors.append(self.document.colors(primitive))
+            faces = self.document.triangles(primitive, counts[-1])
+            uv = self._coordinates(primitive) if len(faces) else None
+            key = primitive.get("material", -1), uv is not None
+            if key not in self.materials:
+                self.materials[key] = self._read(*key)
+            kinds.append(np.full(len(faces), list(self.materials).index(key)))
+            uvs.append(np.zeros((len(faces), 3, 2)) if uv is None else uv[faces])
+        painted = joined_colors(colors, counts)
+        found = Appearance(tuple(self.materials.values()), np.concatenate(kinds), np.concatenate(uvs), painted)
+        if self.picture is not None and not found.textured:
+            raise no_coordinates(self.document.name)
+        return found
+
+    def _base(self, number: int) -> tuple[dict[str, Any], dict[str, Any] | None, tuple[float, ...]]:
+        """A material, its base colour texture and its factor."""
+        if number < 0:
+            return {}, None, (1.0,) * 4
+        material = self.json["materials"][number]
+        gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+        if gloss is not None and "pbrMetallicRoughness" not in material:
+            return material, gloss.get("diffuseTexture"), tuple(gloss.get("diffuseFactor", (1.0,) * 4))
+        pbr = material.get("pbrMetallicRoughness", {})
+        return material, pbr.get("baseColorTexture"), tuple(pbr.get("baseColorFactor", (1.0,) * 4))
+
+    def _read(self, number: int, laid: bool) -> Material:
+        """A material of the file, with its image if there are coordinates."""
+        entry, texture, factor = self._base(number)
+        red, green, blue, alpha = (float(np.clip(value, 0.0, 1.0)) for value in factor)
+        made = Material(
+            str(entry.get("name", "")),
+            factor=(red, green, blue, alpha),
+            alpha=_ALPHAS[entry.get("alphaMode", "OPAQUE")],
+            cutoff=float(entry.get("alphaCutoff", 0.5)),
+        )
+        if laid and self.picture is not None:
+            made = replace(made, image=self.picture, factor=(1.0, 1.0, 1.0, 1.0))
+        if not laid or texture is None:
+            return made
+        described = self.json["textures"][texture["index"]]
+        sampler = self.json["samplers"][described["sampler"]] if "sampler" in described else {}
+        wrap = _WRAPS[sampler.get("wrapS", 10497)], _WRAPS[sampler.get("wrapT", 10497)]
+        made = replace(made, wrap=wrap, nearest=sampler.get("magFilter") == _NEAREST)
+        return made if self.picture is not None else replace(made, image=self._image(described))
+
+    def _image(self, texture: dict[str, Any]) -> Pixels:
+        extensions = texture.get("extensions", {})
+        number = texture.get("source", extensions.get("EXT_texture_webp", {}).get("source"))
+        if number is None:
+            kind = next(iter(extensions), "no image at all")
+            unreadable = f"{self.document.name} holds a texture that cannot be read ({kind})"
+            raise InputError(unreadable, "export it with png or jpg textures")
+        if number not in self.images:
+            entry = self.json["images"][number]
+            uri = entry.get("uri")
+            data = self.document.view_bytes(entry["bufferView"]) if uri is None else self.document.resource(uri)
+            inside = uri is None or uri.startswith("data:")
+            self.images[number] = self.reader.decode(data, f"image {number} of {self.document.name}" if inside else uri)
+        return self.images[number]
+
+    def _coordinates(self, primitive: dict[str, Any]) -> Floats | None:
+        """(V, 2) coordinates of a primitive's vertices, or None where it has none, or nothing to lay on."""
+        _, texture, _ = self._base(primitive.get("material", -1))
+        if texture is None and self.picture is None:
+            return None
+        texture = texture or {}
+        transform = texture.get("extensions", {}).get("KHR_texture_transform", {})
+        chosen = f"TEXCOORD_{int(transform.get('texCoord', texture.get('texCoord', 0)))}"
+        if chosen not in primitive["attributes"]:
+            return None
+        uv = self.document.accessor(primitive["attributes"][chosen])
+        if uv.shape[1] != 2:
+            raise damaged(self.document.name, "texture coordinates are not pairs")
+        if not transform:
+            return uv
+        # Counter-clockwise with v down, as the extension's words and its example have it (its listing does not).
+        angle = float(transform.get("rotation", 0.0))
+        with np.errstate(all="ignore"):  # what is not finite is refused by the appearance
+            u, v = (uv * np.array(transform.get("scale", (1.0, 1.0)), np.float64)).T
+            turned = np.stack([np.cos(angle) * u + np.sin(angle) * v, np.cos(angle) * v - np.sin(angle) * u], axis=1)
+        return np.asarray(turned + np.array(transform.get("offset", (0.0, 0.0)), np.float64))
+
+
+def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
+    skins = document.json.get("skins", [])
+    nodes = sorted({int(joint) for skin in skins for joint in skin["joints"]})
+    if not nodes:
+        raise InputError(f"{document.name} has no skin", "give the weights in a file: --weights weights.npz")
+    place = {node: k for k, node in enumerate(nodes)}
+    parent = {int(c): k for k, node in enumerate(document.nodes) for c in node.get("children", [])}
+    found: list[tuple[Ints, Ints, Floats]] = []  # vertices, joints, weights
+    seen = 0
+    for number, primitive in document.primitives():
+        attributes = primitive["attributes"]
+        V, node = document.count(attributes["POSITION"]), document.nodes[number]
+        if "skin" in node and "JOINTS_0" in attributes:
+            own = np.array([place[int(joint)] for joint in skins[node["skin"]]["joints"]])
+            for numbers, amount in document.influences(primitive):
+                if numbers.shape != (V, 4) or amount.shape != (V, 4):
+                    raise ValueError("joints or weights are not four for each vertex")
+                row, column = np.nonzero(np.isfinite(amount) & (amount > 0))
+                used = numbers[row, column]
+                if not ((used >= 0) & (used < len(own))).all():
+                    raise ValueError(f"a vertex refers to a joint that is not among the {len(own)} of its skin")
+                found.append((seen + row, own[used.astype(np.int64)], amount[row, column]))
+        else:
+            joint: int | None = number
+            while joint is not None and joint not in place:
+                joint = parent.get(joint)
+            if joint is not None:
+                found.append((seen + np.arange(V), np.full(V, place[joint]), np.ones(V)))
+        seen += V
+    if not found:
+        raise InputError(f"{document.name} has a skin that moves no vertex", "was it exported with its weights?")
+    vertices, joints, weights = (np.concatenate(each) for each in zip(*found, strict=True))
+    labels = [document.nodes[node].get("name") or f"joint {node}" for node in nodes]
+    names: dict[str, None] = {}
+    for label in (plain_text(str(label)) for label in labels):
+        again = (f"{label} {k}" for k in count(2))
+        names[next(word for word in chain([label], again) if word not in names)] = None
+    return csr_array((weights, (vertices, joints)), (seen, len(nodes))), tuple(names)

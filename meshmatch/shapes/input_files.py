@@ -1,0 +1,145 @@
+"""Files to be read: are they there, are they where a mesh may ask for them, and the arrays in npy and npz files, which
+can promise more than they hold. Nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+import zipfile
+from collections.abc import Iterable
+from difflib import get_close_matches
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import NDArray
+
+from meshmatch.errors import InputError
+
+LARGEST_FILE = 1 << 32
+"""Bytes: a hundred million vertices, more than anything here can work on. Larger files are refused unread."""
+LARGEST = 1 << 30
+"""Uncompressed bytes of one array in an npz file; a million vertices with 120 dense weights fit."""
+_LAST_CHARACTER = 0x10FFFF
+
+
+def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path:
+    """The path; `InputError` if no ordinary file is there, or one that is empty or larger than `LARGEST_FILE`.
+
+    Without a `hint` for the error one is made up, with the most similar name of a file with one of ``suffixes``.
+    """
+    try:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder, not a file", hint or "give the name of a file")
+        if not path.exists():
+            if path.is_symlink():
+                raise InputError(f"{path} is a link to a file that is not there", "mend the link, or name the file")
+            raise InputError(f"there is no file {path}", hint or _similar(path, suffixes))
+        if not path.is_file():
+            odd = f"{path} is not a regular file (it is a pipe or a device)"
+            raise InputError(odd, "write its data to a file first")
+        size = path.stat().st_size
+        with path.open("rb"):  # may it be read?
+            pass
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}", hint or "check the name") from error
+    if size == 0:
+        raise InputError(f"{path.name} is empty (0 bytes)", hint or "was the download or the export cut short?")
+    if size > LARGEST_FILE:
+        limit = f"the limit is {LARGEST_FILE / 2**30:.0f} GiB"
+        raise InputError(f"{path.name} is too large: {size / 2**30:.1f} GiB", limit)
+    return path
+
+
+def _similar(path: Path, suffixes: tuple[str, ...]) -> str:
+    if not path.parent.is_dir():
+        return f"there is no folder {path.parent} either"
+    names = [entry.name for entry in path.parent.iterdir() if entry.suffix.lower() in suffixes]
+    close = get_close_matches(path.name, names, n=1)
+    return f"did you mean {path.parent / close[0]}?" if close else "check the name and the folder"
+
+
+def read_bytes(path: Path, hint: str = "") -> bytes:
+    """All of a file; `InputError` as `existing`, or if reading fails."""
+    try:
+        return existing(path, hint).read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}", hint or "check the disk") from error
+
+
+def beside(folder: Path, name: str) -> Path | None:
+    """The file of that name in a folder or below it; None if it is not there, or elsewhere."""
+    try:
+        file = (folder / name).resolve()
+        return file if file.is_relative_to(folder.resolve()) and file.is_file() else None
+    except (OSError, RuntimeError, ValueError):  # a name too long, a circle of links, a NUL in the name
+        return None
+
+
+def read_npy(path: Path) -> NDArray[Any]:
+    """The array of an npy file; `InputError` if it is damaged or holds objects."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(2)
+            if start == b"PK":
+                raise ValueError("it holds several arrays, as an npz does")
+            if start != b"\x93N":
+                raise InputError(f"{path.name} is not an npy file", "does the suffix fit the content?")
+            file.seek(0)
+            return _array(file, path.name, path.stat().st_size)
+    except InputError:
+        raise
+    except Exception as error:  # a damaged header can break Python's parser and NumPy in a dozen ways
+        raise _not_arrays(path, error) from error
+
+
+def read_npz(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """Those of the named arrays that an npz file holds; `InputError` if it is damaged, holds objects, or an array of
+    more than `LARGEST` bytes.
+    """
+    found: dict[str, NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            there = set(archive.namelist())
+            for name in names:
+                member = f"{name}.npy"
+                if member in there:
+                    with archive.open(member) as file:
+                        found[name] = _array(file, member, min(archive.getinfo(member).file_size, LARGEST))
+    except Exception as error:  # as above, and the zip around it
+        raise _not_arrays(path, error) from error
+    return found
+
+
+def _array(file: IO[bytes], name: str, most: int) -> NDArray[Any]:
+    """The array of an open npy file, if it promises no more than `most` bytes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of headers as Python 2 wrote them
+        version = npy_format.read_magic(file)
+        if version not in ((1, 0), (2, 0), (3, 0)):
+            raise ValueError(f"{name} has an unknown format version")
+        read = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
+        shape, _, kind = read(file)
+        if kind.hasobject:
+            raise ValueError("it holds Python objects")
+        # An item counts, also one of no bytes: so many of them would fill a list.
+        size = math.prod((max(int(kind.itemsize), 1), *(int(axis) for axis in shape)))
+        if min(shape, default=0) < 0 or size > most:
+            raise ValueError(f"{name} promises {size} bytes")
+        file.seek(0)
+        array = np.asarray(npy_format.read_array(file, allow_pickle=False))
+    if array.dtype.kind == "U" and array.size:
+        characters = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("=")).reshape(-1)
+        codes = characters.view(np.uint32)
+        if ((codes > _LAST_CHARACTER) | ((codes >= 0xD800) & (codes < 0xE000))).any():  # the latter are halves
+            raise ValueError(f"{name} holds invalid characters")
+    return array
+
+
+def _not_arrays(path: Path, error: Exception) -> InputError:
+    if "pickle" in str(error) or "Object arrays" in str(error):
+        return InputError(f"{path.name} holds Python objects, which are not read", "save plain arrays in it")
+    unreadable = f"{path.name} does not hold arrays that can be read: {error}"
+    return InputError(unreadable, "is it damaged, or of another format?")
