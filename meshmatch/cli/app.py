@@ -1,25 +1,17 @@
 """The tree of verbs."""
 
-from collections.abc import Callable
-
 import typer
 
 from meshmatch import __version__
 from meshmatch.cli.evaluate import evaluate
 from meshmatch.cli.info import info
 from meshmatch.cli.interpolate import interpolate
-from meshmatch.cli.match import match
+from meshmatch.cli.match import match, register
 from meshmatch.cli.models import models
-from meshmatch.cli.picture import picture
-from meshmatch.cli.prepare import prepare
-from meshmatch.cli.register import register
-from meshmatch.cli.train import train
-from meshmatch.cli.transfer_color import transfer_color
-from meshmatch.cli.transfer_labels import transfer_labels
-from meshmatch.cli.transfer_landmarks import transfer_landmarks
+from meshmatch.cli.picture import picture, view
+from meshmatch.cli.train import prepare, train
+from meshmatch.cli.transfer import transfer_color, transfer_labels, transfer_landmarks, transfer_weights
 from meshmatch.cli.transfer_texture import transfer_texture
-from meshmatch.cli.transfer_weights import transfer_weights
-from meshmatch.cli.view import view
 
 app = typer.Typer(
     name="meshmatch",
@@ -51,13 +43,10 @@ def root(
     """
 
 
-_VERBS: tuple[Callable[..., None], ...] = (
+for verb in (
     *(match, register, evaluate),
     *(transfer_texture, transfer_color, transfer_labels, transfer_weights, transfer_landmarks),
-    interpolate,
-    *(picture, view),
-    *(info, prepare, train),
-)
-for verb in _VERBS:
+    *(interpolate, picture, view, info, prepare, train),
+):
     app.command()(verb)
 app.add_typer(models, name="models")

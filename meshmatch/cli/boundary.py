@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from meshmatch.cli.console import Console
 from meshmatch.errors import MeshmatchError
 
 DEBUG_VARIABLE = "MESHMATCH_DEBUG"
@@ -31,24 +32,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with _kill_as_interrupt() as killed:
         try:
             status = _run(arguments)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, Exception) as error:
             if debug:
                 raise
-            status = INTERRUPTED
-        except Exception as error:
-            if debug:
-                raise
-            if killed():  # a process that was killed with this one may be missed first
+            if isinstance(error, KeyboardInterrupt) or killed():  # a process killed with this one may be missed first
                 status = INTERRUPTED
             elif isinstance(error, MeshmatchError):
-                _tell("error", error.message, error.hint)
+                Console().trouble("error", error.message, error.hint)
                 return 1
             else:
                 raise
     if killed() and status:
         status = KILLED
     if status in (INTERRUPTED, KILLED):
-        _tell("interrupted" if status == INTERRUPTED else "killed", "no file is half-written")
+        Console().trouble("interrupted" if status == INTERRUPTED else "killed", "no file is half-written")
     return status
 
 
@@ -95,9 +92,3 @@ def _run(arguments: Sequence[str] | None) -> int:
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     return 0
-
-
-def _tell(what: str, message: str, hint: str = "") -> None:
-    from meshmatch.cli.console import Console
-
-    Console().trouble(what, message, hint)

@@ -50,21 +50,13 @@ class Console:
             yield self._open[0][1]
             return
         console = _terminal()
-        if self.quiet:
-            yield lambda stage, name, share: None
-            return
-        if not console.is_terminal:
-            yield self._lines()
+        if self.quiet or not console.is_terminal:
+            yield (lambda stage, name, share: None) if self.quiet else self._lines()
             return
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-        columns = (
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            TextColumn("{task.fields[what]}", markup=False),
-            TimeElapsedColumn(),
-        )
-        with Progress(*columns, console=console, transient=True) as bars:
+        name, what = (TextColumn(f"{{task.{text}}}", markup=False) for text in ("description", "fields[what]"))
+        with Progress(name, BarColumn(), what, TimeElapsedColumn(), console=console, transient=True) as bars:
             rows: dict[str, Any] = {}
 
             def report(stage: str, name: str, share: float) -> None:

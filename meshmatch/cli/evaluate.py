@@ -1,39 +1,37 @@
 """``meshmatch evaluate``."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING
 
-import typer
+from typer import Argument, Option
 
+import meshmatch
 from meshmatch.cli import options
-from meshmatch.cli import truth as truths
 from meshmatch.cli.console import Console, print_json, print_rows
-from meshmatch.cli.output_paths import check_chart, check_distinct, check_png, claimed
+from meshmatch.cli.output_paths import check_outputs
+from meshmatch.errors import OptionError
 
 if TYPE_CHECKING:
     from meshmatch.maps.evaluate import Evaluation
 
 
 def evaluate(
-    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="A map that `meshmatch match` wrote.")],
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="The shape that it maps.")],
-    target: Annotated[Path, typer.Argument(metavar="TARGET", help="The shape that it maps to.")],
-    truth: truths.Truth = None,
-    points: truths.Points = None,
-    threshold: Annotated[
-        float, typer.Option(min=0.0, metavar="CM", help="Give the share of errors over this many cm.")
-    ] = 15.0,
-    curve: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Draw the cumulative error curve, .png, .svg or .pdf (needs the truth)."),
-    ] = None,
-    picture: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Draw both shapes, the errors as a color map (needs the truth).")
-    ] = None,
-    unit: Annotated[
-        Literal["cm", "x100"],
-        typer.Option(help="Of curve and picture: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100."),
-    ] = "cm",
+    *,
+    map_file: Path = Argument(..., metavar="MAP", help="A map that `meshmatch match` wrote."),
+    source: Path = Argument(..., metavar="SOURCE", help="The shape that it maps."),
+    target: Path = Argument(..., metavar="TARGET", help="The shape that it maps to."),
+    truth: options.Truth = None,
+    points: options.Points = None,
+    threshold: float = Option(15.0, min=0.0, metavar="CM", help="Give the share of errors over this many cm."),
+    curve: Path | None = Option(
+        None, metavar="FILE", help="Draw the cumulative error curve, .png, .svg or .pdf (needs the truth)."
+    ),
+    picture: Path | None = Option(
+        None, metavar="PNG", help="Draw both shapes, the errors as a color map (needs the truth)."
+    ),
+    unit: options.ErrorUnit = Option(
+        "cm", help="Of curve and picture: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100."
+    ),
     seed: options.Seed = 0,
     json: options.Json = False,
 ) -> None:
@@ -43,34 +41,25 @@ def evaluate(
     TARGET, over the square root of its area and times 100; and in centimetres with TARGET scaled to 1.9
     square metres, the skin of a person.
     """
-    from meshmatch.api.evaluation import evaluate as evaluated
-    from meshmatch.errors import OptionError
-    from meshmatch.maps.files import load_map
-    from meshmatch.render.charts import draw_curves
-    from meshmatch.shapes.files import load_shape
+    told = options.check_truth(truth, points)
+    for what, file in (("curve", curve), ("picture", picture)):
+        if file is not None and not told:
+            raise OptionError(f"a {what} of errors needs the truth", "give it with --truth or --points")
+    check_outputs([map_file, source, target, truth, *(points or ())], chart=curve, picture=picture)
+    shapes = meshmatch.load_shape(source), meshmatch.load_shape(target)
+    found = meshmatch.load_map(map_file, *shapes)
+    known = options.load_truth(truth, points, shapes[0])
+    result = meshmatch.evaluate(found, *shapes, known, seed=seed)
+    if known is not None and result.errors is not None:
+        if curve is not None:
+            from meshmatch.render.charts import draw_curves
 
-    told = truths.check_truth(truth, points)
-    if curve is not None and not told:
-        raise OptionError("a curve of errors needs the truth", "give it with --truth or --points")
-    if picture is not None and not told:
-        raise OptionError("a picture of errors needs the truth", "give it with --truth or --points")
-    check_chart(curve)
-    check_png(picture)
-    inputs = [map_file, source, target, truth, *(points or ())]
-    check_distinct([curve, picture], inputs)
-    # Pictures that cannot be written are told before the geodesics.
-    with claimed(curve) as plot, claimed(picture) as drawing:
-        shapes = load_shape(source), load_shape(target)
-        found = load_map(map_file, *shapes)
-        known = truths.load_truth(truth, points, shapes[0])
-        result = evaluated(found, *shapes, None if known[0] is None else known, seed=seed)
-        if plot is not None and result.errors is not None:
             limit = 20.0 if unit == "cm" else 25.0
-            draw_curves({found.source or source.stem: result.errors}, plot, limit, unit=unit)
-        if drawing is not None and result.errors is not None and known[0] is not None:
+            draw_curves({found.source or source.stem: result.errors}, curve, limit, unit=unit)
+        if picture is not None:
             from meshmatch.render.compose import compose_errors
 
-            compose_errors(*shapes, found, known, result.errors, unit).render(drawing)
+            compose_errors(*shapes, found, known, result.errors, unit).render(picture)
     for reason in found.reasons:
         Console().say(f"note: {reason}")
     if json:

@@ -1,18 +1,13 @@
 """``meshmatch info``: what is in a file."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.console import print_json, print_rows
-
-if TYPE_CHECKING:
-    from meshmatch.shapes.shape import Shape
-
-Record = dict[str, Any]
+from meshmatch.cli.console import Json, print_json, print_rows
+from meshmatch.errors import InputError
 
 
 def info(
@@ -23,7 +18,15 @@ def info(
 
     Of a shape also what repair would do. Nothing is written.
     """
-    record = _reader(file)(file)
+    from meshmatch.maps import MAP_SUFFIXES
+
+    suffix = file.suffix.lower()
+    about = _shape
+    if suffix == ".safetensors":
+        about = _template
+    elif suffix in MAP_SUFFIXES and (suffix != ".npy" or _is_list(file)):
+        about = _map
+    record = {"file": str(file)} | about(file)
     if json:
         print_json(record)
         return
@@ -31,24 +34,12 @@ def info(
     for key, value in record.items():
         values = value if key in ("repair", "reasons") else [value]  # a line each
         shown = [_shown(item) for item in values] or ["nothing to do" if key == "repair" else "none"]
-        rows += [(key if n == 0 else "", text) for n, text in enumerate(shown)]
-    print_rows([(key.replace("_", " "), text) for key, text in rows])
-
-
-def _reader(file: Path) -> Callable[[Path], Record]:
-    from meshmatch.maps import MAP_SUFFIXES
-
-    suffix = file.suffix.lower()
-    if suffix == ".safetensors":
-        return _template
-    if suffix in MAP_SUFFIXES and (suffix != ".npy" or _is_list(file)):
-        return _map
-    return _shape
+        rows += [(key.replace("_", " ") if n == 0 else "", text) for n, text in enumerate(shown)]
+    print_rows(rows)
 
 
 def _is_list(file: Path) -> bool:
     """A .npy of one axis is a map, one of two is a cloud."""
-    from meshmatch.errors import InputError
     from meshmatch.shapes.input_files import existing, read_npy
 
     try:
@@ -57,83 +48,49 @@ def _is_list(file: Path) -> bool:
         return False  # whatever is wrong with it, the reader of shapes says it well
 
 
-def _shape(file: Path) -> Record:
+def _shape(file: Path) -> Json:
     from meshmatch.geometry.topology import edges_of, face_parts
     from meshmatch.shapes.files import load_shape
     from meshmatch.shapes.normalise import guess_unit, long_axis
     from meshmatch.shapes.repair import repair
 
     shape = load_shape(file)
-    record: Record = {
-        "file": str(file),
-        "kind": "point cloud" if shape.is_cloud else "mesh",
-        "vertices": shape.V,
-        "faces": shape.F,
-        "size": _extent(shape),
-        "area": shape.area,
-        "colors": shape.colors is not None,
-    }
+    size = [float(length) for length in shape.bounds[1] - shape.bounds[0]]
+    clean = repair(shape)
+    edges, parts = {}, {}
     if not shape.is_cloud:
         border, crowded = edges_of(shape.faces).counts
-        record["watertight"] = border == crowded == 0
-        record["open_edges"] = border
-        record["non_manifold_edges"] = crowded
-    clean = repair(shape)
-    if not shape.is_cloud:  # of the repaired mesh: the seams of texture and the corners of an stl are joined
-        record["parts"] = int(face_parts(clean.shape.faces, clean.shape.V).max()) + 1
-    record["longest_along"] = long_axis(clean.shape)
-    record["unit_if_a_person"] = guess_unit(clean.shape)
-    record["repair"] = list(clean.notes)
-    record["repaired_vertices"] = clean.shape.V
-    record["repaired_faces"] = clean.shape.F
-    record["hash"] = shape.hash
-    return record
+        edges = {"watertight": border == crowded == 0, "open_edges": border, "non_manifold_edges": crowded}
+        # of the repaired mesh: the seams of texture and the corners of an stl are joined
+        parts = {"parts": int(face_parts(clean.shape.faces, clean.shape.V).max()) + 1}
+    about: Json = {"kind": "point cloud" if shape.is_cloud else "mesh", "vertices": shape.V, "faces": shape.F}
+    about |= {"size": size, "area": shape.area, "colors": shape.colors is not None}
+    usual = {"longest_along": long_axis(clean.shape), "unit_if_a_person": guess_unit(clean.shape)}
+    repaired = {"repaired_vertices": clean.shape.V, "repaired_faces": clean.shape.F}
+    return about | edges | parts | usual | {"repair": list(clean.notes)} | repaired | {"hash": shape.hash}
 
 
-def _extent(shape: "Shape") -> list[float]:
-    return [float(length) for length in shape.bounds[1] - shape.bounds[0]]
-
-
-def _map(file: Path) -> Record:
+def _map(file: Path) -> Json:
+    from meshmatch.cli.words import map_record
     from meshmatch.maps.files import load_map
     from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN
 
     found = load_map(file)
-    known = found.target_vertices != UNKNOWN
-    return {
-        "file": str(file),
-        "kind": "map",
-        "source": found.source,
-        "target": found.target,
-        "source_vertices": found.source_vertices,
-        "target_vertices": found.target_vertices if known else None,
-        "verdict": found.verdict,
-        "reasons": list(found.reasons),
-        "confidence_mean": float(found.confidence.mean()),
-        "direction": DIRECTION,
-    }
+    record: Json = {"kind": "map"} | map_record(found, (found.source, found.target))
+    if found.target_vertices == UNKNOWN:
+        record["target_vertices"] = None
+    return record | {"confidence_mean": float(found.confidence.mean()), "direction": DIRECTION}
 
 
-def _template(file: Path) -> Record:
+def _template(file: Path) -> Json:
     from meshmatch.templates.template import load_template
 
     template = load_template(file)
-    return {
-        "file": str(file),
-        "kind": "template",
-        "name": template.name,
-        "vertices": template.shape.V,
-        "faces": template.shape.F,
-        "dense_vertices": template.dense.V,
-        "dense_faces": template.dense.F,
-        "nodes": template.K,
-        "radius": template.radius,
-        "parts": list(template.label_names),
-        "pose": template.pose,
-        "source": template.source,
-        "licence": template.licence,
-        "hash": template.hash,
-    }
+    sizes = {"vertices": template.shape.V, "faces": template.shape.F}
+    sizes |= {"dense_vertices": template.dense.V, "dense_faces": template.dense.F, "nodes": template.K}
+    about = {"radius": template.radius, "parts": list(template.label_names)}
+    about |= {name: getattr(template, name) for name in ("pose", "source", "licence", "hash")}
+    return {"kind": "template", "name": template.name} | sizes | about
 
 
 def _shown(value: Any) -> str:

@@ -2,76 +2,58 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-import typer
+from typer import Argument, Option
 
 from meshmatch.cli import words
 from meshmatch.cli.console import Console, Json, print_json
-from meshmatch.cli.options import FitOptions, RunOptions, grouped
-from meshmatch.cli.output_paths import check_chart, check_distinct, claimed
+from meshmatch.cli.options import FitOptions, RunOptions, grouped, output_option
+from meshmatch.cli.output_paths import check_outputs
 from meshmatch.errors import OptionError
+from meshmatch.outputs import folder_on_success, replace_on_success
 
 if TYPE_CHECKING:
-    from meshmatch.api.interpolation import Interpolation, InterpolationOptions
+    from meshmatch.api.interpolation import Interpolation
+
+Met = dict[float, str]
+"""Names of the shapes that are passed, by their times."""
 
 
 @dataclass(frozen=True)
 class SequenceOptions:
     """What the shapes between two shapes are."""
 
-    frames: Annotated[int, typer.Option("--frames", "-n", min=2, max=1000, help="Number of shapes.")] = 9
-    through: Annotated[
-        list[Path] | None, typer.Option(metavar="C", help="A shape to pass on the way; may be repeated.")
-    ] = None
-    start: Annotated[
-        float, typer.Option("--from", metavar="T", help="Time of the first shape; below 0 is before A.")
-    ] = 0.0
-    stop: Annotated[float, typer.Option("--to", metavar="T", help="Time of the last shape; above 1 is beyond B.")] = 1.0
-    mesh: Annotated[
-        Literal["source", "template"],
-        typer.Option(help="Mesh that moves: that of A, with all its detail, or the model's template."),
-    ] = "source"
-    blend: Annotated[
-        Literal["field", "codes"],
-        typer.Option(help="Blend the local rotation and stretch of the surface (field), or the network's codes."),
-    ] = "field"
-    place: Annotated[
-        Literal["auto", "files", "source"],
-        typer.Option(
-            help="Position, orientation and size of the shapes. files: from those of A's file to those of B's; "
-            "source: all as A; auto: files, unless the files seem to have different units."
-        ),
-    ] = "auto"
-    format: Annotated[Literal["ply", "obj", "off", "glb"], typer.Option(help="Format of the files in a folder.")] = (
-        "ply"
+    frames: int = Option(9, "--frames", "-n", min=2, max=1000, help="Number of shapes.")
+    through: list[Path] | None = Option(None, metavar="C", help="A shape to pass on the way; may be repeated.")
+    start: float = Option(0.0, "--from", metavar="T", help="Time of the first shape; below 0 is before A.")
+    stop: float = Option(1.0, "--to", metavar="T", help="Time of the last shape; above 1 is beyond B.")
+    mesh: Literal["source", "template"] = Option(
+        "source", help="Mesh that moves: that of A, with all its detail, or the model's template."
     )
-    plot: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Plot how well each shape keeps volume and distances: .png, .svg or .pdf."),
-    ] = None
-
-    def options(self) -> "InterpolationOptions":
-        """The same for the library."""
-        from meshmatch.api.interpolation import InterpolationOptions
-
-        return InterpolationOptions(self.start, self.stop, self.mesh, self.blend, self.place)
+    blend: Literal["field", "codes"] = Option(
+        "field", help="Blend the local rotation and stretch of the surface (field), or the network's codes."
+    )
+    place: Literal["auto", "files", "source"] = Option(
+        "auto",
+        help="Position, orientation and size of the shapes. files: from those of A's file to those of B's; "
+        "source: all as A; auto: files, unless the files seem to have different units.",
+    )
+    format: Literal["ply", "obj", "off", "glb"] = Option("ply", help="Format of the files in a folder.")
+    plot: Path | None = Option(
+        None, metavar="FILE", help="Plot how well each shape keeps volume and distances: .png, .svg or .pdf."
+    )
 
 
 @grouped
 def interpolate(
-    source: Annotated[Path, typer.Argument(metavar="A", help="The shape at time 0.")],
-    target: Annotated[Path, typer.Argument(metavar="B", help="The shape at time 1.")],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="OUT",
-            help="No suffix: a new folder with a file for each shape. .png: all shapes in a row. .html: a page with a "
-            "slider.",
-        ),
-    ],
+    *,
+    source: Path = Argument(..., metavar="A", help="The shape at time 0."),
+    target: Path = Argument(..., metavar="B", help="The shape at time 1."),
+    output: Path = output_option(
+        "OUT",
+        "No suffix: a new folder with a file for each shape. .png: all shapes in a row. .html: a page with a slider.",
+    ),
     sequence: SequenceOptions,
     how: FitOptions,
     run: RunOptions,
@@ -83,66 +65,55 @@ def interpolate(
     """
     from meshmatch.api import interpolation
     from meshmatch.models.registry import locate_model
-    from meshmatch.outputs import folder_on_success, replace_on_success
     from meshmatch.shapes.files import load_shape
 
     how.check()
-    kind = _kind(output)
-    plot = sequence.plot
-    check_chart(plot)
+    folder = output.suffix == "" or output.is_dir()
+    write = (
+        None if folder else {".png": _draw_strip, ".html": _write_page, ".htm": _write_page}.get(output.suffix.lower())
+    )
+    if not folder and write is None:
+        raise OptionError(
+            f"{output.name}: unsupported format for a sequence: {output.suffix}",
+            "give a name without a suffix for a folder (see --format), or one that ends in .png or .html",
+        )
     files = [source, *(sequence.through or []), target]
-    check_distinct([output, plot], files)
-    options = sequence.options()
+    check_outputs(files, output, chart=sequence.plot)
+    options = interpolation.InterpolationOptions(
+        sequence.start, sequence.stop, sequence.mesh, sequence.blend, sequence.place
+    )
     console = Console(run.quiet)
     # What cannot be written, a mistyped model and broken files are told before the long work.
-    claim = folder_on_success if kind == "folder" else replace_on_success
-    with claimed(plot) as plotted, claim(output) as temporary:
+    with (replace_on_success if write else folder_on_success)(output) as temporary:
         locate_model(how.model)
         shapes = [load_shape(file) for file in files]
         with console.progress() as report:
             result = interpolation.interpolate(
-                shapes, sequence.frames, options=options, model=how.model, config=how.config(), threads=run.threads,
-                progress=report,
+                shapes, sequence.frames, options=options, model=how.model, config=how.configs()[0],
+                threads=run.threads, progress=report,
             )  # fmt: skip
         for file, fit in zip(files, result.fits, strict=True):
             words.refuse_poor(run.strict, fit.verdict, (f"{file.name}: {words.why(fit.reasons)}",))
         met = dict(zip(result.times, [file.name for file in files], strict=True))
-        if plotted is not None:
-            _plot(plotted, result, met)
-        if kind == "folder":
+        if sequence.plot is not None:
+            _plot(sequence.plot, result, met)
+        if write is None:
             interpolation.save_folder(temporary, result, sequence.format)
         else:
-            (_draw_strip if kind == "strip" else _write_page)(temporary, result, met)
+            write(temporary, result, met)
     _tell(console, result, files, sequence.place)
     console.say(
         f"wrote {output}: {sequence.frames} shapes of {result.steps[0].shape.V} vertices, from time "
         f"{sequence.start:g} to {sequence.stop:g} ({result.seconds:.1f} s)"
     )
-    if plot is not None:
-        console.say(f"drew {plot}: how well each shape keeps volume and distances")
+    if sequence.plot is not None:
+        console.say(f"drew {sequence.plot}: how well each shape keeps volume and distances")
     if run.json:
-        print_json(
-            {"output": output, "plot": plot}
-            | _record(result, files)
-            | {"mesh": sequence.mesh, "blend": sequence.blend}
-            | how.record
-        )
+        chosen = {"mesh": sequence.mesh, "blend": sequence.blend}
+        print_json({"output": output, "plot": sequence.plot} | _record(result, files) | chosen | how.record)
 
 
-def _kind(output: Path) -> Literal["folder", "strip", "page"]:
-    if output.suffix == "" or output.is_dir():
-        return "folder"
-    if output.suffix.lower() == ".png":
-        return "strip"
-    if output.suffix.lower() in (".html", ".htm"):
-        return "page"
-    raise OptionError(
-        f"{output.name}: unsupported format for a sequence: {output.suffix}",
-        "give a name without a suffix for a folder (see --format), or one that ends in .png or .html",
-    )
-
-
-def _draw_strip(path: Path, result: "Interpolation", met: dict[float, str]) -> None:
+def _draw_strip(path: Path, result: "Interpolation", met: Met) -> None:
     """All shapes in a row, each with its time, or the name of the shape that is passed then."""
     from meshmatch.render.figures import Panel
     from meshmatch.render.picture import render_shapes
@@ -153,7 +124,7 @@ def _draw_strip(path: Path, result: "Interpolation", met: dict[float, str]) -> N
     render_shapes(panels, path)
 
 
-def _write_page(path: Path, result: "Interpolation", met: dict[float, str]) -> None:
+def _write_page(path: Path, result: "Interpolation", met: Met) -> None:
     """In one frame, that of the first shape: what moves in the files moves on the page."""
     from meshmatch.render.viewer.motion import write_motion
 
@@ -163,7 +134,7 @@ def _write_page(path: Path, result: "Interpolation", met: dict[float, str]) -> N
     write_motion(path, shapes, times, rotation=result.steps[0].rotation, met=met, title=title)
 
 
-def _plot(path: Path, result: "Interpolation", met: dict[float, str]) -> None:
+def _plot(path: Path, result: "Interpolation", met: Met) -> None:
     from meshmatch.render.charts import draw_lines
 
     times = [step.time for step in result.steps]
@@ -192,22 +163,11 @@ def _tell(console: Console, result: "Interpolation", files: list[Path], asked: s
 
 
 def _record(result: "Interpolation", files: list[Path]) -> Json:
-    return {
-        "shapes": [
-            {
-                "shape": str(file),
-                "time": round(moment, 9),
-                "verdict": fit.verdict,
-                "reasons": list(fit.reasons),
-                "up": fit.up,
-                "front": fit.front,
-            }
-            for file, moment, fit in zip(files, result.times, result.fits, strict=True)
-        ],
-        "place": result.place,
-        "vertices": result.steps[0].shape.V,
-        "frames": [step.record for step in result.steps],
-        "distance_to_target": round(result.to_target, 6),
-        "notes": list(result.notes),
-        "seconds": round(result.seconds, 3),
-    }
+    shapes = []
+    for file, time, fit in zip(files, result.times, result.fits, strict=True):
+        about = words.fit_record(str(file), fit)
+        del about["residual"], about["seconds"], about["seed"]
+        shapes.append(about | {"time": round(time, 9)})
+    record: Json = {"shapes": shapes, "place": result.place, "vertices": result.steps[0].shape.V}
+    record |= {"frames": [step.record for step in result.steps], "distance_to_target": round(result.to_target, 6)}
+    return record | {"notes": result.notes, "seconds": round(result.seconds, 3)}

@@ -7,6 +7,9 @@ import typer
 
 from meshmatch.cli import options
 from meshmatch.cli.console import Console, print_json, print_rows, print_text
+from meshmatch.errors import ModelError
+from meshmatch.models import card as cards
+from meshmatch.models import registry
 
 models = typer.Typer(
     help="List, show, add, remove and verify trained models.", no_args_is_help=True, rich_markup_mode=None
@@ -18,20 +21,13 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="The model's name.")]
 @models.command("list")
 def list_all(json: options.Json = False) -> None:
     """List built-in models and your own."""
-    from meshmatch.models.registry import list_models
-
-    entries = list_models()
+    entries = registry.list_models()
     if json:
+        keys = ("category", "created", "licence")
         record = [
-            {
-                "name": entry.name,
-                "built_in": entry.built_in,
-                "folder": str(entry.folder),
-                "category": entry.card.category if entry.card else None,
-                "created": entry.card.created if entry.card else None,
-                "licence": entry.card.licence if entry.card else None,
-                "problem": entry.problem,
-            }
+            {"name": entry.name, "built_in": entry.built_in, "folder": str(entry.folder)}
+            | {key: getattr(entry.card, key, None) for key in keys}
+            | {"problem": entry.problem}
             for entry in entries
         ]
         print_json({"models": record})
@@ -39,10 +35,10 @@ def list_all(json: options.Json = False) -> None:
     rows = [("NAME", "CATEGORY", "CREATED", "FROM", "LICENCE")]
     for entry in entries:
         where = "package" if entry.built_in else "own"
-        if entry.card is None:
-            rows.append((entry.name, "", "", where, "damaged"))
-        else:
-            rows.append((entry.name, entry.card.category, entry.card.created, where, entry.card.licence))
+        category, created, licence = ("", "", "damaged")
+        if entry.card is not None:
+            category, created, licence = entry.card.category, entry.card.created, entry.card.licence
+        rows.append((entry.name, category, created, where, licence))
     print_rows(rows)
     for entry in entries:
         if entry.problem:
@@ -55,11 +51,7 @@ def show(name: Name) -> None:
 
     It names template, data, licence, recipe, time, errors and hashes.
     """
-    from meshmatch.models.card import card_to_json
-    from meshmatch.models.registry import CARD, locate_model
-    from meshmatch.models.registry import read_card as read
-
-    print_text(card_to_json(read(locate_model(name) / CARD)))
+    print_text(cards.card_to_json(cards.read_card(registry.locate_model(name) / registry.CARD)))
 
 
 @models.command()
@@ -72,9 +64,7 @@ def add(
 
     It is checked first, and gets the name on its card.
     """
-    from meshmatch.models.registry import add_model
-
-    entry = add_model(folder, replace=replace)
+    entry = registry.add_model(folder, replace=replace)
     Console().say(f"added model {entry.name} to {entry.folder.parent}")
     if json:
         print_json({"added": entry.name, "folder": str(entry.folder)})
@@ -83,9 +73,7 @@ def add(
 @models.command()
 def remove(name: Name, json: options.Json = False) -> None:
     """Remove one of your own models."""
-    from meshmatch.models.registry import remove_model
-
-    remove_model(name)
+    registry.remove_model(name)
     Console().say(f"removed model {name}")
     if json:
         print_json({"removed": name})
@@ -99,20 +87,17 @@ def verify(
     json: options.Json = False,
 ) -> None:
     """Check that models are whole and unchanged."""
-    from meshmatch.errors import ModelError
-    from meshmatch.models.registry import list_models, verify_model
-
     checked: list[dict[str, str | None]] = []
-    for name in names or [entry.name for entry in list_models()]:
+    for name in names or [entry.name for entry in registry.list_models()]:
         try:
-            card = verify_model(name)
+            digest = registry.verify_model(name).weights_sha256
         except ModelError as error:
             checked.append({"name": name, "sha256": None, "problem": error.message})
             Console().trouble(name, error.message, error.hint)
         else:
-            checked.append({"name": name, "sha256": card.weights_sha256, "problem": ""})
+            checked.append({"name": name, "sha256": digest, "problem": ""})
             if not json:
-                print_text(f"{name}: ok, sha256 {card.weights_sha256}\n")
+                print_text(f"{name}: ok, sha256 {digest}\n")
     if json:
         print_json({"models": checked})
     wrong = sum(model["sha256"] is None for model in checked)

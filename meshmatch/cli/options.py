@@ -1,35 +1,59 @@
-"""Options that several verbs share: each group is spelled once, and `grouped` adds it to a verb's own options."""
+"""Options that several verbs share: each group is spelled once, and `grouped` adds it to a verb's own options.
+
+A group is built by `grouped` alone: the defaults of its fields are typer's descriptions of the options.
+"""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
-import typer
+from typer import Argument, Option
 
-from meshmatch.errors import OptionError
+from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.choices import Refine
 
 if TYPE_CHECKING:
-    from meshmatch.api.results import ConfidenceRule
+    from meshmatch.api.results import ConfidenceRule, MatchResult
     from meshmatch.arrays import Ints
+    from meshmatch.cli.console import Console
     from meshmatch.fitting.fit_config import FitConfig
+    from meshmatch.shapes.shape import Shape
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
-Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="The shape to match.")]
-Target = Annotated[Path, typer.Argument(metavar="TARGET", help="The shape it is matched to.")]
-Seed = Annotated[int, typer.Option(min=0, help="Random seed. The same seed gives the same result.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
-Threads = Annotated[int, typer.Option(min=1, help="Number of threads.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary; warnings stay.")]
-
-
+Source = Annotated[Path, Argument(metavar="SOURCE", help="The shape to match.")]
+Target = Annotated[Path, Argument(metavar="TARGET", help="The shape it is matched to.")]
+Seed = Annotated[int, Option(min=0, help="Random seed. The same seed gives the same result.")]
+Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout.")]
+Threads = Annotated[int, Option(min=1, help="Number of threads.")]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress and no summary; warnings stay.")]
+ErrorUnit = Literal["cm", "x100"]
+Truth = Annotated[
+    Path | None,
+    Option(
+        metavar="FILE",
+        help="True pairs, a source vertex and a target vertex a line (.txt .csv .npy); or one column: the "
+        "target vertex of every source vertex.",
+    ),
+]
+Points = Annotated[
+    tuple[Path, Path] | None,
+    Option(
+        metavar="FILE FILE",
+        help="The truth as two lists: vertices of SOURCE, and the same points as vertices of TARGET.",
+    ),
+]
 PAIRS_HELP = "Known pairs that the map must honour: a source vertex and a target vertex a line, counted from 0."
+
+
+def output_option(metavar: str, help: str) -> Any:
+    """The one option that every verb needs which writes."""
+    return Option(..., "--output", "-o", metavar=metavar, help=help)
 
 
 def check_axes(up: Axis | None, front: Axis | None) -> None:
@@ -38,52 +62,77 @@ def check_axes(up: Axis | None, front: Axis | None) -> None:
         raise OptionError(f"up ({up}) and front ({front}) lie along one axis", "choose two different axes")
 
 
-def _axis(help: str) -> Any:
-    return typer.Option(help=help, case_sensitive=False)
+def check_truth(truth: Path | None, points: tuple[Path, Path] | None) -> bool:
+    """Whether the truth is known; refuse to be told it twice (`OptionError`)."""
+    if truth is not None and points is not None:
+        raise OptionError("--truth and --points both give the truth", "choose one of them")
+    return truth is not None or points is not None
+
+
+def load_truth(truth: Path | None, points: tuple[Path, Path] | None, source: Shape) -> tuple[Ints, Ints] | None:
+    """True points on source and target, where they are known."""
+    import numpy as np
+
+    from meshmatch.maps.pairs import load_pairs, load_points
+
+    if points is not None:
+        return load_points(points[0]), load_points(points[1])
+    if truth is None:
+        return None
+    try:
+        return load_pairs(truth)
+    except InputError:
+        column = load_points(truth)  # its error is the one to tell: a column is the simpler form
+    if len(column) != source.V:
+        raise InputError(
+            f"{truth.name} has {len(column)} entries, but {source.name} has {source.V} vertices",
+            "a truth of one column has an entry for every vertex of the source",
+        )
+    return np.arange(source.V), column
 
 
 @dataclass(frozen=True)
 class FitOptions:
     """How a template is fitted."""
 
-    model: Annotated[
-        str, typer.Option(metavar="NAME", help="Model: a name (see `meshmatch models list`) or a model folder.")
-    ] = "human"
-    refine: Annotated[
-        Refine,
-        typer.Option(
-            help="Refinement of the fit. nodes: Gauss-Newton on the nodes; latent: search over the network's codes; "
-            "none: the network alone."
-        ),
-    ] = "nodes"
-    up: Annotated[Axis | None, _axis("Axis of the file that points up. Default: detect. With two shapes, of both.")] = (
-        None
+    model: str = Option("human", metavar="NAME", help="Model: a name (see `meshmatch models list`) or a model folder.")
+    refine: Refine = Option(
+        "nodes",
+        help="Refinement of the fit. nodes: Gauss-Newton on the nodes; latent: search over the network's codes; "
+        "none: the network alone.",
     )
-    front: Annotated[
-        Axis | None, _axis("Axis of the file that the shape faces. Default: detect. With two shapes, of both.")
-    ] = None
-    partial: Annotated[
-        bool | None,
-        typer.Option(
-            "--partial/--whole",
-            help="Treat shapes as partial scans (--partial) or as complete (--whole). Default: detect.",
-        ),
-    ] = None
+    up: Axis | None = Option(
+        None, help="Axis of the file that points up. Default: detect. With two shapes, of both.", case_sensitive=False
+    )
+    front: Axis | None = Option(
+        None,
+        help="Axis of the file that the shape faces. Default: detect. With two shapes, of both.",
+        case_sensitive=False,
+    )
+    partial: bool | None = Option(
+        None,
+        "--partial/--whole",
+        help="Treat shapes as partial scans (--partial) or as complete (--whole). Default: detect.",
+    )
     seed: Seed = 0
+
+    @property
+    def axes(self) -> tuple[tuple[Axis | None, Axis | None], ...]:
+        """Up and front of all shapes, or of each."""
+        return ((self.up, self.front),)
 
     def check(self) -> None:
         """Refuse up and front along one axis (`OptionError`), before anything is loaded."""
-        check_axes(self.up, self.front)
+        for up, front in self.axes:
+            check_axes(up, front)
 
-    def config(self) -> FitConfig:
-        """The same for the library."""
+    def configs(self) -> tuple[FitConfig, ...]:
+        """The same for the library, one for each of `axes`."""
         from meshmatch.fitting.fit_config import FitConfig
 
-        return FitConfig(refine=self.refine, seed=self.seed, up=self.up, front=self.front, partial=self._partial)
-
-    @property
-    def _partial(self) -> Literal["auto", "yes", "no"]:
-        return "auto" if self.partial is None else "yes" if self.partial else "no"
+        partial: Literal["auto", "yes", "no"] = "auto" if self.partial is None else "yes" if self.partial else "no"
+        plain = FitConfig(refine=self.refine, seed=self.seed, partial=partial)
+        return tuple(replace(plain, up=up, front=front) for up, front in self.axes)
 
     @property
     def record(self) -> dict[str, str | int]:
@@ -95,35 +144,31 @@ class FitOptions:
 class PairOptions(FitOptions):
     """How two shapes are matched."""
 
-    source_up: Annotated[Axis | None, _axis("Up axis of the first shape, where the two differ.")] = None
-    source_front: Annotated[Axis | None, _axis("Front axis of the first shape.")] = None
-    target_up: Annotated[Axis | None, _axis("Up axis of the second shape.")] = None
-    target_front: Annotated[Axis | None, _axis("Front axis of the second shape.")] = None
-    known_pairs: Annotated[Path | None, typer.Option("--landmarks", metavar="FILE", help=PAIRS_HELP)] = None
-
-    def check(self) -> None:
-        """Refuse axes that lie along one line (`OptionError`), before anything is loaded."""
-        for up, front in self._axes:
-            check_axes(up, front)
+    source_up: Axis | None = Option(
+        None, help="Up axis of the first shape, where the two differ.", case_sensitive=False
+    )
+    source_front: Axis | None = Option(None, help="Front axis of the first shape.", case_sensitive=False)
+    target_up: Axis | None = Option(None, help="Up axis of the second shape.", case_sensitive=False)
+    target_front: Axis | None = Option(None, help="Front axis of the second shape.", case_sensitive=False)
+    known_pairs: Path | None = Option(None, "--landmarks", metavar="FILE", help=PAIRS_HELP)
 
     @property
-    def _axes(self) -> tuple[tuple[Axis | None, Axis | None], tuple[Axis | None, Axis | None]]:
+    def axes(self) -> tuple[tuple[Axis | None, Axis | None], ...]:
         source = self.source_up or self.up, self.source_front or self.front
         return source, (self.target_up or self.up, self.target_front or self.front)
 
-    def pairs(self) -> tuple[Ints, Ints] | None:
-        """The known pairs, from their file."""
+    def match(self, source: Shape, target: Shape, run: RunOptions, console: Console) -> MatchResult:
+        """Match two shapes, with bars."""
         from meshmatch.maps.pairs import load_pairs
 
-        return None if self.known_pairs is None else load_pairs(self.known_pairs)
+        pairs = None if self.known_pairs is None else load_pairs(self.known_pairs)
+        from meshmatch.api.matching import match
 
-    def configs(self) -> tuple[FitConfig, FitConfig]:
-        """Those of source and target."""
-        from meshmatch.fitting.fit_config import FitConfig
-
-        source, target = self._axes
-        plain = FitConfig(refine=self.refine, seed=self.seed, partial=self._partial)
-        return replace(plain, up=source[0], front=source[1]), replace(plain, up=target[0], front=target[1])
+        with console.progress() as report:
+            return match(
+                source, target, model=self.model, config=self.configs(), landmarks=pairs, threads=run.threads,
+                progress=report,
+            )  # fmt: skip
 
     @property
     def given(self) -> list[str]:
@@ -137,7 +182,7 @@ class PairOptions(FitOptions):
 class RunOptions:
     """How a verb that takes long behaves."""
 
-    strict: Annotated[bool, typer.Option("--strict", help="Write nothing and exit with 1 if a fit is poor.")] = False
+    strict: bool = Option(False, "--strict", help="Write nothing and exit with 1 if a fit is poor.")
     json: Json = False
     threads: Threads = 2
     quiet: Quiet = False
@@ -147,15 +192,9 @@ class RunOptions:
 class RuleOptions:
     """What is written where the map is not to be trusted."""
 
-    fill: Annotated[
-        bool, typer.Option("--fill", help="Replace values of low confidence by those of their neighbours.")
-    ] = False
-    blank: Annotated[
-        str | None, typer.Option(metavar="VALUE", help="Or write VALUE there. Default: keep them as they are.")
-    ] = None
-    min_confidence: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Minimum confidence for a value to be trusted.")
-    ] = 0.3
+    fill: bool = Option(False, "--fill", help="Replace values of low confidence by those of their neighbours.")
+    blank: str | None = Option(None, metavar="VALUE", help="Or write VALUE there. Default: keep them as they are.")
+    min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for a value to be trusted.")
 
     def rule(self, blank: float | str | Sequence[float] | None = None) -> ConfidenceRule:
         """The same for the library; `blank` is what the text means."""
@@ -169,35 +208,23 @@ class RuleOptions:
 def grouped(verb: Callable[..., None]) -> Callable[..., None]:
     """A verb for typer: each parameter whose type is a group becomes the options of that group."""
     hints = get_type_hints(verb, include_extras=True)
-    groups = {name: hint for name, hint in hints.items() if isinstance(hint, type) and is_dataclass(hint)}
-    parameters, annotations = [], {}
+    groups: dict[str, Any] = {}
+    options: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(verb).parameters.items():
-        for each in _expanded(parameter, hints[name]):
-            parameters.append(each)
-            annotations[each.name] = each.annotation
+        if not is_dataclass(hints[name]):
+            options.append(parameter.replace(annotation=hints[name]))
+            continue
+        groups[name] = hints[name]
+        inside = get_type_hints(hints[name], include_extras=True)
+        for each in fields(hints[name]):
+            options.append(parameter.replace(name=each.name, default=each.default, annotation=inside[each.name]))
 
     @wraps(verb)
     def called(**given: Any) -> None:
         for name, group in groups.items():
-            own = [field.name for field in fields(group)]
-            given[name] = group(**{key: given.pop(key) for key in own})
+            given[name] = group(**{each.name: given.pop(each.name) for each in fields(group)})
         verb(**given)
 
-    called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    called.__annotations__ = annotations
+    called.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    called.__annotations__ = {each.name: each.annotation for each in options}
     return called
-
-
-def _expanded(parameter: inspect.Parameter, hint: Any) -> list[inspect.Parameter]:
-    if not (isinstance(hint, type) and is_dataclass(hint)):
-        return [parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY)]
-    types = get_type_hints(hint, include_extras=True)
-    return [
-        inspect.Parameter(
-            field.name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if field.default is MISSING else field.default,
-            annotation=types[field.name],
-        )
-        for field in fields(hint)
-    ]

@@ -1,40 +1,40 @@
-"""Output files, claimed before the work begins."""
+"""Output files, checked before the work begins."""
 
 import os
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from meshmatch.errors import OptionError
 from meshmatch.outputs import replace_on_success
 
 
-@contextmanager
-def claimed(path: Path | None) -> Iterator[Path | None]:
-    """`replace_on_success` for an output that may not be wanted."""
-    if path is None:
-        yield None
-        return
-    with replace_on_success(path) as temporary:
-        yield temporary
+def check_outputs(
+    inputs: Iterable[Path | None], *outputs: Path | None, picture: Path | None = None, chart: Path | None = None
+) -> None:
+    """Refuse, before the work, what could not be written after it. What is None is not wanted.
 
-
-def check_distinct(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
-    """Refuse an output that would replace an input, or another output (`OptionError`)."""
+    Raises
+    ------
+    OptionError
+        A picture that is not a PNG, a chart of an unknown kind; or an output, be it a picture or a chart, that would
+        replace an input or another output.
+    OutputError
+        The picture or the chart cannot be written. (Other outputs are claimed while the work is done.)
+    """
+    check_chart(chart)
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise OptionError(f"{picture.name}: a picture is a PNG", "end the name in .png")
     taken = {os.path.realpath(path): "is an input of this command" for path in inputs if path is not None}
-    for path in outputs:
+    for path in (*outputs, chart, picture):
         if path is None:
             continue
         real = os.path.realpath(path)  # Path.resolve refuses links that lead in a circle
         if real in taken:
             raise OptionError(f"cannot write {path}: it {taken[real]}", "choose another name for the output")
         taken[real] = "is an output of this command already"
-
-
-def check_png(path: Path | None) -> None:
-    """Refuse a picture that is not a PNG (`OptionError`)."""
-    if path is not None and path.suffix.lower() != ".png":
-        raise OptionError(f"{path.name}: a picture is a PNG", "end the name in .png")
+    for path in (chart, picture):
+        check_writable(path)
 
 
 def check_chart(path: Path | None) -> None:

@@ -1,37 +1,152 @@
-"""``meshmatch picture``."""
+"""``meshmatch picture`` and ``meshmatch view``: pictures of what is known about shapes, and the page of a map."""
 
-import os
+import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Literal
 
-import typer
+from typer import Argument, Option
 
-from meshmatch.cli import options, picture_options
+import meshmatch
+from meshmatch.cli import options, words
 from meshmatch.cli.console import Console, print_json
-from meshmatch.cli.output_paths import check_distinct, check_png
+from meshmatch.cli.output_paths import check_outputs
+from meshmatch.cli.transfer_options import Transfer, ViewMapOptions
+from meshmatch.errors import ModelError, OptionError
 
 if TYPE_CHECKING:
-    from meshmatch.cli.picture_options import Subject
+    from meshmatch.render.compose import Composition
+    from meshmatch.render.picture import Look
+    from meshmatch.shapes.appearance import Appearance
+    from meshmatch.shapes.shape import Shape
+    from meshmatch.templates.template import Template
+
+View = Literal["quarter", "front", "left", "right", "back", "above"]
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """What is shown."""
+
+    map: Path | None = Option(
+        None, metavar="MAP", help="Of two shapes, SOURCE TARGET, a map: matched places in one colour."
+    )
+    confidence: bool = Option(False, "--confidence", help="With --map: its confidence, as a color map.")
+    truth: options.Truth = None
+    points: options.Points = None
+    unit: options.ErrorUnit = Option("cm", help="Of errors: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100.")
+    values: list[Path] | None = Option(
+        None,
+        metavar="FILE",
+        help="A number per vertex, as a color map (.npy .csv); or three, as a colour. Once for each shape.",
+    )
+    title: str | None = Option(None, metavar="TEXT", help="What the numbers of --values are, with their unit.")
+    range: tuple[float, float] | None = Option(
+        None, metavar="LOW HIGH", help="Ends of the scale of a heat; chosen if not given."
+    )
+    labels: list[Path] | None = Option(
+        None, metavar="FILE", help="A label for each vertex or face (.npy .csv .txt .json). Once for each shape."
+    )
+    on: Literal["vertices", "faces"] | None = Option(
+        None, help="What the labels belong to; told by their count if not given."
+    )
+    fit: str | None = Option(
+        None,
+        metavar="MESH|MODEL",
+        help="Over one shape: the template that `meshmatch register` laid on it, or a model whose template is "
+        "laid on it now. The distance is drawn as a color map.",
+    )
+    image: Path | None = Option(
+        None, metavar="FILE", help="A texture for a shape whose file names none, or another one."
+    )
+    plain: bool = Option(False, "--plain", help="Without textures, colours and nodes.")
+    seed: options.Seed = 0
+
+    @property
+    def files(self) -> list[Path | None]:
+        """All that is read beside the shapes."""
+        lists = [*(self.values or []), *(self.labels or []), *(self.points or ())]
+        return [self.map, self.image, self.truth, None if self.fit is None else Path(self.fit), *lists]
+
+    def check(self, count: int) -> None:
+        """Refuse what does not go together, for so many shapes (`OptionError`)."""
+        known = options.check_truth(self.truth, self.points)
+        each = {"--values": self.values, "--labels": self.labels}
+        single = {"--fit": self.fit, "--image": self.image}
+        modes = {"--map": self.map, **each, **single, "--plain": self.plain}
+        chosen = [name for name, given in modes.items() if given]
+        if len(chosen) > 1:
+            raise OptionError(f"{' and '.join(chosen)} do not go together", "make a picture for each")
+        if self.map is not None and count != 2:
+            raise OptionError(f"a map is of two shapes, not of {count}", "name the source, then the target")
+        if self.map is None and (self.confidence or known):
+            who = "--confidence needs" if self.confidence else "--truth and --points need"
+            raise OptionError(f"{who} a map", "add --map")
+        if self.confidence and known:
+            raise OptionError("--confidence and the truth both color the shapes", "make a picture for each")
+        for name, files in each.items():
+            if files and len(files) != count:
+                raise OptionError(f"{count} shapes need {name} {count} times, not {len(files)}")
+        for name, given in single.items():
+            if given is not None and count != 1:
+                raise OptionError(f"{name} is for one shape, not for {count}")
+        if self.on is not None and not self.labels:
+            raise OptionError("--on needs --labels", "give the labels, or leave out --on")
+        if self.title is not None and not self.values:
+            raise OptionError("--title needs --values", "give the values, or leave out --title")
+        if self.range is not None and not (self.values or self.fit or known):
+            raise OptionError("--range needs a color scale", "it goes with --values, --truth, --points and --fit")
+
+
+@dataclass(frozen=True)
+class LookOptions:
+    """How it is shown."""
+
+    view: View = Option("quarter", help="The side that is shown.")
+    up: options.Axis | None = Option(None, help="The files' axis that points up. Guessed if not given.")
+    front: options.Axis | None = Option(None, help="The files' axis that the shapes face. Guessed if not given.")
+    size: str | None = Option(
+        None, metavar="WxH", help="Width and height in pixels, such as 1200x800. Fitted if not given."
+    )
+    background: str = Option("white", metavar="COLOR", help="white, dark, transparent, or a colour such as #e8f0f8.")
+    ground: bool = Option(True, "--ground/--no-ground", help="Whether shadows fall.")
+
+    def look(self) -> "Look":
+        """The same for the library."""
+        from meshmatch.render.layout import VIEWS
+        from meshmatch.render.picture import Look
+
+        options.check_axes(self.up, self.front)
+        return Look(_size(self.size), self.background, self.up, self.front, *VIEWS[self.view], self.ground)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    """Width and height of words such as 1200x800 (`OptionError` if invalid)."""
+    if text is None:
+        return None
+    found = re.fullmatch("([0-9]+)x([0-9]+)", text.lower())
+    if found is None:
+        raise OptionError(f"invalid size '{text}'", "give width and height in pixels, such as 1200x800")
+    if max(map(len, found.groups())) > 9:
+        raise OptionError(f"a picture of {text} pixels is too large", "give a size such as 1200x800")
+    return int(found[1]), int(found[2])
 
 
 @options.grouped
 def picture(
-    shapes: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SHAPE...",
-            help="Shapes, side by side. A template bundle, or the name of a template or model, is drawn with its "
-            "nodes.",
-        ),
-    ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="PNG", help="The picture.")],
-    shown: picture_options.PictureOptions,
-    how: picture_options.LookOptions,
-    name: Annotated[
-        list[str] | None,
-        typer.Option(metavar="TEXT", help="Text below a shape, once for each. Default: the file's name."),
-    ] = None,
-    names: Annotated[bool, typer.Option("--names/--no-names", help="Write the names.")] = True,
+    *,
+    shapes: list[Path] = Argument(
+        ...,
+        metavar="SHAPE...",
+        help="Shapes, side by side. A template bundle, or the name of a template or model, is drawn with its nodes.",
+    ),
+    output: Path = options.output_option("PNG", "The picture."),
+    shown: PictureOptions,
+    how: LookOptions,
+    name: list[str] | None = Option(
+        None, metavar="TEXT", help="Text below a shape, once for each. Default: the file's name."
+    ),
+    names: bool = Option(True, "--names/--no-names", help="Write the names."),
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -39,41 +154,150 @@ def picture(
 
     A PNG without a GPU, a display or OpenGL. Textures and colours of the files are shown where there are any.
     """
-    from meshmatch.errors import OptionError
-    from meshmatch.outputs import replace_on_success
-
-    check_png(output)
     shown.check(len(shapes))
     if name and len(name) != len(shapes):
         raise OptionError(
             f"{len(shapes)} shapes need {len(shapes)} names, not {len(name)}", "give --name once for each shape"
         )
     look = how.look()
-    check_distinct([output], [*shapes, *shown.files])
+    check_outputs([*shapes, *shown.files], picture=output)
     console = Console(quiet)
-    with replace_on_success(output) as temporary:
-        subjects = [picture_options.load_subject(path, shown) for path in shapes]
-        made = picture_options.compose(shown, subjects, look, console)
-        labels = _labels(shapes, subjects, name, [panel.label for panel in made.panels])
-        made = made.named(labels if names else [""] * len(labels))
-        width, height = made.render(temporary, look)
+    subjects = [_load_subject(path, shown) for path in shapes]
+    made = _compose(shown, subjects, look, console)
+    labels = [panel.label for panel in made.panels]
+    own = [subject.name for subject in subjects]
+    for k, (before, given) in enumerate(zip(own, name or words.names_of(shapes, own), strict=True)):
+        if name or given != before:
+            labels[k] = labels[k].replace(before, given) if len(labels) > len(shapes) else given
+    width, height = made.named(labels if names else [""] * len(labels)).render(output, look)
     console.say(f"drew {output}: {made.caption} ({width} x {height} pixels)")
     if json:
         record = {"output": output, "shapes": [str(path) for path in shapes], "shows": made.caption}
         print_json(record | {"width": width, "height": height} | made.record)
 
 
-def _labels(paths: list[Path], subjects: "list[Subject]", names: list[str] | None, labels: list[str]) -> list[str]:
-    """The words below the panels with the names that the user gave; files of one name get their folders."""
-    files: dict[str, set[str]] = {}
-    for path, subject in zip(paths, subjects, strict=True):
-        files.setdefault(subject.name, set()).add(os.path.realpath(path))
-    for k, (path, subject) in enumerate(zip(paths, subjects, strict=True)):
-        if names:
-            given = names[k]
-        elif len(files[subject.name]) > 1:
-            given = str(path)
-        else:
-            continue
-        labels[k] = labels[k].replace(subject.name, given) if len(labels) > len(paths) else given
-    return labels
+@dataclass(frozen=True)
+class Subject:
+    """A shape that was named, with its textures or colors if it has any, and its template if it is one."""
+
+    name: str
+    shape: "Shape"
+    appearance: "Appearance | None" = None
+    template: "Template | None" = None
+
+
+def _load_subject(path: Path, shown: PictureOptions) -> Subject:
+    """Read a shape, or a template by its file or name, or that of a model."""
+    from meshmatch.shapes.textured_files import find_appearance
+
+    template = _template(path)
+    if template is not None:
+        return Subject(template.name, template.shape, None, template)
+    shape = meshmatch.load_shape(path)
+    textured = not (shown.plain or shown.map or shown.values or shown.labels or shown.fit)
+    return Subject(path.name, shape, find_appearance(path, shape, shown.image) if textured else None)
+
+
+def _template(path: Path) -> "Template | None":
+    from meshmatch.models.registry import TEMPLATE, locate_model
+    from meshmatch.templates.location import bundled_folder
+    from meshmatch.templates.template import load_template
+
+    if path.suffix.lower() == ".safetensors":
+        return load_template(path)
+    if path.is_file() or path.suffix:
+        return None
+    bundle = bundled_folder() / "human" / f"{path.name}.safetensors"
+    if len(path.parts) == 1 and bundle.is_file():
+        return load_template(bundle)
+    try:
+        return load_template(locate_model(str(path)) / TEMPLATE)
+    except ModelError:
+        return None  # a missing shape is told as such
+
+
+def _compose(shown: PictureOptions, subjects: list[Subject], look: "Look", console: Console) -> "Composition":
+    """Read what the options name, and compose the picture of it."""
+    from meshmatch.render.compose import compose_labels, compose_shapes, compose_values, merge_labels
+
+    shapes = [subject.shape for subject in subjects]
+    if shown.map is not None:
+        return _compose_map(shown, shown.map, shapes, look)
+    if shown.fit is not None:
+        return _compose_fit(shown, shown.fit, shapes[0], look, console)
+    if shown.values:
+        from meshmatch.transfer.value_files import load_values
+
+        tables = [load_values(*pair).numbers for pair in zip(shown.values, shapes, strict=True)]
+        colors = all(table.ndim == 2 and table.shape[1] > 1 for table in tables)
+        title = shown.title or ("" if colors else shown.values[0].stem)
+        return compose_values(shapes, tables, title, shown.range)
+    if shown.labels:
+        from meshmatch.transfer.label_files import load_labels
+
+        labels = [load_labels(*pair, shown.on) for pair in zip(shown.labels, shapes, strict=True)]
+        return compose_labels(shapes, *merge_labels(labels), [own.on == "faces" for own in labels])
+    return compose_shapes([(each.template or each.shape, each.appearance) for each in subjects], plain=shown.plain)
+
+
+def _compose_map(shown: PictureOptions, file: Path, shapes: "list[Shape]", look: "Look") -> "Composition":
+    from meshmatch.render.compose import compose_confidence, compose_errors, compose_match
+
+    source, target = shapes
+    found = meshmatch.load_map(file, source, target)
+    if shown.confidence:
+        return compose_confidence(source, target, found, look)
+    known = options.load_truth(shown.truth, shown.points, source)
+    if known is None:
+        return compose_match(source, target, found, look=look)
+    from meshmatch.maps.evaluate import map_errors
+    from meshmatch.maps.geodesics import GeodesicDistances
+
+    errors = map_errors(found.index, *known, GeodesicDistances(target))
+    return compose_errors(source, target, found, known, errors, shown.unit, shown.range, look)
+
+
+def _compose_fit(shown: PictureOptions, fit: str, shape: "Shape", look: "Look", console: Console) -> "Composition":
+    """The template over a shape, from the file of a fit or by a model, which is fitted now."""
+    from meshmatch.render.compose import compose_fit
+    from meshmatch.shapes.files import SUFFIXES
+
+    file = Path(fit)
+    if file.is_file() or file.suffix.lower() in SUFFIXES:
+        return compose_fit(shape, meshmatch.load_shape(file), limits=shown.range)
+    from meshmatch.models.registry import locate_model
+
+    locate_model(fit)
+    config = meshmatch.FitConfig(seed=shown.seed, up=look.up, front=look.front)
+    with console.progress() as report:
+        found = meshmatch.register(shape, model=fit, config=config, progress=report)
+    console.say(f"fitted the template of {fit} to {shape.name}: {words.fit_words(found)}")
+    fitted = meshmatch.Shape(found.points_in_file, found.faces, f"{fit} on {shape.name}")
+    return compose_fit(shape, fitted, found.frame.rotation, shown.range)
+
+
+@options.grouped
+def view(
+    *,
+    source: options.Source,
+    target: options.Target,
+    output: Path = options.output_option("PAGE", "The page: one .html file."),
+    maps: ViewMapOptions,
+    run: options.RunOptions,
+) -> None:
+    """Make a page that shows two shapes and the map between them.
+
+    Corresponding points have one colour; point at one shape and see the place on the other. The page is a single file
+    for any recent browser and needs no network. With --map, --up and --front give the orientation of SOURCE.
+    """
+    from meshmatch.render.viewer import check_page
+
+    check_page(output)
+    transfer = Transfer(source, target, output, maps, run)
+    with transfer.outputs() as (temporary,):
+        page = meshmatch.view(source, target, temporary, transfer, up=maps.up, front=maps.front, names=transfer.names)
+    for note in page.notes:
+        transfer.console.say(note)
+    transfer.console.say(f"wrote {output} ({page.size / 1e6:.1f} MB): open it in a browser")
+    record = {"drawn_vertices": list(page.drawn), "bytes": page.size}
+    transfer.print_record(record, page.maps, float(page.maps.forward.confidence.mean()))

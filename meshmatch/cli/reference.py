@@ -12,6 +12,11 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from typer.main import get_command
+
+import meshmatch
+from meshmatch.cli.app import app
+
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 CLI_HEAD = """# The command line
 
@@ -40,10 +45,6 @@ API = {
 
 def pages() -> Iterator[tuple[str, ...]]:
     """Every command, as the words after the program's name."""
-    from typer.main import get_command
-
-    from meshmatch.cli.app import app
-
     yield ()
     for verb, command in get_command(app).commands.items():  # type: ignore[attr-defined]
         yield (verb,)
@@ -55,30 +56,19 @@ def reference() -> str:
     """The commands as markdown. The same on every machine: the width of the terminal plays no part."""
     parts = [CLI_HEAD]
     for words in pages():
-        parts.append(f"## meshmatch {' '.join(words)}".rstrip() + f"\n\n```text\n{_help(words)}\n```\n")
+        heard = io.StringIO()
+        with contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit):
+            get_command(app)(args=[*words, "--help"], prog_name="meshmatch", terminal_width=100, color=False)
+        text = "\n".join(line.rstrip() for line in heard.getvalue().strip().splitlines())
+        parts.append(f"## {' '.join(('meshmatch', *words))}\n\n```text\n{text}\n```\n")
     return "\n".join(parts)
-
-
-def _help(words: Sequence[str]) -> str:
-    from typer.main import get_command
-
-    from meshmatch.cli.app import app
-
-    heard = io.StringIO()
-    with contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit):
-        get_command(app)(args=[*words, "--help"], prog_name="meshmatch", terminal_width=100, color=False)
-    return "\n".join(line.rstrip() for line in heard.getvalue().strip().splitlines())
 
 
 def api_reference() -> str:
     """The library as markdown: every public name with its signature and docstring."""
-    import meshmatch
-
     parts = [API_HEAD]
     for title, names in API.items():
-        parts.append(f"## {title}\n")
-        for name in names:
-            parts.append(_entry(name, getattr(meshmatch, name), "###"))
+        parts += [f"## {title}\n", *(_entry(name, getattr(meshmatch, name), "###") for name in names)]
     return "\n".join(parts)
 
 
@@ -86,15 +76,12 @@ def _entry(name: str, thing: object, level: str) -> str:
     text = f"{level} {name}\n\n```python\n{name}{_signature(thing)}\n```\n\n```text\n{inspect.getdoc(thing)}\n```\n"
     if not inspect.isclass(thing):
         return text
-    members = [
-        (key, value.__func__ if isinstance(value, classmethod | staticmethod) else value)
-        for key, value in vars(thing).items()
-        if not key.startswith("_")
-    ]
-    methods = [(key, value) for key, value in members if inspect.isfunction(value)]
-    properties = [_property(key, value.fget) for key, value in members if isinstance(value, property)]
-    if properties:
-        text += "\nProperties:\n\n" + "\n".join(properties) + "\n"
+    members = {key: value for key, value in vars(thing).items() if not key.startswith("_")}
+    lines = [_property(key, value.fget) for key, value in members.items() if isinstance(value, property)]
+    if lines:
+        text += "\nProperties:\n\n" + "\n".join(lines) + "\n"
+    functions = {key: getattr(value, "__func__", value) for key, value in members.items()}
+    methods = [(key, value) for key, value in functions.items() if inspect.isfunction(value)]
     return "\n".join([text, *(_entry(f"{name}.{key}", value, "####") for key, value in methods)])
 
 
@@ -120,8 +107,10 @@ def _signature(thing: object) -> str:
         if annotation is inspect.Parameter.empty:
             words.append(str(parameter))
             continue
-        default = "" if parameter.default is inspect.Parameter.empty else f" = {_default(parameter.default)}"
-        words.append(f"{parameter.name}: {_written(annotation)}{default}")
+        default = parameter.default
+        shown = f"{type(default).__name__}()" if hasattr(default, "__dataclass_fields__") else repr(default)
+        shown = "" if default is inspect.Parameter.empty else f" = {shown}"
+        words.append(f"{parameter.name}: {_written(annotation)}{shown}")
     back = signature.return_annotation
     end = "" if back in (inspect.Signature.empty, None, "None") else f" -> {_written(back)}"
     line = f"({', '.join(words)}){end}"
@@ -131,10 +120,6 @@ def _signature(thing: object) -> str:
 def _written(annotation: object) -> str:
     text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
     return text.replace("'", '"') if "[" in text else text.strip("'\"")
-
-
-def _default(value: object) -> str:
-    return f"{type(value).__name__}()" if hasattr(value, "__dataclass_fields__") else repr(value)
 
 
 def main(arguments: Sequence[str]) -> int:

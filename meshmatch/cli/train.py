@@ -1,45 +1,181 @@
-"""``meshmatch train``."""
+"""``meshmatch prepare`` and ``meshmatch train``: shapes made ready, and a model that is learned from them."""
 
 import os
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from typer import Argument, Option
 
 from meshmatch.cli import options
-from meshmatch.cli import training_options as given
 from meshmatch.cli.console import Console, print_json
 from meshmatch.cli.output_paths import check_chart, check_writable
+from meshmatch.errors import needs
 from meshmatch.outputs import make_folder
+from meshmatch.threads import set_threads
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from meshmatch.training.loop import StepReport
 
 
+@dataclass(frozen=True)
+class PrepareOptions:
+    """How shapes are made ready."""
+
+    template: str | None = Option(
+        None,
+        metavar="SHAPE",
+        help="The shape that becomes the template: a name in the folder, or any mesh or cloud. Default: the folder's "
+        "first where all are registered, else the one nearest to all others.",
+    )
+    align: Literal["none", "near", "rigid"] | None = Option(
+        None,
+        help="How shapes are turned to the template, now and when fitted: as they are given, a little, or from any "
+        "orientation. Default: near where they are registered and stand alike, else rigid.",
+    )
+    scale: Literal["area", "sphere"] = Option(
+        "area", help="What is made equal to the template's: surface area, or the radius around the centroid."
+    )
+    landmarks: str | None = Option(
+        None,
+        metavar="WHERE",
+        help="Known points of the shapes: a folder of NAME.npy, or a suffix beside them such as .landmarks.npy "
+        "(docs/formats.md).",
+    )
+    strategy: Literal["parts", "spectral", "geodesic", "uniform"] = Option(
+        "geodesic",
+        help="Which nodes are rejected: those between two parts (needs --labels), between two spectral clusters, near "
+        "two points far apart along the surface, or none.",
+    )
+    labels: Path | None = Option(
+        None, metavar="FILE", help="The part of every vertex of a single shape: one number a line, from 0."
+    )
+    nodes: int = Option(320, min=4, max=10_000, help="Number of control nodes.")
+    radius: float = Option(0.13, min=1e-6, help="Support radius of a node, in units of sqrt(surface area).")
+    faces: int = Option(10_000, min=100, help="Triangles of the low resolution.")
+    decimate: Literal["fast", "meshlab"] = Option(
+        "fast",
+        help="How the low resolution is made: fast, or slowly with better triangles by MeshLab (extra `meshlab`).",
+    )
+    seed: options.Seed = 0
+
+
+@options.grouped
+def prepare(
+    *,
+    shapes: Path = Argument(..., metavar="SHAPES", help="A folder of shapes, or the one shape of a template."),
+    output: Path = options.output_option("FOLDER", "The output folder; made if needed."),
+    how: PrepareOptions,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Make a template, and shapes to learn from.
+
+    A folder's shapes are checked, normalised, decimated and brought to the template's position, size and orientation.
+    `meshmatch train --shapes FOLDER` learns from them: from their correspondence if all share the template's vertices
+    and triangles, else without one. Writes template.safetensors, a picture of the nodes (nodes.png) and, from a
+    folder, shapes.safetensors, points.safetensors, normalised/ and prepared.json.
+    """
+    from meshmatch.maps.pairs import load_points
+    from meshmatch.render.compose import compose_shapes
+    from meshmatch.templates.nodes import NodeConfig
+    from meshmatch.templates.prepare import PrepareConfig
+    from meshmatch.templates.prepare import prepare as prepare_shapes
+
+    console = Console(quiet)
+    parts = None if how.labels is None else load_points(how.labels)
+    nodes = NodeConfig(how.strategy, how.nodes, how.radius, seed=how.seed)
+    config = PrepareConfig(nodes, how.faces, how.decimate, how.template, how.align, how.scale, how.landmarks, parts)
+    with console.progress() as progress:
+        made = prepare_shapes(shapes, output, config, progress)
+    found: dict[str, object] = {}
+    if shapes.is_dir():
+        found = {"align": made.align, "scale": how.scale, "landmarks": made.landmarks}
+    template, registered, picture = made.template, len(made.shapes), output / "nodes.png"
+    compose_shapes([(template, None)]).render(picture)
+    for note in made.notes:
+        console.say(note)
+    console.say(
+        f"wrote {output}: a template of {template.shape.V} vertices and {template.K} nodes"
+        + (f", {registered} registered shapes" if registered else "")
+        + (f", {len(made.names)} shapes without correspondence" if found and not registered else "")
+        + (f", {made.landmarks} known points" if made.landmarks else "")
+        + f"; look at {picture}"
+    )
+    if json:
+        record = {"output": output, "template": template.name, "template_hash": template.hash}
+        record |= {"vertices": template.shape.V, "nodes": template.K, "shapes": made.names, "registered": registered}
+        print_json(record | found | {"notes": made.notes})
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """What is learned, and how."""
+
+    template: str = Option(
+        "human-T", metavar="NAME", help="A bundled template (human-T, human-A, human-I), or a bundle's file."
+    )
+    shapes: Path | None = Option(
+        None,
+        metavar="FOLDER",
+        help="Learn from a folder that `meshmatch prepare` made, with its template. Default: generated human bodies "
+        "(needs the extra `train`).",
+    )
+    unsupervised: bool = Option(
+        False,
+        "--unsupervised",
+        help="Learn without correspondence even if the shapes are registered; others always are.",
+    )
+    preset: Literal["default", "paper"] = Option(
+        "default", help="The recipe: what measured best, or the paper's network, losses and rates."
+    )
+    field: Literal["mls", "rbf", "pointwise"] = Option(
+        "mls",
+        help="How a deformation is represented: by moving least squares or radial basis functions of nodes, or by a "
+        "network at every point, which is slow (--refine nodes then refines its code).",
+    )
+    start: str | None = Option(
+        None, metavar="MODEL", help="Begin with the weights of a trained model of the same template and preset."
+    )
+    rate: float | None = Option(None, min=0.0, help="Learning rate; default: the preset's.")
+    blend: float | None = Option(
+        None,
+        metavar="WEIGHT",
+        min=0.0,
+        help="Weight of volume and rigidity between two codes: the paper's l4, 1 for models that interpolate by codes. "
+        "Default: the preset's.",
+    )
+    stiffness: float = Option(
+        1.0,
+        min=1e-6,
+        help="How firmly two fits hold a common stretch of the template; written on the card. 1 suits bodies; 0.05 "
+        "what differs more from shape to shape, such as organs.",
+    )
+    name: str | None = Option(None, metavar="NAME", help="The model's name; default: the folder's.")
+    category: str | None = Option(None, help="What it matches; default: human, or the name of the folder of shapes.")
+    licence: str = Option("unstated", help="Terms of use of the weights; written on the card.")
+    steps: int | None = Option(None, min=1, help="Training steps; default: the preset's.")
+    minutes: float | None = Option(None, min=0.0, help="Stop after so many minutes; the same command goes on later.")
+    identities: int = Option(4096, min=1, help="How many different bodies are generated.")
+    poses: Path | None = Option(
+        None, metavar="FILE", help="Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md)."
+    )
+    pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
+    bf16: bool | None = Option(None, "--bf16/--no-bf16", help="bfloat16 arithmetic; default: the preset's choice.")
+    workers: int | None = Option(None, min=0, help="Processes that draw batches; default: the preset's.")
+    threads: options.Threads = 1
+    seed: options.Seed = 0
+    picture: Path | None = Option(
+        None, metavar="FILE", help="Draw the losses of this run over its steps: .png, .svg or .pdf."
+    )
+    fresh: bool = Option(False, "--fresh", help="Start anew instead of going on from the folder's checkpoint.")
+
+
+@options.grouped
 def train(
-    output: given.ModelFolder,
-    template: given.BodyTemplate = "human-T",
-    shapes: given.TrainingShapes = None,
-    unsupervised: given.Unsupervised = False,
-    preset: given.PresetOption = "default",
-    field: given.FieldOption = "mls",
-    start: given.Start = None,
-    rate: given.Rate = None,
-    blend: given.Blend = None,
-    stiffness: given.Stiffness = 1.0,
-    name: given.ModelName = None,
-    category: given.Category = None,
-    licence: given.Licence = "unstated",
-    steps: given.Steps = None,
-    minutes: given.Minutes = None,
-    identities: given.Identities = 4096,
-    poses: given.Poses = None,
-    pose_share: given.PoseShare = 0.5,
-    bf16: given.Bf16 = None,
-    workers: given.Workers = None,
-    threads: options.Threads = 1,
-    seed: options.Seed = 0,
-    picture: given.LossPicture = None,
-    fresh: given.Fresh = False,
+    *,
+    output: Path = options.output_option("FOLDER", "The model folder; also holds the checkpoint."),
+    how: TrainOptions,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -49,29 +185,25 @@ def train(
     command goes on from the checkpoint, exactly. On several GPUs:
     `torchrun --nproc-per-node N -m meshmatch train ...`.
     """
-    from meshmatch.errors import needs
-    from meshmatch.threads import set_threads
-
     with needs("torch", "train"):
         from meshmatch.training import train as training
         from meshmatch.training.bodies import Bodies
         from meshmatch.training.pose_files import load_poses
         from meshmatch.training.recipes import recipe_for
 
-    set_threads(threads)
-    check_chart(picture)
+    set_threads(how.threads)
+    check_chart(how.picture)
     make_folder(output)
-    check_writable(picture)
+    check_writable(how.picture)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
     console = Console(quiet or not first)
-    recipe = recipe_for(shapes, preset, unsupervised).changed(
-        field=field, blend=blend, rate=rate, steps=steps, minutes=minutes, bf16=bf16, workers=workers,
-        threads=threads, seed=seed,
-    )  # fmt: skip
-    known = None if poses is None else load_poses(poses, pose_share)
-    bodies = Bodies(template, identities, known) if shapes is None or known is not None else None
-    facts = training.CardFacts(name or "", category or "", "", licence, stiffness, start)
-    if not fresh and training.checkpoint_in(output).is_file():
+    settings = ("field", "blend", "rate", "steps", "minutes", "bf16", "workers", "threads", "seed")
+    recipe = recipe_for(how.shapes, how.preset, how.unsupervised)
+    recipe = recipe.changed(**{name: getattr(how, name) for name in settings})
+    known = None if how.poses is None else load_poses(how.poses, how.pose_share)
+    bodies = Bodies(how.template, how.identities, known) if how.shapes is None or known is not None else None
+    facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, how.start)
+    if not how.fresh and training.checkpoint_in(output).is_file():
         console.say(f"going on from the checkpoint in {output}; --fresh starts anew")
     reports: list[StepReport] = []
 
@@ -82,15 +214,15 @@ def train(
 
     with console.progress() as progress:
         training.train(
-            output, shapes=shapes, bodies=bodies, recipe=recipe, facts=facts, resume=not fresh,
+            output, shapes=how.shapes, bodies=bodies, recipe=recipe, facts=facts, resume=not how.fresh,
             progress=progress, report=report,
         )  # fmt: skip
     if first:
-        _picture(console, picture, reports)
-        _summary(console, output, recipe.train.steps, picture, json)
+        _picture(console, how.picture, reports)
+        _summary(console, output, recipe.train.steps, how.picture, json)
 
 
-def _picture(console: Console, picture: "Path | None", reports: "list[StepReport]") -> None:
+def _picture(console: Console, picture: Path | None, reports: "list[StepReport]") -> None:
     if picture is not None and not reports:
         console.say(f"{picture} was not drawn: the run ended before its first report")
     elif picture is not None:
@@ -103,7 +235,7 @@ def _picture(console: Console, picture: "Path | None", reports: "list[StepReport
         console.say(f"drew {picture}: the losses over the steps")
 
 
-def _summary(console: Console, output: "Path", steps: int, picture: "Path | None", json: bool) -> None:
+def _summary(console: Console, output: Path, steps: int, picture: Path | None, json: bool) -> None:
     from meshmatch.models.registry import CARD, read_card
 
     card = read_card(output / CARD)
@@ -114,13 +246,5 @@ def _summary(console: Console, output: "Path", steps: int, picture: "Path | None
     if card.steps < steps:
         console.say(f"unfinished: step {card.steps:,} of {steps:,}; the same command goes on")
     if json:
-        print_json(
-            {
-                "output": str(output),
-                "picture": None if picture is None else str(picture),
-                "model": card.name,
-                "steps": card.steps,
-                "training_minutes": card.training_minutes,
-                "metrics": card.metrics,
-            }
-        )
+        record = {"output": output, "picture": picture, "model": card.name, "steps": card.steps}
+        print_json(record | {"training_minutes": card.training_minutes, "metrics": card.metrics})

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from meshmatch.cli import words
-from meshmatch.cli.console import Console, Json
+from meshmatch.cli.console import Console, Json, print_json
 from meshmatch.cli.options import PAIRS_HELP, PairOptions, RunOptions
-from meshmatch.cli.output_paths import check_distinct, check_png, check_writable
+from meshmatch.cli.output_paths import check_outputs
 from meshmatch.errors import OptionError
 
 if TYPE_CHECKING:
@@ -22,28 +22,25 @@ if TYPE_CHECKING:
     from meshmatch.shapes.shape import Shape
     from meshmatch.transfer.low_confidence import LowConfidence
 
-Source = Annotated[Path, typer.Argument(metavar="SRC", help="Shape to transfer from.")]
-Target = Annotated[Path, typer.Argument(metavar="TGT", help="Shape to transfer to.")]
-Picture = Annotated[Path | None, typer.Option(metavar="PNG", help="Draw both shapes with what was transferred.")]
+Source = Annotated[Path, Argument(metavar="SRC", help="Shape to transfer from.")]
+Target = Annotated[Path, Argument(metavar="TGT", help="Shape to transfer to.")]
+Picture = Annotated[Path | None, Option(metavar="PNG", help="Draw both shapes with what was transferred.")]
 
 
 @dataclass(frozen=True)
 class MapOptions(PairOptions):
     """A map from a file, or how the shapes are matched."""
 
-    map: Annotated[
-        Path | None,
-        typer.Option(
-            "--map", metavar="MAP", help="Map from SRC to TGT that `meshmatch match` wrote. Default: match them."
-        ),
-    ] = None
+    map: Path | None = Option(
+        None, "--map", metavar="MAP", help="Map from SRC to TGT that `meshmatch match` wrote. Default: match them."
+    )
 
 
 @dataclass(frozen=True)
 class MapOptionsWithPairs(MapOptions):
     """The same for a verb whose --landmarks are what it transfers."""
 
-    known_pairs: Annotated[Path | None, typer.Option("--pairs", metavar="FILE", help=PAIRS_HELP)] = None
+    known_pairs: Path | None = Option(None, "--pairs", metavar="FILE", help=PAIRS_HELP)
 
 
 @dataclass(frozen=True)
@@ -55,39 +52,39 @@ class ViewMapOptions(MapOptions):
         return [name for name in super().given if name not in ("--up", "--front")]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Transfer:
     """One transfer between two files: calling it with the loaded shapes finds the maps and says so."""
 
     source: Path
     target: Path
+    output: Path
     options: MapOptions
     run: RunOptions
-    console: Console
+    picture: Path | None = None
 
-    @property
-    def names(self) -> list[str]:
-        """Names to show."""
-        return words.names_of([self.source, self.target])
+    def __post_init__(self) -> None:
+        self.console = Console(self.run.quiet)
+        self.names = words.names_of([self.source, self.target])
 
     @contextmanager
-    def outputs(
-        self, outputs: Sequence[Path], inputs: Sequence[Path | None], picture: Path | None = None
-    ) -> Iterator[list[Path]]:
-        """Temporary paths that become the outputs when all went well; what cannot be written is told before the work."""
+    def outputs(self, read: Path | None = None, files: Sequence[Path] = ()) -> Iterator[list[Path]]:
+        """Temporary paths that become the output, or its ``files``, when all went well.
+
+        What cannot be written, and options that do not go together, are told before the work; ``read`` is another input.
+        """
         from meshmatch.models.registry import locate_model
         from meshmatch.outputs import replace_on_success
 
+        files = files or [self.output]
         self.options.check()
         if self.options.map is not None and self.options.given:
             raise OptionError(
                 f"{self.options.given[0]} is for matching, and --map gives the match", "leave one of them out"
             )
-        check_distinct([*outputs, picture], [self.source, self.target, self.options.map, *inputs])
-        check_png(picture)
-        check_writable(picture)
+        check_outputs([self.source, self.target, self.options.map, read], *files, picture=self.picture)
         with ExitStack() as claims:  # the first is renamed last: it names the others
-            temporary = [claims.enter_context(replace_on_success(output)) for output in outputs]
+            temporary = [claims.enter_context(replace_on_success(file)) for file in files]
             if self.options.map is None:
                 locate_model(self.options.model)  # a mistyped name is told before the long work
             yield temporary
@@ -96,7 +93,10 @@ class Transfer:
         """The maps, from the file or by matching; judged if --strict was given."""
         from meshmatch.api.maps import find_maps
 
-        maps = find_maps(source, target, self.options.map or self._match)
+        def matched(a: Shape, b: Shape) -> MatchResult:
+            return self.options.match(a, b, self.run, self.console)
+
+        maps = find_maps(source, target, self.options.map or matched)
         found = maps.forward
         words.refuse_poor(self.run.strict, found.verdict, found.reasons)
         a, b = self.names
@@ -108,66 +108,35 @@ class Transfer:
         words.tell_verdict(self.console, found.verdict, found.reasons)
         return maps
 
-    def _match(self, source: Shape, target: Shape) -> MatchResult:
-        from meshmatch.api.matching import match
-
-        with self.console.progress() as report:
-            return match(
-                source,
-                target,
-                model=self.options.model,
-                config=self.options.configs(),
-                landmarks=self.options.pairs(),
-                threads=self.run.threads,
-                progress=report,
+    def tell_low(self, low: LowConfidence, minimum: float, what: str = "vertices") -> Json:
+        """Say how many values are not trusted and what became of them; the same for --json."""
+        kept = low.low - low.filled - low.blank
+        parts = (low.filled, "filled in from their neighbours"), (low.blank, "left blank"), (kept, "kept as they are")
+        became = ", ".join(f"{count} {done}" for count, done in parts if count > 0)
+        if low.low:
+            self.console.say(
+                f"{100.0 * low.low / low.total:.1f} % of the {what} ({low.low} of {low.total}) have no value to take, "
+                f"or less confidence than {minimum:g}: {became}"
             )
+        shares = {"min_confidence": minimum, "low_confidence": low.low, "low_confidence_share": low.low / low.total}
+        return shares | {"blank": low.blank, "filled": low.filled}
 
-    def draw(self, picture: Path | None, maps: MapPair, shown: Composition) -> None:
-        """Draw what was transferred, on both shapes, if a picture was asked for."""
-        from meshmatch.outputs import replace_on_success
+    def draw(self, maps: MapPair, shown: Composition) -> None:
+        """Draw what was transferred, on both shapes."""
         from meshmatch.render.facing import same_side
 
-        if picture is None:
-            return
+        assert self.picture is not None
         turns = same_side(maps.source, maps.target, maps.forward, maps.rotations)
-        with replace_on_success(picture) as temporary:
-            shown.rotated(turns).named(self.names).render(temporary)
-        self.console.say(f"drew {picture}: both shapes with what was transferred")
+        shown.rotated(turns).named(self.names).render(self.picture)
+        self.console.say(f"drew {self.picture}: both shapes with what was transferred")
 
-    def record(self, maps: MapPair, confidence: float) -> Json:
-        """What --json says of the map."""
-        record = words.map_record(maps.forward, self.names) | {
-            "map": None if self.options.map is None else str(self.options.map),
-            "confidence_mean": confidence,
-        }
+    def print_record(self, own: Json, maps: MapPair, confidence: float) -> None:
+        """With --json, what was done, and by which map."""
+        if not self.run.json:
+            return
+        record: Json = {"output": self.output} | own | words.map_record(maps.forward, self.names)
+        record["map"] = self.options.map
+        record["confidence_mean"] = confidence
         if maps.match is not None:
-            seconds = round(maps.match.seconds, 3)
-            record |= self.options.record | {"notes": list(maps.match.notes), "seconds": seconds}
-        return record
-
-
-def tell_low(console: Console, low: LowConfidence, minimum: float, what: str = "vertices") -> None:
-    """How many values are not trusted, and what became of them."""
-    if not low.low:
-        return
-    parts = [
-        (low.filled, "filled in from their neighbours"),
-        (low.blank, "left blank"),
-        (low.low - low.filled - low.blank, "kept as they are"),
-    ]
-    became = ", ".join(f"{count} {done}" for count, done in parts if count > 0)
-    console.say(
-        f"{100.0 * low.low / low.total:.1f} % of the {what} ({low.low} of {low.total}) have no value to take, or "
-        f"less confidence than {minimum:g}: {became}"
-    )
-
-
-def low_record(low: LowConfidence, minimum: float) -> Json:
-    """The same for --json."""
-    return {
-        "min_confidence": minimum,
-        "low_confidence": low.low,
-        "low_confidence_share": low.low / low.total,
-        "blank": low.blank,
-        "filled": low.filled,
-    }
+            record |= self.options.record | {"notes": list(maps.match.notes), "seconds": round(maps.match.seconds, 3)}
+        print_json(record)

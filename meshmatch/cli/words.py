@@ -18,12 +18,13 @@ if TYPE_CHECKING:
 _HINT = "is it the model's category? try --up and --front, or leave out --strict to see the result"
 
 
-def names_of(paths: Sequence[Path]) -> list[str]:
-    """Names to show: those of the files, with their folders where two files have the same."""
+def names_of(paths: Sequence[Path], names: Sequence[str] = ()) -> list[str]:
+    """Names to show, those of the files if none are given; where two files have the same, with their folders."""
+    names = names or [path.name for path in paths]
     real: dict[str, set[str]] = {}
-    for path in paths:
-        real.setdefault(path.name, set()).add(os.path.realpath(path))
-    return [path.name if len(real[path.name]) == 1 else str(path) for path in paths]
+    for path, name in zip(paths, names, strict=True):
+        real.setdefault(name, set()).add(os.path.realpath(path))
+    return [name if len(real[name]) == 1 else str(path) for path, name in zip(paths, names, strict=True)]
 
 
 def refuse_poor(strict: bool, verdict: str, reasons: Sequence[str]) -> None:
@@ -61,39 +62,21 @@ def tell_match(console: Console, result: MatchResult, names: Sequence[str]) -> N
 
 def fit_record(name: str, fit: Fit) -> Json:
     """A fit for --json."""
-    return {
-        "shape": name,
-        "verdict": fit.verdict,
-        "reasons": list(fit.reasons),
-        "residual": float(fit.residual),
-        "up": fit.up,
-        "front": fit.front,
-        "seconds": round(fit.seconds, 3),
-        "seed": fit.seed,
-    }
+    record = {"shape": name, "verdict": fit.verdict, "reasons": fit.reasons, "residual": float(fit.residual)}
+    return record | {"up": fit.up, "front": fit.front, "seconds": round(fit.seconds, 3), "seed": fit.seed}
 
 
 def map_record(found: VertexMap, names: Sequence[str]) -> Json:
     """A map for --json."""
-    return {
-        "source": names[0],
-        "target": names[1],
-        "source_vertices": found.source_vertices,
-        "target_vertices": found.target_vertices,
-        "verdict": found.verdict,
-        "reasons": list(found.reasons),
-    }
+    sizes = {"source_vertices": found.source_vertices, "target_vertices": found.target_vertices}
+    return {"source": names[0], "target": names[1]} | sizes | {"verdict": found.verdict, "reasons": found.reasons}
 
 
 def match_record(result: MatchResult, names: Sequence[str]) -> Json:
     """A match for --json."""
     from meshmatch.maps.vertex_map import DIRECTION
 
-    fits = zip(names, (result.source_fit, result.target_fit), strict=True)
-    return map_record(result.map, names) | {
-        "direction": DIRECTION,
-        "confidence_mean": float(result.map.confidence.mean()),
-        "notes": list(result.notes),
-        "fits": [fit_record(name, fit) for name, fit in fits],
-        "seconds": round(result.seconds, 3),
-    }
+    confidence = float(result.map.confidence.mean())
+    fits = [fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)]
+    about = {"direction": DIRECTION, "confidence_mean": confidence, "notes": result.notes, "fits": fits}
+    return map_record(result.map, names) | about | {"seconds": round(result.seconds, 3)}

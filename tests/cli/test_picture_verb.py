@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from meshmatch.cli.picture_options import PictureOptions
+from meshmatch.cli.picture import PictureOptions
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.files import save_map

@@ -1,0 +1,224 @@
+"""The verbs that transfer what vertices, faces or points have: colours, labels, skin weights, landmarks."""
+
+from pathlib import Path
+from typing import Literal
+
+from typer import Option
+
+import meshmatch
+from meshmatch.cli.options import RuleOptions, RunOptions, grouped, output_option
+from meshmatch.cli.transfer_options import MapOptions, MapOptionsWithPairs, Picture, Source, Target, Transfer
+from meshmatch.errors import InputError
+
+_FAR = 0.02  # of the size of a shape: a landmark this far from its surface is worth a warning
+On = Literal["vertices", "faces"]
+
+
+@grouped
+def transfer_color(
+    *,
+    source: Source,
+    target: Target,
+    output: Path = output_option(
+        "FILE", "TGT with colours: .ply .glb .obj .off, or the colours alone: .npy .csv. With --values: .npy .csv .ply."
+    ),
+    maps: MapOptions,
+    rules: RuleOptions,
+    run: RunOptions,
+    values: Path | None = Option(
+        None, metavar="FILE", help="Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colours."
+    ),
+    picture: Picture = None,
+) -> None:
+    """Transfer vertex colours, or other numbers per vertex.
+
+    They are interpolated within the faces of SRC. The VALUE of --blank is a number, one number for each column
+    (1,0,0), or a colour (#ff0000).
+    """
+    from meshmatch.transfer import colors
+    from meshmatch.transfer.value_files import Values, check_values_suffix, load_values, parse_blank, save_values
+
+    transfer = Transfer(source, target, output, maps, run, picture)
+    (colors.check_suffix if values is None else check_values_suffix)(output)
+    with transfer.outputs(values) as (temporary,):
+        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
+        given = None if values is None else load_values(values, a)
+        here = colors.light_of(a) if given is None else given.numbers
+        columns = 1 if here.ndim == 1 else here.shape[1]
+        rule = rules.rule(None if rules.blank is None else parse_blank(rules.blank, columns).tolist())
+        if given is None:
+            result = meshmatch.transfer_colors(a, b, transfer, rule=rule)
+            colors.save(temporary, b, result.data)
+        else:
+            result = meshmatch.transfer_values(a, b, given.numbers, transfer, rule=rule)
+            save_values(temporary, Values(result.data, given.names), b)
+    low = transfer.tell_low(result.low, rule.minimum)
+    what = "colours" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
+    transfer.console.say(f"wrote {output}: {what} for the {b.V} vertices of {transfer.names[1]}")
+    if picture is not None:
+        from meshmatch.render.compose import compose_light, compose_values
+
+        if given is None:
+            shown = compose_light((a, b), (here, colors.light(result.data)))
+        else:
+            title = given.names[0] if given.names else str(values and values.stem)
+            title += "" if columns == 1 else f" (the first of {columns} numbers)"
+            tables = [table if table.ndim == 1 else table[:, 0] for table in (here, result.data)]
+            shown = compose_values((a, b), tables, title)
+        transfer.draw(result.maps, shown)
+    transfer.print_record({"picture": picture, "columns": columns} | low, result.maps, float(result.confidence.mean()))
+
+
+@grouped
+def transfer_labels(
+    *,
+    source: Source,
+    target: Target,
+    output: Path = output_option("FILE", "Labels: .npy .csv .txt .json, or TGT as .ply."),
+    labels: Path = Option(
+        ..., metavar="FILE", help="A whole number or a word per vertex or face of SRC: .npy .csv .txt .json."
+    ),
+    maps: MapOptions,
+    rules: RuleOptions,
+    run: RunOptions,
+    on: On | None = Option(None, help="What the labels of FILE belong to. Default: told by their number."),
+    to: On | None = Option(None, help="What of TGT gets labels. Default: the same."),
+    picture: Picture = None,
+) -> None:
+    """Transfer labels of vertices or faces.
+
+    Labels are voted on and never averaged. The VALUE of --blank is a label, such as -1 or unknown; TGT also gets it
+    where SRC has no label.
+    """
+    import numpy as np
+
+    from meshmatch.transfer.label_files import check_labels_suffix, load_labels, save_labels
+
+    transfer = Transfer(source, target, output, maps, run, picture)
+    rule = rules.rule(rules.blank)
+    check_labels_suffix(output)
+    with transfer.outputs(labels) as (temporary,):
+        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
+        given = load_labels(labels, a, on)
+        result = meshmatch.transfer_labels(a, b, given, transfer, to=to, rule=rule)
+        found = result.data
+        save_labels(temporary, found, b)
+    low = transfer.tell_low(result.low, rule.minimum, found.on)
+    used = len(np.unique(found.codes))
+    transfer.console.say(
+        f"wrote {output}: {used} different labels on the {len(found.codes)} {found.on} of {transfer.names[1]}"
+    )
+    if picture is not None:
+        from meshmatch.render.compose import compose_labels
+
+        names = [str(name) for name in given.names]
+        theirs = np.where(found.codes < len(names), found.codes, -1)  # a blank comes after the names
+        faces = given.on == "faces", found.on == "faces"
+        transfer.draw(result.maps, compose_labels((a, b), (given.codes, theirs), names, faces))
+    record = {"picture": picture, "from": given.on, "to": found.on, "labels": used} | low
+    transfer.print_record(record, result.maps, float(result.maps.backward.confidence.mean()))
+
+
+@grouped
+def transfer_weights(
+    *,
+    source: Source,
+    target: Target,
+    output: Path = output_option("FILE", "Skin weights of TGT: .npz .json."),
+    maps: MapOptions,
+    run: RunOptions,
+    weights: Path | None = Option(
+        None, metavar="FILE", help="Skin weights of SRC: .npz .json .glb. Default: the skin in SRC."
+    ),
+    influences: int = Option(4, min=1, help="Maximum number of joints per vertex."),
+    fill: bool = Option(False, "--fill", help="Replace weights of low confidence by those of their neighbours."),
+    min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for weights to be trusted."),
+    picture: Picture = None,
+) -> None:
+    """Transfer skin weights.
+
+    They are interpolated within the faces of SRC; each vertex keeps its heaviest joints, and their weights sum to 1.
+    """
+    import numpy as np
+
+    from meshmatch.transfer.weight_files import check_weights_suffix, load_weights, save_weights
+
+    transfer = Transfer(source, target, output, maps, run, picture)
+    rule = meshmatch.ConfidenceRule(min_confidence, fill)
+    check_weights_suffix(output)
+    with transfer.outputs(weights) as (temporary,):
+        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
+        if weights is None and source.suffix.lower() not in (".glb", ".gltf"):
+            raise InputError(f"{a.name} has no skin weights", "give them in a file: --weights weights.npz")
+        given = load_weights(weights or source, a)
+        result = meshmatch.transfer_weights(a, b, given, transfer, influences=influences, rule=rule)
+        matrix = result.data.matrix
+        save_weights(temporary, result.data)
+    low = transfer.tell_low(result.low, min_confidence)
+    bare = int((np.diff(matrix.indptr) == 0).sum())
+    if bare:
+        transfer.console.warn(f"{bare} of the {b.V} vertices have no weights: no joint moves them on {a.name}")
+    used = len(np.unique(matrix.indices))
+    transfer.console.say(f"wrote {output}: weights of {used} joints for the {b.V} vertices of {transfer.names[1]}")
+    if picture is not None:
+        from meshmatch.render.compose import compose_labels
+        from meshmatch.transfer.attributes import most_votes
+
+        heaviest = most_votes(given.matrix), most_votes(matrix)
+        transfer.draw(result.maps, compose_labels((a, b), heaviest, given.names))
+    counts = {"picture": picture, "joints": len(given.names), "used_joints": used, "without_weights": bare}
+    transfer.print_record(counts | low, result.maps, float(result.confidence.mean()))
+
+
+@grouped
+def transfer_landmarks(
+    *,
+    source: Source,
+    target: Target,
+    output: Path = output_option("FILE", "Landmarks of TGT: .csv .json .pp."),
+    landmarks: Path = Option(
+        ...,
+        "--landmarks",
+        metavar="FILE",
+        help="Landmarks of SRC, as vertices or positions: .csv .json, MeshLab's .pp, or .txt .npy of vertices.",
+    ),
+    maps: MapOptionsWithPairs,
+    run: RunOptions,
+    min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Landmarks of less confidence are named."),
+    picture: Picture = None,
+) -> None:
+    """Transfer landmarks to exact points on the surface of another shape.
+
+    The output has for each: its vertex, its position, its face with barycentric weights, and its confidence (.csv,
+    .json); or name and position (.pp). A position in FILE stands for the nearest point of SRC.
+    """
+    import numpy as np
+
+    from meshmatch.transfer.landmarks import check_landmarks_suffix, load_landmarks, save_landmarks
+
+    transfer = Transfer(source, target, output, maps, run, picture)
+    console = transfer.console
+    check_landmarks_suffix(output)
+    with transfer.outputs(landmarks) as (temporary,):
+        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
+        given, furthest = load_landmarks(landmarks, a)
+        if furthest > _FAR * a.diagonal:
+            console.warn(
+                f"a landmark lies {furthest:.4g} from {a.name}, {100 * furthest / a.diagonal:.0f} % of its size: the "
+                "nearest point of the surface was taken"
+            )
+        result = meshmatch.transfer_landmarks(a, b, given, transfer, rule=meshmatch.ConfidenceRule(min_confidence))
+        found = result.data
+        save_landmarks(temporary, found)
+    low = np.flatnonzero(found.confidence < min_confidence)
+    for k in low[:10].tolist():
+        console.warn(f"landmark {found.names[k]} is uncertain: its confidence is {found.confidence[k]:.2f}")
+    if len(low) > 10:
+        console.warn(f"so are {len(low) - 10} more")
+    console.say(f"wrote {output}: {len(found.names)} landmarks on {transfer.names[1]}")
+    if picture is not None:
+        from meshmatch.render.compose import compose_points
+
+        transfer.draw(result.maps, compose_points((a, b), (given.points, found.points)))
+    counts = {"landmarks": len(found.names), "min_confidence": min_confidence, "low_confidence": len(low)}
+    transfer.print_record({"picture": picture} | counts, result.maps, float(result.maps.forward.confidence.mean()))
