@@ -122,7 +122,7 @@ def choose_shapes(model: TrainedModel, name: str, count: int, seed: int, data: P
         No pair of the set is among so few shapes.
     """
     if name == "bodies":
-        from meshmatch.training.bodies import unseen_bodies
+        from meshmatch.experiments.human_bodies import unseen_bodies
 
         bodies = unseen_bodies(model.template, count, model.card.seed, seed)
         return [Shape(verts, model.template.shape.faces, f"body {k}") for k, verts in enumerate(bodies)]

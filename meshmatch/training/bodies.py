@@ -9,7 +9,7 @@ import numpy as np
 import platformdirs
 import torch
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float
 from meshmatch.errors import OptionError
 from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress
@@ -17,7 +17,7 @@ from meshmatch.templates.template import Template
 from meshmatch.training.datasets import Source
 from meshmatch.training.pose_files import GivenPoses
 from meshmatch.training.poses import sample_free_pose
-from meshmatch.training.rig import RIG_VERSION, Rig, build_rig, load_rig, save_rig
+from meshmatch.training.rig import RIG_VERSION, Rig, build_rig, load_rig, save_rig, skin
 
 
 @dataclass(frozen=True)
@@ -49,18 +49,6 @@ def draw_identities(
     rest = torch.lerp(rig.rest[pick[0]].float(), rig.rest[pick[1]].float(), blend)
     heads = torch.lerp(rig.heads[pick[0]], rig.heads[pick[1]], blend)
     return rest, heads
-
-
-def skin(
-    rig: Rig,
-    rest: Float[torch.Tensor, "B V 3"],
-    world: Float[torch.Tensor, "B J 3 3"],
-    offset: Float[torch.Tensor, "B J 3"],
-) -> Float[torch.Tensor, "B V 3"]:
-    """Linear blend skinning: posed vertices."""
-    transforms = torch.cat([world.flatten(2), offset], -1)  # B J 12
-    blended = torch.einsum("vj,bjk->bvk", rig.weights, transforms)
-    return (blended[..., :9].unflatten(-1, (3, 3)) @ rest[..., None])[..., 0] + blended[..., 9:]
 
 
 def sample_bodies(
@@ -108,15 +96,6 @@ def human_source(
             "train on a prepared folder (--shapes), or use a human template",
         )
     return body_source(rig.restricted(keep, np.array(template.shape.faces)), poses)
-
-
-def unseen_bodies(template: Template, count: int, trained: int = 0, seed: int = 0) -> Float[Floats, "N V 3"]:
-    """So many generated bodies in metres on a human template's vertices, of people that a training never drew.
-
-    ``trained`` is the seed of that training: people are drawn with another one, and few of them.
-    """
-    other = trained + 1 + seed
-    return human_source(template, 64, other)(count, torch.Generator().manual_seed(other)).double().numpy()
 
 
 def cached_rig(identities: int, seed: int, progress: Progress | None = None) -> Rig:

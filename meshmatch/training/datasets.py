@@ -1,14 +1,23 @@
-"""Training batches, drawn statelessly: batch s is a function of (seed, s), which makes resuming exact."""
+"""Training batches, drawn statelessly: batch s is a function of (seed, s), which makes resuming exact.
+
+Registered shapes are scanned (`BatchDataset`); shapes without correspondence are known by samples (`CloudDataset`), which
+are smoothly deformed, a little turned, scaled and roughened.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Self
 
+import numpy as np
 import torch
 
-from meshmatch.arrays import Float, Int
+from meshmatch.arrays import Float, Floats, Int
+from meshmatch.fields.field import Field
+from meshmatch.fields.mls import build_field
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
+from meshmatch.templates.unregistered import ShapeSamples
 from meshmatch.training.scans import (
     ScanConfig,
     bump,
@@ -19,6 +28,10 @@ from meshmatch.training.scans import (
     small_rotations,
     yaw_rotations,
 )
+
+_SIDE = 4  # nodes of the lattice along each axis; this and the reach are set by hand
+_REACH = 1.9  # of a lattice node, in spacings
+_MAX_POINTS = 400_000  # for which a lattice is kept ready; with more shapes there is no need to deform them
 
 # Draws shapes with the template's connectivity: (count, generator) -> vertices (count, V, 3), any unit.
 Source = Callable[[int, torch.Generator], Float[torch.Tensor, "N V 3"]]
@@ -35,8 +48,15 @@ def step_generator(seed: int, step: int) -> torch.Generator:
     return torch.Generator().manual_seed((seed * 2_654_435_761 + step) % (2**63))
 
 
+class OnDevice:
+    """Dataclasses of tensors."""
+
+    def to(self, device: torch.device) -> Self:
+        return type(self)(**{n: v if v is None else v.to(device) for n, v in vars(self).items()})
+
+
 @dataclass(frozen=True, eq=False)
-class Batch:
+class Batch(OnDevice):
     """One training batch; lengths in units of sqrt(surface area).
 
     points : scan in a roughly right core frame
@@ -52,8 +72,9 @@ class Batch:
     align_rotation: Float[torch.Tensor, "B 3 3"] | None = None
     align_center: Float[torch.Tensor, "B 3"] | None = None
 
-    def to(self, device: torch.device) -> Batch:
-        return replace(self, **{n: v.to(device) for n, v in vars(self).items() if v is not None})
+
+def _features(encoder: BasisEncoder | PointEncoder | None, points: torch.Tensor) -> torch.Tensor:
+    return torch.zeros(len(points), 0) if encoder is None else encoder.features(points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +93,7 @@ class BatchDataset(torch.utils.data.Dataset):
     template_core: Float[torch.Tensor, "C 3"]
     core: Int[torch.Tensor, " C"]
     loss_points: Int[torch.Tensor, " M"]
-    encoder: BasisEncoder | PointEncoder
+    encoder: BasisEncoder | PointEncoder | None
     aligner: BasisEncoder | None
     scan: ScanConfig
     shapes: int = 32
@@ -108,7 +129,7 @@ class BatchDataset(torch.utils.data.Dataset):
             shift = 0.03 * torch.randn(B, 1, 3, generator=generator)
         in_core = (points - t[:, None]) @ turn.transpose(1, 2) + shift
         targets = (verts[:, self.loss_points] - t[:, None]) @ turn.transpose(1, 2) + shift
-        features = self.encoder.features(in_core)
+        features = _features(self.encoder, in_core)
         if self.aligner is None:
             return Batch(in_core, targets, features)
         # The aligner sees the scan centred on its own points and turned anywhere.
@@ -117,3 +138,143 @@ class BatchDataset(torch.utils.data.Dataset):
         turned = (points - middle) @ anywhere.transpose(1, 2)
         center = (anywhere @ (t - middle[:, 0])[..., None])[..., 0]
         return Batch(in_core, targets, features, self.aligner.features(turned), anywhere @ R, center)
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How much shapes are deformed from one drawing to the next; set by hand.
+
+    deform : standard deviation, in units of sqrt(surface area), of the vectors of a coarse lattice of nodes, whose field
+    deforms a shape smoothly; every shape draws how much of it. plain : share of the shapes that are not deformed.
+    """
+
+    deform: float = 0.08
+    plain: float = 0.25
+
+    def vectors(self, B: int, L: int, generator: torch.Generator) -> Float[torch.Tensor, "B L 3"]:
+        """Vectors of the lattice's nodes for a batch of shapes."""
+        size = self.deform * torch.rand(B, 1, 1, generator=generator)
+        size = size * (torch.rand(B, 1, 1, generator=generator) >= self.plain)
+        return size * torch.randn(B, L, 3, generator=generator)
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """A coarse field on every sample of N shapes, its gradient there, and the field on their landmarks."""
+
+    phi: Float[torch.Tensor, "N P L"]
+    gradient: Float[torch.Tensor, "N P 3 L"]
+    landmark_phi: Float[torch.Tensor, "N M L"]
+
+
+@dataclass(frozen=True, eq=False)
+class CloudBatch(OnDevice):
+    """One batch; lengths in units of sqrt(surface area), roughly the template's frame.
+
+    Landmarks that a shape lacks are NaN; ``encode_features`` are what the encoder reads of ``points``.
+    """
+
+    points: Float[torch.Tensor, "B P 3"]
+    normals: Float[torch.Tensor, "B P 3"]
+    landmarks: Float[torch.Tensor, "B L 3"]
+    encode_features: torch.Tensor
+
+
+def build_lattice(samples: ShapeSamples) -> Lattice | None:
+    """A lattice around all shapes and its field on their samples; None where there are so many that none is needed."""
+    N, P, _ = samples.points.shape
+    if N * P > _MAX_POINTS:
+        return None
+    known = np.nan_to_num(samples.landmarks)
+    everything = np.concatenate([samples.points.reshape(-1, 3), known.reshape(-1, 3)]).astype(np.float64)
+    field = _lattice_field(everything)
+    phi = field.phi.to_dense()
+    gradient = field.gradient.to_dense()[: 3 * N * P].reshape(N, P, 3, -1)
+    return Lattice(
+        phi[: N * P].reshape(N, P, -1), gradient, phi[N * P :].reshape(N, samples.landmarks.shape[1], field.K)
+    )
+
+
+def _lattice_field(points: Float[Floats, "N 3"]) -> Field:
+    """The field of a coarse lattice around all points, at them."""
+    low, high = points.min(0), points.max(0)
+    middle, half = 0.5 * (low + high), 0.55 * float((high - low).max())
+    ticks = np.linspace(-half, half, _SIDE)
+    lattice = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3) + middle
+    return Field.of(build_field(points, lattice, _REACH * float(ticks[1] - ticks[0]), "smooth"))
+
+
+def deformed_source(shapes: Float[torch.Tensor, "N V 3"], augmentation: Augmentation | None = None) -> Source:
+    """Registered shapes, drawn with replacement and smoothly deformed; all stand alike, in any unit.
+
+    So many that no change is needed (see `build_lattice`) are drawn as they are.
+    """
+    augmentation = augmentation or Augmentation()
+    N, V, _ = shapes.shape
+    if N * V > _MAX_POINTS or augmentation.deform <= 0:
+        return registered_source(shapes)
+    shapes = shapes - shapes.mean(1, keepdim=True)
+    shapes = 0.3 * shapes / shapes.flatten(1).std(1)[:, None, None]  # about area 1
+    phi = _lattice_field(shapes.reshape(-1, 3).double().numpy()).phi.to_dense().reshape(N, V, -1)
+
+    def draw(count: int, generator: torch.Generator) -> torch.Tensor:
+        which = torch.randint(N, (count,), generator=generator)
+        return shapes[which] + phi[which] @ augmentation.vectors(count, phi.shape[2], generator)
+
+    return draw
+
+
+@dataclass(frozen=True, eq=False)
+class CloudDataset(torch.utils.data.Dataset):
+    """Item s is the batch of training step s, a function of the seed and s alone."""
+
+    points: Float[torch.Tensor, "N P 3"]
+    normals: Float[torch.Tensor, "N P 3"]
+    landmarks: Float[torch.Tensor, "N L 3"]
+    lattice: Lattice | None
+    encoder: BasisEncoder | PointEncoder | None
+    scan: ScanConfig
+    augmentation: Augmentation
+    shapes: int = 8
+    seed: int = 0
+    length: int = 1
+
+    def __len__(self) -> int:
+        return self.length
+
+    @torch.no_grad()
+    def __getitem__(self, step: int) -> CloudBatch:
+        generator = step_generator(self.seed, step)
+        N, total, _ = self.points.shape
+        # Every shape once before one comes again, as far as a batch goes.
+        order = [torch.randperm(N, generator=generator) for _ in range(-(-self.shapes // N))]
+        which = torch.cat(order)[: self.shapes]
+        P = min(self.scan.points, total)
+        pick = torch.stack([torch.randperm(total, generator=generator)[:P] for _ in which])
+        rows = which[:, None]
+        points, normals, known = self.points[rows, pick], self.normals[rows, pick], self.landmarks[which]
+        B = len(which)
+        if self.lattice is not None and self.augmentation.deform > 0:
+            vectors = self.augmentation.vectors(B, self.lattice.phi.shape[2], generator)
+            points = points + self.lattice.phi[rows, pick] @ vectors
+            known = known + self.lattice.landmark_phi[which] @ vectors
+            slopes = self.lattice.gradient[rows, pick] @ vectors[:, None]  # B P k a: d u_a / d x_k
+            normals = deformed_normals(slopes.transpose(-1, -2) + torch.eye(3), normals)
+        turn = small_rotations(B, generator)
+        size = 1 + self.scan.scale * torch.randn(B, 1, 1, generator=generator).clamp(-2, 2)
+        shift = 0.02 * torch.randn(B, 1, 3, generator=generator)
+        points = size * points @ turn.transpose(1, 2) + shift
+        known = size * known @ turn.transpose(1, 2) + shift
+        normals = normals @ turn.transpose(1, 2)
+        sigma = self.scan.noise * torch.rand(B, 1, 1, generator=generator) ** 3
+        points = points + sigma * torch.randn(B, P, 3, generator=generator)
+        return CloudBatch(points, normals, known, _features(self.encoder, points))
+
+
+def deformed_normals(
+    F: Float[torch.Tensor, "*B 3 3"], normals: Float[torch.Tensor, "*#B 3"]
+) -> Float[torch.Tensor, "*B 3"]:
+    """Unit normals after a deformation with gradient F: its cofactors on the normals."""
+    a, b, c = F.unbind(-1)  # columns
+    cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -1)
+    return torch.nn.functional.normalize((cofactors @ normals[..., None])[..., 0], dim=-1)

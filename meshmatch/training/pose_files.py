@@ -21,9 +21,8 @@ import torch
 from meshmatch.arrays import Float, Floats32
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.input_files import read_npz
-from meshmatch.training.rig import Rig
+from meshmatch.training.rig import Rig, forward_kinematics
 from meshmatch.training.rotations import rotation_from_vector
-from meshmatch.training.skeleton import forward_kinematics
 
 MAX_BYTES = 60_000_000
 """A larger file is refused before it is read."""

@@ -6,15 +6,12 @@ are expressed in the axes of the rest pose (y up, facing +z, left at +x) about t
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 
 from meshmatch.arrays import Float
-from meshmatch.training.limbs import FOLDED, Draw, Limbs, Still, draw_arms, draw_limbs, mirrored, with_legs
-from meshmatch.training.rig import Rig
+from meshmatch.training.limbs import FOLDED, Draw, Limbs, draw_arms, draw_limbs, mirrored, with_legs
+from meshmatch.training.rig import Rig, forward_kinematics, penetration
 from meshmatch.training.rotations import DEGREE, rotation_between, rotation_from_vector, unit
-from meshmatch.training.skeleton import forward_kinematics, penetration
 
 
 def sample_free_pose(
@@ -50,9 +47,7 @@ def sample_pose(
     same_arms = (torch.rand(B, generator=generator) < 0.3) & (arms[0] != FOLDED)
     same_legs = torch.rand(B, generator=generator) < 0.35
     right = with_legs(mirrored(left, right, same_arms, draw), mirrored(left, right, same_legs, draw))
-
-    rotations_of = _pose_limbs(vectors, rig, heads, left, right, draw)
-
+    matrices = pose_limbs(vectors, rig, heads, left, right, draw)
     flex = draw.choice([0.6, 0.25, 0.15], [draw.normal(4, 10), draw.uniform(-30, 75), draw.normal(35, 20)])
     spine = torch.stack([flex, draw.normal(0, 20), draw.normal(0, 14)], -1) * DEGREE
     spine = spine * (0.6 + 0.8 * torch.rand(B, 1, generator=generator))
@@ -61,49 +56,37 @@ def sample_pose(
     neck = torch.stack([draw.normal(2, 18), draw.normal(0, 28), draw.normal(0, 14)], -1) * DEGREE
     for name, share in (("neck01", 0.3), ("neck02", 0.2), ("neck03", 0.2), ("head", 0.3)):
         vectors[:, joint(name)] = neck * share
+    return joint_rotations(vectors, matrices)
 
-    return rotations_of()
 
-
-def _pose_limbs(
-    vectors: torch.Tensor, rig: Rig, heads: torch.Tensor, left: Limbs, right: Limbs, draw: Draw
-) -> Callable[[], torch.Tensor]:
-    """Write both sides into ``vectors``; the returned function turns the finished vectors into matrices."""
-    extra: dict[int, torch.Tensor] = {}
+def pose_limbs(
+    vectors: Float[torch.Tensor, "B J 3"],
+    rig: Rig,
+    heads: Float[torch.Tensor, "B J 3"],
+    left: Limbs,
+    right: Limbs,
+    draw: Draw,
+) -> dict[int, Float[torch.Tensor, "B 3 3"]]:
+    """Write both sides into ``vectors``; returns the rotations of joints that are no single turn, for `joint_rotations`."""
+    matrices: dict[int, torch.Tensor] = {}
     for side, suffix, limbs in ((1.0, ".L", left), (-1.0, ".R", right)):
-        _pose_arm(vectors, extra, rig, heads, side, suffix, limbs, draw)
-        _pose_leg(vectors, extra, rig, heads, side, suffix, limbs, draw)
+        _pose_arm(vectors, matrices, rig, heads, side, suffix, limbs, draw)
+        _pose_leg(vectors, matrices, rig, heads, side, suffix, limbs, draw)
         _pose_hand(vectors, rig, heads, suffix, limbs, draw)
-
-    def finish() -> torch.Tensor:
-        rotations = rotation_from_vector(vectors)
-        for index, rotation in extra.items():
-            rotations[:, index] = rotation
-        return rotations
-
-    return finish
+    return matrices
 
 
-def still_pose(
-    rig: Rig, heads: Float[torch.Tensor, "B J 3"], arms: float, legs: float
+def joint_rotations(
+    vectors: Float[torch.Tensor, "B J 3"], matrices: dict[int, Float[torch.Tensor, "B 3 3"]]
 ) -> Float[torch.Tensor, "B J 3 3"]:
-    """Stand still with straight limbs: arms raised and legs spread by so many degrees."""
-    B, J = heads.shape[:2]
-    vectors = torch.zeros(B, J, 3)
-    angles = dict.fromkeys(Limbs.__dataclass_fields__, 0.0) | {
-        "arm_elevation": arms,
-        "arm_azimuth": 8.0,
-        "elbow": 4.0,
-        "hip_flexion": 2.0,
-        "hip_abduction": legs,
-        "knee": 2.0,
-        "curl": -0.15,
-    }
-    limbs = Limbs(**{name: torch.full((B,), angle) for name, angle in angles.items()})
-    return _pose_limbs(vectors, rig, heads, limbs, limbs, Still(B))()
+    """Rotation vectors as matrices; some joints have theirs already."""
+    rotations = rotation_from_vector(vectors)
+    for index, rotation in matrices.items():
+        rotations[:, index] = rotation
+    return rotations
 
 
-def _pose_arm(vectors, extra, rig, heads, side, suffix, limbs, draw) -> None:
+def _pose_arm(vectors, matrices, rig, heads, side, suffix, limbs, draw) -> None:
     joint = rig.joint
     upper, elbow, wrist = (heads[:, joint(name + suffix)] for name in ("upperarm01", "lowerarm01", "wrist"))
     rest_arm, rest_fore = unit(elbow - upper), unit(wrist - elbow)
@@ -111,16 +94,13 @@ def _pose_arm(vectors, extra, rig, heads, side, suffix, limbs, draw) -> None:
     target = torch.stack(
         [side * elevation.sin() * azimuth.cos(), -elevation.cos(), elevation.sin() * azimuth.sin()], -1
     )
-    swing = rotation_between(rest_arm, target)
     # The shoulder girdle takes part of every elevation.
-    share = draw.uniform(0.1, 0.3)[:, None]
-    clavicle = rotation_from_vector(swing * share)
+    clavicle = rotation_from_vector(rotation_between(rest_arm, target) * draw.uniform(0.1, 0.3)[:, None])
     local = (clavicle.transpose(1, 2) @ target[..., None])[..., 0]
-    extra[joint("clavicle" + suffix)] = clavicle
+    matrices[joint("clavicle" + suffix)] = clavicle
     twist = side * limbs.arm_twist[:, None] * DEGREE * rest_arm
-    extra[joint("upperarm01" + suffix)] = rotation_from_vector(
-        rotation_between(rest_arm, local)
-    ) @ rotation_from_vector(0.5 * twist)
+    swing = rotation_from_vector(rotation_between(rest_arm, local))
+    matrices[joint("upperarm01" + suffix)] = swing @ rotation_from_vector(0.5 * twist)
     vectors[:, joint("upperarm02" + suffix)] = 0.5 * twist
     hinge = torch.linalg.cross(rest_arm, rest_fore)
     rest_flexion = torch.asin(hinge.norm(dim=-1).clamp(max=1.0))
@@ -129,19 +109,18 @@ def _pose_arm(vectors, extra, rig, heads, side, suffix, limbs, draw) -> None:
     vectors[:, joint("wrist" + suffix)] = draw.normal3(16)
 
 
-def _pose_leg(vectors, extra, rig, heads, side, suffix, limbs, draw) -> None:
+def _pose_leg(vectors, matrices, rig, heads, side, suffix, limbs, draw) -> None:
     joint = rig.joint
     hip, knee, ankle = (heads[:, joint(name + suffix)] for name in ("upperleg01", "lowerleg01", "foot"))
     rest_thigh, rest_shin = unit(knee - hip), unit(ankle - knee)
     flexion, spread = limbs.hip_flexion * DEGREE, limbs.hip_abduction * DEGREE
     target = torch.stack([side * spread.sin(), -spread.cos() * flexion.cos(), spread.cos() * flexion.sin()], -1)
     # Flex first, then spread: a plain smallest rotation would roll the knee outwards.
-    flex = rotation_from_vector(torch.stack([-flexion, torch.zeros_like(flexion), torch.zeros_like(flexion)], -1))
+    flex = rotation_from_vector(-flexion[:, None] * torch.tensor([1.0, 0.0, 0.0]))
     flexed = (flex @ rest_thigh[..., None])[..., 0]
     twist = -side * limbs.hip_twist[:, None] * DEGREE * rest_thigh
-    extra[joint("upperleg01" + suffix)] = (
-        rotation_from_vector(rotation_between(flexed, target)) @ flex @ rotation_from_vector(0.5 * twist)
-    )
+    spreading = rotation_from_vector(rotation_between(flexed, target))
+    matrices[joint("upperleg01" + suffix)] = spreading @ flex @ rotation_from_vector(0.5 * twist)
     vectors[:, joint("upperleg02" + suffix)] = 0.5 * twist
     backward = torch.tensor([0.0, 0.0, -1.0]).expand_as(rest_thigh)
     hinge = unit(torch.linalg.cross(rest_thigh, backward))

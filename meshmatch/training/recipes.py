@@ -11,9 +11,8 @@ from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.checkpoint import Storage
 from meshmatch.models.config import PAPER, NetworkConfig
 from meshmatch.templates.registered import frame_of, is_registered
-from meshmatch.training.chamfer import ChamferLoss
 from meshmatch.training.loop import TrainConfig
-from meshmatch.training.losses import CorrespondenceLoss
+from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss
 from meshmatch.training.scans import ScanConfig
 
 Preset = Literal["default", "paper"]

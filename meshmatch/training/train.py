@@ -26,11 +26,9 @@ from meshmatch.templates.registered import frame_of, read_registered
 from meshmatch.templates.template import Template, read_template, save_template
 from meshmatch.templates.unregistered import ShapeSamples, read_samples
 from meshmatch.training.bodies import Bodies, human_source
-from meshmatch.training.chamfer import surface_error
-from meshmatch.training.clouds import deformed_source
-from meshmatch.training.datasets import Source, registered_source
+from meshmatch.training.datasets import Source, deformed_source, registered_source
 from meshmatch.training.loop import StepReport, Trainer
-from meshmatch.training.losses import validation_error
+from meshmatch.training.losses import surface_error, validation_error
 from meshmatch.training.recipes import Recipe, recipe_for
 from meshmatch.training.setup import (
     build_cloud_dataset,

@@ -10,7 +10,7 @@ import torch
 
 from meshmatch.api.inputs import validated
 from meshmatch.errors import OptionError
-from meshmatch.experiments import refinement
+from meshmatch.experiments import human_bodies, refinement
 from meshmatch.experiments.refinement import (
     METHODS,
     Answer,
@@ -26,7 +26,6 @@ from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
-from meshmatch.training import bodies as training
 from tests.experiments.small_bench import build
 from tests.fitting.eggs import egg_model
 from tests.training.small import bent_eggs
@@ -126,7 +125,7 @@ def test_the_command_on_bodies_and_a_set(
         return np.stack([shape.verts for shape in eggs(model, count)])
 
     monkeypatch.setattr(refinement, "as_model", lambda name: model)
-    monkeypatch.setattr(training, "unseen_bodies", bodies)
+    monkeypatch.setattr(human_bodies, "unseen_bodies", bodies)
     words = ["--sets", "bodies,scape", "--shapes", "2", "--steps", "3", "--model", "egg", "--seed", "4"]
     assert main([*words, "--data", str(small), "--cache", str(tmp_path)]) == 0
     lines = capsys.readouterr().out.strip().splitlines()

@@ -11,9 +11,9 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 from meshmatch.templates.unregistered import ShapeSamples
-from meshmatch.training.chamfer import ChamferLoss, chamfer, robust, surface_error
-from meshmatch.training.clouds import Augmentation, CloudDataset, build_lattice, deformed_normals, deformed_source
+from meshmatch.training.datasets import Augmentation, CloudDataset, build_lattice, deformed_normals, deformed_source
 from meshmatch.training.loop import TrainConfig, Trainer
+from meshmatch.training.losses import ChamferLoss, chamfer, robust, surface_error
 from meshmatch.training.recipes import Recipe
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.setup import build_cloud_dataset, build_cloud_deformer, build_surface_points

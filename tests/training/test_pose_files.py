@@ -14,8 +14,7 @@ from meshmatch.shapes import input_files
 from meshmatch.training import bodies, pose_files
 from meshmatch.training.bodies import sample_bodies
 from meshmatch.training.pose_files import GivenPoses, load_poses
-from meshmatch.training.rig import Rig
-from meshmatch.training.skeleton import forward_kinematics
+from meshmatch.training.rig import Rig, forward_kinematics
 from tests.training.small import egg_template
 from tests.training.stick import stick_figure
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from meshmatch.errors import InputError, OptionError, OutputError, TemplateError
+from meshmatch.experiments import human_bodies
 from meshmatch.models.registry import load_model, verify_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import save_shape
@@ -208,9 +209,9 @@ def test_unseen_bodies_are_of_people_that_the_training_never_drew(monkeypatch: p
         asked.append((identities, seed))
         return lambda count, generator: torch.rand(count, 5, 3, generator=generator)
 
-    monkeypatch.setattr(bodies, "human_source", source)
+    monkeypatch.setattr(human_bodies, "human_source", source)
     egg = egg_template()
-    drawn = [bodies.unseen_bodies(egg, 2, trained, seed) for trained, seed in ((0, 0), (0, 1), (7, 0), (0, 0))]
+    drawn = [human_bodies.unseen_bodies(egg, 2, trained, seed) for trained, seed in ((0, 0), (0, 1), (7, 0), (0, 0))]
     assert [seed for _, seed in asked] == [1, 2, 8, 1]
     assert all(identities < 4096 for identities, _ in asked)
     assert drawn[0].shape == (2, 5, 3)

