@@ -25,9 +25,9 @@ from meshmatch.render.compose import (
     compose_values,
     merge_labels,
 )
-from meshmatch.render.facing import facing
+from meshmatch.render.facing import facing, facing_alike
 from meshmatch.render.picture import Look
-from meshmatch.render.viewer import Looks, levelled, share_look, write_page
+from meshmatch.render.viewer import Looks, PageReport, share_look, write_page
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
 from meshmatch.shapes.shape import Shape
@@ -149,24 +149,9 @@ def _table(values: ArrayLike, shape: Shape) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Page:
-    """A page that was written.
+class Page(PageReport):
+    """A page that was written, and the maps that it shows."""
 
-    Attributes
-    ----------
-    drawn : (int, int)
-        How many vertices of each shape are drawn.
-    size : int
-        Bytes of the file.
-    notes : tuple of str
-        What was left out.
-    maps : MapPair
-        The maps that it shows.
-    """
-
-    drawn: tuple[int, int]
-    size: int
-    notes: tuple[str, ...]
     maps: MapPair
 
 
@@ -223,7 +208,7 @@ def view(
             looks=looks,
         )
     notes = tuple(each for each in (note, other_note) if each)
-    return Page(report.drawn, report.size, (*notes, *report.notes), maps)
+    return Page(report.drawn, (*notes, *report.notes), report.size, maps)
 
 
 def _rotations(
@@ -231,8 +216,12 @@ def _rotations(
 ) -> tuple[Floats | None, Floats | None]:
     """How the shapes stand: as they were fitted, if well; else the source as the user or its format says."""
     if maps.match is not None and maps.forward.verdict != "poor":
+        # The frame of a fit follows the trunk; what stands is to stay on its ground.
         first, second = maps.match.rotations
-        return levelled(maps.source, first), levelled(maps.target, second)
+        return (
+            facing_alike(maps.source, maps.source.verts, maps.source.verts @ first.T),
+            facing_alike(maps.target, maps.target.verts, maps.target.verts @ second.T),
+        )
     if up is not None or front is not None:
         return facing(maps.source, up, front), None
     if isinstance(source, str | Path) and Path(source).suffix.lower() in (".glb", ".gltf"):

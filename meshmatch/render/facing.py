@@ -35,12 +35,13 @@ def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Flo
     OptionError
         An axis other than x, y, z, -x, -y, -z, or the same axis twice.
     """
-    for name, axis in (("up", up), ("front", front)):
-        if axis is not None and axis.lstrip("+").lower() not in _AXES:
+    axes = {name: axis.lstrip("+").lower() for name, axis in (("up", up), ("front", front)) if axis is not None}
+    for name, axis in axes.items():
+        if axis not in _AXES:
             raise OptionError(f"{name}: invalid axis '{axis}'", f"choose from {', '.join(_AXES)}")
-    ahead = None if front is None else _axis(front)
+    ahead = _AXES[axes["front"]] if front is not None else None
     points, weights = _samples(shape)
-    upward, stands = (_axis(up), False) if up is not None else _upward(points, ahead)
+    upward, stands = (_AXES[axes["up"]], False) if up is not None else _upward(points, ahead)
     if ahead is None and stands:
         ahead = _chest(points, weights, upward)
     if ahead is None:
@@ -59,11 +60,9 @@ def upright(rotation: Float[Floats, "3 3"]) -> Float[Floats, "3 3"]:
     """
     axis = int(np.abs(rotation[1]).argmax())
     upward = np.sign(rotation[1, axis]) * np.eye(3)[axis]
-    ahead = rotation[2] - (rotation[2] @ upward) * upward
-    length = float(np.linalg.norm(ahead))
-    if rotation[1] @ upward < _NEAR_AXIS or length < 0.5:
+    if rotation[1] @ upward < _NEAR_AXIS:
         return rotation
-    return np.stack([np.cross(upward, ahead / length), upward, ahead / length])
+    return _standing(upward, rotation[2])
 
 
 def same_side(
@@ -82,23 +81,26 @@ def same_side(
     first, second = (None if rotation is None else upright(rotation) for rotation in rotations)
     if first is None:
         first = facing(source, up, front)
-    if second is None and (up is not None or front is not None):
-        second = facing(target, up, front)
-    elif second is None:
-        known = slice(None) if source.invalid is None else ~source.invalid
-        second = facing_alike(target, vertex_map.points(target)[known], source.verts[known] @ first.T)
+    if second is None:
+        named = up is not None or front is not None
+        second = facing(target, up, front) if named else facing_matched(source, target, vertex_map, first)
     return first, second
+
+
+def facing_matched(
+    source: Shape, target: Shape, vertex_map: VertexMap, rotation: Float[Floats, "3 3"]
+) -> Float[Floats, "3 3"]:
+    """Rotation that shows the target from the side from which ``rotation`` shows the source; that if nothing tells."""
+    known = np.ones(source.V, bool) if source.invalid is None else ~source.invalid
+    if not known.any():
+        return rotation
+    return facing_alike(target, vertex_map.points(target)[known], source.verts[known] @ rotation.T)
 
 
 def facing_alike(shape: Shape, points: Float[Floats, "N 3"], seen: Float[Floats, "N 3"]) -> Float[Floats, "3 3"]:
     """Rotation that shows a shape from the side from which another one is seen; if it stands by itself, upright.
 
-    Parameters
-    ----------
-    points
-        Of this shape, in its file's frame.
-    seen
-        The same points of the other one, y up and z to the viewer.
+    ``points`` are of this shape, in its file's frame; ``seen`` the same of the other one, y up and z to the viewer.
     """
     a, b = points - points.mean(axis=0), seen - seen.mean(axis=0)
     left, sizes, right = np.linalg.svd(b.T @ a)
@@ -106,15 +108,14 @@ def facing_alike(shape: Shape, points: Float[Floats, "N 3"], seen: Float[Floats,
         return facing(shape)
     turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right)) or 1.0]) @ right
     upward, stands = _upward(_samples(shape)[0], None)
-    if not stands or upward @ turn[1] < 0.5:
-        return np.asarray(turn)
-    ahead = turn[2] - (turn[2] @ upward) * upward
-    ahead /= np.linalg.norm(ahead)
+    return _standing(upward, turn[2]) if stands and upward @ turn[1] >= 0.5 else np.asarray(turn)
+
+
+def _standing(upward: Float[Floats, " 3"], ahead: Float[Floats, " 3"]) -> Float[Floats, "3 3"]:
+    """The rotation whose y is ``upward`` and whose z is the nearest to ``ahead``."""
+    ahead = ahead - (ahead @ upward) * upward
+    ahead = ahead / np.linalg.norm(ahead)
     return np.stack([np.cross(upward, ahead), upward, ahead])
-
-
-def _axis(name: str) -> Float[Floats, " 3"]:
-    return _AXES[name.lstrip("+").lower()]
 
 
 def _samples(shape: Shape) -> tuple[Float[Floats, "N 3"], Float[Floats, " N"]]:
@@ -169,10 +170,8 @@ def _chest(
     share = (height - height.min()) / np.ptp(height)
     flat = points[:, level]
     chest = (share > 0.5) & (share < 0.8)
-    if chest.sum() < 20:
-        return None
-    middle = np.median(flat[chest], axis=0)
-    chest &= np.linalg.norm(flat - middle, axis=1) < _TORSO
+    if chest.sum() >= 20:
+        chest &= np.linalg.norm(flat - np.median(flat[chest], axis=0), axis=1) < _TORSO
     if chest.sum() < 20:
         return None
     spread, axes = np.linalg.eigh(np.cov(flat[chest].T, aweights=weights[chest]))

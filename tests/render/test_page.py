@@ -16,11 +16,11 @@ import pytest
 from meshmatch.errors import InputError, OptionError, OutputError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.colors import position_colors
+from meshmatch.render.facing import facing_alike
 from meshmatch.render.scales import UNKNOWN
 from meshmatch.render.viewer import Looks, write_page
-from meshmatch.render.viewer.drawn import draw
-from meshmatch.render.viewer.packing import pack, small_integers
-from meshmatch.render.viewer.placement import levelled, relative_size, upright
+from meshmatch.render.viewer.assembly import pack, small_integers
+from meshmatch.render.viewer.drawn import draw, relative_size, upright
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
 from tests.render.pairs import Pair, bump, stirred
@@ -180,7 +180,7 @@ def test_the_scripts_that_ship_cannot_end_their_element() -> None:
     from meshmatch.render.viewer import page
 
     scripts = sorted(Path(page.__file__).parent.glob("*.js"))
-    assert {f"{name}.js" for name in (*page._SCRIPTS, "three.min")} <= {path.name for path in scripts}
+    assert {f"{name}.js" for name in (*page.SCRIPTS, "three.min")} <= {path.name for path in scripts}
     for path in scripts:
         text = path.read_text(encoding="utf-8")
         for forbidden in ("</script", "<script", "<!--", "innerHTML", "eval(", "new Function", "document.write"):
@@ -313,7 +313,7 @@ def test_a_fit_that_leans_is_levelled_where_the_shape_stands(make_sphere: Callab
     foot = np.array([-9, -2.2, -9])  # flat below
     tower = Shape(np.maximum(ball.verts * np.array([0.6, 3.0, 0.6]), foot), ball.faces, "tower")
     heading = about(1, 0.6)
-    assert np.allclose(levelled(tower, about(0, 0.4) @ heading), heading)
+    assert np.allclose(facing_alike(tower, tower.verts, tower.verts @ (about(0, 0.4) @ heading).T), heading)
 
 
 def test_given_rotations_are_kept(pair: Pair) -> None:
@@ -405,7 +405,7 @@ def test_large_images_become_smaller(tmp_path: Path, cube: Shape, monkeypatch: p
     assert page.words["source"]["look"]["images"] == ["image/jpeg"]
     with Image.open(BytesIO(data)) as picture:
         assert (picture.format, picture.size) == ("JPEG", (1024, 2048))
-    monkeypatch.setattr("meshmatch.render.viewer.skins.MOST_PIXELS", 512 * 1024)
+    monkeypatch.setattr("meshmatch.render.viewer.looks.MOST_PIXELS", 512 * 1024)
     page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look)))
     with Image.open(BytesIO(page.arrays["source.look.image0"].tobytes())) as picture:
         assert picture.size == (512, 1024)

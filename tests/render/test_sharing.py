@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.render.viewer import sharing
-from meshmatch.render.viewer.looks import vertex_paint
-from meshmatch.render.viewer.sharing import share_look
+from meshmatch.render.viewer import looks as module
+from meshmatch.render.viewer.looks import share_look, vertex_paint
 from meshmatch.shapes.appearance import Appearance, Material, vertex_colors_alone
 from meshmatch.shapes.shape import Shape
 from tests.render.pairs import Pair, bump, stirred
@@ -50,7 +49,7 @@ def test_a_texture_is_baked_for_the_other_mesh(pair: Pair, textured: Appearance)
     assert looks.worn[0] is textured
     (material,) = looks.worn[1].materials
     assert material.image is not None
-    assert material.image.shape == (sharing.TEXELS, sharing.TEXELS, 4)
+    assert material.image.shape == (module.TEXELS, module.TEXELS, 4)
     seen = vertex_paint(looks.worn[1], pair.target)[:, 0]
     assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.06
 
@@ -105,7 +104,7 @@ def test_colours_of_vertices_are_carried_as_such(pair: Pair) -> None:
 def test_where_nothing_can_be_baked_vertices_have_colours(
     pair: Pair, textured: Appearance, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sharing, "MOST_FACES", 100 if why == "fine" else 10**6)
+    monkeypatch.setattr(module, "MOST_FACES", 100 if why == "fine" else 10**6)
     faces = pair.target.faces if why == "fine" else np.empty((0, 3), np.int64)
     other = Shape(pair.target.verts, faces, "other")
     back = VertexMap.between(other, pair.source, pair.back.index)

@@ -1,4 +1,4 @@
-"""What of a shape a page draws: all of it, or less of a large one."""
+"""What of two shapes a page draws, all of it or less of a large one, and where: both upright and in one scale."""
 
 from __future__ import annotations
 
@@ -6,47 +6,39 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.geometry.topology import edges_of
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.render.facing import Rotations, facing, facing_matched
 from meshmatch.shapes.debris import seams
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
 
 MOST = 150_000
 """Vertices up to which a shape is drawn whole."""
-NO_FACES = np.empty((0, 3), np.int64)
 _NONE = np.empty(0, np.int64)
 _LEAN = 2 / 3  # of `MOST` is drawn of a larger one
 _NORMAL_WEIGHT = 3.0  # mean edges of the drawn mesh that an opposite normal pushes a vertex away
+_PAIRS = 20_000
+_ODD = 3.0  # more than this between the sizes drawn, and the map is no guide to them
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """The part of a shape that is drawn.
+    """The part of a shape that is drawn, in the file's own frame and unit.
 
-    Parameters
-    ----------
-    verts : (N, 3) float64
-        Positions, the file's own frame and unit.
-    faces : (M, 3) int64
-        Triangles of these; (0, 3) where points are drawn.
-    normals : (N, 3) float64
-        Unit normals, the same on both sides of a texture seam; zeros where there is none.
-    vertex : (N,) int64
-        The vertex of the file that each stands for.
-    file_face : (M,) int64
-        The face of the file that each triangle is; empty where the surface is drawn coarser.
-    note : str
-        What was left out, for people; empty if nothing was.
+    ``faces`` is empty where points are drawn. ``normals`` are the same on both sides of a texture seam, and zeros where
+    there is none. ``vertex`` is the vertex of the file that each row stands for, and ``file_face`` the face of the file
+    that each triangle is: empty where the surface is drawn coarser. ``note`` says what was left out, if anything.
     """
 
-    verts: Floats
-    faces: Ints
-    normals: Floats
-    vertex: Ints
-    file_face: Ints
+    verts: Float[Floats, "N 3"]
+    faces: Int[Ints, "M 3"]
+    normals: Float[Floats, "N 3"]
+    vertex: Int[Ints, " N"]
+    file_face: Int[Ints, " K"]
     note: str = ""
 
     @property
@@ -59,7 +51,7 @@ class Drawn:
         return float(np.median(reach[:, -1])) / 2
 
     @cached_property
-    def used(self) -> Ints:
+    def used(self) -> Int[Ints, " U"]:
         """Rows that can be seen: those of a face, or every point."""
         return _corners(self.faces, len(self.verts)) if len(self.faces) else np.arange(len(self.verts))
 
@@ -69,8 +61,6 @@ def draw(shape: Shape, most: int = MOST) -> Drawn:
     valid = np.ones(shape.V, bool) if shape.invalid is None else ~shape.invalid
     if not valid.any():  # nothing but stand-ins: still a page
         valid[:] = True
-    if shape.is_cloud:
-        return _some_points(shape, np.flatnonzero(valid), most)
     sound = np.flatnonzero(valid[shape.faces].all(axis=1))
     faces = shape.faces[sound]
     if len(faces) == 0:
@@ -79,43 +69,102 @@ def draw(shape: Shape, most: int = MOST) -> Drawn:
     smooth = Shape(shape.verts, joined[faces]).vertex_normals[joined]
     if shape.V <= most:
         return Drawn(shape.verts, faces, smooth, np.arange(shape.V), sound)
-    coarse = decimate(_compact(shape.verts, joined[faces]), 2 * int(_LEAN * most))
+    kept = _corners(joined[faces], shape.V)
+    number = np.empty(shape.V, np.int64)
+    number[kept] = np.arange(len(kept))
+    coarse = decimate(Shape(shape.verts[kept], number[joined[faces]]), 2 * int(_LEAN * most))
+    used = _corners(faces, shape.V)
     if coarse.V > most:  # nothing that holds together: a heap of single triangles
-        return _some_points(shape, _corners(faces, shape.V), most)
-    normals = coarse.vertex_normals
-    vertex = _stands_for(coarse, shape.verts, smooth, _corners(faces, shape.V))
+        return _some_points(shape, used, most)
+    # Each vertex of the coarse mesh stands for the nearest one of the file that faces the same way.
+    edges = coarse.verts[coarse.faces] - coarse.verts[np.roll(coarse.faces, 1, axis=1)]
+    weight = _NORMAL_WEIGHT * float(np.linalg.norm(edges, axis=2).mean()) / 2
+    tree = cKDTree(np.hstack([shape.verts[used], weight * smooth[used]]))
+    vertex = used[tree.query(np.hstack([coarse.verts, weight * coarse.vertex_normals]))[1]]
     note = f"drawn with {coarse.V:,} of {shape.V:,} vertices"
-    return Drawn(coarse.verts, coarse.faces, normals, vertex, _NONE, note)
+    return Drawn(coarse.verts, coarse.faces, coarse.vertex_normals, vertex, _NONE, note)
 
 
-def _some_points(shape: Shape, rows: NDArray[np.int64], most: int) -> Drawn:
-    note = ""
-    if len(rows) > most:
-        count = len(rows)
+def _some_points(shape: Shape, rows: Int[Ints, " N"], most: int) -> Drawn:
+    note, count = "", len(rows)
+    if count > most:
         rows = rows[np.linspace(0, count - 1, int(_LEAN * most)).astype(np.int64)]
         note = f"drawn with {len(rows):,} of {count:,} points"
-    normals = (Shape(shape.verts[rows], NO_FACES) if shape.is_cloud else shape).vertex_normals
-    normals = normals if shape.is_cloud else normals[rows]
-    return Drawn(shape.verts[rows], NO_FACES, normals, rows, _NONE, note)
+    none = np.empty((0, 3), np.int64)
+    verts = shape.verts[rows]
+    normals = Shape(verts, none).vertex_normals if shape.is_cloud else shape.vertex_normals[rows]
+    return Drawn(verts, none, normals, rows, _NONE, note)
 
 
-def _compact(verts: Floats, faces: Ints) -> Shape:
-    used = _corners(faces, len(verts))
-    new = np.empty(len(verts), np.int64)
-    new[used] = np.arange(len(used))
-    return Shape(verts[used], new[faces])
-
-
-def _corners(faces: Ints, V: int) -> Ints:
+def _corners(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " U"]:
     """The vertices of some face, in order."""
     seen = np.zeros(V, bool)
     seen[faces] = True
     return np.flatnonzero(seen)
 
 
-def _stands_for(coarse: Shape, verts: Floats, normals: Floats, used: Ints) -> Ints:
-    """(N,) for each vertex of the coarse mesh the nearest used one of the file that faces the same way."""
-    edges = coarse.verts[coarse.faces] - coarse.verts[np.roll(coarse.faces, 1, axis=1)]
-    weight = _NORMAL_WEIGHT * float(np.linalg.norm(edges, axis=2).mean()) / 2
-    tree = cKDTree(np.hstack([verts[used], weight * normals[used]]))
-    return np.asarray(used[tree.query(np.hstack([coarse.verts, weight * coarse.vertex_normals]))[1]])
+@dataclass(frozen=True, eq=False)
+class Box:
+    """The cube in which a shape is drawn.
+
+    ``rotation`` is from the file's axes to y up, z to the front; ``low`` its lowest corner, turned, and ``edge`` its
+    edge, both in the file's unit; ``size`` its edge on the page, where one unit is the same for both shapes.
+    """
+
+    rotation: Float[Floats, "3 3"]
+    low: Float[Floats, " 3"]
+    edge: float
+    size: float
+
+    def place(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
+        """Points of the file, 0..1 in the cube; what lies outside comes to its side."""
+        return np.asarray(np.clip((points @ self.rotation.T - self.low) / self.edge, 0.0, 1.0))
+
+
+def boxes(
+    shapes: tuple[Shape, Shape], drawn: tuple[Drawn, Drawn], there: VertexMap, rotations: tuple[Floats, Floats]
+) -> list[Box]:
+    """A cube for each of two shapes, in one scale as far as the map can tell."""
+    ratio = relative_size(*shapes, there)
+    if there.verdict == "poor":
+        ratio = float(np.sqrt(shapes[1].area / shapes[0].area)) if min(s.area for s in shapes) > 0 else 1.0
+    turned = [part.verts[part.used] @ turn.T for part, turn in zip(drawn, rotations, strict=True)]
+    edges = [float(np.ptp(verts, axis=0).max()) or 1.0 for verts in turned]
+    sizes = [edges[0], edges[1] / ratio]
+    if not 1 / _ODD < sizes[0] / sizes[1] < _ODD:
+        sizes = [1.0, 1.0]
+    lows = [(verts.min(axis=0) + verts.max(axis=0)) / 2 - edge / 2 for verts, edge in zip(turned, edges, strict=True)]
+    return [Box(rotations[k], lows[k], edges[k], sizes[k] / max(sizes)) for k in (0, 1)]
+
+
+def relative_size(source: Shape, target: Shape, there: VertexMap) -> float:
+    """Length on the target of what has length 1 on the source.
+
+    Compares short distances, which a pose hardly changes, where the map is confident, without those that it
+    has torn; 1 where no pair of vertices tells.
+    """
+    if source.is_cloud:
+        some = np.arange(source.V)[:: max(1, source.V // _PAIRS)]
+        near = cKDTree(source.verts).query(source.verts[some], k=min(9, source.V))[1].reshape(len(some), -1)
+        pairs = np.stack([some, near[:, -1]], axis=1)
+    else:
+        pairs = edges_of(source.faces).vertices
+        pairs = pairs[:: max(1, len(pairs) // _PAIRS)]
+    points = there.points(target)
+    own = np.linalg.norm(source.verts[pairs[:, 0]] - source.verts[pairs[:, 1]], axis=1)
+    image = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    sure = there.confidence[pairs].min(axis=1) * (image <= np.quantile(image, 0.95))
+    lengths = float(sure @ own), float(sure @ image)
+    return lengths[1] / lengths[0] if min(lengths) > 0 else 1.0
+
+
+def upright(source: Shape, target: Shape, there: VertexMap, given: Rotations = (None, None)) -> tuple[Floats, Floats]:
+    """Rotations (3, 3) of both shapes to y up, z front.
+
+    The source's is guessed unless it is given. The target's, unless it is given, shows matched points from the same
+    side; with a poor map it is that of the source.
+    """
+    own = np.asarray(facing(source) if given[0] is None else given[0], np.float64)
+    if given[1] is not None:
+        return own, np.asarray(given[1], np.float64)
+    return own, own if there.verdict == "poor" else facing_matched(source, target, there, own)

@@ -1,46 +1,56 @@
-"""What two shapes wear in a page: the look that one has in its file, and the same carried to the other."""
+"""What two shapes wear in a page: the look that one has in its file, and the same carried to the other by the map."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from io import BytesIO
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from meshmatch.arrays import Floats
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.errors import InputError
+from meshmatch.geometry.topology import same_rows
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.render.viewer.assembly import scaled, small_integers
 from meshmatch.render.viewer.drawn import Drawn
-from meshmatch.render.viewer.packing import to_bytes
-from meshmatch.render.viewer.skins import make_skin
-from meshmatch.shapes.appearance import Appearance
+from meshmatch.shapes.appearance import Appearance, Material, Pixels, png_bytes
 from meshmatch.shapes.colors import LINEAR_OF_BYTE, to_srgb
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.bake import BakeOptions
+from meshmatch.transfer.texture import colors_of_vertices, transfer_texture
+from meshmatch.transfer.unwrap import atlas_of
 
-SideName = Literal["source", "target"]
+Arrays = dict[str, NDArray[Any]]
+TEXELS = 1024
+"""Width and height of a texture that is baked for a page."""
+MOST_FACES = 40_000
+"""A finer mesh wears colours of vertices: they show nearly as much, and it is unwrapped for a minute."""
+LARGEST = 2048
+"""Pixels along an image's longer side; a larger one is made smaller."""
+MOST_PIXELS = 3 * LARGEST**2
+"""Of all images of one look together."""
+_DRAWN = 256  # pixels along a side up to which an image is kept without loss: it may be drawn by hand
 
 
 @dataclass(frozen=True, eq=False)
 class Looks:
     """One look on two shapes.
 
-    Parameters
-    ----------
-    side : {"source", "target"}
-        Whose look it is.
-    worn : (Appearance, Appearance)
-        Of source and target; one of them is carried.
-    own : Appearance, optional
-        What the other one has in its own file.
+    ``side`` says whose look it is; source and target have it ``worn``, one of them carried. ``own`` is what the other
+    one has in its own file, if anything.
     """
 
-    side: SideName
+    side: Literal["source", "target"]
     worn: tuple[Appearance, Appearance]
     own: Appearance | None = None
 
     @property
     def words(self) -> dict[str, Any]:
         """What the page's buttons and legend say."""
-        textured = self.worn[0 if self.side == "source" else 1].textured
+        textured = self.worn[self.side == "target"].textured
         kind = "texture" if textured else "colours"
         return {"look": {"kind": kind, "side": self.side}, "own": self.own is not None}
 
@@ -48,25 +58,128 @@ class Looks:
         """The looks of one shape (0 the source, 1 the target), each with its name in the page."""
         found = [("look", self.worn[k])]
         if self.own is not None:
-            itself = k == (0 if self.side == "source" else 1)
-            found.append(("own", self.worn[k] if itself else self.own))
+            found.append(("own", self.worn[k] if k == (self.side == "target") else self.own))
         return found
 
 
-def dress(look: Appearance, shape: Shape, part: Drawn) -> tuple[dict[str, NDArray[Any]], dict[str, Any] | None]:
+def share_look(
+    shapes: tuple[Shape, Shape],
+    own: tuple[Appearance | None, Appearance | None],
+    there: VertexMap,
+    back: VertexMap,
+    *,
+    coordinates: tuple[Floats | None, Floats | None] = (None, None),
+    workers: int = 1,
+) -> Looks | None:
+    """The source's look on both shapes; the target's if the source has none; None if neither has one.
+
+    ``own`` is what source and target have in their files, and ``coordinates`` (F, 3, 2) the texture coordinates there,
+    which are baked to where they serve. The maps are from source to target, and from target to source.
+    """
+    source, target = shapes
+    first, second = own
+    if first is not None:
+        return Looks("source", (first, _carried(first, source, target, back, coordinates[1], workers)), second)
+    if second is not None:
+        return Looks("target", (_carried(second, target, source, there, coordinates[0], workers), second))
+    return None
+
+
+def _carried(
+    look: Appearance, owner: Shape, wearer: Shape, back: VertexMap, coordinates: Floats | None, workers: int
+) -> Appearance:
+    """A look of `owner` on `wearer`, by a map from `wearer` to `owner`: baked, or as colours of vertices."""
+    material = np.zeros(wearer.F, np.int64)
+    if look.textured and 0 < wearer.F <= MOST_FACES:
+        choices = BakeOptions(size=TEXELS, padding=4, workers=workers)
+        try:
+            atlas = atlas_of(wearer, coordinates, choices.size, choices.padding)
+            baked = transfer_texture(owner, look, wearer, back, atlas, choices).baked
+        except InputError:  # no surface to speak of, or none that can be unwrapped
+            pass
+        else:
+            cloth = Material("", baked.image, wrap=("clamp", "clamp"), alpha=baked.alpha, cutoff=baked.cutoff)
+            return Appearance((cloth,), material, atlas.uv)
+    colors = colors_of_vertices(owner, look, wearer, back)
+    return Appearance((Material(),), material, np.zeros((wearer.F, 3, 2)), colors)
+
+
+def dress(look: Appearance, shape: Shape, part: Drawn) -> tuple[Arrays, dict[str, Any] | None]:
     """Arrays and words of a look on what is drawn of a shape.
 
     A skin where there is an image and the triangles are the file's own; else ``paint`` (N, 3), a colour for each
     vertex that is drawn, without words.
     """
     if len(part.file_face) and (look.textured or len(look.materials) > 1):
-        skin = make_skin(look, part.faces, part.file_face)
-        return skin.arrays, skin.words
-    return {"paint": to_bytes(vertex_paint(look, shape)[part.vertex])}, None
+        return _skin(look, part)
+    return {"paint": scaled(vertex_paint(look, shape)[part.vertex], np.uint8)}, None
 
 
-def vertex_paint(look: Appearance, shape: Shape) -> Floats:
-    """(V, 3) the colour at each vertex as screens show it: of the last of its faces, at the nearest texel."""
+def _skin(look: Appearance, part: Drawn) -> tuple[Arrays, dict[str, Any]]:
+    """A textured surface as the page has it.
+
+    Arrays: ``vertex`` (S,) the row of the shape that is drawn, ``uv`` (S, 2), ``face`` (M, 3) of these S, by material;
+    ``paint`` (S, 3) where vertex colours are to be multiplied; ``image0``, ``image1``...: bytes of files. Words:
+    ``groups``, which faces have which material, and ``images``, the kinds of the files.
+    """
+    material = look.material[part.file_face]
+    order = np.argsort(material, kind="stable")
+    corners = part.faces[order].reshape(-1)
+    uv = look.uv[part.file_face[order]].reshape(-1, 2).astype(np.float32)
+    first = same_rows(np.column_stack([corners.astype(np.float64), uv]))
+    own = first == np.arange(len(first))
+    number = (np.cumsum(own) - 1)[first]
+    arrays: Arrays = {
+        "vertex": small_integers(corners[own]),
+        "uv": uv[own],
+        "face": small_integers(number.reshape(-1, 3)),
+    }
+    if look.colors is not None:
+        arrays["paint"] = scaled(to_srgb(look.colors[corners[own], :3]), np.uint8)
+    used, starts, counts = np.unique(material[order], return_index=True, return_counts=True)
+    materials = [look.materials[k] for k in used.tolist()]
+    pictures = {id(m.image): m.image for m in materials if m.image is not None}
+    sizes = [min(1.0, LARGEST / max(image.shape[:2])) ** 2 * image[..., 0].size for image in pictures.values()]
+    shrink = min(1.0, float(np.sqrt(MOST_PIXELS / max(sum(sizes), 1.0))))
+    kinds = []
+    for k, image in enumerate(pictures.values()):
+        kind, data = _encoded(image, shrink, all(m.alpha == "opaque" for m in materials if m.image is image))
+        arrays[f"image{k}"] = np.frombuffer(data, np.uint8)
+        kinds.append(kind)
+    groups = [
+        {
+            "start": 3 * start,
+            "count": 3 * count,
+            "image": None if m.image is None else list(pictures).index(id(m.image)),
+            "factor": [round(float(part), 5) for part in m.factor],
+            "wrap": list(m.wrap),
+            "nearest": m.nearest,
+            "alpha": m.alpha,
+            "cutoff": float(m.cutoff),
+        }
+        for m, start, count in zip(materials, starts.tolist(), counts.tolist(), strict=True)
+    ]
+    return arrays, {"groups": groups, "images": kinds}
+
+
+def _encoded(pixels: Pixels, shrink: float, opaque: bool) -> tuple[str, bytes]:
+    """Media type and bytes of an image file: PNG where it is small or has alpha, else JPEG."""
+    height, width = pixels.shape[:2]
+    scale = shrink * min(1.0, LARGEST / max(height, width))
+    if opaque:
+        pixels = np.concatenate([pixels[..., :3], np.full_like(pixels[..., 3:], 255)], axis=2)
+    if scale < 1.0:
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        pixels = np.asarray(Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS))
+    if not opaque or max(pixels.shape[:2]) <= _DRAWN:
+        return "image/png", png_bytes(pixels)
+    out = BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels[..., :3])).save(out, format="JPEG", quality=90)
+    return "image/jpeg", out.getvalue()
+
+
+def vertex_paint(look: Appearance, shape: Shape) -> Float[Floats, "V 3"]:
+    """The colour at each vertex as screens show it: of the last of its faces, at the nearest texel."""
     light = np.ones((shape.V, 3)) if look.colors is None else np.array(look.colors[:, :3])
     for k, material in enumerate(look.materials):
         face = np.flatnonzero(look.material == k)
@@ -75,11 +188,9 @@ def vertex_paint(look: Appearance, shape: Shape) -> Floats:
         corner = shape.faces[face].reshape(-1) if shape.F else np.arange(shape.V)
         seen = np.tile(np.array(material.factor[:3]), (len(corner), 1))
         if material.image is not None:
-            height, width = material.image.shape[:2]
-            uv = look.uv[face].reshape(-1, 2)
-            column, row = (
-                np.floor(_wrapped(uv[:, axis], material.wrap[axis]) * size).astype(np.int64).clip(0, size - 1)
-                for axis, size in ((0, width), (1, height))
+            row, column = (
+                _texel(look.uv[face].reshape(-1, 2)[:, axis], material.wrap[axis], material.image.shape[1 - axis])
+                for axis in (1, 0)
             )
             seen *= LINEAR_OF_BYTE[material.image[row, column, :3]]
         at, last = np.unique(corner[::-1], return_index=True)
@@ -87,9 +198,10 @@ def vertex_paint(look: Appearance, shape: Shape) -> Floats:
     return to_srgb(light)
 
 
-def _wrapped(values: Floats, wrap: str) -> Floats:
+def _texel(values: Float[Floats, " N"], wrap: str, size: int) -> Int[Ints, " N"]:
+    """Row or column of the texel at coordinates."""
     if wrap == "repeat":
-        return np.asarray(values % 1.0)
-    if wrap == "mirror":
-        return np.asarray(1.0 - np.abs(values % 2.0 - 1.0))
-    return np.clip(values, 0.0, 1.0)
+        values = values % 1.0
+    elif wrap == "mirror":
+        values = 1.0 - np.abs(values % 2.0 - 1.0)
+    return np.floor(np.clip(values, 0.0, 1.0) * size).astype(np.int64).clip(0, size - 1)

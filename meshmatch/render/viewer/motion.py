@@ -1,4 +1,4 @@
-"""One HTML file that shows a shape in motion, with a slider. It needs no network, and forbids it."""
+"""The page that shows a shape in motion, with a slider."""
 
 from __future__ import annotations
 
@@ -9,20 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch import __version__
-from meshmatch.arrays import Floats
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
-from meshmatch.outputs import replace_on_success
 from meshmatch.render.colors import CLAY
+from meshmatch.render.viewer.assembly import check_page, plain_text, scaled, small_integers, write_html
 from meshmatch.render.viewer.drawn import MOST, draw
-from meshmatch.render.viewer.packing import pack, small_integers, to_bytes, to_shorts, to_signed_bytes
-from meshmatch.render.viewer.page import assemble, check_page, plain_text
 from meshmatch.shapes.debris import seams
 from meshmatch.shapes.shape import Shape
 
 MOST_PLACES = 4_000_000
 """Vertices times frames up to which a shape is drawn whole."""
-_SCRIPTS = ("data", "materials", "motion")
 
 
 def write_motion(
@@ -30,12 +26,12 @@ def write_motion(
     frames: Sequence[Shape],
     times: Sequence[float],
     *,
-    rotation: Floats,
+    rotation: Float[Floats, "3 3"],
     met: Mapping[float, str] | None = None,
     title: str = "",
     most: int = MOST,
 ) -> int:
-    """Write a page on which a shape goes through frames. The same input gives the same bytes.
+    """Write a page on which a shape goes through frames; how many bytes it has. The same input gives the same bytes.
 
     Parameters
     ----------
@@ -44,16 +40,11 @@ def write_motion(
     times
         (N,) increasing, one for each frame.
     rotation
-        (3, 3) from the frame of the shapes into y up, z to the front.
+        From the frame of the shapes into y up, z to the front.
     met
         Names to show at some of the times.
     most
         Vertices up to which the shape is drawn whole; less where there are many frames.
-
-    Returns
-    -------
-    int
-        Bytes written.
 
     Raises
     ------
@@ -62,7 +53,6 @@ def write_motion(
     OutputError
         The file cannot be written.
     """
-    path = Path(path)
     check_page(path)
     first = frames[0] if frames else None
     if first is None or len(frames) < 2 or len(times) != len(frames) or not (np.diff(times) > 0).all():
@@ -75,14 +65,17 @@ def write_motion(
     used = np.concatenate([verts[part.used] for verts in turned])
     low, extent = used.min(axis=0), np.ptp(used, axis=0)
     edge = float(extent.max()) or 1.0
-    joined = seams(turned[0], faces) if len(faces) else rows
+    normals = [np.zeros_like(verts) for verts in turned]  # of points, which then face the viewer
+    if len(faces):  # the same on both sides of a seam
+        joined = seams(turned[0], faces)
+        normals = [Shape(verts, joined[faces]).vertex_normals[joined] for verts in turned]
+    colors = np.tile(CLAY, (first.V, 1)) if first.colors is None else first.colors[:, :3]
     arrays: dict[str, NDArray[Any]] = {
-        "position": to_shorts((np.stack(turned) - low) / edge),
-        "normal": to_signed_bytes(np.stack([_normals(verts, faces, joined) for verts in turned])),
-        "color": to_bytes(_colors(first)[rows]),
+        "position": scaled((np.stack(turned) - low) / edge, np.uint16),
+        "normal": scaled(np.stack(normals), np.int8),
+        "color": scaled(colors[rows], np.uint8),
         "face": small_integers(faces),
     }
-    table, packed = pack(arrays)
     words: dict[str, Any] = {
         "title": plain_text(title),
         "note": part.note or f"{first.V:,} vertices",
@@ -92,21 +85,5 @@ def write_motion(
         "low": (-extent / edge / 2).round(6).tolist(),
         "extent": (extent / edge).round(6).tolist(),
         "radius": float(f"{part.radius / edge:.4g}"),
-        "version": __version__,
-        "arrays": table,
     }
-    text = assemble("motion", _SCRIPTS, words, packed, title)
-    with replace_on_success(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-    return len(text.encode())
-
-
-def _normals(verts: Floats, faces: np.ndarray, joined: np.ndarray) -> Floats:
-    """Unit normals (N, 3), the same on both sides of a seam; zeros for points, which then face the viewer."""
-    if not len(faces):
-        return np.zeros_like(verts)
-    return Shape(verts, joined[faces]).vertex_normals[joined]
-
-
-def _colors(shape: Shape) -> Floats:
-    return np.tile(np.array(CLAY), (shape.V, 1)) if shape.colors is None else shape.colors[:, :3]
+    return write_html(Path(path), "motion", ("data", "materials", "motion"), words, arrays, title)
