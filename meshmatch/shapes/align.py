@@ -36,16 +36,10 @@ class Alignment:
 
 
 def align(shape: OrientedPoints, target: OrientedPoints, how: Align, keep: int = 1) -> list[Alignment]:
-    """Rigid motions that bring a target onto a shape, the best one first.
+    """Rigid motions that bring a target onto a shape, the best one first; at most `keep`, and one but for "rigid".
 
-    Parameters
-    ----------
-    shape, target : OrientedPoints
-        Both centered, of one scale, their points in random order.
-    how : {"none", "near", "rigid"}
-        Take the orientation as it is; improve it; search all orientations.
-    keep : int
-        How many to return at most. "none" and "near" have one.
+    Both are centered, of one scale, their points in random order. "none" takes the orientation as it is, "near"
+    improves it, "rigid" searches all orientations.
     """
     coarse_shape, coarse_target = shape.thinned(200), target.thinned(300)
     fine_shape, fine_target = shape.thinned(1200), target.thinned(1200)
@@ -54,24 +48,28 @@ def align(shape: OrientedPoints, target: OrientedPoints, how: Align, keep: int =
     given = _icp(fine_shape, fine_target, RigidPose.identity(), 25)
     if how == "near":
         return [given]
-    rough = [
-        _icp(coarse_shape, coarse_target, RigidPose(start, np.zeros(3)), 6)
-        for start in _starts(shape.points, target.points)
-    ]
-    chosen: list[Alignment] = []
-    for each in sorted(rough, key=lambda found: found.residual):
-        if len(chosen) < max(keep, 4) and all(each.pose.angle_to(other.pose) > _CLOSE for other in chosen):
-            chosen.append(each)
-    fine = sorted((_icp(fine_shape, fine_target, each.pose, 25) for each in chosen), key=lambda found: found.residual)
-    if fine[0].residual > _CLEARLY * given.residual:
-        fine.insert(0, given)
-    else:
-        fine.append(given)
+    # the 24 turns of a cube in the files' own axes, and in the principal axes of both
+    turns = Rotation.create_group("O").as_matrix()
+    own, theirs = _principal_axes(shape.points), _principal_axes(target.points)
+    starts = [RigidPose(start, np.zeros(3)) for start in (*turns, *(own @ turn @ theirs.T for turn in turns))]
+    rough = sorted((_icp(coarse_shape, coarse_target, start, 6) for start in starts), key=_by_residual)
+    chosen = _distinct(rough)[: max(keep, 4)]
+    fine = sorted((_icp(fine_shape, fine_target, each.pose, 25) for each in chosen), key=_by_residual)
+    fine.insert(0 if fine[0].residual > _CLEARLY * given.residual else len(fine), given)
+    return _distinct(fine)[:keep]
+
+
+def _by_residual(found: Alignment) -> float:
+    return found.residual
+
+
+def _distinct(found: list[Alignment]) -> list[Alignment]:
+    """Those that are not near an earlier one."""
     distinct: list[Alignment] = []
-    for each in fine:
+    for each in found:
         if all(each.pose.angle_to(other.pose) > _CLOSE for other in distinct):
             distinct.append(each)
-    return distinct[:keep]
+    return distinct
 
 
 def residual(shape: OrientedPoints, target: OrientedPoints, cap: float = _CAP) -> float:
@@ -96,13 +94,6 @@ def _icp(shape: OrientedPoints, target: OrientedPoints, pose: RigidPose, steps: 
         if np.abs(step.rotation - np.eye(3)).max() < 1e-4 and np.abs(step.center).max() < 1e-4:
             break
     return Alignment(pose, residual(shape.to_local(pose), target))
-
-
-def _starts(shape: Floats, target: Floats) -> list[Floats]:
-    """The 24 turns of a cube in the files' own axes, and in the principal axes of both."""
-    turns = Rotation.create_group("O").as_matrix()
-    own, theirs = (_principal_axes(points) for points in (shape, target))
-    return [*turns, *(own @ turn @ theirs.T for turn in turns)]
 
 
 def _principal_axes(points: Floats) -> Floats:

@@ -13,8 +13,8 @@ from meshmatch.shapes.orientation import agreeing_flips
 LARGEST = 20_000
 
 
-def local_areas(points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None = None) -> Float[Floats, " V"]:
-    """(V,) area that each point stands for, squared units; 0 for an invalid one.
+def local_areas(points: Float[Floats, "V 3"]) -> Float[Floats, " V"]:
+    """Area that each point stands for, squared units.
 
     Among points scattered with density n over a surface, the disc that just holds a point's k nearest others
     has an area of k / n on average; so pi (r_1^2 + ... + r_k^2) / (1 + ... + k) is an unbiased estimate of 1
@@ -24,12 +24,9 @@ def local_areas(points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None 
     Where limbs are thinner than the neighbourhood the result is some per cent low (measured on bodies: -10 to
     +8 % of area).
     """
-    areas = np.zeros(len(points))
-    valid = np.arange(len(points)) if invalid is None else np.flatnonzero(~invalid)
-    own = points[valid]
-    if len(own) < 4:
-        return areas
-    part, distance, index = _neighbourhoods(own)
+    if len(points) < 4:
+        return np.zeros(len(points))
+    part, distance, index = _neighbourhoods(points)
     k, noise = _size(part, index)
     squared = distance**2
     discs = np.pi * squared[:, 1 : k + 1].sum(axis=1) / (0.5 * k * (k + 1))
@@ -39,27 +36,22 @@ def local_areas(points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None 
     if noise > 0 and total > 0:
         growth = np.pi * (squared[:, k] - squared[:, k // 3]).mean() / (k - k // 3)
         discs *= np.clip(growth * len(part) / total, 0.2, 1.0) ** min(2.0 * noise, 1.0)
-    if len(part) == len(own):
-        areas[valid] = discs
-    else:
-        shares = discs[_nearest(part, own)]
-        areas[valid] = shares * (discs.sum() / shares.sum()) if shares.sum() > 0 else 0.0
-    return areas
+    if len(part) == len(points):
+        return np.asarray(discs)
+    shares = discs[_nearest(part, points)]
+    return np.asarray(shares * (discs.sum() / shares.sum()) if shares.sum() > 0 else np.zeros(len(points)))
 
 
-def estimate_normals(points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None = None) -> Float[Floats, "V 3"]:
-    """(V, 3) unit normals: where the neighbourhood is thinnest; zeros for an invalid point.
+def estimate_normals(points: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
+    """Unit normals: where the neighbourhood is thinnest.
 
     Signs are made to agree between neighbours (Hoppe et al. 1992, section 3.3), then each connected part is
     turned to face away from its own center; for an open or very noisy cloud that can be wrong, so treat the
     sign with care.
     """
-    normals = np.zeros((len(points), 3))
-    valid = np.arange(len(points)) if invalid is None else np.flatnonzero(~invalid)
-    own = points[valid]
-    if len(own) < 4:
-        return normals
-    part, _, index = _neighbourhoods(own)
+    if len(points) < 4:
+        return np.zeros((len(points), 3))
+    part, _, index = _neighbourhoods(points)
     k, _ = _size(part, index)
     found = np.linalg.eigh(_spread(part, index[:, : k + 1]))[1][:, :, 0]
     near = index[:, 1 : min(k, 8) + 1]
@@ -72,36 +64,29 @@ def estimate_normals(points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | 
     center = np.stack([np.bincount(component, weights=part[:, i]) for i in range(3)], axis=1) / sizes[:, None]
     away = np.einsum("ni,ni->n", part - center[component], found)
     found[np.bincount(component, weights=away)[component] < 0] *= -1.0
-    normals[valid] = found if len(part) == len(own) else found[_nearest(part, own)]
-    return normals
+    return np.asarray(found if len(part) == len(points) else found[_nearest(part, points)])
 
 
-def roughness(points: Float[Floats, "V 3"], invalid: Bool[Bools, " V"] | None = None) -> float:
+def roughness(points: Float[Floats, "V 3"]) -> float:
     """How noisy a cloud is beside its spacing, 0..1: about 0 for a clean one, 1 for noise of 1 % of the diagonal."""
-    valid = points if invalid is None else points[~invalid]
-    if len(valid) < 20:
+    if len(points) < 20:
         return 0.0
-    part, _, index = _neighbourhoods(valid)
+    part, _, index = _neighbourhoods(points)
     return _size(part, index)[1]
 
 
 def outlier_points(points: Float[Floats, "V 3"], far: float = 3.0) -> Bool[Bools, " V"]:
-    """(V,) True for a point that lies ``far`` times further from its neighbours than these from theirs, and than usual."""
+    """True for a point that lies ``far`` times further from its neighbours than these from theirs, and than usual."""
     from scipy.spatial import cKDTree
 
     if len(points) < 20:
         return np.zeros(len(points), bool)
     part = _part(points)
     tree = cKDTree(part)
-    k = 8
-    own_reach = tree.query(part, k + 1)[0][:, -1]
-    if len(part) == len(points):
-        reach, (_, index) = own_reach, tree.query(part, k + 1)
-    else:
-        distance, index = tree.query(points, k + 1)
-        reach = distance[:, -1]
+    distance, index = tree.query(points, 9)  # 8 neighbours, and itself
+    own_reach = (distance if part is points else tree.query(part, 9)[0])[:, -1]
     usual = np.median(own_reach[index[:, 1:]], axis=1)
-    return np.asarray((reach > far * usual) & (reach > far * np.median(own_reach)))
+    return np.asarray((distance[:, -1] > far * usual) & (distance[:, -1] > far * np.median(own_reach)))
 
 
 def on_a_line(points: Float[Floats, "V 3"]) -> bool:

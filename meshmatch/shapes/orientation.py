@@ -15,54 +15,36 @@ def agreeing_flips(
 
     Parameters
     ----------
-    count : int
-    pairs : (N, 2) int64
+    pairs
         Neighbours.
-    differ : (N,) bool
+    differ
         True where the two disagree as they are.
-    cost : (N,) float64
+    cost
         Small where a pair's word counts.
 
     Returns
     -------
-    flip : (count,) bool
-        Relative to an arbitrary member of each component.
-    component : (count,) int64
-        Number of the component that each thing is in.
+    Whether to flip each thing, relative to an arbitrary member of its component; and the component's number.
     """
-    from scipy.sparse import coo_array, csr_array
-    from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
     low, high = pairs.min(axis=1), pairs.max(axis=1)
     order = np.argsort(low * count + high, kind="stable")
     keys = (low * count + high)[order]
     first = order[np.flatnonzero(np.diff(keys, prepend=-1))]  # a pair named twice would add up
     low, high, differ, cost = low[first], high[first], differ[first], cost[first]
-    # scipy takes an explicit 0 for no edge; the sign is stored beside the cost
-    graph = coo_array((1.0 + cost, (low, high)), (count, count)).tocsr()
-    forest = minimum_spanning_tree(graph)
-    components, component = connected_components(graph, directed=False)
-    component = component.astype(np.int64)
-    # one more node joins all components, so that a single walk reaches everything
-    roots = np.full(components, -1, np.int64)
-    roots[component[::-1]] = np.arange(count)[::-1]
-    tree = forest.tocoo()
-    rows = np.concatenate([tree.row, np.full(components, count)])
-    columns = np.concatenate([tree.col, roots])
-    walk = csr_array((np.ones(len(rows)), (rows, columns)), (count + 1, count + 1))
-    _, parent = breadth_first_order(walk, count, directed=False, return_predecessors=True)
-    parent = parent.astype(np.int64)
-    parent[count] = count
-    inner = np.flatnonzero(parent[:count] < count)
-    a, b = np.minimum(inner, parent[inner]), np.maximum(inner, parent[inner])
-    place = np.searchsorted(low * count + high, a * count + b)
-    flip = np.zeros(count + 1, bool)
-    flip[inner] = differ[place]
-    while True:  # pointer doubling: the path to the root halves each time
-        if (parent == count).all():
-            return flip[:count], component
-        flip ^= flip[parent]
-        parent = parent[parent]
+    graph = coo_array((1.0 + cost, (low, high)), (count, count)).tocsr()  # scipy takes an explicit 0 for no edge
+    forest = minimum_spanning_tree(graph).tocoo()
+    a, b = forest.row.astype(np.int64), forest.col.astype(np.int64)
+    across = differ[np.searchsorted(low * count + high, a * count + b)]
+    # everything stands there twice, as it is and flipped; what agrees is connected
+    rows, columns = np.concatenate([a, a + count]), np.concatenate([b + count * across, b + count * ~across])
+    both = coo_array((np.ones(len(rows), np.int8), (rows, columns)), (2 * count, 2 * count))
+    side = connected_components(both, directed=False)[1]
+    component = connected_components(graph, directed=False)[1].astype(np.int64)
+    first = np.unique(component, return_index=True)[1]
+    return side[:count] != side[first[component]], component
 
 
 def turn_faces(
@@ -72,16 +54,7 @@ def turn_faces(
 
     A part whose faces disagreed is turned outwards by the sign of its volume; if they agreed everywhere, the
     shape is turned as a whole, and only if its volume is clearly negative. An edge of more than two faces
-    joins nothing.
-
-    Parameters
-    ----------
-    verts : (V, 3) float64
-    faces : (F, 3) int64
-    cross : (F, 3) float64
-        Normal of each face, twice its area long.
-    edges : Edges
-        Of these faces.
+    joins nothing. `cross` is the normal of each face, twice its area long.
     """
     flip = np.zeros(len(faces), bool)
     areas = 0.5 * np.sqrt(np.einsum("fi,fi->f", cross, cross))

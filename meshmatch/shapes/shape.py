@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -52,8 +53,7 @@ class Shape:
     def __post_init__(self) -> None:
         label = self.name or "the shape"
         verts = read_only(self.verts, np.float64, label)
-        faces = self.faces
-        faces = np.empty((0, 3), np.int64) if faces is None or np.size(faces) == 0 else faces
+        faces = np.empty((0, 3), np.int64) if self.faces is None or np.size(self.faces) == 0 else self.faces
         if np.asarray(faces).dtype.kind not in "iu":
             raise InputError(f"{label}: faces must be integers, not {np.asarray(faces).dtype}")
         faces = read_only(faces, np.int64, label)
@@ -61,30 +61,25 @@ class Shape:
             raise InputError(f"{label}: vertices must be an array of (V, 3), not {verts.shape}")
         if faces.ndim != 2 or faces.shape[1] != 3:
             raise InputError(f"{label}: faces must be an array of (F, 3), not {faces.shape}")
-        if len(verts) == 0:
+        V = len(verts)
+        if V == 0:
             raise InputError(f"{label} has no vertices")
         if not np.isfinite(verts).all():
-            raise InputError(
-                f"{label}: some vertex positions are not finite", "load it with load_shape, which marks them invalid"
-            )
-        if len(faces) and (faces.min() < 0 or faces.max() >= len(verts)):
+            what = f"{label}: some vertex positions are not finite"
+            raise InputError(what, "load it with load_shape, which marks them invalid")
+        if len(faces) and (faces.min() < 0 or faces.max() >= V):
             worst = int(faces.min()) if faces.min() < 0 else int(faces.max())
-            raise InputError(
-                f"{label}: a face refers to vertex {worst}, but there are only {len(verts)} vertices",
-                "the file is damaged, or was cut short",
-            )
-        object.__setattr__(self, "verts", verts)
-        object.__setattr__(self, "faces", faces)
-        if self.colors is not None:
-            colors = read_only(self.colors, np.float64, label)
-            if colors.shape != (len(verts), 4):
-                raise InputError(f"{label}: colors must be an array of ({len(verts)}, 4), not {colors.shape}")
-            object.__setattr__(self, "colors", colors)
-        if self.invalid is not None:
-            invalid = read_only(self.invalid, np.bool_, label)
-            if invalid.shape != (len(verts),):
-                raise InputError(f"{label}: invalid must be an array of ({len(verts)},), not {invalid.shape}")
-            object.__setattr__(self, "invalid", invalid if invalid.any() else None)
+            what = f"{label}: a face refers to vertex {worst}, but there are only {V} vertices"
+            raise InputError(what, "the file is damaged, or was cut short")
+        colors = None if self.colors is None else read_only(self.colors, np.float64, label)
+        if colors is not None and colors.shape != (V, 4):
+            raise InputError(f"{label}: colors must be an array of ({V}, 4), not {colors.shape}")
+        invalid = None if self.invalid is None else read_only(self.invalid, np.bool_, label)
+        if invalid is not None and invalid.shape != (V,):
+            raise InputError(f"{label}: invalid must be an array of ({V},), not {invalid.shape}")
+        invalid = invalid if invalid is not None and invalid.any() else None
+        for name, array in (("verts", verts), ("faces", faces), ("colors", colors), ("invalid", invalid)):
+            object.__setattr__(self, name, array)
 
     @classmethod
     def with_invalid(
@@ -148,11 +143,24 @@ class Shape:
         """(F, 3) unit normals by the right-hand rule; zeros for a face without area."""
         return frozen(unit(self.face_vectors))
 
+    @property
+    def _valid(self) -> Floats:
+        return self.verts if self.invalid is None else self.verts[~self.invalid]
+
+    def _estimated(self, estimate: Callable[[Floats], Floats]) -> Floats:
+        """What is estimated of a cloud's points; zeros for invalid ones."""
+        if self.invalid is None:
+            return frozen(estimate(self.verts))
+        found = estimate(self._valid)
+        every = np.zeros((self.V, *found.shape[1:]))
+        every[~self.invalid] = found
+        return frozen(every)
+
     @cached_property
     def vertex_areas(self) -> Floats:
         """(V,) share of the surface around each vertex: a third of its faces; a cloud's are estimated."""
         if self.is_cloud:
-            return frozen(local_areas(self.verts, self.invalid))
+            return self._estimated(local_areas)
         return frozen(share_areas(self.face_areas, self.faces, self.V))
 
     @cached_property
@@ -162,7 +170,7 @@ class Shape:
         A cloud's are estimated from its neighbourhoods and turned outwards as far as that can be told.
         """
         if self.is_cloud:
-            return frozen(estimate_normals(self.verts, self.invalid))
+            return self._estimated(estimate_normals)
         return frozen(average_normals(self.face_vectors, self.faces, self.V))
 
     @cached_property
@@ -173,16 +181,12 @@ class Shape:
     @cached_property
     def roughness(self) -> float:
         """How noisy a cloud is, 0..1 (see `cloud.roughness`); 0 for a mesh, whose faces say what lies where."""
-        if not self.is_cloud:
-            return 0.0
-        return roughness(self.verts, self.invalid)
+        return roughness(self._valid) if self.is_cloud else 0.0
 
     @cached_property
     def bounds(self) -> Floats:
         """(2, 3) lowest and highest corner of the box around the valid vertices."""
-        verts = self.verts if self.invalid is None else self.verts[~self.invalid]
-        if len(verts) == 0:
-            verts = self.verts
+        verts = self._valid if len(self._valid) else self.verts
         return frozen(np.stack([verts.min(axis=0), verts.max(axis=0)]))
 
     @property

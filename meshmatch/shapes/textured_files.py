@@ -13,14 +13,8 @@ import numpy as np
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.appearance import (
-    Appearance,
-    ImageReader,
-    Pixels,
-    no_coordinates,
-    png_bytes,
-    vertex_colors_alone,
-)  # fmt: skip
+from meshmatch.shapes import appearance
+from meshmatch.shapes.appearance import Appearance, ImageReader, Pixels, png_bytes
 from meshmatch.shapes.formats import Textured, gltf_attributes, gltf_out, obj, obj_look
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
@@ -67,9 +61,9 @@ def find_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
         elif suffix == ".obj":
             found = obj_look.read_look(path, read_bytes(path), shape, reader, picture)
         elif picture is not None:
-            raise no_coordinates(path.name)
+            raise appearance.no_coordinates(path.name)
         else:
-            found = vertex_colors_alone(shape)
+            found = appearance.vertex_colors_alone(shape)
     if len(found.material) != shape.F or (found.colors is not None and len(found.colors) != shape.V):
         raise _another_file(path, shape)
     return None if found.plain else found

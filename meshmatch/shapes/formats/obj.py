@@ -11,20 +11,8 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import (
-    NO_MESH,
-    WRONG_SUFFIX,
-    Raw,
-    Textured,
-    columns,
-    damaged,
-    fan,
-    lines_of,
-    numbers,
-    painted,
-    without_comments,
-    words_per_line,
-)  # fmt: skip
+from meshmatch.shapes import formats
+from meshmatch.shapes.formats import Raw, columns, damaged, fan, numbers, words_per_line
 from meshmatch.shapes.shape import Shape
 
 
@@ -32,10 +20,10 @@ def read(path: Path, data: bytes) -> Raw:
     """One vertex per ``v`` line, in their order; with colours where six numbers are given."""
     name = path.name
     if b"\0" in data[:4096]:
-        raise InputError(f"{name} is not an obj file: it is binary", WRONG_SUFFIX)
+        raise InputError(f"{name} is not an obj file: it is binary", formats.WRONG_SUFFIX)
     text, vertex_lines, faces_text, sizes, face_lines = entries_and_faces(name, joined_lines(data), b"v")
     if len(vertex_lines) == 0:
-        raise InputError(f"{name} holds no vertices: it has no 'v' lines", NO_MESH)
+        raise InputError(f"{name} holds no vertices: it has no 'v' lines", formats.NO_MESH)
     counts = words_per_line(text)
     if len(counts) < len(vertex_lines) or counts.min() < 3:
         raise damaged(name, "a vertex has fewer than 3 coordinates")
@@ -46,7 +34,7 @@ def read(path: Path, data: bytes) -> Raw:
     if (corners == 0).any():
         raise damaged(name, "a face refers to vertex 0, but obj files count from 1")
     corner = from_one(name, "vertex", corners, vertex_lines, np.repeat(face_lines, sizes)) - 1
-    colors = painted(columns(values, counts, 3, 6)) if counts.min() >= 6 else None
+    colors = formats.painted(columns(values, counts, 3, 6)) if counts.min() >= 6 else None
     return Raw(columns(values, counts, 0, 3), fan(corner, sizes), colors)
 
 
@@ -62,7 +50,9 @@ def entries_and_faces(name: str, data: bytes, word: bytes) -> tuple[bytes, Ints,
 
     Faces of the old spelling ``fo`` come last.
     """
-    (text, listed), (faces, lines), (old, old_lines) = lines_of(without_comments(data), word, b"f", b"fo")
+    (text, listed), (faces, lines), (old, old_lines) = formats.lines_of(
+        formats.without_comments(data), word, b"f", b"fo"
+    )
     if len(old_lines):
         faces, lines = faces + b"\n" + old, np.concatenate([lines, old_lines])
     sizes = words_per_line(faces)
@@ -103,7 +93,7 @@ def write(path: Path, shape: Shape) -> None:
     _write(path, [*lines, *(f"f {a} {b} {c}" for a, b, c in (shape.faces + 1).tolist())])
 
 
-def write_textured(path: Path, mesh: Textured, mtl: str, material: str) -> None:
+def write_textured(path: Path, mesh: formats.Textured, mtl: str, material: str) -> None:
     """Vertices and faces exactly as they are, texture coordinates listed apart: seams split nothing.
 
     `mtl` is the name of the material file beside it, `material` that of the only material in it.
@@ -116,7 +106,7 @@ def write_textured(path: Path, mesh: Textured, mtl: str, material: str) -> None:
     _write(path, [*lines, f"usemtl {material}", *faces])
 
 
-def write_material(path: Path, material: str, image: str, mesh: Textured) -> None:
+def write_material(path: Path, material: str, image: str, mesh: formats.Textured) -> None:
     """The mtl: plain paint in the colours of the image. No options of maps: not every reader knows them."""
     paint = [f"newmtl {material}", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {image}"]
     _write(path, paint if mesh.alpha == "opaque" else [*paint, f"map_d {image}"])

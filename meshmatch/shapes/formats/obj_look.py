@@ -13,16 +13,8 @@ import numpy as np
 
 from meshmatch.arrays import Bools, Float, Floats, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.appearance import (
-    Alpha,
-    Appearance,
-    ImageReader,
-    Material,
-    Pixels,
-    Wrap,
-    no_coordinates,
-    vertex_colors_alone,
-)  # fmt: skip
+from meshmatch.shapes import appearance
+from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap
 from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.formats import columns, damaged, fan, lines_of, numbers, words_per_line
 from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines
@@ -79,11 +71,11 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
             corners[rows] = corners[rows] * entry.image.scale + entry.image.offset
     corners[laid, :, 1] = 1.0 - corners[laid, :, 1]
     if not materials or (picture is None and all(material.image is None for material in materials)):
-        bare = vertex_colors_alone(shape)
+        bare = appearance.vertex_colors_alone(shape)
         if bare.colors is not None or not materials:
             return bare
     if picture is not None and not laid.any():
-        raise no_coordinates(path.name)
+        raise appearance.no_coordinates(path.name)
     return Appearance(tuple(materials), kind, corners)
 
 

@@ -9,20 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import (
-    NO_FACES,
-    WRONG_SUFFIX,
-    Raw,
-    columns,
-    damaged,
-    fan,
-    indices,
-    numbers,
-    painted,
-    runs,
-    without_comments,
-    words_per_line,
-)  # fmt: skip
+from meshmatch.shapes import formats
+from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, numbers, words_per_line
 from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.shape import Shape
 
@@ -32,10 +20,10 @@ _HEADER = re.compile(rb"\s*((?:ST)?C?N?)OFF\b|\s*((?:ST)?C?N?)OFF(?=\d)")
 def read_off(path: Path, data: bytes) -> Raw:
     """With or without colours and normals."""
     name = path.name
-    text = without_comments(data).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    text = formats.without_comments(data).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     header = _HEADER.match(text)
     if not header:
-        raise InputError(f"{name} is not an off file: it does not begin with 'OFF'", WRONG_SUFFIX)
+        raise InputError(f"{name} is not an off file: it does not begin with 'OFF'", formats.WRONG_SUFFIX)
     kind = header.group(1) or header.group(2) or b""
     body = text[header.end() :]
     if body.lstrip()[:6] == b"BINARY":
@@ -58,7 +46,7 @@ def read_off(path: Path, data: bytes) -> Raw:
     at = 6 if b"N" in kind else 3
     colors = None
     if b"C" in kind and V and widths.min() >= at + 3:
-        colors = painted(columns(rows, widths, at, min(at + 4, int(widths.min()))))
+        colors = formats.painted(columns(rows, widths, at, min(at + 4, int(widths.min()))))
     verts = columns(rows, widths, 0, 3) if V else np.empty((0, 3))
     if F == 0:
         return Raw(verts, NO_FACES, colors)
@@ -67,7 +55,7 @@ def read_off(path: Path, data: bytes) -> Raw:
     if not ((corners >= 0) & (corners < sizes)).all():
         raise damaged(name, "a face has fewer corners than it says")
     many = corners.astype(np.int64)
-    return Raw(verts, fan(indices(name, faces[runs(starts + 1, many)]), many), colors)
+    return Raw(verts, formats.fan(formats.indices(name, faces[formats.runs(starts + 1, many)]), many), colors)
 
 
 def write_off(path: Path, shape: Shape) -> None:
@@ -105,8 +93,8 @@ def read_xyz(path: Path, data: bytes) -> Raw:
     """x y z at the start of each line, split by space, comma or semicolon; further columns are ignored."""
     name = path.name
     if b"\0" in data[:4096]:
-        raise InputError(f"{name} is not a text file of points", WRONG_SUFFIX)
-    text = without_comments(data.translate(bytes.maketrans(b",;\r", b"  \n")))
+        raise InputError(f"{name} is not a text file of points", formats.WRONG_SUFFIX)
+    text = formats.without_comments(data.translate(bytes.maketrans(b",;\r", b"  \n")))
     counts = words_per_line(text)
     if len(counts) > 1 and counts[0] == 1 and text.split(None, 1)[0] == str(len(counts) - 1).encode():
         text, counts = text.split(None, 1)[1], counts[1:]  # a first line with the number of points
