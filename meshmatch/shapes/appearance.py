@@ -37,22 +37,9 @@ _DAMAGE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error,
 class Material:
     """The base colour of some faces: an image times a factor.
 
-    Parameters
-    ----------
-    name : str
-        As the file has it.
-    image : (H, W, 4) uint8, optional
-        sRGB colours and plain alpha. Its top row begins at v = 0.
-    factor : 4 floats
-        Linear red, green, blue, and alpha.
-    wrap : two of "repeat", "clamp", "mirror"
-        What u and v outside 0..1 mean.
-    nearest : bool
-        True where the file wants texels as squares, not blended.
-    alpha : {"opaque", "mask", "blend"}
-        Ignored, a threshold, or a share.
-    cutoff : float
-        The threshold of "mask".
+    `image` (H, W, 4) has sRGB colours and plain alpha; its top row begins at v = 0. `factor` is linear red, green, blue,
+    and alpha. `wrap` says what u and v outside 0..1 mean, `nearest` that the file wants texels as squares, not blended.
+    Alpha is ignored ("opaque"), compared with `cutoff` ("mask"), or a share ("blend").
     """
 
     name: str = ""
@@ -68,22 +55,11 @@ class Material:
 class Appearance:
     """What lies on the faces of one shape.
 
-    Parameters
-    ----------
-    materials
-        At least one.
-    material
-        Of each face.
-    uv
-        Texture coordinates of each corner: u to the right, v *down*, as in glTF; zeros where a material has no
-        image. Transforms that the file asks for are applied.
-    colors
-        Linear colour and alpha of each vertex, to be multiplied.
+    There is at least one material; each face has one. `uv` are the texture coordinates of each corner: u to the right,
+    v *down*, as in glTF, with the transforms that the file asks for; zeros where a material has no image. `colors` are
+    linear colour and alpha of each vertex, to be multiplied.
 
-    Raises
-    ------
-    InputError
-        A coordinate that is not finite or absurdly large on a face with an image.
+    `InputError` for a coordinate that is not finite or absurdly large on a face with an image.
     """
 
     materials: tuple[Material, ...]
@@ -95,11 +71,9 @@ class Appearance:
         pictured = np.array([m.image is not None for m in self.materials])[self.material]
         fine = (np.abs(self.uv[pictured]) < _FURTHEST_UV).all(axis=(1, 2))
         if not fine.all():
-            raise InputError(
-                f"the texture coordinates of {len(fine) - int(fine.sum())} faces are out of range (not a number, or over "
-                "a million)",
-                "unwrap the source again, or export it again",
-            )
+            bad = f"the texture coordinates of {len(fine) - int(fine.sum())} faces are out of range"
+            hint = "unwrap the source again, or export it again"
+            raise InputError(f"{bad} (not a number, or over a million)", hint)
 
     @property
     def textured(self) -> bool:
@@ -124,10 +98,8 @@ def vertex_colors_alone(shape: Shape) -> Appearance:
 
 def no_coordinates(name: str) -> InputError:
     """The error for a picture that nothing says how to lay on."""
-    return InputError(
-        f"{name} has no texture coordinates: an image cannot be laid on it",
-        "unwrap it, or leave out --image and use its vertex colours",
-    )
+    what = f"{name} has no texture coordinates: an image cannot be laid on it"
+    return InputError(what, "unwrap it, or leave out --image and use its vertex colours")
 
 
 class ImageReader:
@@ -137,10 +109,7 @@ class ImageReader:
         self.left = MAX_ALL_PIXELS
 
     def decode(self, data: bytes, label: str) -> Pixels:
-        """(H, W, 4) red, green, blue, alpha of the bytes of a png, jpeg, webp, bmp, tga or tiff, top row first.
-
-        `InputError` if it is no image of these, damaged, or too large.
-        """
+        """(H, W, 4) red, green, blue, alpha of a png, jpeg, webp, bmp, tga or tiff, top row first; or `InputError`."""
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # the bomb is judged here; other warnings are of metadata

@@ -20,26 +20,18 @@ from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, plain, 
 from meshmatch.shapes.input_files import existing, read_bytes
 from meshmatch.shapes.shape import Shape
 
-_READERS: dict[str, Callable[[Path, bytes], Raw]] = {
-    ".ply": ply.read,
-    ".obj": obj.read,
-    ".off": plain.read_off,
-    ".stl": plain.read_stl,
-    ".glb": gltf.read,
-    ".gltf": gltf.read,
-    ".xyz": plain.read_xyz,
-    ".npy": plain.read_points,
+_FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], None] | None]] = {
+    ".ply": (ply.read, ply.write),
+    ".obj": (obj.read, obj.write),
+    ".off": (plain.read_off, plain.write_off),
+    ".stl": (plain.read_stl, plain.write_stl),
+    ".glb": (gltf.read, gltf_out.write),
+    ".gltf": (gltf.read, None),
+    ".xyz": (plain.read_xyz, plain.write_xyz),
+    ".npy": (plain.read_points, plain.write_points),
 }
-_WRITERS: dict[str, Callable[[Path, Shape], None]] = {
-    ".ply": ply.write,
-    ".obj": obj.write,
-    ".off": plain.write_off,
-    ".stl": plain.write_stl,
-    ".glb": gltf_out.write,
-    ".xyz": plain.write_xyz,
-    ".npy": plain.write_points,
-}
-SUFFIXES = tuple(_READERS)
+_WRITERS = {suffix: write for suffix, (_, write) in _FORMATS.items() if write is not None}
+SUFFIXES = tuple(_FORMATS)
 """The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf."""
 _HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
 
@@ -59,12 +51,12 @@ def load_shape(path: str | Path) -> Shape:
     """
     path = existing(Path(path), suffixes=SUFFIXES)
     suffix = path.suffix.lower()
-    if suffix not in _READERS:
+    if suffix not in _FORMATS:
         unknown = f"{path.name}: unsupported file format {suffix or '(no suffix)'}"
         raise InputError(unknown, f"meshmatch reads {', '.join(SUFFIXES)}")
     data = read_bytes(path)
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
-        raw = _READERS[suffix](path, data)
+        raw = _FORMATS[suffix][0](path, data)
     return Shape.with_invalid(raw.verts, raw.faces, plain_text(path.name), raw.colors)
 
 

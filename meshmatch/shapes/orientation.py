@@ -11,20 +11,10 @@ from meshmatch.geometry.topology import Edges, directed_edges
 def agreeing_flips(
     count: int, pairs: Int[Ints, "N 2"], differ: Bool[Bools, " N"], cost: Float[Floats, " N"]
 ) -> tuple[Bool[Bools, " count"], Int[Ints, " count"]]:
-    """Which of `count` things to flip so that neighbours agree along a minimum spanning forest.
+    """Which of `count` things to flip so that neighbours agree along a minimum spanning forest, and their components.
 
-    Parameters
-    ----------
-    pairs
-        Neighbours.
-    differ
-        True where the two disagree as they are.
-    cost
-        Small where a pair's word counts.
-
-    Returns
-    -------
-    Whether to flip each thing, relative to an arbitrary member of its component; and the component's number.
+    `differ` says which `pairs` of neighbours disagree as they are; `cost` is small where a pair's word counts. Things
+    are flipped relative to an arbitrary member of their component.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree

@@ -32,14 +32,10 @@ class Repaired:
         The repaired vertex that stands for each original one: itself, its twin at the same position, or if it
         was dropped the nearest one. The nearest to a vertex without a position is a valid corner of one of
         its faces, or if there is none the nearest in the file's order.
-    kept_vertex
-        The original vertex that each repaired one is; increasing.
+    kept_vertex, kept_face
+        The original vertex (increasing) or face that each repaired one is; corners may be turned, or stand for twins.
     notes
         What was found and done, a line each; empty for a shape that was fine.
-    original
-        The shape that this one came from.
-    kept_face
-        The original face that each repaired one is; its corners may be turned, or stand for twins.
     far_parts
         Big parts that lie far from the largest one: perhaps two objects in one file. They are kept.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,14 +22,8 @@ _LONGEST = 3.0  # of an edge, against the usual reach of a point's sixth neighbo
 class Samples(OrientedPoints):
     """Points on a shape in its own frame, with the normals of their faces; a cloud's are estimated, not signed.
 
-    Parameters
-    ----------
-    face
-        Face that each point lies on; -1 for a cloud.
-    barycentric
-        Weights of that face's corners, in 0..1, sum 1; for a cloud (1, 0, 0).
-    vertex
-        The face's corner of the largest weight; for a cloud the very point that was drawn.
+    Each lies on a `face` (-1 for a cloud), whose corners have weights that sum to 1 (`barycentric`; for a cloud
+    (1, 0, 0)); `vertex` is the corner of the largest weight, or the very point of the cloud that was drawn.
     """
 
     face: Int[Ints, " P"]
@@ -48,10 +43,11 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
         raise InputError(f"{shape.name or 'the shape'} has no surface to sample", "all its faces are degenerate")
     if shape.is_cloud:
         chosen = _draw_points(areas, P, rng)
-        weights = np.zeros((P, 3))
-        weights[:, 0] = 1.0
-        normals = shape.vertex_normals[chosen]
-        face = np.full(P, -1, np.int64)
+        weights, face, normals = (
+            np.tile([1.0, 0.0, 0.0], (P, 1)),
+            np.full(P, -1, np.int64),
+            shape.vertex_normals[chosen],
+        )
         return Samples(shape.verts[chosen], normals, signed=False, face=face, barycentric=weights, vertex=chosen)
     # side="right" steps over faces without area
     face = np.searchsorted(total, rng.random(P) * total[-1], side="right").astype(np.int64)
@@ -111,20 +107,9 @@ def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Int
     Dimensional Localized Delaunay Triangulation*, 2000): a triangle is kept where the stars of all three corners have
     it. Where points are noisy stars disagree and a small hole stays; nothing is moved or invented.
 
-    Parameters
-    ----------
-    most
-        About how many triangles at most; half as many points are taken, evenly spread.
-
-    Returns
-    -------
-    The points of the cloud that are corners, and faces over them, counter-clockwise seen from where the cloud's
-    estimated normals point.
-
-    Raises
-    ------
-    InputError
-        Hardly any two stars agree: the points lie on no surface.
+    There are about `most` triangles at most: half as many points are taken, evenly spread. Returns those that are
+    corners, and faces over them, counter-clockwise seen from where the cloud's estimated normals point. `InputError` if
+    hardly any two stars agree: the points lie on no surface.
     """
     chosen = np.arange(cloud.V)
     if cloud.V > most // 2:
@@ -133,12 +118,10 @@ def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Int
     k = min(_NEIGHBOURS, len(points) - 1)
     distance, index = cKDTree(points).query(points, k + 1)
     reach = _LONGEST * np.median(distance[:, min(6, k)])
-    votes: dict[tuple[int, int, int], int] = {}
+    votes: Counter[tuple[int, ...]] = Counter()
     for own, near in enumerate(index):
-        for second, third in _star(points[near], normals[own], reach):
-            corners = sorted((own, int(near[second]), int(near[third])))
-            key = (corners[0], corners[1], corners[2])
-            votes[key] = votes.get(key, 0) + 1
+        stars = _star(points[near], normals[own], reach)
+        votes.update(tuple(sorted((own, int(near[second]), int(near[third])))) for second, third in stars)
     faces = np.array([key for key, count in votes.items() if count == 3], np.int64).reshape(-1, 3)
     if 3 * len(faces) < len(points):
         raise InputError(
@@ -161,10 +144,9 @@ def _star(points: Floats, normal: Floats, reach: float) -> list[tuple[int, int]]
     except QhullError:
         return []  # all on a line
     found = []
-    for corners in triangles:
-        if 0 in corners:
-            b, c = (int(i) for i in corners if i != 0)
-            edges = (points[b] - points[0], points[c] - points[0], points[b] - points[c])
-            if max(float(edge @ edge) for edge in edges) < reach**2:
-                found.append((b, c))
+    for corners in triangles[(triangles == 0).any(axis=1)]:
+        b, c = (int(i) for i in corners if i != 0)
+        edges = (points[b] - points[0], points[c] - points[0], points[b] - points[c])
+        if max(float(edge @ edge) for edge in edges) < reach**2:
+            found.append((b, c))
     return found

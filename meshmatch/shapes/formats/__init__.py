@@ -44,18 +44,10 @@ class Raw:
 
 @dataclass(frozen=True, eq=False)
 class Textured:
-    """A mesh that wears one image, ready to be written.
+    """A mesh that wears one image, ready to be written, in the unit of the file.
 
-    Parameters
-    ----------
-    verts, faces
-        In the unit of the file.
-    uv
-        Of each corner: u to the right, v down.
-    cutoff
-        The threshold of "mask".
-    wrap
-        What lies outside 0..1.
+    `uv` belongs to each corner: u to the right, v down; `wrap` says what lies outside 0..1, `cutoff` is the threshold of
+    "mask".
     """
 
     verts: Float[Floats, "V 3"]

@@ -66,12 +66,7 @@ def from_one(
 ) -> Int[Ints, " N"]:
     """Numbers of faces that count from 1, also those that counted backwards from the last entry before their line.
 
-    Parameters
-    ----------
-    values
-        As the faces have them; 0 stays 0.
-    listed, lines
-        The lines of the entries, and of the face of each value.
+    `values` are as the faces have them (0 stays 0), on the `lines` of these; `listed` are the lines of the entries.
     """
     if not (np.abs(values) < 2**53).all() or (values != np.trunc(values)).any():
         raise damaged(name, f"a face refers to a {what} that is not a whole number")

@@ -6,7 +6,7 @@ An image is taken as it is: Kd counts for faces without one (many programs write
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -21,12 +21,12 @@ from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lin
 from meshmatch.shapes.input_files import beside, read_bytes
 from meshmatch.shapes.shape import Shape
 
-# How many numbers follow an option of a map; up to three where it is None.
-_OPTIONS = {
-    **dict.fromkeys(("-o", "-s", "-t"), None),
-    **dict.fromkeys(("-blendu", "-blendv", "-cc", "-clamp", "-bm", "-boost", "-texres", "-imfchan", "-type"), 1),
-    "-mm": 2,
-}
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
+_OPTION = re.compile(
+    rf"(?:(-o|-s|-t)((?:\s+{_NUMBER}(?!\S)){{0,3}})|-mm\s+\S+\s+\S+|(-clamp)\s+(\S+)|"
+    r"-(?:blendu|blendv|cc|bm|boost|texres|imfchan|type)\s+\S+)(?:\s+|\Z)",
+    re.IGNORECASE,
+)
 
 
 @dataclass
@@ -167,36 +167,21 @@ def _parse(file: Path) -> dict[str, _Entry]:
 
 def _map(text: str) -> _Map:
     """Options and file of a map; the file's name may hold spaces."""
-    made, rest = _Map(""), text
-    while rest.startswith("-"):
-        option, rest = (*rest.split(None, 1), "")[:2]
-        option = option.lower()
-        count = _OPTIONS[option]
-        taken: list[str] = []
-        while rest and len(taken) < (count or 3):
-            word, behind = (*rest.split(None, 1), "")[:2]
-            if count is None and not _is_number(word):
-                break
-            taken.append(word)
-            rest = behind
-        if option == "-o":
-            made.offset = (float(taken[0]), float((*taken, "0")[1]))
-        elif option == "-s":
-            made.scale = (float(taken[0]), float((*taken, "1")[1]))
-        elif option == "-clamp":
-            made.clamp = taken[0].lower() == "on"
-    if not rest:
+    made = _Map("")
+    while text.startswith("-"):
+        found = _OPTION.match(text)
+        if found is None:
+            raise ValueError("an unknown option")
+        option, words, clamp, state = (group.lower() for group in found.groups(""))
+        if option in ("-o", "-s"):
+            u, v = [*map(float, words.split()), 0.0 if option == "-o" else 1.0][:2]
+            made = replace(made, offset=(u, v)) if option == "-o" else replace(made, scale=(u, v))
+        elif clamp:
+            made.clamp = state == "on"
+        text = text[found.end() :]
+    if not text:
         raise ValueError("no file")
-    made.file = rest
-    return made
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+    return replace(made, file=text)
 
 
 def _material(name: str, entry: _Entry, image: Pixels | None) -> Material:
