@@ -15,8 +15,8 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
-from meshmatch.transfer.inverse_map import invert_map
 from meshmatch.transfer.low_confidence import LowConfidence
+from meshmatch.transfer.mapped_mesh import invert_map
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,9 +18,7 @@ from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer import colors as vertex_colors
-from meshmatch.transfer.attributes import pull_labels, pull_values, pull_weights
-from meshmatch.transfer.directions import pull_directions
-from meshmatch.transfer.face_labels import mean_of_corners, pull_face_labels
+from meshmatch.transfer.attributes import pull_directions, pull_face_labels, pull_labels, pull_values, pull_weights
 from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, named
 from meshmatch.transfer.landmarks import Landmarks, at_points, at_vertices, load_landmarks, push_landmarks
 from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels, replace_low_values, replace_low_weights
@@ -183,7 +181,7 @@ def transfer_labels(
         confidence = _confidence(back)
         if kind == "faces":
             found = pull_face_labels(back, source, target, given.codes, of_face, maps.threads)
-            confidence = mean_of_corners(confidence, target)
+            confidence = confidence[target.faces].mean(axis=1)
         else:
             found = pull_labels(back, source, given.codes, of_face)
         found, low = replace_low_labels(

@@ -28,9 +28,8 @@ from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 from meshmatch.transfer.attributes import pull_values
-from meshmatch.transfer.inverse_map import invert_map
 from meshmatch.transfer.label_files import Labels
-from meshmatch.transfer.mapped_mesh import MappedMesh
+from meshmatch.transfer.mapped_mesh import MappedMesh, invert_map
 
 ErrorUnit = Literal["cm", "x100"]
 

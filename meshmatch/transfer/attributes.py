@@ -1,6 +1,8 @@
-"""Values, labels and skin weights of the source, pulled back to the vertices of the target.
+"""Values, directions, labels and skin weights of the source, pulled back to the target by `back`, a map from the target
+to the source.
 
-Smooth things are interpolated between the corners of the source's face; labels are voted on and never averaged.
+Smooth things are interpolated between the corners of the source's face; labels are voted on and never averaged. They
+are numbers from 0, and `NO_LABEL` for none; one for each vertex of the source or, ``on_faces``, for each of its faces.
 """
 
 from __future__ import annotations
@@ -9,10 +11,19 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.errors import InputError
+from meshmatch.geometry.topology import edges_of
+from meshmatch.geometry.triangles import triangle_areas
+from meshmatch.maps.map_checks import corners_of
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals
 
 NO_LABEL = -1
+# A face is cut into the square of so many small triangles, whose centers vote.
+_ROWS = 3
+# A face this many times as large as those of the source there may hold more labels than its corners tell.
+_LARGE = 4.0
 
 
 def pull_values(back: VertexMap, values: Floats) -> Floats:
@@ -20,11 +31,6 @@ def pull_values(back: VertexMap, values: Floats) -> Floats:
 
     As `VertexMap.apply`, except that a value that is not finite takes no part, unless it has more than half of the
     weight: then the result is nan.
-
-    Parameters
-    ----------
-    back : VertexMap
-        From target to source.
     """
     values = np.asarray(values, np.float64)
     matrix = back.sparse()
@@ -36,53 +42,148 @@ def pull_values(back: VertexMap, values: Floats) -> Floats:
     return np.where(share >= 0.5, sums / np.maximum(share, 0.5), np.nan)
 
 
+def pull_directions(
+    back: VertexMap, source: Shape, target: Shape, directions: Float[Floats, "V_source 3"]
+) -> Float[Floats, "V_target 3"]:
+    """Unit vectors at the target's vertices from vectors, such as normals, at the source's; each in its file's frame.
+
+    Around each vertex of the target the rotation is taken that best turns the edges and the normal of the source
+    there into those of the target (Kabsch); vectors that cancel become zeros. `InputError` if one of the shapes is a
+    point cloud, or there is not one vector for each vertex.
+    """
+    if source.is_cloud or target.is_cloud:
+        raise InputError("directions need meshes, not point clouds", "transfer them as plain numbers")
+    if directions.shape != (source.V, 3):
+        raise InputError(f"directions must be an array of ({source.V}, 3), not {directions.shape}")
+    points = back.points(source)
+    edges = edges_of(target.faces).vertices
+    here, there = (place[edges[:, 1]] - place[edges[:, 0]] for place in (target.verts, points))
+    unit = np.sqrt(target.area * source.area) or 1.0
+    products = np.einsum("ni,nj->nij", here, there) / unit
+    sums = np.zeros((target.V, 3, 3))
+    np.add.at(sums, edges[:, 0], products)
+    np.add.at(sums, edges[:, 1], products)
+    # the normal counts as much as the edges do: in a flat ring these leave its sign open
+    weight = np.maximum(np.linalg.norm(sums, axis=(1, 2)), 1e-12)[:, None, None]
+    sums += weight * np.einsum("ni,nj->nij", target.vertex_normals, back.apply(source.vertex_normals))
+    left, _, right = np.linalg.svd(sums)
+    sign = np.ones((target.V, 3))
+    sign[:, 2] = np.sign(np.linalg.det(left @ right))
+    rotations = (left * sign[:, None, :]) @ right
+    turned = np.einsum("nij,nj->ni", rotations, back.apply(np.nan_to_num(directions)))
+    length = np.linalg.norm(turned, axis=1, keepdims=True)
+    return turned / np.where(length > 0, length, 1.0)
+
+
 def pull_labels(
     back: VertexMap, source: Shape, labels: Int[Ints, " N"], on_faces: bool = False
 ) -> Int[Ints, " V_target"]:
-    """Labels of the target's vertices: those with most weight around their places on the source.
+    """Labels of the target's vertices: those with most weight around their places on the source."""
+    return most_votes(_vertex_votes(back, source, labels, on_faces))
 
-    Parameters
-    ----------
-    labels : (V_source,) or, ``on_faces``, (F_source,) int64
-        A number for each label from 0; `NO_LABEL` for none.
 
-    Returns
-    -------
-    (V_target,) int64
-        `NO_LABEL` where nothing around has a label.
+def pull_face_labels(
+    back: VertexMap, source: Shape, target: Shape, labels: Int[Ints, " N"], on_faces: bool, workers: int = 1
+) -> Int[Ints, " F_target"]:
+    """Labels of the target's faces.
+
+    Where everything around the places of its three corners has one label, a face has it too. Elsewhere evenly
+    spread points of the face look up the source, and the label that most of them find wins.
     """
-    return most_votes(vertex_votes(back, source, labels, on_faces))
+    # Whatever occurs around the places of a face's corners, however small its weight.
+    touched = _corner_matrix(corners_of(source.faces, back.face, back.index), source.V)
+    occurring, corners = _one_hot(labels), _corner_matrix(target.faces, target.V)
+    if on_faces:
+        occurring = csr_array(_corner_matrix(source.faces, source.V).T @ occurring)
+    around = csr_array(corners @ (touched @ occurring))
+    found = most_votes(around)
+    area = triangle_areas(back.points(source), target.faces)
+    usual = _face_area_around(source)[back.index[target.faces]].mean(axis=1)
+    ask = np.flatnonzero((np.diff(around.indptr) != 1) | (area > _LARGE * usual))
+    if not len(ask):
+        return found
+    votes = csr_array(corners @ _vertex_votes(back, source, labels, on_faces))[ask]
+    continuous = np.flatnonzero(~discontinuous_faces(back, target, source)[ask])
+    if len(continuous):
+        sampled = _sampled_votes(back, source, target, labels, on_faces, ask[continuous], workers)
+        # The corners decide only where no point of a face has found a label.
+        votes = 1e-6 * votes + _ones(continuous, np.arange(len(continuous)), (len(ask), len(continuous))) @ sampled
+    found[ask] = most_votes(csr_array(votes))
+    return found
 
 
-def vertex_votes(back: VertexMap, source: Shape, labels: Ints, on_faces: bool = False) -> csr_array:
+def _sampled_votes(
+    back: VertexMap, source: Shape, target: Shape, labels: Ints, on_faces: bool, faces: Ints, workers: int
+) -> csr_array:
+    """(N, labels) votes of the points of N faces of the target."""
+    spread = lattice(_ROWS)  # P 3
+    corners = target.faces[faces]
+    normals = back.apply(known_normals(source))
+    points, facing = (
+        np.einsum("pk,nkd->npd", spread, values[corners]).reshape(-1, 3) for values in (back.points(source), normals)
+    )
+    found = MappedMesh.of(source).query(points, facing, workers)
+    voter = np.repeat(np.arange(len(faces)), len(spread))
+    if on_faces and source.F:
+        code = np.where(found.face >= 0, labels[found.face], NO_LABEL)
+    else:
+        at = corners_of(source.faces, found.face, found.vertex)
+        rows = np.repeat(np.arange(len(at)), 3)
+        places = csr_array((found.barycentric.ravel(), (rows, at.ravel())), (len(at), source.V))
+        code = most_votes(places @ _one_hot(labels))
+    known = code >= 0
+    return _ones(voter[known], code[known], (len(faces), max(int(labels.max(initial=-1)) + 1, 1)))
+
+
+def lattice(rows: int) -> Float[Floats, "P 3"]:
+    """Barycentric centers of the rows^2 equal triangles into which a triangle is cut."""
+    points = []
+    for i in range(rows):
+        for j in range(rows - i):
+            points.append((i + 1 / 3, j + 1 / 3))
+            if j < rows - i - 1:
+                points.append((i + 2 / 3, j + 2 / 3))
+    first, second = np.array(points).T / rows
+    return np.stack([1.0 - first - second, first, second], axis=1)
+
+
+def _face_area_around(shape: Shape) -> Float[Floats, " V"]:
+    """Mean area of the faces at each vertex; of a cloud, the area of each point."""
+    if shape.is_cloud:
+        return shape.vertex_areas
+    corners = shape.faces.ravel()
+    total = np.bincount(corners, np.repeat(shape.face_areas, 3), shape.V)
+    return np.asarray(total / np.maximum(np.bincount(corners, minlength=shape.V), 1))
+
+
+def _vertex_votes(back: VertexMap, source: Shape, labels: Ints, on_faces: bool) -> csr_array:
     """(V_target, labels) sparse: the weight of each label at each target vertex."""
-    places = face_weights(back, source) if on_faces else back.sparse()
-    return csr_array(places @ one_hot(labels))
-
-
-def face_weights(back: VertexMap, source: Shape) -> csr_array:
-    """(V_target, F_source) sparse: the source's face at each place; at a vertex all faces around, by their area."""
-    V = back.source_vertices
+    if not on_faces:
+        return csr_array(back.sparse() @ _one_hot(labels))
+    # The source's face at each place; at a vertex all faces around, by their area.
     within = (back.face >= 0) & (back.barycentric.max(axis=1) < 1.0 - 1e-9)
-    rows = np.flatnonzero(within)
-    direct = csr_array((np.ones(len(rows)), (rows, back.face[rows])), shape=(V, source.F))
-    rows = np.flatnonzero(~within)
-    at = csr_array((np.ones(len(rows)), (rows, back.index[rows])), shape=(V, source.V))
+    inside, outside = np.flatnonzero(within), np.flatnonzero(~within)
+    direct = _ones(inside, back.face[inside], (len(within), source.F))
+    at = _ones(outside, back.index[outside], (len(within), source.V))
     area = source.face_areas / max(float(source.face_areas.max()), 1e-300) + 1e-12
-    return csr_array(direct + at @ faces_at_vertices(source, area))
+    entries = np.repeat(area, 3), (source.faces.ravel(), np.repeat(np.arange(source.F), 3))
+    return csr_array(csr_array(direct + at @ csr_array(entries, shape=(source.V, source.F))) @ _one_hot(labels))
 
 
-def faces_at_vertices(shape: Shape, weight: Float[Floats, " F"]) -> csr_array:
-    """(V, F) sparse: `weight` (F,) of each face at each of its corners."""
-    entries = np.repeat(weight, 3), (shape.faces.ravel(), np.repeat(np.arange(shape.F), 3))
-    return csr_array(entries, shape=(shape.V, shape.F))
+def _corner_matrix(corners: Int[Ints, "N 3"], V: int) -> csr_array:
+    """(N, V) sparse: 1 for each corner."""
+    return _ones(np.repeat(np.arange(len(corners)), 3), corners.ravel(), (len(corners), V))
 
 
-def one_hot(labels: Int[Ints, " N"]) -> csr_array:
+def _one_hot(labels: Int[Ints, " N"]) -> csr_array:
     """(N, labels) sparse: 1 at the label of each; rows without a label are empty."""
     rows = np.flatnonzero(labels >= 0)
-    width = int(labels.max(initial=-1)) + 1
-    return csr_array((np.ones(len(rows)), (rows, labels[rows])), shape=(len(labels), max(width, 1)))
+    return _ones(rows, labels[rows], (len(labels), max(int(labels.max(initial=-1)) + 1, 1)))
+
+
+def _ones(rows: Ints, columns: Ints, shape: tuple[int, int]) -> csr_array:
+    """A sparse matrix with 1 at these places, added up."""
+    return csr_array((np.ones(len(rows)), (rows, columns)), shape=shape)
 
 
 def most_votes(votes: csr_array) -> Int[Ints, " N"]:

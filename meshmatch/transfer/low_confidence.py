@@ -1,4 +1,7 @@
-"""What to do where a map has little confidence: leave blank, or fill in from the neighbours."""
+"""What to do where a map has little confidence: leave blank, or fill in from the neighbours.
+
+Entries without a value count as of low confidence: the source had none there.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +16,16 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.topology import edges_of, same_rows
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.attributes import largest_weights
+from meshmatch.transfer.attributes import NO_LABEL, largest_weights
 
 _NEIGHBOURS = 8  # of a point of a cloud
 
 
 @dataclass(frozen=True)
 class LowConfidence:
-    """How much of a result has low confidence, and what was done with it.
+    """How many entries a result has, and how many of low confidence; how many of all were left blank, and filled in.
 
-    Parameters
-    ----------
-    total, low : int
-        How many entries there are, and how many of low confidence.
-    blank, filled : int
-        How many of all were left blank, and filled in. The rest of `low` was kept as it came.
+    The rest of `low` was kept as it came.
     """
 
     total: int
@@ -71,32 +69,28 @@ def _graph(points: Floats, pairs: Ints) -> csr_array:
     return csr_array(coo_array((np.tile(length, 2), (both[:, 0], both[:, 1])), shape=(len(points), len(points))))
 
 
+def _with_neighbours(graph: csr_array, some: Bools) -> Ints:
+    """Numbers of some nodes and of their neighbours: only these matter, however large the rest is."""
+    return np.flatnonzero(some | (np.asarray(graph @ some.astype(np.float64)) > 0))
+
+
 def nearest_known(graph: csr_array, known: Bools) -> Ints:
     """(N,) for each node the nearest known one along the graph; itself if it is known; -1 out of reach."""
     nearest = np.where(known, np.arange(len(known)), -1)
-    # Only the unknown and their neighbours matter, however large the rest is.
-    adjacent = np.asarray(graph @ (~known).astype(np.float64)) > 0
-    some = np.flatnonzero(~known | adjacent)
-    if not known[some].any():
-        return nearest
-    distance, _, first = dijkstra(
-        csr_array(graph[some][:, some]), indices=np.flatnonzero(known[some]), min_only=True, return_predecessors=True
-    )
-    reached = np.isfinite(distance)
-    nearest[some[reached]] = some[first[reached]]
+    some = _with_neighbours(graph, ~known)
+    if known[some].any():
+        part, begin = csr_array(graph[some][:, some]), np.flatnonzero(known[some])
+        distance, _, first = dijkstra(part, indices=begin, min_only=True, return_predecessors=True)
+        reached = np.isfinite(distance)
+        nearest[some[reached]] = some[first[reached]]
     return nearest
 
 
 def diffuse(graph: csr_array, known: Bools, values: Floats) -> tuple[Floats, Bools]:
     """Values (N, D) with the unknown rows filled in: each is the mean of its neighbours, weighted by 1 / distance.
 
-    That is the discrete harmonic function with the known values as its boundary; solved by conjugate gradients.
-
-    Returns
-    -------
-    values : (N, D)
-    filled : (N,) bool
-        Which rows were filled in; those that no known row reaches stay as they were.
+    That is the discrete harmonic function with the known values as its boundary; solved by conjugate gradients. The
+    second result (N,) says which rows were filled in; those that no known row reaches stay as they were.
     """
     nearest = nearest_known(graph, known)
     ask = ~known & (nearest >= 0)
@@ -108,17 +102,14 @@ def diffuse(graph: csr_array, known: Bools, values: Floats) -> tuple[Floats, Boo
     near = csr_array(graph[rows])
     near.data = 1.0 / near.data
     total = np.asarray(near.sum(axis=1)).ravel()
-    inner = csr_array(near[:, rows])
-    system = csr_array(diags_array(total) - inner)
+    system = csr_array(diags_array(total) - csr_array(near[:, rows]))
     fixed = np.where(known[:, None], out, 0.0)
     right = np.asarray(near @ fixed)
     scale = diags_array(1.0 / total)
     for column in range(out.shape[1]):
-        start = out[rows, column]
-        found, _ = cg(system, right[:, column], x0=start, rtol=1e-8, maxiter=2000, M=scale)
+        found, _ = cg(system, right[:, column], x0=out[rows, column], rtol=1e-8, maxiter=2000, M=scale)
         # A mean lies between the known values; the solver's last bits may not.
-        lowest, highest = fixed[known, column].min(), fixed[known, column].max()
-        out[rows, column] = np.clip(found, lowest, highest)
+        out[rows, column] = np.clip(found, fixed[known, column].min(), fixed[known, column].max())
     return out, ask
 
 
@@ -130,10 +121,7 @@ def replace_low_values(
     blank: Floats | float | None = None,
     fill: bool = False,
 ) -> tuple[Floats, LowConfidence]:
-    """Values (V,) or (V, D) of the target; those of low confidence are left blank, filled in, or kept.
-
-    Values that are nan always count as low: the source had none there.
-    """
+    """Values (V,) or (V, D) of the target; those of low confidence, or nan, are left blank, filled in, or kept."""
     table = values if values.ndim == 2 else values[:, None]
     low = (confidence < min_confidence) | ~np.isfinite(table).all(axis=1)
     N, count = len(low), int(low.sum())
@@ -155,17 +143,13 @@ def replace_low_weights(
     fill: bool,
     max_joints: int,
 ) -> tuple[csr_array, LowConfidence]:
-    """Skin weights (V, J) of the target; those of low confidence are filled in, or kept. Rows still sum to 1.
-
-    Vertices without weights always count as low.
-    """
+    """Skin weights (V, J) of the target; those of low confidence are filled in, or kept. Rows still sum to 1."""
     low = (confidence < min_confidence) | (np.diff(weights.indptr) == 0)
     N, count = len(low), int(low.sum())
     if not fill or not count:
         return weights, LowConfidence(N, count)
     graph = vertex_graph(target)
-    # Dense numbers only where they are needed: for the low vertices and their neighbours.
-    some = np.flatnonzero(low | (np.asarray(graph @ low.astype(np.float64)) > 0))
+    some = _with_neighbours(graph, low)  # dense numbers only where they are needed
     dense, done = diffuse(csr_array(graph[some][:, some]), ~low[some], weights[some].toarray())
     filled = np.zeros(N, bool)
     filled[some[done]] = True
@@ -186,8 +170,6 @@ def replace_low_labels(
 ) -> tuple[Int[Ints, " N"], LowConfidence]:
     """Labels of the target's vertices or faces; those of low confidence are left blank (-1), taken from the nearest
     other vertex or face along the surface, or kept.
-
-    Those without a label (-1) always count as low.
     """
     low = (confidence < min_confidence) | (labels < 0)
     out, filled = labels.copy(), 0
@@ -197,5 +179,5 @@ def replace_low_labels(
         out[ask] = labels[nearest[ask]]
         filled = int(ask.sum())
     elif blank:
-        out[low] = -1
+        out[low] = NO_LABEL
     return out, LowConfidence(len(labels), int(low.sum()), int((out < 0).sum()), filled)

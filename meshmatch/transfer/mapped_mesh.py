@@ -1,8 +1,8 @@
 """The source as it lies on the target: every source vertex at its matched point, with the source's own faces.
 
-A point of the target finds its place on the source as the closest point of that image. Where several parts of the
-image pass by, the most trustworthy wins: facing the same way, mapped with confidence, near, and never a triangle that
-the map has pulled apart.
+A point of the target finds its place on the source as the closest point of that image; those of all its vertices are
+the inverse of a map. Where several parts of the image pass by, the most trustworthy wins: facing the same way, mapped
+with confidence, near, and never a triangle that the map has pulled apart.
 
 The search is exact for triangles of any size, which an image needs: a map stretches some and shrinks others, and
 leaves vertices without a triangle. `meshmatch.maps.surface` asks only the triangles around the nearest vertex, which is
@@ -11,14 +11,16 @@ faster but misses large ones; `meshmatch.transfer.surface_walk` needs to know wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.topology import edges_of
 from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths, unit
+from meshmatch.maps.islands import reassign_islands
 from meshmatch.maps.map_checks import corners_of
 from meshmatch.maps.surface import Footpoints
 from meshmatch.maps.vertex_map import VertexMap
@@ -40,29 +42,21 @@ _STRETCH, _SLACK = 3.0, 0.02
 _CLASSES = 12
 # Queries at a time; how many triangles are tried first, and at most.
 _CHUNK, _FIRST, _MAX_TRIED = 8192, 12, 512
+# Rounds in which islands of an inverse are searched again.
+_ROUNDS = 2
+# Of the source vertices that meet on a target vertex, those with this share of the highest confidence count.
+_MEETING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class MappedFootpoints(Footpoints):
-    """Where N points of the target lie on the source; distances are to the image, in the unit of the target's file.
+    """Where N points of the target lie on the source; distances are to the image, in the unit of the target's file."""
 
-    Parameters
-    ----------
-    confidence : (N,) float64
-        That of the map there, falling with the distance to the image.
-    """
-
-    confidence: Float[Floats, " N"]
+    confidence: Float[Floats, " N"]  # that of the map there, falling with the distance to the image
 
 
 class MappedMesh:
-    """The source laid on the target by a map from source to target.
-
-    Parameters
-    ----------
-    source_to_target : VertexMap
-        Made for these two shapes; see `VertexMap.for_shapes`.
-    """
+    """The source laid on the target by a map that was made for these two shapes; see `VertexMap.for_shapes`."""
 
     @classmethod
     def of(cls, shape: Shape) -> MappedMesh:
@@ -72,15 +66,16 @@ class MappedMesh:
     def __init__(self, source_to_target: VertexMap, source: Shape, target: Shape) -> None:
         self.points = source_to_target.points(target)
         self.confidence = source_to_target.confidence.astype(np.float64)
-        self.unit = float(np.sqrt(target.area)) or target.diagonal or 1.0
-        self.normals = normals_at(source_to_target, target)
+        self.unit = length_of(target)
+        found = corners_of(target.faces, source_to_target.face, source_to_target.index)
+        self.normals = unit(interpolate(known_normals(target), found, source_to_target.barycentric))
         kept = np.flatnonzero(~discontinuous_faces(source_to_target, source, target))
         lone = np.ones(source.V, bool)
         if source.invalid is not None:  # their places are stand-ins
             kept = kept[~source.invalid[source.faces[kept]].any(axis=1)]
             lone &= ~source.invalid
         lone[source.faces[kept].ravel()] = False
-        self._source_unit = float(np.sqrt(source.area)) or source.diagonal or 1.0
+        self._source_unit = length_of(source)
         self._source = source.verts / self._source_unit
         single = np.flatnonzero(lone)
         # Triangles, then the points that no triangle holds: those of a cloud, or between discontinuities.
@@ -89,17 +84,14 @@ class MappedMesh:
         held = self.points[self.corners]
         self._center = held.mean(axis=1)
         self._radius = np.sqrt(((held - self._center[:, None]) ** 2).sum(axis=2).max(axis=1))
-        self._trees = self._by_size()
-        # A cloud has gaps between its points, which are no reason for low confidence.
-        distinct = len(np.unique(self.points, axis=0)) if source.is_cloud else 1
-        self._gap = self.unit / np.sqrt(distinct) if source.is_cloud else 0.0
-
-    def _by_size(self) -> list[tuple[cKDTree, Ints, float]]:
-        """For triangles of each size: a tree of their centers, their numbers, and the largest radius."""
+        # For triangles of each size: a tree of their centers, their numbers, and the largest radius.
         largest = float(self._radius.max()) or 1.0
         size = np.floor(np.log2(np.maximum(self._radius / largest, 0.5**_CLASSES)))
         groups = [np.flatnonzero(size == k) for k in np.unique(size)]
-        return [(cKDTree(self._center[own]), own, float(self._radius[own].max())) for own in groups]
+        self._trees = [(cKDTree(self._center[own]), own, float(self._radius[own].max())) for own in groups]
+        # A cloud has gaps between its points, which are no reason for low confidence.
+        distinct = len(np.unique(self.points, axis=0)) if source.is_cloud else 1
+        self._gap = self.unit / np.sqrt(distinct) if source.is_cloud else 0.0
 
     def query(
         self,
@@ -108,19 +100,14 @@ class MappedMesh:
         workers: int = 1,
         near: Float[Floats, "N 3"] | None = None,
     ) -> MappedFootpoints:
-        """Points on the source of (N, 3) points on the target, in its file's frame.
+        """Points on the source of points on the target, in its file's frame, where it has these unit normals (zeros
+        where unknown).
 
-        Parameters
-        ----------
-        normals : (N, 3), optional
-            Unit normals of the target there; zeros where unknown.
-        near : (N, 3), optional
-            Points of the source, in its file's frame, near which the places should be. They select the right one
-            of two sheets that touch.
+        `near` selects the right one of two sheets that touch: points of the source, in its file's frame, near which
+        the places should be.
         """
         points = np.asarray(points, np.float64)
-        N = len(points)
-        facing = np.zeros((N, 3)) if normals is None else np.asarray(normals, np.float64)
+        facing = np.zeros((len(points), 3)) if normals is None else np.asarray(normals, np.float64)
         about = None if near is None else np.asarray(near, np.float64) / self._source_unit
         item, weights = self._search(points, facing, workers, about)
         corners = self.corners[item]
@@ -132,11 +119,11 @@ class MappedMesh:
         opposed = self._opposed(facing, corners)
         confidence *= np.exp(-np.square(_FACING / _DISTANCE_SCALE * opposed))
         face = self.face[item]
-        vertex = corners[np.arange(N), weights.argmax(axis=1)]
+        vertex = corners[np.arange(len(points)), weights.argmax(axis=1)]
         weights[face < 0] = (1.0, 0.0, 0.0)
         return MappedFootpoints(vertex, face, weights, distance, confidence)
 
-    def _search(self, points: Floats, normals: Floats, workers: int, near: Floats | None = None) -> tuple[Ints, Floats]:
+    def _search(self, points: Floats, normals: Floats, workers: int, near: Floats | None) -> tuple[Ints, Floats]:
         """The best item of each point, a triangle or a lone vertex, and the weights of its corners.
 
         Centers come nearest first, so that a search ends where no further item can be better. That is exact
@@ -168,11 +155,9 @@ class MappedMesh:
             for tree, which, largest in self._trees:
                 rows, done, ask = easy[low : low + _CHUNK], 0, min(_FIRST, len(which))
                 while len(rows):
-                    reach = np.sqrt(best[rows].max()) + largest
-                    distance, close = tree.query(
-                        points[rows], ask, distance_upper_bound=reach * (1 + 1e-9), workers=workers
-                    )
-                    distance, close = distance.reshape(len(rows), -1), close.reshape(len(rows), -1)
+                    reach = (np.sqrt(best[rows].max()) + largest) * (1 + 1e-9)
+                    found = tree.query(points[rows], ask, distance_upper_bound=reach, workers=workers)
+                    distance, close = (each.reshape(len(rows), -1) for each in found)
                     row, column = np.nonzero(np.isfinite(distance[:, done:]))
                     items = which[close[row, column + done]]
                     lower = np.maximum(distance[row, column + done] - self._radius[items], 0.0)
@@ -218,9 +203,8 @@ def discontinuous_faces(source_to_target: VertexMap, source: Shape, target: Shap
     usual = image <= np.quantile(image, 0.95)
     total = float(own[usual].sum())
     scale = float(image[usual].sum()) / total if total > 0 else 0.0
-    length = float(np.sqrt(target.area)) or target.diagonal or 1.0
     rounded = np.where(source_to_target.on_vertex, _edge_lengths(target)[source_to_target.index], 0.0)
-    allowed = _STRETCH * scale * own + rounded[source.faces] + rounded[around] + _SLACK * length
+    allowed = _STRETCH * scale * own + rounded[source.faces] + rounded[around] + _SLACK * length_of(target)
     return np.asarray((image > allowed).any(axis=1))
 
 
@@ -240,8 +224,65 @@ def known_normals(shape: Shape) -> Float[Floats, "V 3"]:
     return np.zeros_like(shape.verts) if shape.is_cloud else shape.vertex_normals
 
 
-def normals_at(found: VertexMap, target: Shape) -> Float[Floats, "V_source 3"]:
-    """The target's unit normals at the matched points; zeros on a cloud."""
-    return unit(
-        interpolate(known_normals(target), corners_of(target.faces, found.face, found.index), found.barycentric)
-    )
+def length_of(shape: Shape) -> float:
+    """The length that others are compared with: sqrt(area), or the diagonal of a shape without area."""
+    return float(np.sqrt(shape.area)) or shape.diagonal or 1.0
+
+
+def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
+    """A map from target to source, from one from source to target; `InputError` as `VertexMap.for_shapes`.
+
+    Confidence falls with the distance to the image: it is low where nothing of the source was mapped to.
+    """
+    checked = source_to_target.for_shapes(source, target)
+    identical = bool((checked.index == np.arange(source.V)).all() and (checked.face < 0).all())
+    if source.hash == target.hash and target.invalid is None and identical:
+        return replace(checked, source=target.name, target=source.name)
+    image = MappedMesh(checked, source, target)
+    normals = known_normals(target)
+    found = image.query(target.verts, normals, workers)
+    several, vertex = _meeting_vertices(checked, source, target.V)
+    weights = np.tile([1.0, 0.0, 0.0], (len(several), 1))
+    confidence = checked.confidence[vertex].astype(np.float64)
+    met = MappedFootpoints(vertex, np.full(len(several), -1), weights, found.distance[several], confidence)
+    found = found.updated(several, met)
+    if not target.is_cloud:
+        length, source_length = (float(np.sqrt(shape.area)) or 1.0 for shape in (target, source))
+        found, _ = reassign_islands(
+            target.verts / length,
+            target.faces,
+            target.vertex_areas,
+            found,
+            lambda places: places.values(source.faces, source.verts) / source_length,
+            lambda rows, near: image.query(target.verts[rows], normals[rows], workers, near * source_length),
+            _ROUNDS,
+        )
+    sure = np.clip(found.confidence, 0.0, 1.0)
+    if target.invalid is not None:
+        sure[target.invalid] = 0.0
+    rest: dict[str, Any] = {"face": found.face, "barycentric": found.barycentric, "confidence": sure}
+    return VertexMap.between(target, source, found.vertex, verdict=checked.verdict, reasons=checked.reasons, **rest)
+
+
+def _meeting_vertices(found: VertexMap, source: Shape, V: int) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
+    """Target vertices on which several source vertices meet, and of these the one nearest to their mean.
+
+    A map of vertex numbers to a coarser target puts a patch of the source on each vertex, and any of it would be
+    closest.
+    """
+    highest = np.zeros(V)
+    rows = np.flatnonzero(found.on_vertex)
+    at = found.index[rows]
+    np.maximum.at(highest, at, found.confidence[rows])
+    trusted = found.confidence[rows] >= _MEETING * highest[at]
+    if source.invalid is not None:
+        trusted &= ~source.invalid[rows]
+    rows, at = rows[trusted], at[trusted]
+    count = np.bincount(at, minlength=V)
+    sums = np.stack([np.bincount(at, source.verts[rows, k], V) for k in range(3)], axis=1)
+    mean = sums / np.maximum(count, 1)[:, None]
+    distance = np.linalg.norm(source.verts[rows] - mean[at], axis=1)
+    order = np.lexsort((rows, distance, at))
+    vertex, first = np.unique(at[order], return_index=True)
+    several = count[vertex] > 1
+    return vertex[several], rows[order[first[several]]]

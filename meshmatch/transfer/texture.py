@@ -67,7 +67,7 @@ def transfer_texture(
     look : Appearance
         Of the source's file (`load_appearance`).
     back : VertexMap
-        From target to source (`meshmatch.maps.build`, or `meshmatch.transfer.inverse_map`).
+        From target to source (`meshmatch.maps.build`, or `meshmatch.transfer.mapped_mesh`).
     atlas : Atlas
         Of the target (`meshmatch.transfer.unwrap.atlas_of`), for the size and padding of `options`.
     progress

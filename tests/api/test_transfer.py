@@ -93,6 +93,8 @@ def test_arrays_of_all_kinds(pair: tuple[Shape, Shape, VertexMap]) -> None:
     labels = meshmatch.transfer_labels(source, target, words, found)
     assert np.array_equal(labels.data.values, words)
     assert labels.low.low == 0
+    of_faces = meshmatch.transfer_labels(source, target, words, found, to="faces")
+    assert np.allclose(of_faces.confidence, labels.confidence[target.faces].mean(axis=1))
     weights = np.eye(3)[np.arange(V) % 3]
     assert np.allclose(meshmatch.transfer_weights(source, target, weights, found).data.matrix.toarray(), weights)
     points = meshmatch.transfer_landmarks(source, target, [3, 5], found).data

@@ -27,8 +27,8 @@ from meshmatch.render.scales import UNKNOWN, Scale
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import load_template
-from meshmatch.transfer.inverse_map import invert_map
 from meshmatch.transfer.label_files import Labels
+from meshmatch.transfer.mapped_mesh import invert_map
 
 
 def turned(shape: Shape, degrees: float, name: str) -> Shape:

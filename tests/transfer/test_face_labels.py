@@ -5,8 +5,8 @@ import pytest
 
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.face_labels import lattice, mean_of_corners, pull_face_labels
-from meshmatch.transfer.inverse_map import invert_map
+from meshmatch.transfer.attributes import lattice, pull_face_labels
+from meshmatch.transfer.mapped_mesh import invert_map
 from tests.conftest import icosphere
 from tests.transfer.known import split
 
@@ -103,8 +103,3 @@ def test_what_has_no_label_stays_without(on_faces: bool) -> None:
     labels[0] = 4
     some = pull_face_labels(VertexMap.identity(COARSE), COARSE, COARSE, labels, on_faces)
     assert set(some) == {-1, 4} if on_faces else {4} <= set(some) <= {-1, 4}
-
-
-def test_confidence_of_faces() -> None:
-    confidence = COARSE.verts[:, 0] / 2 + 0.5
-    assert np.allclose(mean_of_corners(confidence, COARSE), COARSE.verts[COARSE.faces, 0].mean(axis=1) / 2 + 0.5)

@@ -11,7 +11,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
-from meshmatch.transfer.inverse_map import invert_map
+from meshmatch.transfer.mapped_mesh import invert_map
 from tests.conftest import icosphere
 from tests.transfer.known import brute_force, split
 
