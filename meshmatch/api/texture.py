@@ -17,7 +17,7 @@ from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance, load_coordinates, save_textured
 from meshmatch.threads import thread_limit
-from meshmatch.transfer import texture as baking
+from meshmatch.transfer import bake
 from meshmatch.transfer.bake import Baked, BakeOptions
 from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of
 
@@ -97,7 +97,7 @@ def transfer_texture(
         The source has neither a texture nor colours, the target is a point cloud, its texture coordinates are to be
         kept and are not valid; or as `meshmatch.match`.
     """
-    baking.check_bake_options(options)
+    bake.check_bake_options(options)
     if uv not in get_args(Keep):
         raise OptionError(f"invalid uv {uv!r}", f"choose one of {', '.join(get_args(Keep))}")
     own = None
@@ -115,8 +115,8 @@ def transfer_texture(
     began = time.monotonic() - unwrapped
     report = Progress(progress, mesh.name, "baking")
     with thread_limit(1):
-        made = baking.transfer_texture(shape, look, mesh, maps.backward, atlas, options, report)
-    return TexturedResult(made.mesh, made.baked, atlas, maps, time.monotonic() - began)
+        baked = bake.transfer_texture(shape, look, mesh, maps.backward, atlas, options, report)
+    return TexturedResult(baked.mesh, baked, atlas, maps, time.monotonic() - began)
 
 
 def _look_of(source: ShapeLike, image: str | Path | None, look: Appearance | None) -> tuple[Shape, Appearance]:

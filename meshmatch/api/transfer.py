@@ -122,7 +122,7 @@ def transfer_colors(
         if given is not None:
             found = pull_values(maps.backward, given)
         else:
-            from meshmatch.transfer.texture import colors_of_vertices
+            from meshmatch.transfer.bake import colors_of_vertices
 
             assert isinstance(colors, Appearance)
             found = colors_of_vertices(maps.source, colors, maps.target, maps.backward)

@@ -64,7 +64,7 @@ def transfer_texture(
     """
     from meshmatch.shapes import textured_files
     from meshmatch.transfer import colors
-    from meshmatch.transfer.texture import check_bake_options
+    from meshmatch.transfer.bake import check_bake_options
 
     transfer = Transfer(source, target, output, maps, run, picture)
     size, uv, image = texture.size, texture.uv, texture.image

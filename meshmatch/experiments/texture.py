@@ -46,11 +46,10 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance, save_textured
 from meshmatch.templates.location import bundled_folder
 from meshmatch.threads import set_threads
-from meshmatch.transfer.bake import BakeOptions
+from meshmatch.transfer.bake import Baked, BakeOptions, transfer_texture
 from meshmatch.transfer.mapped_mesh import MappedMesh
 from meshmatch.transfer.material_sampler import MaterialSampler
 from meshmatch.transfer.surface_walk import SurfaceWalker
-from meshmatch.transfer.texture import BakedMesh, transfer_texture
 from meshmatch.transfer.unwrap import atlas_of
 
 POINTS = 200_000
@@ -122,9 +121,9 @@ def colors_at(shape: Shape, look: Appearance, points: Float[Floats, "N 3"]) -> F
     return np.asarray(to_srgb(found[:3].T))
 
 
-def look_of(worn: BakedMesh) -> Appearance:
+def look_of(worn: Baked) -> Appearance:
     """The look that a baked texture gives."""
-    material = Material(image=worn.baked.image, alpha=worn.baked.alpha, wrap=("clamp", "clamp"))
+    material = Material(image=worn.image, alpha=worn.alpha, wrap=("clamp", "clamp"))
     return Appearance((material,), np.zeros(len(worn.mesh.faces), np.int64), worn.mesh.uv)
 
 
@@ -132,9 +131,7 @@ def measure(name: str, trip: Trip, choices: BakeOptions, keep: Path | None) -> d
     """Carry there and back, and compare; also the share of texels where the map is discontinuous."""
     samples = sample_surface(trip.source, POINTS, np.random.default_rng(0)).points
 
-    def carried(
-        source: Shape, look: Appearance, target: Shape, back: VertexMap, own: Floats | None = None
-    ) -> BakedMesh:
+    def carried(source: Shape, look: Appearance, target: Shape, back: VertexMap, own: Floats | None = None) -> Baked:
         atlas = atlas_of(target, own, choices.size, choices.padding)
         return transfer_texture(source, look, target, back, atlas, choices)
 
@@ -143,9 +140,9 @@ def measure(name: str, trip: Trip, choices: BakeOptions, keep: Path | None) -> d
     again = carried(trip.target, look_of(there), trip.source, trip.back, trip.look.uv)
     after = colors_at(trip.source, look_of(again), samples)
     if keep is not None:
-        save_textured(keep / f"{name}-there.glb", there.mesh, there.baked.image)
-        save_textured(keep / f"{name}-back.glb", again.mesh, again.baked.image)
-    record = {"case": name, "a": trip.source.V, "b": trip.target.V, "torn": there.baked.torn}
+        save_textured(keep / f"{name}-there.glb", there.mesh, there.image)
+        save_textured(keep / f"{name}-back.glb", again.mesh, again.image)
+    record = {"case": name, "a": trip.source.V, "b": trip.target.V, "torn": there.torn}
     if name != "re-posed":  # elsewhere the points of A lie on B too
         found = loss(before, colors_at(trip.target, look_of(there), samples))
         record |= {f"there_{key}": value for key, value in found.items()}

@@ -8,7 +8,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats32, Int, Ints
 from meshmatch.render.surface import AnyFloats
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.pyramid import Pyramid
+from meshmatch.transfer.texels import Pyramid
 
 _INVISIBLE = 0.05  # an alpha below this is meant to be invisible
 

@@ -10,21 +10,26 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 
-from meshmatch.arrays import Bools, Float, Floats, Floats32, Ints, Ints32
+from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
+from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.appearance import Alpha, Pixels
+from meshmatch.shapes.appearance import Alpha, Appearance, Pixels
 from meshmatch.shapes.colors import bytes_of
+from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.material_sampler import MaterialSampler
-from meshmatch.transfer.pyramid import fill
-from meshmatch.transfer.surface_walk import SurfaceWalker
-from meshmatch.transfer.texel_locator import TexelLocator
-from meshmatch.transfer.texels import beside_another, faces_on, grown
+from meshmatch.transfer.surface_walk import SurfaceWalker, walker_of
+from meshmatch.transfer.texel_locator import TexelLocator, images_of
+from meshmatch.transfer.texels import beside_another, faces_on, fill, grown
+from meshmatch.transfer.unwrap import Atlas
 
-# So many texels past a seam show the surface that goes on there; further out, the nearest mean (see `pyramid`).
+LARGEST = 8192
+"""Texels along a side."""
+# So many texels past a seam show the surface that goes on there; further out, the nearest mean (see `fill`).
 _OVERHANG = 2
 # Texels that cover more than this of the source's are sampled several times.
 _COARSE = 1.25
@@ -64,59 +69,97 @@ class BakeOptions:
 
 @dataclass(frozen=True, eq=False)
 class Baked:
-    """A finished texture.
+    """A finished texture."""
 
-    Parameters
-    ----------
-    image : (size, size, 4) uint8
-    alpha, cutoff
-        What its alpha means.
-    used : float
-        Share of its texels that lie on the surface.
-    low, torn : float
-        Shares of the surface of low confidence, and on triangles where the map is discontinuous.
-    """
-
-    image: Pixels
-    alpha: Alpha
+    mesh: Textured  # the target that wears it, ready to be written (`meshmatch.shapes.textured_files`)
+    image: Pixels  # (size, size, 4) uint8
+    alpha: Alpha  # what its alpha means, with `cutoff`
     cutoff: float
-    used: float
-    low: float
-    torn: float
+    used: float  # share of its texels that lie on the surface
+    low: float  # share of the surface that is of low confidence
+    torn: float  # share on triangles where the map is discontinuous
 
 
-def bake(
-    sampler: MaterialSampler,
-    walker: SurfaceWalker,
+def check_bake_options(options: BakeOptions) -> None:
+    """Refuse sizes that are out of range, and choices that contradict each other (`OptionError`)."""
+    for name in ("size", "samples", "padding", "workers"):
+        if not isinstance(getattr(options, name), Integral):
+            raise OptionError(f"{name} must be an integer, not {getattr(options, name)!r}")
+    if options.workers < 1:
+        raise OptionError(f"workers must be 1 or more, not {options.workers}")
+    if options.fill and options.blank is not None:
+        raise OptionError("fill and blank contradict each other", "choose one of them")
+    if not 16 <= options.size <= LARGEST:
+        raise OptionError(f"a texture has 16 to {LARGEST} texels a side, not {options.size}", "1024 or 2048 suit most")
+    if not 1 <= options.samples <= 8:
+        raise OptionError(f"a texel takes 1 to 8 samples each way, not {options.samples}", "2 or 3 suit most")
+    if not 0 <= options.padding <= options.size // 4:
+        raise OptionError(
+            f"padding of {options.padding} texels does not go with {options.size}", f"choose 0 to {options.size // 4}"
+        )
+
+
+def transfer_texture(
+    source: Shape,
+    look: Appearance,
     target: Shape,
     back: VertexMap,
-    uv: Float[Floats, "F 3 2"],
-    options: BakeOptions,
+    atlas: Atlas,
+    options: BakeOptions = BakeOptions(),  # frozen
     progress: Callable[[float], None] = lambda share: None,
 ) -> Baked:
-    """Paint an atlas of the target.
+    """Bake the look of a source's file (`load_appearance`) for a target mesh, along a map from target to source.
 
-    Parameters
-    ----------
-    sampler, walker
-        Of the source.
-    back : VertexMap
-        From target to source.
-    uv : (F, 3, 2) float64
-        The target's atlas: u to the right, v down, within 0..1, without overlaps.
-    progress
-        Is called with the share that is done.
+    The atlas is one for the size and padding of the options (`atlas_of`); `progress` is called with the share that is
+    done. `OptionError` as `check_bake_options`.
     """
+    check_bake_options(options)
+    walker, sampler = _arranged(source, look)
+    uv = atlas.uv
+    if target.invalid is not None:  # faces with a corner that has no position
+        valid = ~target.invalid[target.faces].any(axis=1)
+        target, uv = Shape(target.verts, target.faces[valid], target.name), uv[valid]
+    locator = TexelLocator(walker, target, back, uv * options.size)
+    inside = faces_on(uv * options.size, options.size)[0]
+    on = grown(inside, _OVERHANG if options.padding else 0)
+    image, low = _painted(sampler, locator, on.reshape(-1), options, progress)
+    alpha = _fill_and_blank(image, on.reshape(-1) >= 0, low, options, sampler.alpha)
+    if options.padding == 0:
+        image[inside < 0] = 0
+    elif alpha == "opaque":
+        image[..., 3] = 255
+    progress(1.0)
+    torn = float(target.face_areas[locator.discontinuous].sum()) / max(target.area, 1e-300)
+    mesh = Textured(target.verts, target.faces, uv, alpha, sampler.cutoff)
+    used = float((inside >= 0).mean())
+    return Baked(mesh, image, alpha, sampler.cutoff, used, _share_of_surface(target, inside.reshape(-1), low), torn)
+
+
+def colors_of_vertices(source: Shape, look: Appearance, target: Shape, back: VertexMap) -> Floats:
+    """(V_tgt, 4) linear colours and alpha of a target's vertices or points, as wide as the gaps between them."""
+    walker, sampler = _arranged(source, look)
+    points, start = images_of(walker, back)
+    place, weights, _ = walker.closest(points.T.astype(np.float32, order="C"), start.astype(np.int32))
+    reach = np.sqrt(target.vertex_areas / max(target.area, 1e-300)).astype(np.float32)
+    return sampler.colors(place, weights, sampler.footprint(place, reach)).T.astype(np.float64)
+
+
+def _arranged(source: Shape, look: Appearance) -> tuple[SurfaceWalker, MaterialSampler]:
+    """A source and its look, ready to be looked up; each point of a cloud is a face."""
+    walker = walker_of(source)
+    if source.is_cloud:
+        look = Appearance(look.materials, np.zeros(source.V, np.int64), np.zeros((source.V, 3, 2)), look.colors)
+    return walker, MaterialSampler(look, walker)
+
+
+def _painted(
+    sampler: MaterialSampler, locator: TexelLocator, on: Ints32, options: BakeOptions, progress: Callable[[float], None]
+) -> tuple[Pixels, Bools]:
+    """The image, painted where a triangle lies on a texel (N,), and the texels (N,) of low confidence."""
     size = options.size
-    locator = TexelLocator(walker, target, back, uv * size)
-    inside = faces_on(uv * size, size)[0]
-    on = grown(inside, _OVERHANG if options.padding else 0).reshape(-1)
-    texels = np.flatnonzero(on >= 0)
     pixels = np.zeros((size * size, 4), np.uint8)
-    chart = np.full(size * size, -1, np.int32)
-    hint = np.full(size * size, -1, np.int32)
-    coarse = np.zeros(size * size, bool)
-    low = np.zeros(size * size, bool)
+    chart, hint = np.full(size * size, -1, np.int32), np.full(size * size, -1, np.int32)
+    coarse, low = np.zeros(size * size, bool), np.zeros(size * size, bool)
 
     def first(at: Ints) -> None:
         face = on[at]
@@ -146,32 +189,18 @@ def bake(
         total[3] /= len(steps)
         _store(pixels, at, total)
 
-    done = 0.0
     with ThreadPoolExecutor(options.workers) as pool:
-        for work, share, which in ((first, 0.5, lambda: texels), (again, 0.45, lambda: _several(chart, coarse, size))):
-            if work is again and options.samples == 1:
-                break
-            chosen = which()
+
+        def run(work: Callable[[Ints], None], chosen: Ints, done: float, share: float) -> None:
             parts = [chosen[k : k + _CHUNK] for k in range(0, len(chosen), _CHUNK)]
             for count, _ in enumerate(pool.map(work, parts)):
                 progress(done + share * (count + 1) / len(parts))
-            done += share
-    image = pixels.reshape(size, size, 4)
-    held = (inside >= 0).reshape(-1)
-    low_share = _share_of_surface(target, inside, low)
-    alpha = _fill_and_blank(image, on >= 0, low, options, sampler.alpha)
-    if options.padding == 0:
-        pixels[~held] = 0
-    elif alpha == "opaque":
-        pixels[:, 3] = 255
-    progress(1.0)
-    torn = float(target.face_areas[locator.discontinuous].sum()) / max(target.area, 1e-300)
-    return Baked(image, alpha, sampler.cutoff, float(held.mean()), low_share, torn)
 
-
-def _several(chart: Ints32, coarse: Bools, size: int) -> Ints:
-    """Texels that need more than one sample: at seams, or where they cover much of the source's."""
-    return np.flatnonzero(coarse | beside_another(chart.reshape(size, size)).reshape(-1))
+        run(first, np.flatnonzero(on >= 0), 0.0, 0.5)
+        if options.samples > 1:  # at seams, and where a texel covers much of the source's
+            several = coarse | beside_another(chart.reshape(size, size)).reshape(-1)
+            run(again, np.flatnonzero(several), 0.5, 0.45)
+    return pixels.reshape(size, size, 4), low
 
 
 def _store(pixels: Pixels, at: Ints, colors: Floats32) -> None:
@@ -185,29 +214,27 @@ def _store(pixels: Pixels, at: Ints, colors: Floats32) -> None:
 def _fill_and_blank(image: Pixels, painted: Bools, low: Bools, options: BakeOptions, alpha: Alpha) -> Alpha:
     """Fill in what is not painted, treat low confidence as the options say, and return what alpha then means."""
     pixels = image.reshape(-1, 4)
-    size = image.shape[0]
     known = painted & ~low if options.fill or options.blank is not None else painted
     weight = known.astype(np.float32)
     if alpha != "opaque":
         weight *= np.maximum(pixels[:, 3], 1) / np.float32(255)
     if options.padding or options.fill:
-        fill(image, weight.reshape(size, size))
+        fill(image, weight.reshape(image.shape[:2]))
     if options.blank is not None:
         red, green, blue, share = np.round(255 * np.array(options.blank)).astype(np.uint8).tolist()
         pixels[low, 3] = share
         if share:  # what is transparent keeps the colours around it, for the filters of viewers
             pixels[low, :3] = (red, green, blue)
-        if share < 255 and low.any():
-            return "mask" if alpha == "opaque" and share == 0 else "blend" if alpha == "opaque" else alpha
+        if share < 255 and low.any() and alpha == "opaque":
+            return "blend" if share else "mask"
     return alpha
 
 
 def _share_of_surface(target: Shape, inside: Ints32, low: Bools) -> float:
-    """How much of the target's area has the texels that are `low`."""
-    flat = inside.reshape(-1)
-    held = flat >= 0
-    count = np.bincount(flat[held], minlength=target.F)
-    part = np.bincount(flat[held & low], minlength=target.F)
+    """How much of the target's area has the texels (N,) that are `low`, by the triangle on each."""
+    held = inside >= 0
+    count = np.bincount(inside[held], minlength=target.F)
+    part = np.bincount(inside[held & low], minlength=target.F)
     some = count > 0
-    area = target.face_areas
-    return float((area[some] * part[some] / count[some]).sum() / max(area[some].sum(), 1e-300))
+    area = target.face_areas[some]
+    return float((area * part[some] / count[some]).sum() / max(area.sum(), 1e-300))

@@ -11,9 +11,8 @@ from scipy.sparse.csgraph import connected_components
 from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.triangles import cross_product, squared_lengths
 from meshmatch.shapes.appearance import Alpha, Appearance, Material
-from meshmatch.transfer.pyramid import Pyramid, wrapped
 from meshmatch.transfer.surface_walk import SurfaceWalker, duals
-from meshmatch.transfer.texels import MOST_ROWS, rows_of, spans
+from meshmatch.transfer.texels import MOST_ROWS, Pyramid, rows_of, spans, wrapped
 
 
 class MaterialSampler:

@@ -1,30 +1,43 @@
-"""Which triangle lies on each texel of an atlas: scanlines, for all triangles at once."""
+"""Images texel by texel: which triangle of an atlas lies on each, and what they are in ever smaller sizes.
+
+A pyramid is made of known texels alone. Every texel of a smaller level is the mean, in light, of those known among its
+four; texels that nobody painted then take the colour of the next smaller level. So a mip level that a viewer makes of a
+filled image never shows a background: each of its texels that touches a chart is the mean of chart texels.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from meshmatch.arrays import Bools, Floats, Ints, Ints32
+from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
+from meshmatch.shapes.appearance import Material, Pixels, Wrap
+from meshmatch.shapes.colors import LINEAR_OF_BYTE, bytes_of
 
 _AT_ONCE = 1 << 21  # texels
+_ROWS = 256  # of an image at a time
 MOST_ROWS = 40_000_000
 """Of all triangles together; coordinates that need more are no atlas."""
+# Neighbours of a texel, so far down and to the right: the straight ones first.
+_AROUND = ((1, 0), (0, 1), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+_SHARE: Floats32 = (np.arange(256) / 255.0).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Spans:
-    """Runs of texels whose centers lie in a triangle: face (N,), row (N,), first column (N,), length (N,).
+    """Runs of texels whose centers lie in a triangle. Rows and columns are not bounded.
 
-    A center on an edge belongs to one of the two triangles that share it. Rows and columns are not bounded.
+    A center on an edge belongs to one of the two triangles that share it.
     """
 
-    face: Ints
-    row: Ints
-    first: Ints
-    length: Ints
+    face: Ints  # N
+    row: Ints  # N
+    first: Ints  # N: columns
+    length: Ints  # N
 
     @property
     def texels(self) -> int:
@@ -39,8 +52,7 @@ class Spans:
             high = max(int(np.searchsorted(ends, done + _AT_ONCE, side="right")), low + 1)
             length = self.length[low:high]
             span = np.repeat(np.arange(low, high), length)
-            begins = np.cumsum(length) - length
-            column = self.first[span] + np.arange(len(span)) - np.repeat(begins, length)
+            column = self.first[span] + np.arange(len(span)) - np.repeat(np.cumsum(length) - length, length)
             yield self.face[span], column, self.row[span]
             low, done = high, int(ends[high - 1])
 
@@ -61,10 +73,8 @@ def spans(corners: Floats) -> Spans:
     row = np.arange(len(face)) - np.repeat(np.cumsum(rows) - rows, rows) + first_row[face]
     y = row + 0.5
     long_edge = _crossing(top[face], low[face], y)
-    upper = y < middle[face, 1]
-    begin = np.where(upper[:, None], top[face], middle[face])
-    end = np.where(upper[:, None], middle[face], low[face])
-    short_edge = _crossing(begin, end, y)
+    upper = (y < middle[face, 1])[:, None]
+    short_edge = _crossing(np.where(upper, top[face], middle[face]), np.where(upper, middle[face], low[face]), y)
     first = np.ceil(np.minimum(long_edge, short_edge) - 0.5).astype(np.int64)
     length = np.ceil(np.maximum(long_edge, short_edge) - 0.5).astype(np.int64) - first
     some = length > 0
@@ -93,25 +103,14 @@ def faces_on(corners: Floats, size: int) -> tuple[Ints32, int]:
 
 def grown(found: Ints32, steps: int) -> Ints32:
     """The same with each texel that is free, but has a neighbour that is not, taking over from it; `steps` times."""
+    height, width = found.shape
     for _ in range(steps):
-        out = found.copy()
-        for straight in (True, False):
-            for down in (-1, 0, 1):
-                for right in (-1, 0, 1):
-                    if (down == 0) == (right == 0) if straight else 0 in (down, right):
-                        continue
-                    to, source = _shifted(down, right)
-                    part = out[to]
-                    np.copyto(part, found[source], where=part < 0)
-        found = out
+        framed = np.pad(found, 1, constant_values=-1)
+        found = found.copy()
+        for down, right in _AROUND:
+            beside = framed[1 + down : 1 + down + height, 1 + right : 1 + right + width]
+            np.copyto(found, beside, where=found < 0)
     return found
-
-
-def _shifted(down: int, right: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Slices of an image and of its neighbour's image, moved by one."""
-    ahead, back, whole = slice(1, None), slice(None, -1), slice(None)
-    pick = {1: (ahead, back), -1: (back, ahead), 0: (whole, whole)}
-    return (pick[down][0], pick[right][0]), (pick[down][1], pick[right][1])
 
 
 def beside_another(values: Ints32) -> Bools:
@@ -122,3 +121,149 @@ def beside_another(values: Ints32) -> Bools:
         out[a] |= differ
         out[b] |= differ
     return out
+
+
+def fill(pixels: Pixels, weight: Floats32) -> list[Pixels]:
+    """All levels of (H, W, 4) pixels, these first, each half as large as the one before, down to one texel.
+
+    Texels count by their weight (H, W), and where it is 0 they are filled, in place; if nothing at all is known,
+    everything counts.
+    """
+    levels, weights = [pixels], [weight if (weight > 0).any() else np.ones_like(weight)]
+    while max(levels[-1].shape[:2]) > 1:
+        smaller, lighter = _next_level(levels[-1], weights[-1])
+        levels.append(smaller)
+        weights.append(lighter)
+    for k in range(len(levels) - 2, -1, -1):
+        for low in range(0, len(levels[k]), _ROWS):
+            part = levels[k][low : low + _ROWS]
+            unknown = weights[k][low : low + _ROWS] <= 0
+            if unknown.any():
+                row = np.arange(low, low + len(part)) // 2
+                larger = levels[k + 1][row][:, np.arange(part.shape[1]) // 2]
+                part[unknown] = larger[unknown]
+    return levels
+
+
+def _next_level(pixels: Pixels, weight: Floats32) -> tuple[Pixels, Floats32]:
+    height, width = pixels.shape[:2]
+    out = np.zeros(((height + 1) // 2, (width + 1) // 2, 4), np.uint8)
+    total = np.zeros(out.shape[:2], np.float32)
+    for low in range(0, height, 2 * _ROWS):
+        part = pixels[low : low + 2 * _ROWS]
+        light = np.empty(part.shape, np.float32)
+        light[..., :3] = LINEAR_OF_BYTE.take(part[..., :3])
+        light[..., 3] = part[..., 3]
+        mean, known = _halved(light, weight[low : low + 2 * _ROWS])
+        rows = slice(low // 2, low // 2 + len(mean))
+        out[rows, :, :3] = bytes_of(mean[..., :3])
+        out[rows, :, 3] = np.round(mean[..., 3])
+        total[rows] = known
+    return out, total
+
+
+def _halved(values: Floats32, weight: Floats32) -> tuple[Floats32, Floats32]:
+    """Means of fours of values (H, W, C), and their weights, at most 1; beyond the edge there is nothing that counts."""
+    odd = tuple((0, n % 2) for n in weight.shape)
+    if odd != ((0, 0), (0, 0)):
+        values, weight = np.pad(values, (*odd, (0, 0))), np.pad(weight, odd)
+    sums, known = _sum_of_fours(values * weight[..., None]), _sum_of_fours(weight)
+    return (sums / np.maximum(known, 1e-20)[..., None]).astype(np.float32), np.minimum(known, np.float32(1.0))
+
+
+def _sum_of_fours(values: Floats32) -> Floats32:
+    return (values[0::2, 0::2] + values[1::2, 0::2]) + (values[0::2, 1::2] + values[1::2, 1::2])
+
+
+@dataclass(frozen=True, eq=False)
+class Pyramid:
+    """An image with its smaller levels, ready to be looked up."""
+
+    texels: NDArray[np.uint32]  # all levels one after the other: red, green, blue and alpha in one number
+    starts: Ints  # of each level
+    widths: Ints
+    heights: Ints
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    nearest: bool = False  # True: the largest level is not blended
+
+    @classmethod
+    def of(cls, material: Material, known: Bools | None = None) -> Pyramid:
+        """The pyramid of a material's image; what is not `known` (H, W), or fully transparent, is made up from
+        its surroundings.
+        """
+        assert material.image is not None
+        pixels = material.image.copy()
+        weight = np.ones(pixels.shape[:2], np.float32) if known is None else known.astype(np.float32)
+        alpha = pixels[..., 3].copy()
+        if material.alpha == "opaque":
+            pixels[..., 3] = 255
+        else:
+            weight *= alpha / np.float32(255)
+        levels = fill(pixels, weight)
+        if material.alpha != "opaque":  # colours are made up, not the holes between them
+            pixels[..., 3] = alpha
+            means, share = alpha.astype(np.float32)[..., None], np.ones(alpha.shape, np.float32)
+            for level in levels[1:]:
+                means, share = _halved(means, share)
+                level[..., 3] = np.round(means[..., 0])
+        heights, widths = np.array([level.shape[:2] for level in levels]).T
+        starts = np.cumsum(heights * widths) - heights * widths
+        flat = np.concatenate([np.ascontiguousarray(level).view(np.uint32).ravel() for level in levels])
+        return cls(flat, starts, widths, heights, material.wrap, material.nearest)
+
+    def look(self, u: Floats32, v: Floats32, footprint: Floats32) -> Floats32:
+        """Linear colours and alpha (4, N) at (N,), (N,), as wide as `footprint` (N,) texels of the largest level."""
+        level = np.log2(np.maximum(footprint, np.float32(1.0)))
+        level = np.minimum(level, np.float32(len(self.starts) - 1))
+        whole = level.astype(np.int32)
+        rest = level - whole.astype(np.float32)
+        out = self._blended(u, v, whole)
+        between = np.flatnonzero(rest > 0)
+        if len(between):
+            next_level = self._blended(u[between], v[between], whole[between] + 1)
+            out[:, between] = _mixed(out[:, between], next_level, rest[between])
+        return out
+
+    def _blended(self, u: Floats32, v: Floats32, level: Ints32) -> Floats32:
+        one = len(level) == 0 or bool((level == level[0]).all())
+        pick = level[0] if one and len(level) else level
+        width, height, start = self.widths[pick], self.heights[pick], self.starts[pick]
+        # a texel of level k covers 2^k texels of level 0, also where the size is odd
+        smaller = np.float32(0.5) ** np.asarray(pick, np.float32)
+        x = u * (np.float32(self.widths[0]) * smaller) - np.float32(0.5)
+        y = v * (np.float32(self.heights[0]) * smaller) - np.float32(0.5)
+        left, top = np.floor(x), np.floor(y)
+        across, down = x - left, y - top
+        if self.nearest:
+            sharp = level == 0
+            across, down = (np.where(sharp, np.round(s), s).astype(np.float32) for s in (across, down))
+        left, top = left.astype(np.int64), top.astype(np.int64)
+        columns = [wrapped(left + k, width, self.wrap[0]) for k in (0, 1)]
+        rows = [start + width * wrapped(top + k, height, self.wrap[1]) for k in (0, 1)]
+        corners = [self.texels.take(row + column) for row in rows for column in columns]
+        out = np.empty((4, len(u)), np.float32)
+        for k in range(4):
+            a, b, c, d = (_light(texel, k) for texel in corners)
+            out[k] = _mixed(_mixed(a, b, across), _mixed(c, d, across), down)
+        return out
+
+
+def _light(texels: NDArray[np.uint32], channel: int) -> Floats32:
+    """Light of red, green or blue, or alpha as it is, of texels whose bytes come in this order."""
+    shift = 8 * channel if sys.byteorder == "little" else 24 - 8 * channel
+    byte = (texels >> np.uint32(shift)).astype(np.uint8)
+    return (_SHARE if channel == 3 else LINEAR_OF_BYTE).take(byte)
+
+
+def _mixed(a: Floats32, b: Floats32, share: Floats32) -> Floats32:
+    return a + share * (b - a)
+
+
+def wrapped(index: Ints, size: Ints | int, wrap: Wrap) -> Ints:
+    """Texel numbers brought into 0 <= index < size as a sampler does."""
+    if wrap == "clamp":
+        return np.clip(index, 0, np.asarray(size) - 1)
+    if wrap == "repeat":
+        return index % size
+    folded = index % (2 * np.asarray(size))
+    return np.minimum(folded, 2 * size - 1 - folded)

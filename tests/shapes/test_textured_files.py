@@ -18,7 +18,7 @@ from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.formats.gltf_out import split_at_seams
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import files_of, load_appearance, load_coordinates, save_textured
-from meshmatch.transfer.pyramid import Pyramid
+from meshmatch.transfer.texels import Pyramid
 from tests.shapes.painted import CORNERS, FACES, UV, quarters
 
 

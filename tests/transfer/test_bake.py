@@ -14,9 +14,8 @@ from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.colors import bytes_of, to_linear, to_srgb
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer import texel_locator
-from meshmatch.transfer.bake import Baked, BakeOptions
+from meshmatch.transfer.bake import Baked, BakeOptions, colors_of_vertices, transfer_texture
 from meshmatch.transfer.texels import faces_on
-from meshmatch.transfer.texture import colors_of_vertices, transfer_texture
 from meshmatch.transfer.unwrap import Atlas, atlas_of, unwrapped
 from tests.shapes.painted import CORNERS, FACES, UV, quarters
 from tests.transfer.known import split
@@ -47,7 +46,7 @@ def worn(
 ) -> Baked:
     atlas = atlas_of(target, None, choices.size, choices.padding) if uv is None else Atlas(uv, True)
     back = VertexMap.identity(target) if back is None else back
-    return transfer_texture(source, look, target, back, atlas, choices).baked
+    return transfer_texture(source, look, target, back, atlas, choices)
 
 
 def nearest_map(a: Shape, b: Shape) -> VertexMap:
@@ -509,7 +508,7 @@ def test_a_corner_without_a_place_takes_its_faces_along() -> None:
     back = VertexMap.between(target, SQUARE, [0, 1, 2, 3, 0])
     made = transfer_texture(SQUARE, wearing(noise(32)), target, back, Atlas(uv, True), SMALL)
     assert len(made.mesh.faces) == 2 and len(made.mesh.verts) == 5
-    np.testing.assert_array_equal(made.baked.image, noise(32))
+    np.testing.assert_array_equal(made.image, noise(32))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 
 from meshmatch.shapes.appearance import Material, Wrap
 from meshmatch.shapes.colors import LINEAR_OF_BYTE, to_linear, to_srgb
-from meshmatch.transfer.pyramid import Pyramid, fill, wrapped
+from meshmatch.transfer.texels import Pyramid, fill, wrapped
 from tests.shapes.painted import quarters
 
 

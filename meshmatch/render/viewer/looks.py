@@ -19,8 +19,7 @@ from meshmatch.render.viewer.drawn import Drawn
 from meshmatch.shapes.appearance import Appearance, Material, Pixels, png_bytes
 from meshmatch.shapes.colors import LINEAR_OF_BYTE, to_srgb
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.bake import BakeOptions
-from meshmatch.transfer.texture import colors_of_vertices, transfer_texture
+from meshmatch.transfer.bake import BakeOptions, colors_of_vertices, transfer_texture
 from meshmatch.transfer.unwrap import atlas_of
 
 Arrays = dict[str, NDArray[Any]]
@@ -94,7 +93,7 @@ def _carried(
         choices = BakeOptions(size=TEXELS, padding=4, workers=workers)
         try:
             atlas = atlas_of(wearer, coordinates, choices.size, choices.padding)
-            baked = transfer_texture(owner, look, wearer, back, atlas, choices).baked
+            baked = transfer_texture(owner, look, wearer, back, atlas, choices)
         except InputError:  # no surface to speak of, or none that can be unwrapped
             pass
         else:
