@@ -18,19 +18,9 @@ from meshmatch.transfer.texels import MOST_ROWS, Pyramid, rows_of, spans, wrappe
 class MaterialSampler:
     """The look of a shape: materials, images as pyramids, and how dense their texels lie.
 
-    Parameters
-    ----------
-    look : Appearance
-    walker : SurfaceWalker
-        Of the same file; lengths are in its unit. For a cloud, whose points are its faces, the look has a material
-        for each point.
-
-    Attributes
-    ----------
-    chart : (F,) int32
-        Faces over whose edges the colours go on without a seam have one number.
-    alpha, cutoff
-        What the alpha of `colors` means.
+    The walker is of the same file; lengths are in its unit. For a cloud, whose points are its faces, the look has a
+    material for each point. `alpha` and `cutoff` say what the alpha of `colors` means; faces over whose edges the
+    colours go on without a seam have one number in `chart` (F,).
     """
 
     def __init__(self, look: Appearance, walker: SurfaceWalker) -> None:
@@ -38,34 +28,26 @@ class MaterialSampler:
         self._material = look.material
         self._faces = walker.faces
         self._colors = None if look.colors is None else list(look.colors.T.astype(np.float32, order="C"))
-        used = [self.materials[k] for k in np.unique(look.material).tolist()]
-        self.alpha, self.cutoff, self._hard = _meaning(used, look.colors)
+        used = np.unique(look.material).tolist()
+        self.alpha, self.cutoff, self._hard = _meaning([self.materials[k] for k in used])
         pictured = np.array([m.image is not None for m in self.materials])[look.material]
-        uv = look.uv - 2.0 * np.floor(
-            look.uv.min(axis=1, keepdims=True) / 2.0
-        )  # whole repeats of an image change nothing
+        uv = _folded(look.uv)
         held = np.array(["clamp" in m.wrap for m in self.materials])[look.material]
         uv[held] = look.uv[held]
         self._uv = [list(uv[:, :, k].T.astype(np.float32, order="C")) for k in range(2)]
         self.chart = _charts(walker, look, pictured)
         self._density = _densities(walker, self.materials, look.material, look.uv)
-        self._pyramids = self._build(look)
-
-    def _build(self, look: Appearance) -> list[Pyramid | None]:
-        """One pyramid for each material with an image; materials that share all of it share the pyramid."""
-        made: dict[tuple[int, object], Pyramid] = {}
-        keys = [(id(m.image), (m.wrap, m.nearest, m.alpha == "opaque")) for m in self.materials]
-        out: list[Pyramid | None] = []
-        present = set(np.unique(look.material).tolist())
-        for number, (key, material) in enumerate(zip(keys, self.materials, strict=True)):
-            if material.image is None or number not in present:
-                out.append(None)
-                continue
-            if key not in made:
-                alike = np.array([other == key for other in keys])
-                made[key] = Pyramid.of(material, known_texels(material, look.uv[alike[look.material]]))
-            out.append(made[key])
-        return out
+        # One pyramid for each material with an image; materials that share all of it share the pyramid.
+        self._pyramids: dict[int, Pyramid] = {}
+        made: dict[tuple[object, ...], Pyramid] = {}
+        keys = [(id(m.image), m.wrap, m.nearest, m.alpha == "opaque") for m in self.materials]
+        for number in used:
+            material, key = self.materials[number], keys[number]
+            if material.image is not None:
+                if key not in made:
+                    alike = np.array([other == key for other in keys])
+                    made[key] = Pyramid.of(material, known_texels(material, look.uv[alike[look.material]]))
+                self._pyramids[number] = made[key]
 
     def footprint(self, face: NDArray[np.integer], reach: Floats32) -> Floats32:
         """How many texels of its image a step of `reach` (N,) covers on faces (N,)."""
@@ -83,18 +65,17 @@ class MaterialSampler:
         return out
 
     def _of_one(self, number: int, face: NDArray[np.integer], weights: Floats32, footprint: Floats32) -> Floats32:
-        made, pyramid = self.materials[number], self._pyramids[number]
+        made = self.materials[number]
         out = np.ones((4, len(face)), np.float32)
-        if pyramid is not None:
-            u, v = (_interpolated(weights, columns, face) for columns in self._uv)
-            out = pyramid.look(u, v, footprint)
+        if number in self._pyramids:
+            u, v = (_mean(weights, [column.take(face) for column in columns]) for columns in self._uv)
+            out = self._pyramids[number].look(u, v, footprint)
         if made.factor != (1.0, 1.0, 1.0, 1.0):
             out *= np.array(made.factor, np.float32)[:, None]
         if self._colors is not None:
             corners = self._faces[face].T
             for k in range(4):
-                values = [self._colors[k].take(corner) for corner in corners]
-                out[k] *= weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2]
+                out[k] *= _mean(weights, [self._colors[k].take(corner) for corner in corners])
         if made.alpha == "opaque":
             out[3] = 1.0
         elif made.alpha == "mask" and self._hard:
@@ -102,12 +83,16 @@ class MaterialSampler:
         return out
 
 
-def _interpolated(weights: Floats32, columns: list[Floats32], face: NDArray[np.integer]) -> Floats32:
-    a, b, c = (weight * column.take(face) for weight, column in zip(weights, columns, strict=True))
-    return a + b + c
+def _mean(weights: Floats32, values: list[Floats32]) -> Floats32:
+    return weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2]
 
 
-def _meaning(used: list[Material], colors: Floats | None) -> tuple[Alpha, float, bool]:
+def _folded(uv: Floats) -> Floats:
+    """Coordinates (F, 3, 2) without whole repeats of an image, also of a mirrored one: they change nothing."""
+    return uv - 2.0 * np.floor(uv.min(axis=1, keepdims=True) / 2.0)
+
+
+def _meaning(used: list[Material]) -> tuple[Alpha, float, bool]:
     """Alpha and cutoff for all materials together, and whether those of "mask" are decided at once."""
     kinds = {material.alpha for material in used}
     cutoffs = {material.cutoff for material in used if material.alpha == "mask"}
@@ -127,8 +112,7 @@ def known_texels(material: Material, uv: Floats) -> Bools | None:
     height, width = material.image.shape[:2]
     if len(uv) == 0 or (uv.max(axis=1) - uv.min(axis=1)).max() >= 1.0:
         return None
-    uv = uv - np.floor(uv.min(axis=1, keepdims=True) / 2.0) * 2.0 if "clamp" not in material.wrap else uv
-    corners = uv * np.array([width, height])
+    corners = (uv if "clamp" in material.wrap else _folded(uv)) * np.array([width, height])
     size = corners.max(axis=1) - corners.min(axis=1) + 1.0
     if np.prod(size, axis=1).sum() > 16.0 * width * height + 64.0 * len(uv) or rows_of(corners).sum() > MOST_ROWS:
         return None
@@ -152,10 +136,9 @@ def _texels_at(points: Floats, material: Material, shape: tuple[int, ...]) -> tu
 
 
 def _densities(walker: SurfaceWalker, materials: tuple[Material, ...], material: Ints, uv: Floats) -> Floats32:
-    """(F,) texels of its image that lie along a unit of length on each face.
+    """(F,) texels of its image that lie along a unit of length on each face; one on the whole face without an image.
 
-    As an area has them, or half of what the densest direction has if that is more. Without an image a face counts
-    as one texel.
+    As an area has them, or half of what the densest direction has if that is more.
     """
     sizes = np.array([(0, 0) if m.image is None else m.image.shape[1::-1] for m in materials], np.float64)
     corners = uv * sizes[material][:, None]
@@ -184,16 +167,14 @@ def _charts(walker: SurfaceWalker, look: Appearance, pictured: Bools) -> Ints32:
     joined = []
     for k in range(3):
         face = np.flatnonzero(walker.opposite[:, k] >= 0)
-        other, edge = (walker.opposite[face, k].astype(np.int64), walker.opposite_edge[face, k].astype(np.int64))
-        rows = np.arange(len(face))
+        other, edge = (each[face, k].astype(np.int64) for each in (walker.opposite, walker.opposite_edge))
         ends, theirs = ((k + 1) % 3, (k + 2) % 3), ((edge + 1) % 3, (edge + 2) % 3)
         # the other face runs along the edge the other way round, unless it is turned over
         same_way = walker.same[face, ends[0]] == walker.same[other, theirs[0]]
         agree = look.material[face] == look.material[other]
         for i in (0, 1):
             corner = np.where(same_way, theirs[i], theirs[1 - i])
-            apart = np.abs(look.uv[face, ends[i]] - look.uv[other[rows], corner]).max(axis=1)
-            agree &= apart < 1e-6
+            agree &= np.abs(look.uv[face, ends[i]] - look.uv[other, corner]).max(axis=1) < 1e-6
         joined.append(np.stack([face[agree], other[agree]]))
     pairs = np.concatenate(joined, axis=1)
     graph = coo_array((np.ones(pairs.shape[1], np.int8), (pairs[0], pairs[1])), shape=(F, F))

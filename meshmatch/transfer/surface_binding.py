@@ -15,22 +15,14 @@ from meshmatch.shapes.shape import Shape
 class SurfaceBinding:
     """Every vertex of a shape is bound to its footpoint on the fitted template.
 
-    The offset from the footpoint is kept, and turns with the template: so the pose of the fit reproduces the shape
-    with all its detail.
-
-    Parameters
-    ----------
-    part : Repaired
-        The shape; all vertices of its original are bound.
-    fit : Fit
-    turns : (V, 3, 3)
-        Rotation of the fitted template at each of its vertices.
+    The offset from the footpoint is kept, and turns with the template (``turns`` are rotations at its vertices): so the
+    pose of the fit reproduces the shape with all its detail.
     """
 
     def __init__(self, part: Repaired, fit: Fit, turns: Float[Floats, "V 3 3"], workers: int = 1) -> None:
         self._shape = part.original
         foot, _ = template_footpoints(part.shape, fit, workers)
-        rows = part.original_to_repaired
+        rows = part.original_to_repaired  # all vertices of the original are bound
         self._corners, self._weights = fit.faces[foot.face[rows]], foot.barycentric[rows]
         offset = fit.frame.apply(part.original.verts) - self._on(fit.points)
         self._offsets = [np.einsum("nji,nj->ni", turns[self._corners[:, k]], offset) for k in range(3)]

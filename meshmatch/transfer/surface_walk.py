@@ -15,23 +15,18 @@ from meshmatch.arrays import Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.topology import same_rows
 from meshmatch.geometry.triangles import blend, closest_on_triangles, interpolate, squared_lengths, triangle_areas
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.mapped_mesh import length_of
 
 _INSIDE = np.float32(-1e-5)
 _STEPS, _STEPS_AGAIN = 32, 12
 
 
 class SurfaceWalker:
-    """A mesh arranged for walks; lengths in units of `unit`, seen from `center`.
-
-    Parameters
-    ----------
-    shape : Shape
-        With faces.
-    """
+    """A mesh arranged for walks; lengths in units of `unit`, seen from `center`."""
 
     def __init__(self, shape: Shape) -> None:
         self.center = shape.bounds.mean(axis=0)
-        self.unit = float(np.sqrt(shape.area)) or shape.diagonal or 1.0
+        self.unit = length_of(shape)
         self.verts = (shape.verts - self.center) / self.unit
         self.faces = shape.faces
         self.same = same_rows(shape.verts)[shape.faces]  # corners by position: seams do not separate
@@ -42,7 +37,8 @@ class SurfaceWalker:
         self._flat = (first == 0).all(axis=1) & (second == 0).all(axis=1)
         self._table = list(np.concatenate([a, first, second], axis=1).T.astype(np.float32, order="C"))
         self._opposite = list(np.ascontiguousarray(self.opposite.T))
-        self._around = _a_face_of_each_vertex(shape.faces, shape.V)
+        self._around = np.full(shape.V, -1, np.int64)
+        self._around[shape.faces[::-1].ravel()] = np.repeat(np.arange(shape.F - 1, -1, -1), 3)
         self._broken = np.zeros(shape.F, bool)
         if shape.invalid is not None:
             self._broken |= shape.invalid[shape.faces].any(axis=1)
@@ -57,18 +53,8 @@ class SurfaceWalker:
         return interpolate(self.verts, self.faces[face], weights)
 
     def closest(self, points: Floats32, face: Ints32) -> tuple[Ints32, Floats32, Floats32]:
-        """The closest place on the surface that a walk reaches.
-
-        Parameters
-        ----------
-        points : (3, N) float32
-            x, y and z.
-        face : (N,) int32
-            Where each begins; -1 where that is not known.
-
-        Returns
-        -------
-        face (N,), weights (3, N), and the distance (N,), 0 for all whose foot lies inside its face.
+        """The closest place on the surface that a walk reaches from points (3, N), beginning on faces (N,), -1 where
+        that is not known: a face (N,), weights (3, N), and the distance (N,), 0 for all whose foot lies inside its face.
         """
         lost = np.flatnonzero(face < 0)
         if len(lost):
@@ -79,15 +65,14 @@ class SurfaceWalker:
             unfinished = np.union1d(unfinished, np.flatnonzero(self._flat[face]))
         if len(unfinished):  # a long walk, or a circular one: start near its end
             some = points[:, unfinished]
-            face[unfinished], weights[:, unfinished], out, _ = self._walk(
-                some, self._nearest_center(some), _STEPS_AGAIN
-            )
+            again = self._walk(some, self._nearest_center(some), _STEPS_AGAIN)
+            face[unfinished], weights[:, unfinished], out, _ = again
             outside = np.concatenate([np.setdiff1d(outside, unfinished), unfinished[out]])
         distance = np.zeros(len(face), np.float32)
         if len(outside):
             corners = self.verts[self.faces[face[outside]]]
             asked = points[:, outside].T.astype(np.float64)
-            held = closest_on_triangles(asked, corners[:, 0], corners[:, 1], corners[:, 2])
+            held = closest_on_triangles(asked, *corners.swapaxes(0, 1))
             foot = blend(corners, held)
             weights[:, outside] = held.T
             distance[outside] = np.sqrt(squared_lengths(foot - asked))
@@ -96,7 +81,7 @@ class SurfaceWalker:
         return face, weights, distance
 
     def _walk(self, points: Floats32, face: Ints32, steps: int) -> tuple[Ints32, Floats32, Ints, Ints]:
-        """Ints32 and weights where each walk ended; those that ended at an edge; those that did not end.
+        """Face and weights where each walk ended; those that ended at an edge; those that did not end.
 
         Column by column: reductions over three numbers take NumPy fifty times as long.
         """
@@ -151,7 +136,7 @@ class PointWalker(SurfaceWalker):
         near = cKDTree(shape.verts[valid]).query(shape.verts, min(3, len(valid)))[1].reshape(shape.V, -1)
         faces = np.concatenate([valid[near], valid[near[:, -1:]].repeat(3 - near.shape[1], axis=1)], axis=1)
         super().__init__(Shape(shape.verts, faces, shape.name, invalid=shape.invalid))
-        self.unit = float(np.sqrt(shape.area)) or shape.diagonal or 1.0
+        self.unit = length_of(shape)
         self.verts = (shape.verts - self.center) / self.unit
         self.areas = shape.vertex_areas / self.unit**2
         self._valid, self._points = valid, cKDTree(self.verts[valid])
@@ -186,12 +171,6 @@ def duals(first: Floats, second: Floats) -> tuple[Floats, Floats]:
     flat = determinant <= 1e-14 * a * c
     share = np.where(flat, 0.0, 1.0 / np.where(flat, 1.0, determinant))[:, None]
     return share * (c[:, None] * first - b[:, None] * second), share * (a[:, None] * second - b[:, None] * first)
-
-
-def _a_face_of_each_vertex(faces: Ints, V: int) -> Ints:
-    around = np.full(V, -1, np.int64)
-    around[faces[::-1].ravel()] = np.repeat(np.arange(len(faces) - 1, -1, -1), 3)
-    return around
 
 
 def _neighbours(faces: Ints, same: Ints) -> tuple[Ints32, NDArray[np.int8]]:

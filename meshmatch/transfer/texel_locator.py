@@ -20,33 +20,19 @@ _FAR = 0.1
 class TexelLocator:
     """Where the target's triangles lie on the source, and where each point of their texels does.
 
-    Parameters
-    ----------
-    walker : SurfaceWalker
-        The source.
-    target : Shape
-    back : VertexMap
-        From target to source.
-    corners : (F, 3, 2) float64
-        The target's triangles in the atlas, counted in texels.
-
-    Attributes
-    ----------
-    discontinuous : (F,) bool
-        Triangles whose corners' images lie far apart. Their texels continue the surface around the nearest corner,
-        and meet in the middle: a cut, where interpolation would smear.
-    reach : (F,) float32
-        Size of a texel on the source.
+    The walker is that of the source, `back` a map from target to source, and corners (F, 3, 2) are those of the
+    target's triangles in the atlas, counted in texels. `discontinuous` (F,) are triangles whose corners' images lie far
+    apart. Their texels continue the surface around the nearest corner, and meet in the middle: a cut, where
+    interpolation would smear. `reach` (F,) is the size of a texel on the source.
     """
 
     def __init__(self, walker: SurfaceWalker, target: Shape, back: VertexMap, corners: Floats) -> None:
         self.walker = walker
         self._confidence = back.confidence.astype(np.float32)
-        image, start = images_of(walker, back)
+        self._image, start = images_of(walker, back)
         self._faces, self._verts = target.faces, target.verts
         self._corners = list(np.ascontiguousarray(target.faces.T))
-        self._image = image
-        held = image[target.faces]
+        held = self._image[target.faces]
         first, second = held[:, 1] - held[:, 0], held[:, 2] - held[:, 0]
         flat = _inverse(corners)
         right = flat[:, 0:1] * first + flat[:, 2:3] * second
@@ -63,10 +49,8 @@ class TexelLocator:
             self.discontinuous |= target.invalid[target.faces].any(axis=1)
         if self.discontinuous.any():
             self._jacobian = _jacobians(target, held, ~self.discontinuous)
-            bend = np.maximum(self._size, 1e-12)
-            self.reach[self.discontinuous] *= (scale * own_length.max(axis=1) / bend).astype(np.float32)[
-                self.discontinuous
-            ]
+            bend = (scale * own_length.max(axis=1) / np.maximum(self._size, 1e-12)).astype(np.float32)
+            self.reach[self.discontinuous] *= bend[self.discontinuous]
         self._start = list(start[target.faces].T.astype(np.int32, order="C"))
         table = np.concatenate([corners[:, 0], flat, held[:, 0], first, second], axis=1)
         self._table = list(table.T.astype(np.float32, order="C"))
@@ -74,13 +58,8 @@ class TexelLocator:
     def locate(
         self, face: Ints32, x: Floats32, y: Floats32, start: Ints32 | None = None
     ) -> tuple[Floats32, Ints32, Floats32]:
-        """Places of points (N,), (N,) of the atlas that belong to triangles (N,) of the target.
-
-        Points outside their triangle continue its plane.
-
-        Returns
-        -------
-        weights (3, N) in the triangle of the target; face (N,) and weights (3, N) on the source.
+        """Places of points (N,), (N,) of the atlas that belong to triangles (N,) of the target: weights (3, N) in the
+        triangle; face (N,) and weights (3, N) on the source. Points outside their triangle continue its plane.
         """
         column = [values.take(face) for values in self._table]
         right, down = x - column[0], y - column[1]
@@ -95,14 +74,12 @@ class TexelLocator:
         points = np.empty((3, len(face)), np.float32)
         for k in range(3):
             points[k] = column[6 + k] + weights[1] * column[9 + k] + weights[2] * column[12 + k]
-        corner = np.where(weights[1] > weights[0], np.where(weights[2] > weights[1], 2, 1),
-                          np.where(weights[2] > weights[0], 2, 0))  # fmt: skip
+        corner = np.where(weights[2] > np.maximum(weights[0], weights[1]), 2, weights[1] > weights[0])
         cut = np.flatnonzero(self.discontinuous.take(face))
         if len(cut):
             points[:, cut] = self._continued(face[cut], weights[:, cut], corner[cut])
         begin = self._begin(face, corner)
-        if start is not None:
-            begin = np.where(start >= 0, start, begin)
+        begin = begin if start is None else np.where(start >= 0, start, begin)
         place, held, distance = self.walker.closest(points, begin)
         far = np.flatnonzero(distance > _FAR * self._size.take(face))
         for k in (1, 2) if len(far) else ():

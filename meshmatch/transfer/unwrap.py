@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import xatlas
 
-from meshmatch.arrays import Floats, Ints
+from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.texels import MOST_ROWS, faces_on, rows_of
@@ -34,64 +34,39 @@ _MAX_EDGE = 500.0
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """Texture coordinates that give every place of a surface its own place in an image.
+    """Texture coordinates that give every place of a surface its own place in an image."""
 
-    Parameters
-    ----------
-    uv : (F, 3, 2) float64
-        Within 0..1, u to the right, v down; zeros for a face without area.
-    own : bool
-        True if they are those of the file.
-    note : str
-        Why the file's own are not used; empty if they are, or if there are none.
-    """
-
-    uv: Floats
-    own: bool
-    note: str = ""
+    uv: Float[Floats, "F 3 2"]  # within 0..1, u to the right, v down; zeros for a face without area
+    own: bool  # True if they are those of the file
+    note: str = ""  # why the file's own are not used; empty if they are, or if there are none
 
 
 def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Keep = "auto") -> Atlas:
-    """The coordinates to bake with.
+    """The coordinates to bake an image of `size` with: the file's own (F, 3, 2) where they are valid ("auto"), these
+    or an error ("keep"), or new ones, with at least `padding` texels between charts.
 
-    Parameters
-    ----------
-    own : (F, 3, 2), optional
-        The file's.
-    size, padding : int
-        Of the image; and the least number of texels between new charts.
-    keep : {"auto", "keep", "new"}
-        Own ones where they are valid; own ones or an error; new ones.
-
-    Raises
-    ------
-    OptionError
-        A cloud; or "keep", and there are no coordinates, or they are not valid.
-    InputError
-        No triangle has an area, or xatlas fails.
+    `OptionError` for a cloud, or if there are none to keep, or they are not valid; `InputError` if no triangle has an
+    area, or xatlas fails.
     """
+    name = shape.name or "the target"
     if shape.is_cloud:
         raise OptionError(
-            f"{shape.name or 'the target'} is a point cloud, which has no surface for a texture",
+            f"{name} is a point cloud, which has no surface for a texture",
             "its points can have colours: end the output in .ply",
         )
     if not (shape.face_areas > 0).any():
-        raise InputError(f"{shape.name or 'the target'} has no triangle with an area", "is it a mesh?")
-    if keep == "new" or own is None:
-        if keep == "keep":
-            raise OptionError(
-                f"{shape.name or 'the target'} has no texture coordinates to keep",
-                "leave out --uv keep: new ones are made",
-            )
-        return Atlas(unwrapped(shape, size, padding), False)
-    within, problem = _within(own, shape)
-    problem = problem or _problem(within, shape, size)
-    if not problem:
-        return Atlas(within, True)
-    words = f"{shape.name or 'the target'}: its own texture coordinates cannot be used: {problem}"
+        raise InputError(f"{name} has no triangle with an area", "is it a mesh?")
+    words, note = f"{name} has no texture coordinates to keep", ""
+    if own is not None and keep != "new":
+        within, problem = _within(own, shape)
+        problem = problem or _problem(within, shape, size)
+        if not problem:
+            return Atlas(within, True)
+        words = f"{name}: its own texture coordinates cannot be used: {problem}"
+        note = f"{words}; new ones were made"
     if keep == "keep":
         raise OptionError(words, "leave out --uv keep: new ones are made")
-    return Atlas(unwrapped(shape, size, padding), False, f"{words}; new ones were made")
+    return Atlas(unwrapped(shape, size, padding), False, note)
 
 
 def _within(uv: Floats, shape: Shape) -> tuple[Floats, str]:
@@ -113,8 +88,7 @@ def _within(uv: Floats, shape: Shape) -> tuple[Floats, str]:
 
 def _problem(uv: Floats, shape: Shape, size: int) -> str:
     """Why coordinates within 0..1 are not an atlas; empty if they are."""
-    one, two = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    room = 0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+    room = _flat_areas(uv)
     if room.sum() < _MIN_USED:
         return f"they use only {100 * room.sum():.1f} % of the image"
     if room.sum() > 1.0 + _OVERLAP or rows_of(uv * size).sum() > MOST_ROWS:
@@ -128,23 +102,23 @@ def _problem(uv: Floats, shape: Shape, size: int) -> str:
     return f"they overlap on {100 * share:.1f} % of their texels" if share > _OVERLAP else ""
 
 
-def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
-    """(F, 3, 2) new coordinates.
+def _flat_areas(corners: Floats) -> Floats:
+    """(F,) areas of triangles (F, 3, 2) in the plane."""
+    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.asarray(0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
 
-    Raises
-    ------
-    InputError
-        xatlas cannot do it.
-    """
+
+def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
+    """(F, 3, 2) new coordinates; `InputError` if xatlas cannot make them."""
     real = np.flatnonzero(shape.face_areas > 0)
     used, corners = np.unique(shape.faces[real], return_inverse=True)
     verts = shape.verts[used]
     verts = (verts - verts.mean(axis=0)) / max(float(np.sqrt(shape.face_areas.sum())), 1e-300)
     corners = corners.reshape(-1, 3)
     edges = verts[corners] - verts[corners[:, [1, 2, 0]]]
-    if np.sqrt((edges**2).sum(axis=2).max()) > _MAX_EDGE:
-        raise _failed(shape, "it has triangles as thin as a thread")
     try:
+        if np.sqrt((edges**2).sum(axis=2).max()) > _MAX_EDGE:
+            raise RuntimeError("it has triangles as thin as a thread")
         maker, pack = xatlas.Atlas(), xatlas.PackOptions()
         pack.resolution, pack.padding = 256, 0
         maker.add_mesh(verts.astype(np.float32), corners.astype(np.uint32))
@@ -158,7 +132,10 @@ def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
         grid = min(size, _GRID)
         uv = _packed(charts, faces, grid, padding * grid / size)
     except (RuntimeError, IndexError) as error:
-        raise _failed(shape, str(error)) from error
+        raise InputError(
+            f"{shape.name or 'the target'} cannot be unwrapped ({error})",
+            "unwrap it in a modelling program, and use --uv keep",
+        ) from error
     out = np.zeros((shape.F, 3, 2))
     # Room at the border too: a repeated image goes on there with its other side.
     margin = min(_MARGIN, padding) / size
@@ -171,8 +148,7 @@ def _packed(charts: Floats, faces: Ints, grid: int, padding: float) -> Floats:
 
     xatlas finds a width and a height by itself; the most square of a few attempts wins.
     """
-    one, two = (charts[faces[:, k]] - charts[faces[:, 0]] for k in (1, 2))
-    area = 0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]).sum()
+    area = float(_flat_areas(charts[faces]).sum())
     best, most = charts, 0.0
     for density in _DENSITIES:
         packer, pack = xatlas.Atlas(), xatlas.PackOptions()
@@ -191,10 +167,3 @@ def _packed(charts: Floats, faces: Ints, grid: int, padding: float) -> Floats:
     if not most:
         raise RuntimeError("its charts could not be packed")
     return best
-
-
-def _failed(shape: Shape, why: str) -> InputError:
-    return InputError(
-        f"{shape.name or 'the target'} cannot be unwrapped ({why})",
-        "unwrap it in a modelling program, and use --uv keep",
-    )
