@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Float, Floats, Floats32
+from meshmatch.arrays import Float, Floats, Floats32, frozen
 from meshmatch.errors import InputError
 from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
 from meshmatch.maps.vertex_map import VertexMap
@@ -18,20 +18,14 @@ from meshmatch.shapes.shape import Shape
 SKIN_M2 = 1.9
 CM_PER_UNIT = 100.0 * float(np.sqrt(SKIN_M2))
 """Centimetres in one sqrt(area) of a person with 1.9 m2 of skin."""
-
 LOST_CM = 15.0
 """An error above this is a point on the wrong limb; a pair whose mean lies above it is a left-right flip."""
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors of a map, one for each point whose truth is known.
-
-    Parameters
-    ----------
-    values : (N,) float32
-        Distance between predicted and true point along the target's surface, over the square root of its
-        area.
+    """Errors of a map, one for each point whose truth is known: distance between predicted and true point along the
+    target's surface, over the square root of its area; as "cm", with the target scaled to 1.9 m2 of skin.
     """
 
     values: Float[Floats32, " N"]
@@ -40,33 +34,26 @@ class Errors:
         values = np.array(self.values, dtype=np.float32).reshape(-1)
         if not values.size or not np.isfinite(values).all() or values.min() < 0:
             raise ValueError("there must be errors, all finite and 0 or more")
-        values.setflags(write=False)
-        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "values", frozen(values))
 
     @property
     def cm(self) -> Float[Floats32, " N"]:
-        """The same in centimetres, the target scaled to 1.9 m2 of skin."""
-        scaled: Floats32 = self.values * np.float32(CM_PER_UNIT)
-        return scaled
+        return np.asarray(self.values * np.float32(CM_PER_UNIT))
 
     @property
     def mean(self) -> float:
-        """Mean, in units of sqrt(area)."""
         return float(self.values.mean(dtype=np.float64))
 
     @property
     def median(self) -> float:
-        """Median, in units of sqrt(area)."""
         return float(np.median(self.values))
 
     @property
     def mean_cm(self) -> float:
-        """Mean, in centimetres at 1.9 m2."""
         return self.mean * CM_PER_UNIT
 
     @property
     def median_cm(self) -> float:
-        """Median, in centimetres at 1.9 m2."""
         return self.median * CM_PER_UNIT
 
     def share_over(self, cm: float = LOST_CM) -> float:
@@ -89,14 +76,12 @@ class Errors:
 class Coverage:
     """How much of a target a map reaches: little where many source vertices share few of the target's.
 
-    A source with fewer vertices than the target cannot reach all of them: `vertices` is at most V_source /
-    V_target.
+    Shares (0..1) of the target's vertices that are hit, and of the area that belongs to them. A source with fewer
+    vertices than the target cannot reach all: `vertices` is at most V_source / V_target.
     """
 
     vertices: float
-    """Share (0..1) of the target's vertices that are hit."""
     area: float
-    """Share (0..1) of the target's area that belongs to them."""
 
 
 def map_errors(
@@ -104,19 +89,8 @@ def map_errors(
 ) -> Errors:
     """Errors at known points: is ``index[source_points[n]]`` the vertex ``target_points[n]``?
 
-    Parameters
-    ----------
-    index : (V_source,) int
-        The map.
-    source_points, target_points : (N,) int
-        Vertex ids of the same N points on the source and on the target.
-    geodesics
-        Of the target.
-
-    Raises
-    ------
-    InputError
-        The lists differ in length or name a vertex that is not there.
+    `index` (V_source,) is the map; both kinds of points (N,) are vertices, `geodesics` those of the target.
+    `InputError` if the lists differ in length or name a vertex that is not there.
     """
     index, a, b = (np.asarray(ids) for ids in (index, source_points, target_points))
     if a.shape != b.shape or a.ndim != 1 or not a.size:
@@ -164,9 +138,7 @@ class Evaluation:
     geodesic: str = GEODESIC
 
     def as_dict(self, threshold_cm: float = LOST_CM) -> Mapping[str, Any]:
-        """Plain numbers for a JSON line; lengths in sqrt(area) x 100 and, for people, in cm at 1.9 m2 of
-        skin.
-        """
+        """Plain numbers for a JSON line; lengths in sqrt(area) x 100 and, for people, in cm at 1.9 m2 of skin."""
         record: dict[str, Any] = {
             "coverage_vertices": self.coverage.vertices,
             "coverage_area": self.coverage.area,
@@ -195,29 +167,18 @@ def evaluate_map(
     *,
     rng: np.random.Generator | None = None,
 ) -> Evaluation:
-    """Coverage, distortion (if both shapes are meshes) and, where the truth is given, errors.
+    """Coverage, distortion (if both shapes are meshes) and, where the truth is given as in `map_errors`, errors.
 
-    Parameters
-    ----------
-    source_points, target_points : (N,) int, optional
-        The truth, as in `map_errors`. With `target_points` alone, entry i belongs to vertex i of the source.
-    rng
-        Chooses the points of `distortion`; ``default_rng(0)`` if none is given.
-
-    Raises
-    ------
-    InputError
-        The map does not belong to these shapes, or the truth to them; the truth is given and the target is a
-        cloud.
+    With `target_points` alone, entry i belongs to vertex i of the source. `rng` chooses the points of `distortion`;
+    ``default_rng(0)`` if none is given. `InputError` if the map does not belong to these shapes, or the truth to them;
+    or if the truth is given and the target is a cloud.
     """
     vertex_map = vertex_map.for_shapes(source, target)
     errors = stretched = None
     if target_points is not None:
-        if source_points is None:
-            source_points = np.arange(source.V)
+        source_points = np.arange(source.V) if source_points is None else source_points
         errors = map_errors(vertex_map.index, source_points, target_points, GeodesicDistances(target))
     if not source.is_cloud and not target.is_cloud:
-        stretched = distortion(
-            vertex_map.index, GeodesicDistances(source), GeodesicDistances(target), rng or np.random.default_rng(0)
-        )
+        both = GeodesicDistances(source), GeodesicDistances(target)
+        stretched = distortion(vertex_map.index, *both, rng or np.random.default_rng(0))
     return Evaluation(coverage(vertex_map.index, target), stretched, errors)

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from meshmatch.errors import InputError
 from meshmatch.maps import table_files
 from meshmatch.maps.mat_file import read_mat
-from meshmatch.maps.table_files import check_numbered, read_by_suffix, short_floats
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.files import ShapeLike, as_shape
@@ -31,7 +30,6 @@ from meshmatch.shapes.input_files import read_npy, read_npz
 
 CSV_COLUMNS = ("source_vertex", "target_vertex", "face", "w0", "w1", "w2", "confidence")
 _ARRAYS = ("index", "face", "barycentric", "confidence")
-_LISTS = ("index", "face", "confidence")
 _WORDS = ("source", "target", "verdict", "source_hash", "target_hash")
 _COUNTS = ("source_vertices", "target_vertices")
 _KNOWN = (*_ARRAYS, *_WORDS, *_COUNTS, "reasons")
@@ -72,22 +70,23 @@ def load_map(path: str | Path, source: ShapeLike | None = None, target: ShapeLik
         Unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`.
     """
     check_suffix(path)
-    readers = {suffix: read for suffix, (_, read) in _FORMATS.items()}
-    found = read_by_suffix(path, readers, "maps", f"a map holds an array 'index': {DIRECTION}")
+    readers = dict.fromkeys(_FORMATS, _read)
+    found = table_files.read_by_suffix(path, readers, "maps", f"a map holds an array 'index': {DIRECTION}")
     source = None if source is None else as_shape(source)
     target = None if target is None else as_shape(target)
     return found.for_shapes(source, target, Path(path).name)
 
 
-def _record(m: VertexMap) -> dict[str, Any]:
-    fields = {name: getattr(m, name) for name in (*_ARRAYS, *_WORDS, *_COUNTS)}
-    return {"format": _FORMAT, "direction": DIRECTION, **fields, "reasons": list(m.reasons)}
-
-
-def _from_record(record: dict[str, Any]) -> VertexMap:
+def _read(path: Path) -> VertexMap:
+    record = _FORMATS[path.suffix.lower()][1](path)
     if not isinstance(record, dict) or "index" not in record:
         raise InputError("there is no 'index' in it")
     return VertexMap(**{"source": "", "target": "", **{k: v for k, v in record.items() if k in _KNOWN}})
+
+
+def _record(m: VertexMap) -> dict[str, Any]:
+    fields = {name: getattr(m, name) for name in (*_ARRAYS, *_WORDS, *_COUNTS)}
+    return {"format": _FORMAT, "direction": DIRECTION, **fields, "reasons": list(m.reasons)}
 
 
 def _plain(arrays: Mapping[str, Any]) -> dict[str, Any]:
@@ -100,45 +99,30 @@ def _plain(arrays: Mapping[str, Any]) -> dict[str, Any]:
     return record
 
 
-def _bare(index: NDArray[Any]) -> VertexMap:
-    if index.ndim == 2 and 1 in index.shape:
-        index = index.reshape(-1)
-    return VertexMap("", "", index)
-
-
-def _write_npy(path: Path, m: VertexMap) -> None:
-    table_files.write_npy(path, m.index)
-
-
-def _read_npy(path: Path) -> VertexMap:
-    return _bare(read_npy(path))
+def _bare(index: NDArray[Any]) -> dict[str, Any]:
+    return {"index": index.reshape(-1) if index.ndim == 2 and 1 in index.shape else index}
 
 
 def _write_txt(path: Path, m: VertexMap) -> None:
     path.write_text("\n".join(map(str, m.index.tolist())) + "\n", encoding="ascii")
 
 
-def _read_txt(path: Path) -> VertexMap:
-    return _bare(np.loadtxt(path, dtype=np.int64, ndmin=1, encoding="utf-8"))
-
-
 def _write_npz(path: Path, m: VertexMap) -> None:
     table_files.write_npz(path, _record(m) | {"reasons": np.array(m.reasons, dtype=np.str_)})
 
 
-def _read_npz(path: Path) -> VertexMap:
+def _read_npz(path: Path) -> dict[str, Any]:
     record = _plain(read_npz(path, _KNOWN))
-    record["reasons"] = tuple(str(reason) for reason in np.ravel(record.get("reasons", ())))
-    return _from_record(record)
+    return record | {"reasons": tuple(str(reason) for reason in np.ravel(record.get("reasons", ())))}
 
 
 def _write_csv(path: Path, m: VertexMap) -> None:
     columns: list[list[Any]] = [list(range(m.source_vertices)), m.index.tolist(), m.face.tolist()]
-    columns += [*m.barycentric.T.tolist(), short_floats(m.confidence)]
+    columns += [*m.barycentric.T.tolist(), table_files.short_floats(m.confidence)]
     table_files.write_rows(path, CSV_COLUMNS, zip(*columns, strict=True))
 
 
-def _read_csv(path: Path) -> VertexMap:
+def _read_csv(path: Path) -> dict[str, Any]:
     with path.open(encoding="utf-8-sig", newline="") as file:
         names = [name.strip() for name in next(csv.reader(file))]
         if "target_vertex" not in names:
@@ -146,51 +130,49 @@ def _read_csv(path: Path) -> VertexMap:
         table = np.loadtxt(file, delimiter=",", ndmin=2)
     column = {name: table[:, k] for k, name in enumerate(names)}
     if "source_vertex" in column:
-        check_numbered(column["source_vertex"])
-    record: dict[str, Any] = {"index": column["target_vertex"]}
-    record |= {name: column[name] for name in ("face", "confidence") if name in column}
+        table_files.check_numbered(column["source_vertex"])
+    record = {
+        "index": column["target_vertex"],
+        **{name: column[name] for name in names if name in ("face", "confidence")},
+    }
     if {"w0", "w1", "w2"} <= set(names):
         record["barycentric"] = np.column_stack([column[name] for name in ("w0", "w1", "w2")])
-    return _from_record(record)
+    return record
 
 
 def _write_json(path: Path, m: VertexMap) -> None:
     record = _record(m)
     record |= {name: record[name].tolist() for name in ("index", "face", "barycentric")}
-    table_files.write_json(path, record | {"confidence": short_floats(m.confidence)})
+    table_files.write_json(path, record | {"confidence": table_files.short_floats(m.confidence)})
 
 
-def _read_json(path: Path) -> VertexMap:
+def _read_json(path: Path) -> Any:
     record = table_files.read_json(path)
-    if isinstance(record, list):
-        return _bare(np.array(record))
-    return _from_record(record)
+    return _bare(np.array(record)) if isinstance(record, list) else record
 
 
 def _write_mat(path: Path, m: VertexMap) -> None:
     from scipy.io import savemat
 
-    record = _record(m)
-    record["matlab_index"] = m.index + 1
-    record["reasons"] = np.array(list(m.reasons), dtype=object)
+    record = _record(m) | {"matlab_index": m.index + 1, "reasons": np.array(list(m.reasons), dtype=object)}
     with path.open("wb") as file:
         savemat(file, record, oned_as="column")
         file.seek(0)  # the first 116 bytes are free text; the time in it would make every file differ
         file.write(f"MATLAB 5.0 MAT-file, {_FORMAT}".encode("ascii").ljust(116))
 
 
-def _read_mat(path: Path) -> VertexMap:
+def _read_mat(path: Path) -> dict[str, Any]:
     record = _plain(read_mat(path.read_bytes(), _KNOWN))
     reasons = record.get("reasons", ())
     record["reasons"] = tuple(reasons) if isinstance(reasons, list) else ()
-    return _from_record({name: np.ravel(value) if name in _LISTS else value for name, value in record.items()})
+    return record | {name: np.ravel(record[name]) for name in ("index", "face", "confidence") if name in record}
 
 
-_FORMATS: dict[str, tuple[Callable[[Path, VertexMap], None], Callable[[Path], VertexMap]]] = {
-    ".npy": (_write_npy, _read_npy),
+_FORMATS: dict[str, tuple[Callable[[Path, VertexMap], None], Callable[[Path], Any]]] = {
+    ".npy": (lambda path, m: table_files.write_npy(path, m.index), lambda path: _bare(read_npy(path))),
     ".npz": (_write_npz, _read_npz),
     ".csv": (_write_csv, _read_csv),
-    ".txt": (_write_txt, _read_txt),
+    ".txt": (_write_txt, lambda path: _bare(np.loadtxt(path, dtype=np.int64, ndmin=1, encoding="utf-8"))),
     ".mat": (_write_mat, _read_mat),
     ".json": (_write_json, _read_json),
 }

@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.shape import Shape
 
 UNKNOWN = -1
 """A number of vertices that is not known."""
@@ -21,28 +20,20 @@ def checked_arrays(
     confidence: ArrayLike | None,
     target_vertices: int,
 ) -> tuple[int, dict[str, NDArray[np.generic]]]:
-    """The number of source vertices, and copies of a map's arrays; see `VertexMap` for what they are.
-
-    Raises
-    ------
-    InputError
-        One is not what it must be; the message calls the map `label`.
-    """
-    vertex = whole_numbers(index, f"{label}: index")
+    """The number of source vertices, and copies of a map's arrays, if they are what `VertexMap` says (`InputError`)."""
+    vertex = _whole_numbers(index, f"{label}: index")
     size = len(vertex) if vertex.ndim else 0
     if vertex.ndim != 1 or size == 0:
         raise InputError(f"{label}: index must be a list of (V_source,) vertices, not an array of {vertex.shape}")
     if target_vertices != UNKNOWN and target_vertices < 1:
         raise InputError(f"{label}: a target needs vertices, not {target_vertices}")
     check_range(vertex, target_vertices, label)
-    faces = np.full(size, -1) if face is None else whole_numbers(face, f"{label}: face")
+    faces = np.full(size, -1) if face is None else _whole_numbers(face, f"{label}: face")
     weights = np.array(np.tile([1.0, 0.0, 0.0], (size, 1)) if barycentric is None else barycentric, np.float64)
     trust = np.array(np.ones(size) if confidence is None else confidence, np.float32)
-    for name, array, shape in (
-        ("face", faces, (size,)),
-        ("barycentric", weights, (size, 3)),
-        ("confidence", trust, (size,)),
-    ):
+    arrays = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
+    for name, array in arrays.items():
+        shape = (size, 3) if name == "barycentric" else (size,)
         if array.shape != shape:
             raise InputError(f"{label}: {name} must be an array of {shape}, not {array.shape}")
     if faces.min() < -1:
@@ -51,26 +42,13 @@ def checked_arrays(
         raise InputError(f"{label}: barycentric weights must be 0 or more and sum to 1")
     if not ((trust >= 0) & (trust <= 1)).all():
         raise InputError(f"{label}: confidence must lie in 0..1")
-    return size, {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
+    return size, arrays
 
 
 def check_faces(face: Int[Ints, " V_source"], target_faces: int, label: str) -> None:
     """Refuse faces that a target of so many does not have (`InputError`)."""
     if face.max() >= target_faces:
         raise InputError(f"{label} names face {int(face.max())}, but its target has only {target_faces} faces")
-
-
-def misfit(side: str, made_for: str, vertices: int, digest: str, shape: Shape) -> str:
-    """In what `shape` differs from the source or target ("side") that a map was made for; empty if in nothing.
-
-    The map knows a name, a number of vertices (or `UNKNOWN`) and a hash (or "").
-    """
-    name = shape.name or f"the {side}"
-    if vertices not in (UNKNOWN, shape.V):
-        return f"{side}: {made_for or 'a mesh'} of {vertices} vertices, but {name} has {shape.V}"
-    if digest not in ("", shape.hash):
-        return f"{side}: {made_for or 'a mesh'} ({digest}), but {name} is {shape.hash}: vertices or faces differ"
-    return ""
 
 
 def corners_of(faces: Int[Ints, "F 3"] | None, face: Int[Ints, " N"], vertex: Int[Ints, " N"]) -> Int[Ints, "N 3"]:
@@ -84,9 +62,8 @@ def corners_of(faces: Int[Ints, "F 3"] | None, face: Int[Ints, " N"], vertex: In
 
 def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None:
     if index.min() < 0:
-        raise InputError(
-            f"{label}: vertex {int(np.argmin(index))} is matched to {int(index.min())}; indices start at 0"
-        )
+        first = int(np.argmin(index))
+        raise InputError(f"{label}: vertex {first} is matched to {int(index.min())}; indices start at 0")
     if target_vertices != UNKNOWN and index.max() >= target_vertices:
         one_based = index.min() >= 1 and index.max() == target_vertices
         raise InputError(
@@ -96,7 +73,7 @@ def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None
         )
 
 
-def whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
+def _whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
     array = np.asarray(values)
     if array.dtype.kind == "f" and np.isfinite(array).all() and (array == np.round(array)).all():
         return array.astype(np.int64)  # MATLAB's numbers are doubles

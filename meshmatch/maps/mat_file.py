@@ -23,7 +23,7 @@ LARGEST = 1 << 30  # bytes of one variable, unpacked
 _HEADER = 128
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_LETTERS = {16: "utf-8", 17: "utf-16", 18: "utf-32"}
+_LETTERS = {1: "latin-1", 2: "latin-1", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
 _CELL, _CHAR, _SMALLEST_NUMBER, _LARGEST_NUMBER = 1, 4, 6, 15  # classes of arrays
 _HINT = "save it with -v7, or as .csv"
 
@@ -31,10 +31,7 @@ _HINT = "save it with -v7, or as .csv"
 def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
     """Those of the named variables that the file holds and that are numbers, text, or cells of text.
 
-    Raises
-    ------
-    InputError
-        It is not a MAT-file of level 5, is damaged, or a variable is larger than `LARGEST`.
+    `InputError` if it is not a MAT-file of level 5, is damaged, or a variable is larger than `LARGEST`.
     """
     if data[:4] == b"\x89HDF" or data[:10] == b"MATLAB 7.3":
         raise InputError("it is a MAT-file of version 7.3", _HINT)
@@ -45,23 +42,17 @@ def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
     try:
         for kind, body in _elements(data[_HEADER:], order):
             if kind == _COMPRESSED:
-                kind, body = next(_elements(_unpacked(body), order))
-            if kind != _MATRIX:
-                continue
-            name, value = _matrix(body, order)
+                stream = zlib.decompressobj()
+                unpacked = stream.decompress(body, LARGEST)
+                if stream.unconsumed_tail:
+                    raise ValueError(f"a variable of more than {LARGEST} bytes")
+                kind, body = next(_elements(unpacked, order))
+            name, value = _matrix(body, order) if kind == _MATRIX else ("", None)
             if name in wanted and value is not None:
                 found[name] = value
     except (ValueError, StopIteration, zlib.error) as error:
         raise InputError(f"it is damaged: {error or 'something is missing in it'}", _HINT) from error
     return found
-
-
-def _unpacked(body: bytes) -> bytes:
-    stream = zlib.decompressobj()
-    out = stream.decompress(body, LARGEST)
-    if stream.unconsumed_tail:
-        raise ValueError(f"a variable of more than {LARGEST} bytes")
-    return out
 
 
 def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
@@ -114,12 +105,9 @@ def _matrix(body: bytes, order: str, inside: bool = False) -> tuple[str, Value |
 
 def _text(stored: int, letters: bytes, shape: list[int], order: str) -> str:
     """Text row by row; MATLAB keeps it column by column."""
-    if stored in _LETTERS:
-        coding = _LETTERS[stored] + ("" if stored == 16 else "-le" if order == "<" else "-be")
-        text = letters.decode(coding)
-    elif stored in (1, 2):
-        text = letters.decode("latin-1")
-    else:
-        text = letters.decode("utf-16-le" if order == "<" else "utf-16-be")
+    coding = _LETTERS.get(stored, "utf-16")
+    if coding in ("utf-16", "utf-32"):
+        coding += "-le" if order == "<" else "-be"
+    text = letters.decode(coding)
     rows = shape[0] if shape else 1
     return "".join(text[row::rows] for row in range(min(rows, len(text)))) if rows > 1 else text

@@ -45,20 +45,9 @@ def expectation(
 ) -> tuple[list[Float[Floats, "N D"]], Float[Floats, " N"]]:
     """Expected values over the places of the template where points may belong, and how uncertain the first are.
 
-    Parameters
-    ----------
-    points : (N, 3)
-        In the fit's core frame.
-    noise : float
-        Standard deviation along each axis, units of sqrt(area).
-    values : each (T, D)
-        At the vertices of the fitted template.
-
-    Returns
-    -------
-    means : list of (N, D)
-    variance : (N,)
-        Of the first values, summed over D.
+    `points` are in the fit's core frame; `noise` is the standard deviation along each axis, in units of sqrt(area);
+    `values` belong to the vertices of the fitted template. Returns the mean of each, and the variance of the first,
+    summed over D.
     """
     matrix, prior = _samples(fit)
     tree = cKDTree(matrix @ fit.points)

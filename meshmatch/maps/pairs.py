@@ -22,23 +22,14 @@ _POINTS = "one vertex a line, counted from 0"
 def load_pairs(path: str | Path) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
     """Read pairs: vertices of the source, and the same N points on the target.
 
-    Raises
-    ------
-    InputError
-        The file is missing or empty, or is not a table of two columns of vertices.
+    `InputError` if the file is missing or empty, or is not a table of two columns of vertices.
     """
-    table = _table(Path(path), 2, _PAIRS)
-    return table[:, 0].copy(), table[:, 1].copy()
+    first, second = _table(Path(path), 2, _PAIRS).T.copy()
+    return first, second
 
 
 def load_points(path: str | Path) -> Int[Ints, " N"]:
-    """Read a list of vertices of one shape.
-
-    Raises
-    ------
-    InputError
-        The file is missing or empty, or is not a list of vertices.
-    """
+    """Read a list of vertices of one shape; `InputError` if the file is missing or empty, or is none."""
     return _table(Path(path), 1, _POINTS)[:, 0].copy()
 
 
@@ -46,9 +37,12 @@ def _table(path: Path, columns: int, hint: str) -> Ints:
     if not path.is_file():
         raise InputError(f"there is no file {path}", hint)
     try:
-        rows = _from_npy(path) if path.suffix.lower() == ".npy" else _from_text(path)
+        rows = read_npy(path) if path.suffix.lower() == ".npy" else _from_text(path)
+        if rows.dtype.kind not in "iu":
+            raise ValueError("its numbers are not whole")
     except (ValueError, OSError, EOFError) as error:
         raise InputError(f"{path.name} is not a list of vertices: {error}", hint) from error
+    rows = rows.astype(np.int64)
     if rows.ndim == 1 and columns == 1:
         rows = rows[:, None]
     if rows.size == 0:
@@ -59,13 +53,6 @@ def _table(path: Path, columns: int, hint: str) -> Ints:
     if rows.min() < 0:
         raise InputError(f"{path.name} names vertex {int(rows.min())}", hint)
     return rows
-
-
-def _from_npy(path: Path) -> Ints:
-    array = read_npy(path)
-    if array.dtype.kind not in "iu":
-        raise ValueError("its numbers are not whole")
-    return array.astype(np.int64)
 
 
 def _from_text(path: Path) -> Ints:

@@ -25,22 +25,17 @@ def check_suffix(path: str | Path, suffixes: Iterable[str], what: str) -> str:
     suffix = Path(path).suffix.lower()
     if suffix not in suffixes:
         given = f"'{suffix}'" if suffix else "a name without a suffix"
-        raise OptionError(
-            f"{Path(path).name}: {given} is not a format for {what}", f"end the name in one of {' '.join(suffixes)}"
-        )
+        unknown = f"{Path(path).name}: {given} is not a format for {what}"
+        raise OptionError(unknown, f"end the name in one of {' '.join(suffixes)}")
     return suffix
 
 
 def read_by_suffix(path: str | Path, readers: Mapping[str, Callable[[Path], T]], what: str, hint: str) -> T:
-    """What the reader for the file's suffix makes of it.
+    """What the reader for the file's suffix makes of it; `InputError` where there is none, or the file is missing, empty
+    or damaged.
 
-    Raises
-    ------
-    InputError
-        The file is missing, empty or damaged, or there is no reader for its suffix; the file's name comes first. A
-        reader's own errors keep their words, and get `hint` where they have none.
-    OptionError
-        The reader's own.
+    The file's name comes first in the message. A reader's own errors keep their kind and words, and get `hint` where
+    they have none.
     """
     path = existing(Path(path), hint)
     suffix = path.suffix.lower()

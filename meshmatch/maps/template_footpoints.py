@@ -1,14 +1,23 @@
-"""Where every vertex of a shape belongs on the template, also where two sheets touch."""
+"""Where every vertex of a shape belongs on the template, also where two sheets of the surface touch.
+
+There the closest point may lie on the wrong sheet. Neighbours whose images lie far apart reveal it: the small islands
+that such discontinuities cut off are searched again, near the images of their surroundings.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.topology import edges_of, is_discontinuous
 from meshmatch.geometry.triangles import vertex_normals
-from meshmatch.maps.islands import reassign_islands
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.shapes.shape import Shape
 
@@ -17,13 +26,17 @@ _ROUNDS = 3
 # largest number of them. Set by hand on noisy scans of bodies.
 _NEIGHBOURS, _NEIGHBOUR_RANGE = 0.005, (9, 64)
 _CHUNK = 16_384  # points at a time
+# A piece with at least this share of the surface is not an island. Set by hand.
+_MAINLAND = 0.06
+# Steps from the rim into an island over which images of the surroundings are extended.
+_STEPS = 120
+Found = TypeVar("Found", bound=Footpoints)
 
 
 def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, Float[Floats, "V 3"]]:
     """The point of the fitted template for every vertex, and the same point of the resting template.
 
-    The closest point in space jumps to another limb where two of them touch: `meshmatch.maps.islands` corrects that on
-    a mesh. Points of a cloud have no edges that would reveal it, and noise takes them across: each is searched again,
+    Points of a cloud have no edges that would reveal an island, and noise takes them across: each is searched again,
     near the median of its neighbours.
     """
     points, normals = in_core_frame(shape, fit)
@@ -35,15 +48,11 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
         return foot.values(fit.faces, fit.resting)
 
     if not shape.is_cloud:
-        return reassign_islands(
-            points,
-            shape.faces,
-            shape.vertex_areas,
-            found,
-            resting,
-            lambda rows, near: surface.query(points[rows], normals[rows], workers, near),
-            _ROUNDS,
-        )
+
+        def search(rows: Ints, near: Floats) -> Footpoints:
+            return surface.query(points[rows], normals[rows], workers, near)
+
+        return reassign_islands(points, shape.faces, shape.vertex_areas, found, resting, search, _ROUNDS)
     near = neighbours(points, shape.roughness)
     for _ in range(_ROUNDS):
         found = surface.query(points, normals, workers, neighbour_medians(resting(found), near))
@@ -75,3 +84,71 @@ def in_core_frame(shape: Shape, fit: Fit) -> tuple[Float[Floats, "V 3"], Float[F
     """Vertices and unit normals of a shape in the core frame, where its fit is; zero normals for a cloud."""
     points = fit.frame.apply(shape.verts)
     return points, np.zeros_like(points) if shape.is_cloud else shape.vertex_normals @ fit.frame.rotation.T
+
+
+def reassign_islands(
+    verts: Float[Floats, "V 3"],
+    faces: Int[Ints, "F 3"],
+    areas: Float[Floats, " V"],
+    found: Found,
+    images: Callable[[Found], Float[Floats, "N 3"]],
+    search: Callable[[Int[Ints, " M"], Float[Floats, "M 3"]], Found],
+    rounds: int,
+) -> tuple[Found, Float[Floats, "V 3"]]:
+    """Search again for the vertices on small islands of a map of a mesh.
+
+    The mesh is in units of sqrt(area), `areas` are those around its vertices in any unit. Each vertex lies at a place in
+    `found`; `images` are the points themselves, in units of their own surface's sqrt(area), and `search` gives
+    footpoints of some vertices near such points. Returns the footpoints and their images.
+    """
+    edges = edges_of(faces).vertices
+    length = np.linalg.norm(verts[edges[:, 0]] - verts[edges[:, 1]], axis=1)
+    image = images(found)
+    for _ in range(rounds):
+        island = small_islands(edges, length, image, areas)
+        if not island.any():
+            break
+        around = surrounding_values(edges, image, island)
+        rows = np.flatnonzero(island & np.isfinite(around).all(axis=1))
+        if not len(rows):
+            break
+        again = search(rows, around[rows])
+        found, image[rows] = found.updated(rows, again), images(again)
+    return found, image
+
+
+def small_islands(
+    edges: Int[Ints, "E 2"], length: Float[Floats, " E"], image: Float[Floats, "V 3"], areas: Float[Floats, " V"]
+) -> Bool[Bools, " V"]:
+    """True on small pieces between discontinuities: edges whose ends have images much further apart than they are.
+
+    Lengths are in units of sqrt(area); ``areas`` are those around the vertices.
+    """
+    V = len(image)
+    continuous = ~is_discontinuous(image[edges[:, 0]], image[edges[:, 1]], length)
+    if continuous.all():
+        return np.zeros(V, bool)
+    kept = edges[continuous]
+    graph = csr_matrix((np.ones(len(kept)), (kept[:, 0], kept[:, 1])), (V, V))
+    piece = connected_components(graph, directed=False)[1]
+    return np.asarray((np.bincount(piece, areas) < _MAINLAND * areas.sum())[piece])
+
+
+def surrounding_values(
+    edges: Int[Ints, "E 2"], values: Float[Floats, "V D"], unknown: Bool[Bools, " V"]
+) -> Float[Floats, "V D"]:
+    """Values with the unknown rows replaced by the average of their surroundings; NaN out of reach."""
+    V = len(values)
+    graph = csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (V, V))
+    graph = (graph + graph.T).tocsr()
+    rows = np.flatnonzero(unknown)
+    part = graph[rows]
+    filled = np.where(unknown[:, None], 0.0, values)
+    known = (~unknown).astype(float)
+    for _ in range(_STEPS):
+        weight = part @ known
+        total = part @ (known[:, None] * filled)
+        filled[rows] = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], filled[rows])
+        known[rows] = weight > 0
+    filled[rows[known[rows] == 0]] = np.nan
+    return filled

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, as_numbers, frozen
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.map_checks import UNKNOWN, check_faces, check_range, checked_arrays, corners_of, misfit
+from meshmatch.maps.map_checks import UNKNOWN, check_faces, check_range, checked_arrays, corners_of
 from meshmatch.shapes.shape import Shape
 
 DIRECTION = "index[i] is the vertex of the target matched to vertex i of the source"
@@ -21,6 +21,9 @@ _OTHER_MESH = (
     "match these two again; a map needs one entry for each vertex of the source, in the order of its file, and one "
     "kept as .npy or .csv goes by the count of vertices alone"
 )
+
+
+_READ_WITH_SHAPES = "read it with load_map(path, source, target)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,27 +36,25 @@ class VertexMap:
 
     Parameters
     ----------
-    source, target : str
+    source, target
         Names of the two shapes, for people.
-    index : (V_source,) int64
+    index
         Target vertex of each source vertex.
-    face : (V_source,) int64, optional
-        Target face in which the matched point lies; -1 where it is the vertex ``index[i]`` itself (always for
-        a cloud).
-    barycentric : (V_source, 3) float64, optional
+    face
+        Target face in which the matched point lies; -1 where it is the vertex ``index[i]`` itself (always for a cloud).
+    barycentric
         Weights of that face's corners: not negative, rows sum to 1. (1, 0, 0) where the face is -1.
-    confidence : (V_source,) float32, optional
+    confidence
         0 (a guess) to 1 (certain). All 1 where nothing is known about it (see `verdict`).
-    verdict : str
-        "good", "fair" or "poor", of the map as a whole; "unknown" if it was read from a file that does not
-        say.
-    reasons : tuple of str
+    verdict
+        "good", "fair" or "poor", of the map as a whole; "unknown" if it was read from a file that does not say.
+    reasons
         Why it is not good, a line each.
-    source_vertices, target_vertices : int
+    source_vertices, target_vertices
         Vertex counts; -1 for an unknown target count (a plain list of indices does not contain it).
-    source_hash, target_hash : str
+    source_hash, target_hash
         `Shape.hash` of both; empty where not known.
-    target_faces : (F_target, 3) int64, optional
+    target_faces
         The target's triangles, whose corners ``barycentric`` weights; not written to files.
 
     Raises
@@ -95,25 +96,12 @@ class VertexMap:
 
     @classmethod
     def between(cls, source: Shape, target: Shape, index: ArrayLike, **rest: Any) -> VertexMap:
-        """A map between two shapes in memory; `rest` are the other fields (face, barycentric, confidence,
-        verdict, ...).
+        """A map between two shapes in memory; `rest` are the other fields (face, barycentric, confidence, verdict, ...).
 
-        Raises
-        ------
-        InputError
-            As `VertexMap`, or a face that the target does not have.
+        `InputError` as `VertexMap`, or for a face that the target does not have.
         """
-        return cls(
-            source=source.name,
-            target=target.name,
-            index=np.asarray(index),
-            source_vertices=source.V,
-            target_vertices=target.V,
-            source_hash=source.hash,
-            target_hash=target.hash,
-            target_faces=target.faces,
-            **rest,
-        )
+        fields = _side("source", source) | _side("target", target)
+        return cls(index=np.asarray(index), target_faces=target.faces, **fields, **rest)
 
     @classmethod
     def identity(cls, shape: Shape) -> VertexMap:
@@ -146,16 +134,21 @@ class VertexMap:
             raise InputError(f"{label} was made for another {found}", _OTHER_MESH)
         fill: dict[str, Any] = {} if target is None else {"target_faces": target.faces}
         for side, shape in sides:
-            name = getattr(self, side) or shape.name
-            fill |= {side: name, f"{side}_vertices": shape.V, f"{side}_hash": shape.hash}
+            fill |= _side(side, shape) | ({side: getattr(self, side)} if getattr(self, side) else {})
         try:
             return replace(self, **fill)
         except InputError as error:
             raise InputError(f"{label}: {error.message}", error.hint) from error
 
     def _misfit(self, side: str, shape: Shape) -> str:
+        """In what `shape` differs from the source or target ("side") that the map was made for; empty if in nothing."""
         vertices, digest = getattr(self, f"{side}_vertices"), getattr(self, f"{side}_hash")
-        return misfit(side, getattr(self, side), vertices, digest, shape)
+        made_for, name = getattr(self, side) or "a mesh", shape.name or f"the {side}"
+        if vertices not in (UNKNOWN, shape.V):
+            return f"{side}: {made_for} of {vertices} vertices, but {name} has {shape.V}"
+        if digest not in ("", shape.hash):
+            return f"{side}: {made_for} ({digest}), but {name} is {shape.hash}: vertices or faces differ"
+        return ""
 
     @property
     def on_vertex(self) -> Bool[Bools, " V_source"]:
@@ -168,19 +161,13 @@ class VertexMap:
         `InputError` if points lie in faces that are not known: the map was read without its target.
         """
         if self.target_faces is None and self.face.max() >= 0:
-            raise InputError(
-                f"the faces that the map {_way(self)} leads to are unknown",
-                "read it with load_map(path, source, target)",
-            )
+            raise InputError(f"the faces that the map {_way(self)} leads to are unknown", _READ_WITH_SHAPES)
         return corners_of(self.target_faces, self.face, self.index)
 
     def points(self, target: Shape) -> Float[Floats, "V_source 3"]:
         """The matched points on `target`, in its own frame and unit; another pose of it with the same faces will do.
 
-        Raises
-        ------
-        InputError
-            `target` has other vertices or faces than the shape that this map leads to.
+        `InputError` if `target` has other vertices or faces than the shape that this map leads to.
         """
         if self.target_vertices not in (UNKNOWN, target.V):
             raise InputError(
@@ -197,16 +184,12 @@ class VertexMap:
         `InputError` if the map was read without its target, whose vertices or faces are unknown.
         """
         if self.target_vertices == UNKNOWN:
-            raise InputError(
-                f"the number of vertices that the map {_way(self)} leads to is unknown",
-                "read it with load_map(path, source, target)",
-            )
+            what = f"the number of vertices that the map {_way(self)} leads to is unknown"
+            raise InputError(what, _READ_WITH_SHAPES)
         weight = self.barycentric.ravel()
         kept = weight > 0
-        rows = np.repeat(np.arange(self.source_vertices), 3)[kept]
-        matrix = csr_array(
-            (weight[kept], (rows, self.corners().ravel()[kept])), shape=(self.source_vertices, self.target_vertices)
-        )
+        places = np.repeat(np.arange(self.source_vertices), 3)[kept], self.corners().ravel()[kept]
+        matrix = csr_array((weight[kept], places), shape=(self.source_vertices, self.target_vertices))
         matrix.sum_duplicates()
         return matrix
 
@@ -214,12 +197,8 @@ class VertexMap:
         """Values of the *target's* vertices, pulled back to the source: at each source vertex the value at its
         matched point, interpolated between the corners of the target's face.
 
-        (V_target,) becomes (V_source,), and (V_target, D) becomes (V_source, D), float64.
-
-        Raises
-        ------
-        InputError
-            Not one row for each vertex of the target; or as `sparse`.
+        (V_target,) becomes (V_source,), and (V_target, D) becomes (V_source, D), float64. `InputError` as `sparse`, or
+        if there is not one row for each vertex of the target.
         """
         numbers = as_numbers(values, "values")
         matrix = self.sparse()
@@ -249,10 +228,9 @@ class VertexMap:
             As `apply`; the source's functions do not have a row for each vertex; or a value is not finite.
         """
         basis = as_numbers(basis_source, "a basis", finite=True)
-        if basis.ndim != 2 or len(basis) != self.source_vertices:
-            raise InputError(
-                f"a basis of the source must be an array of ({self.source_vertices}, K), not {basis.shape}"
-            )
+        V = self.source_vertices
+        if basis.ndim != 2 or len(basis) != V:
+            raise InputError(f"a basis of the source must be an array of ({V}, K), not {basis.shape}")
         pulled = self.apply(as_numbers(basis_target, "a basis", finite=True)).reshape(len(basis), -1)
         return np.asarray(np.linalg.lstsq(basis, pulled, rcond=None)[0])
 
@@ -260,12 +238,7 @@ class VertexMap:
         """This map, then `other`: from this source to the other's target.
 
         The point of a vertex is where `other` puts the vertex ``index[i]``; the confidence is the lower of
-        the two, the verdict the worse.
-
-        Raises
-        ------
-        InputError
-            `other` does not start on the shape where this one ends.
+        the two, the verdict the worse. `InputError` if `other` does not start on the shape where this one ends.
         """
         counts = {self.target_vertices, other.source_vertices} - {UNKNOWN}
         hashes = {self.target_hash, other.source_hash} - {""}
@@ -273,15 +246,16 @@ class VertexMap:
             ends = _named(self.target, self.target_vertices, self.target_hash)
             starts = _named(other.source, other.source_vertices, other.source_hash)
             backwards = ends == _named(other.target, other.target_vertices, other.target_hash)
-            raise InputError(
-                f"cannot join {_way(self)} with {_way(other)}: the first ends on {ends}, the second starts on {starts}",
-                "the second runs the wrong way round" if backwards else "the first must end where the second starts",
+            what = (
+                f"cannot join {_way(self)} with {_way(other)}: the first ends on {ends}, the second starts on {starts}"
             )
+            hint = "the second runs the wrong way round" if backwards else "the first must end where the second starts"
+            raise InputError(what, hint)
         check_range(self.index, other.source_vertices, _way(self))
         worse = max(self.verdict, other.verdict, key=("good", "fair", "unknown", "poor").index)
-        return VertexMap(
+        return replace(
+            other,
             source=self.source,
-            target=other.target,
             index=other.index[self.index],
             face=other.face[self.index],
             barycentric=other.barycentric[self.index],
@@ -289,15 +263,16 @@ class VertexMap:
             verdict=worse,
             reasons=tuple(dict.fromkeys(self.reasons + other.reasons)),
             source_vertices=self.source_vertices,
-            target_vertices=other.target_vertices,
             source_hash=self.source_hash,
-            target_hash=other.target_hash,
-            target_faces=other.target_faces,
         )
 
     def __repr__(self) -> str:
         target = "?" if self.target_vertices == UNKNOWN else self.target_vertices
         return f"VertexMap({_way(self)}, {self.source_vertices} -> {target} vertices, {self.verdict})"
+
+
+def _side(side: str, shape: Shape) -> dict[str, Any]:
+    return {side: shape.name, f"{side}_vertices": shape.V, f"{side}_hash": shape.hash}
 
 
 def _way(m: VertexMap) -> str:

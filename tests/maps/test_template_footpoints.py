@@ -5,8 +5,13 @@ import pytest
 
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.frames import Frame
-from meshmatch.maps.islands import small_islands, surrounding_values
-from meshmatch.maps.template_footpoints import neighbour_medians, neighbours, template_footpoints
+from meshmatch.maps.template_footpoints import (
+    neighbour_medians,
+    neighbours,
+    small_islands,
+    surrounding_values,
+    template_footpoints,
+)
 from meshmatch.shapes.shape import Shape
 
 # A chain of ten vertices, one apart; where they belong is where they are.
