@@ -20,9 +20,9 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.topology import edges_of
 from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths, unit
-from meshmatch.maps.template_footpoints import reassign_islands
 from meshmatch.maps.map_checks import corners_of
 from meshmatch.maps.surface import Footpoints
+from meshmatch.maps.template_footpoints import reassign_islands
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
