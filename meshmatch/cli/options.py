@@ -73,7 +73,7 @@ def load_truth(truth: Path | None, points: tuple[Path, Path] | None, source: Sha
     """True points on source and target, where they are known."""
     import numpy as np
 
-    from meshmatch.maps.pairs import load_pairs, load_points
+    from meshmatch.maps.table_files import load_pairs, load_points
 
     if points is not None:
         return load_points(points[0]), load_points(points[1])
@@ -159,7 +159,7 @@ class PairOptions(FitOptions):
 
     def match(self, source: Shape, target: Shape, run: RunOptions, console: Console) -> MatchResult:
         """Match two shapes, with bars."""
-        from meshmatch.maps.pairs import load_pairs
+        from meshmatch.maps.table_files import load_pairs
 
         pairs = None if self.known_pairs is None else load_pairs(self.known_pairs)
         from meshmatch.api.matching import match

@@ -76,7 +76,7 @@ def prepare(
     and triangles, else without one. Writes template.safetensors, a picture of the nodes (nodes.png) and, from a
     folder, shapes.safetensors, points.safetensors, normalised/ and prepared.json.
     """
-    from meshmatch.maps.pairs import load_points
+    from meshmatch.maps.table_files import load_points
     from meshmatch.render.compose import compose_shapes
     from meshmatch.templates.nodes import NodeConfig
     from meshmatch.templates.prepare import PrepareConfig

@@ -1,4 +1,10 @@
-"""What the files of maps and of values on shapes share: the choice by suffix, tables of text, errors in one line."""
+"""What the files of maps and of values on shapes share: the choice by suffix, tables of text, errors in one line; and
+lists of known vertices: pairs of two shapes (landmarks, a partial truth), or points of one.
+
+The text of such a list has one pair, or one vertex, a line: numbers separated by spaces, tabs, commas or semicolons;
+``#`` begins a comment; a first line of words is taken for a header. ``.npy`` files hold the same as an integer array.
+Vertices are counted from 0, in the order of the shape's file.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +17,14 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.input_files import existing
+from meshmatch.shapes.input_files import existing, read_npy
 
 T = TypeVar("T")
+_PAIRS = "one pair a line: a vertex of the source, then a vertex of the target, counted from 0"
+_POINTS = "one vertex a line, counted from 0"
 # What a damaged file raises in the readers of the standard library and NumPy.
 _DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError, RecursionError, EOFError, StopIteration, csv.Error)
 
@@ -102,3 +111,60 @@ def short_floats(values: np.ndarray) -> list[Any]:
     """float32 numbers as the floats with the fewest digits that read back as the same float32."""
     short: list[Any] = values.astype(np.float32).astype(np.str_).astype(np.float64).tolist()
     return short
+
+
+def load_pairs(path: str | Path) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
+    """Read pairs: vertices of the source, and the same N points on the target.
+
+    `InputError` if the file is missing or empty, or is not a table of two columns of vertices.
+    """
+    first, second = _table(Path(path), 2, _PAIRS).T.copy()
+    return first, second
+
+
+def load_points(path: str | Path) -> Int[Ints, " N"]:
+    """Read a list of vertices of one shape; `InputError` if the file is missing or empty, or is none."""
+    return _table(Path(path), 1, _POINTS)[:, 0].copy()
+
+
+def _table(path: Path, columns: int, hint: str) -> Ints:
+    if not path.is_file():
+        raise InputError(f"there is no file {path}", hint)
+    try:
+        rows = read_npy(path) if path.suffix.lower() == ".npy" else _from_text(path)
+        if rows.dtype.kind not in "iu":
+            raise ValueError("its numbers are not whole")
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(f"{path.name} is not a list of vertices: {error}", hint) from error
+    rows = rows.astype(np.int64)
+    if rows.ndim == 1 and columns == 1:
+        rows = rows[:, None]
+    if rows.size == 0:
+        raise InputError(f"{path.name} holds no vertex", hint)
+    if rows.ndim != 2 or rows.shape[1] != columns:
+        shape = " x ".join(str(n) for n in rows.shape)
+        raise InputError(f"{path.name} has {shape} numbers, not {columns} a line", hint)
+    if rows.min() < 0:
+        raise InputError(f"{path.name} names vertex {int(rows.min())}", hint)
+    return rows
+
+
+def _from_text(path: Path) -> Ints:
+    rows: list[list[int]] = []
+    words_allowed = True
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        cells = line.partition("#")[0].replace(",", " ").replace(";", " ").split()
+        if not cells:
+            continue
+        try:
+            rows.append([int(cell) for cell in cells])
+        except ValueError:
+            if not words_allowed:
+                raise ValueError(f"line {number} is {line.strip()[:40]!r}") from None
+        words_allowed = False
+        if rows and len(rows[-1]) != len(rows[0]):
+            raise ValueError(f"line {number} has {len(rows[-1])} numbers, the first has {len(rows[0])}")
+    try:
+        return np.array(rows, np.int64)
+    except OverflowError:
+        raise ValueError("a number is too large to be a vertex") from None

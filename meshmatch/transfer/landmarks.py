@@ -27,7 +27,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps import table_files
 from meshmatch.maps.map_checks import corners_of
-from meshmatch.maps.pairs import load_points
+from meshmatch.maps.table_files import load_points
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.shape import Shape
