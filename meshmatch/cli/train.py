@@ -78,7 +78,7 @@ def prepare(
     """
     from meshmatch.maps.table_files import load_points
     from meshmatch.render.compose import compose_shapes
-    from meshmatch.templates.nodes import NodeConfig
+    from meshmatch.templates.make import NodeConfig
     from meshmatch.templates.prepare import PrepareConfig
     from meshmatch.templates.prepare import prepare as prepare_shapes
 

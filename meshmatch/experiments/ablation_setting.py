@@ -19,8 +19,8 @@ from meshmatch.errors import TemplateError
 from meshmatch.experiments.ablation_views import BASE, Run
 from meshmatch.models.config import NetworkConfig
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
-from meshmatch.templates.nodes import NodeConfig, Strategy, choose_nodes
-from meshmatch.templates.registered import read_registered
+from meshmatch.templates.make import NodeConfig, Strategy, choose_nodes
+from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import Template, read_template
 from meshmatch.training.bodies import human_source
 from meshmatch.training.datasets import Batch, Source, registered_source

@@ -12,7 +12,7 @@ from typing import Any
 
 from meshmatch.fields.choice import FIELDS, FieldName
 from meshmatch.geometry.kernels import Kernel
-from meshmatch.templates.nodes import STRATEGIES, Strategy
+from meshmatch.templates.make import STRATEGIES, Strategy
 
 CONSTRAINTS = ("none", "arap", "vol", "vol+arap", "vol+arap+Z")
 PAPER_SETS = ("shrec19", "scape-pcn")

@@ -27,7 +27,7 @@ from meshmatch.experiments.category import Maps, Shapes
 from meshmatch.experiments.sets import load_folder
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.sampling import farthest_points
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig
 
 TRUTH = ".landmarks.npy"
 RIGHT = 0.15

@@ -30,10 +30,10 @@ from meshmatch.render.scales import label_colors
 from meshmatch.shapes.align import Align, align
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
-from meshmatch.templates.registered import frame_of
-from meshmatch.templates.unregistered import Scale, unit_frame
+from meshmatch.templates.prepared_folder import Scale, frame_of
+from meshmatch.templates.unregistered import unit_frame
 from meshmatch.training.recipes import clouds, small_data
 from meshmatch.training.train import CardFacts, train
 

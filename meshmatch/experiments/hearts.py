@@ -46,7 +46,7 @@ from meshmatch.outputs import make_folder
 from meshmatch.render.picture import Look
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.template import Template
 from meshmatch.templates.unregistered import medoid

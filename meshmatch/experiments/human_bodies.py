@@ -9,8 +9,7 @@ import torch
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import make_template
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig, make_template
 from meshmatch.templates.template import Template
 from meshmatch.training.bodies import human_source
 from meshmatch.training.limbs import Limbs, Still

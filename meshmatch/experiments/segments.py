@@ -44,7 +44,7 @@ from meshmatch.render.picture import Look
 from meshmatch.shapes.align import Align
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig
 
 KEYPOINTS = ".keypoints.npy"
 RIGHT = 0.1

@@ -12,7 +12,8 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel, once_per_model
 from meshmatch.shapes.align import ALIGNS, align
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.unregistered import SCALES, template_radius, template_samples, unit_frame
+from meshmatch.templates.prepared_folder import SCALES
+from meshmatch.templates.unregistered import template_radius, template_samples, unit_frame
 
 # All of these were set by hand.
 _ALIGNED = 4  # orientations that are tried where the alignment has to search

@@ -10,21 +10,15 @@ def bundled_folder() -> Path:
 
     It holds ``human/`` (template bundles), ``models/NAME/`` (trained models) and ``samples/`` (two shapes to try).
     The wheel's own copy wins, and of a checkout only one with its ``pyproject.toml``, so that an installed package
-    never reads a stranger's ``templates/``.
-
-    Raises
-    ------
-    TemplateError
-        There is neither.
+    never reads a stranger's ``templates/``. `TemplateError` if there is neither.
     """
     package = Path(__file__).resolve().parents[1]
-    installed = package / "_templates"
+    installed, beside = package / "_templates", package.parent / "templates"
     if installed.is_dir():
         return installed
-    checkout = package.parent
-    if (checkout / "pyproject.toml").is_file() and (checkout / "templates").is_dir():
-        return checkout / "templates"
+    if (package.parent / "pyproject.toml").is_file() and beside.is_dir():
+        return beside
     raise TemplateError(
-        f"the templates and models that come with meshmatch are neither in {installed} nor in {checkout / 'templates'}",
+        f"the templates and models that come with meshmatch are neither in {installed} nor in {beside}",
         "the installation is incomplete: install meshmatch again",
     )

@@ -1,31 +1,80 @@
-"""A template from one shape: two resolutions, nodes, labels."""
+"""A template from one shape: two resolutions, control nodes, labels.
+
+Nodes are chosen among candidates in the volume near the surface, by a rejection rule and farthest points. Rejection
+keeps a node from moving two pieces of surface that are close in space but not along the body (two thighs, an arm and a
+flank). Four rules, all measured by the paper: body ``parts``, ``spectral`` clusters, ``geodesic`` distance, and
+``uniform`` (no rejection).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
+import robust_laplacian
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Int, Ints
-from meshmatch.errors import TemplateError
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.errors import OptionError, TemplateError
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.normalise import sqrt_area_frame
-from meshmatch.shapes.sampling import triangulate_cloud
+from meshmatch.shapes.sampling import Samples, farthest_points, sample_surface, triangulate_cloud
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig, choose_nodes
+from meshmatch.templates.support import poorly_supported
 from meshmatch.templates.template import Template
 
 LOW_FACES = 10_000
+Strategy = Literal["parts", "spectral", "geodesic", "uniform"]
+STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
+# Of the diameter along the surface: how far apart what one node moves may be. Where parts lie so close that a vertex
+# is left without nodes, the next share is tried. Set by hand.
+_GEODESIC_SHARES = (0.2, 0.3, 0.45, 1.0)
+_FUNCTIONS = 12  # eigenvectors that tell clusters apart
 
 
-def low_resolution(
+@dataclass(frozen=True)
+class NodeConfig:
+    """How nodes are chosen. Lengths in units of sqrt(surface area).
+
+    radius 0.13 is the paper's 0.2 in the unit sphere for a standing body. Candidates lie up to ``depth`` below the
+    surface; ``spectral`` begins with so many ``clusters``. `OptionError` for an unknown strategy, fewer than 4 nodes, or
+    a length or count that is not positive.
+    """
+
+    strategy: Strategy = "parts"
+    K: int = 320
+    radius: float = 0.13
+    depth: float = 0.03
+    clusters: int = 24
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.strategy not in STRATEGIES:
+            raise OptionError(f"unknown node strategy {self.strategy!r}", f"choose one of {', '.join(STRATEGIES)}")
+        if self.K < 4:
+            raise OptionError(f"{self.K} nodes are too few", "moving least squares needs at least 4")
+        if not 0 < self.radius < np.inf:
+            raise OptionError(f"a node radius must be positive, not {self.radius:g}", "0.13 suits a body")
+        if not 0 <= self.depth < np.inf:
+            raise OptionError(f"a depth of candidates must be 0 or more, not {self.depth:g}")
+        if self.clusters < 1:
+            raise OptionError(f"at least one cluster is needed, not {self.clusters}")
+
+
+def low_mesh(
     shape: Shape, faces: int = LOW_FACES, quality: Quality = "fast"
 ) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
-    """Decimate onto a subset of the shape's own vertices: kept indices, faces.
+    """Decimate onto a subset of the shape's own vertices, or triangulate a cloud: kept indices, faces.
 
     Whatever belongs to a vertex (weights, labels, positions on registered shapes) is then kept by indexing.
     """
+    if shape.is_cloud:
+        return triangulate_cloud(shape, faces)
     if shape.F <= faces:
         return np.arange(shape.V), np.asarray(shape.faces)
     small = decimate(shape, faces, quality)
@@ -34,13 +83,6 @@ def low_resolution(
     corners = renumbered.reshape(-1)[small.faces]
     a, b, c = corners.T
     return keep, corners[(a != b) & (b != c) & (c != a)]
-
-
-def low_mesh(
-    shape: Shape, faces: int = LOW_FACES, quality: Quality = "fast"
-) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
-    """`low_resolution` of a mesh, or a triangulation of a cloud: kept indices, faces."""
-    return triangulate_cloud(shape, faces) if shape.is_cloud else low_resolution(shape, faces, quality)
 
 
 def make_template(
@@ -53,25 +95,12 @@ def make_template(
     core: Int[Ints, " C"] | None = None,
     low: tuple[Int[Ints, " V_low"], Int[Ints, "F_low 3"]] | None = None,
 ) -> Template:
-    """Template bundle of a mesh.
+    """Template bundle of a shape of the resting category, in any unit.
 
-    Parameters
-    ----------
-    shape
-        Of the resting category, any unit; a mesh becomes the dense mesh, a cloud is triangulated.
-    labels
-        Part of every vertex of ``shape``; a single part where not given.
-    core
-        Vertices of ``shape`` that fix the category's frame; all where not given.
-    low
-        A low resolution made before (see :func:`low_resolution`).
-
-    Raises
-    ------
-    TemplateError
-        If nodes cannot support every vertex.
-    InputError
-        If a cloud's points lie on no surface.
+    A mesh becomes the dense mesh, a cloud is triangulated. `labels` are the part of every vertex (a single part where
+    not given), `core` are vertices that fix the category's frame (all where not given), and `low` is a low resolution
+    made before (see `low_mesh`). `TemplateError` if nodes cannot support every vertex; `InputError` if a cloud's points
+    lie on no surface.
     """
     keep, faces = low_mesh(shape) if low is None else low
     small = Shape(shape.verts[keep], faces, name)
@@ -82,7 +111,6 @@ def make_template(
         raise TemplateError(f"{len(parts)} labels for {shape.V} vertices of {shape.name}", "one label a vertex, from 0")
     if parts.min() < 0:
         raise TemplateError(f"{shape.name} has a label below 0: {parts.min()}", "count parts from 0")
-    names = tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1))
     in_core = np.ones(shape.V, bool) if core is None else np.isin(np.arange(shape.V), core)
     return Template(
         name=name,
@@ -91,6 +119,143 @@ def make_template(
         nodes=choose_nodes(small, config, None if labels is None else parts[keep], noisy=shape.is_cloud),
         radius=config.radius,
         labels=parts[keep],
-        label_names=names,
+        label_names=tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1)),
         core=np.flatnonzero(in_core[keep]),
     )
+
+
+def choose_nodes(
+    shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None, noisy: bool = False
+) -> Float[Floats, "K 3"]:
+    """Nodes such that every vertex of a mesh in the template frame has four non-coplanar ones in reach: ``config.K``,
+    or more where vertices that farthest points leave short need them.
+
+    Strategy ``parts`` needs `labels`, the body parts. `noisy` candidates are the surface's points plus Gaussian noise of
+    ``config.depth``, as suits the mesh of a cloud, whose inside is uncertain. `TemplateError` names the vertices that
+    cannot be supported.
+    """
+    if config.strategy == "parts" and labels is None and not shape.is_cloud:
+        raise OptionError("node strategy 'parts' needs part labels", "use --strategy spectral or geodesic")
+    rng = np.random.default_rng(config.seed)
+    samples = sample_surface(shape, 30 * config.K, rng)
+    if noisy:
+        candidates = samples.points + config.depth * rng.standard_normal(samples.points.shape)
+    else:
+        candidates = samples.points - samples.normals * rng.uniform(0, config.depth, (len(samples.points), 1))
+    failure: TemplateError | None = None
+    for allowed in _allowed(shape, config, candidates, labels, samples):
+        chosen = candidates[allowed] if allowed.any() else candidates
+        nodes = chosen[farthest_points(chosen, min(config.K, len(chosen)))]
+        try:
+            return _complete(shape, config, nodes, chosen)
+        except TemplateError as error:
+            failure = error
+    assert failure is not None
+    raise failure
+
+
+def _complete(
+    shape: Shape, config: NodeConfig, nodes: Float[Floats, "K 3"], candidates: Float[Floats, "N 3"]
+) -> Float[Floats, "K2 3"]:
+    """Add the candidates that poorly supported vertices lack, nearest first, a few rounds."""
+    for _ in range(20):
+        bad = poorly_supported(shape.verts, nodes, config.radius)
+        if not len(bad):
+            return nodes
+        extra = candidates[cKDTree(candidates).query(shape.verts[bad], k=min(40, len(candidates)))[1].reshape(-1)]
+        spread = farthest_points(np.concatenate([nodes, extra]), min(len(nodes) + 8, len(nodes) + len(extra)))
+        fresh = spread[spread >= len(nodes)] - len(nodes)
+        if not len(fresh):
+            fresh = np.arange(min(8, len(extra)))
+        nodes = np.concatenate([nodes, extra[fresh]])
+    some = ", ".join(str(int(index)) for index in bad[:5])
+    raise TemplateError(
+        f"{len(bad)} vertices have fewer than four non-coplanar nodes within {config.radius:g} (vertices {some}"
+        + (", ...)" if len(bad) > 5 else ")"),
+        "use more nodes, a larger radius or another strategy",
+    )
+
+
+def _allowed(
+    shape: Shape, config: NodeConfig, candidates: Float[Floats, "N 3"], labels: Int[Ints, " V"] | None, samples: Samples
+) -> Iterator[Bool[Bools, " N"]]:
+    """Which candidates a strategy keeps; a weaker rule follows, for when one leaves some vertices without nodes.
+
+    Clusters narrower than the radius (fingers, ears) leave no candidate near them: then a coarser clustering is tried.
+    """
+    if config.strategy == "uniform" or shape.is_cloud:
+        yield np.ones(len(candidates), bool)
+        return
+    own = shape.faces[samples.face, samples.barycentric.argmax(1)]
+    touched = cKDTree(shape.verts).query_ball_point(candidates, config.radius)
+    if config.strategy == "parts":
+        assert labels is not None
+        yield _parts_allowed(shape, labels, touched, own)
+    elif config.strategy == "geodesic":
+        for share in _GEODESIC_SHARES:
+            yield _geodesic_allowed(shape, touched, own, share)
+    else:
+        clusters = config.clusters
+        while True:
+            parts = spectral_clusters(shape, clusters, np.random.default_rng(config.seed))
+            yield _parts_allowed(shape, parts, touched, own)
+            if clusters <= 2:
+                return
+            clusters = clusters * 4 // 5
+
+
+def _parts_allowed(shape: Shape, parts: Int[Ints, " V"], touched: list, own: Int[Ints, " N"]) -> Bool[Bools, " N"]:
+    """Drop candidates that touch a part which does not border on their own."""
+    count = int(parts.max()) + 1
+    joined = np.eye(count, dtype=bool)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        joined[parts[shape.faces[:, a]], parts[shape.faces[:, b]]] = True
+    joined |= joined.T
+    return np.array([joined[parts[at], np.unique(parts[hits])].all() for at, hits in zip(own, touched, strict=True)])
+
+
+def _geodesic_allowed(shape: Shape, touched: list, own: Int[Ints, " N"], share: float) -> Bool[Bools, " N"]:
+    """Drop candidates that touch surface further than a share of the diameter along the surface."""
+    graph = edge_graph(shape)
+    far = dijkstra(graph, indices=farthest_points(shape.verts, 40))
+    diameter = far[np.isfinite(far)].max()
+    owners, place = np.unique(own, return_inverse=True)
+    distance = dijkstra(graph, indices=owners, limit=share * diameter)
+    return np.array([np.isfinite(distance[at, hits]).all() for at, hits in zip(place, touched, strict=True)])
+
+
+def edge_graph(shape: Shape) -> coo_matrix:
+    """Symmetric sparse graph (V, V) of edge lengths."""
+    edges = np.unique(np.sort(shape.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    length = np.maximum(np.linalg.norm(shape.verts[edges[:, 0]] - shape.verts[edges[:, 1]], axis=1), 1e-12)
+    places = edges.T.reshape(-1), edges[:, ::-1].T.reshape(-1)
+    return coo_matrix((np.tile(length, 2), places), (shape.V, shape.V)).tocsr()
+
+
+def spectral_clusters(shape: Shape, clusters: int, rng: np.random.Generator) -> Int[Ints, " V"]:
+    """k-means on the global point signature (Rustamov 2007) of Laplace-Beltrami eigenvectors.
+
+    Returns labels from 0, at most ``clusters`` of them, none without a vertex.
+    """
+    stiffness, mass = robust_laplacian.mesh_laplacian(shape.verts, shape.faces)
+    count = min(_FUNCTIONS + 1, shape.V - 2)
+    # Not a constant start: that is an eigenvector already, and the search would go on from a random one.
+    values, vectors = eigsh(stiffness, count, mass, sigma=-1e-8, v0=rng.standard_normal(shape.V))
+    signature = vectors[:, 1:] / np.sqrt(np.maximum(values[1:], 1e-9))
+    centers = signature[farthest_points_any(signature, clusters)]
+    for _ in range(20):
+        label = cKDTree(centers).query(signature)[1]
+        for axis in range(signature.shape[1]):
+            total = np.bincount(label, signature[:, axis], len(centers))
+            centers[:, axis] = total / np.maximum(np.bincount(label, minlength=len(centers)), 1)
+    return np.unique(cKDTree(centers).query(signature)[1], return_inverse=True)[1].astype(np.int64)
+
+
+def farthest_points_any(points: Float[Floats, "N D"], K: int) -> Int[Ints, " K"]:
+    """Farthest-point sampling in any dimension: indices, starting from the first point."""
+    chosen = [0]
+    distance = np.full(len(points), np.inf)
+    for _ in range(min(K, len(points)) - 1):
+        distance = np.minimum(distance, np.square(points - points[chosen[-1]]).sum(1))
+        chosen.append(int(distance.argmax()))
+    return np.array(chosen)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.numpy import save_file
 
 from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
@@ -20,12 +19,10 @@ from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.landmarks import find_landmarks, read_landmarks
-from meshmatch.templates.make import LOW_FACES, low_mesh, make_template
-from meshmatch.templates.nodes import NodeConfig
-from meshmatch.templates.registered import registered_stack, rotation_range, same_faces
-from meshmatch.templates.template import Template, save_template
-from meshmatch.templates.unregistered import MAX_RESIDUAL, Scale, collect_samples, medoid, save_samples
+from meshmatch.templates.make import LOW_FACES, NodeConfig, low_mesh, make_template
+from meshmatch.templates.prepared_folder import Scale, registered_stack, rotation_range, same_faces, save_samples
+from meshmatch.templates.template import Template, save_arrays, save_template
+from meshmatch.templates.unregistered import MAX_RESIDUAL, collect_samples, find_landmarks, medoid, read_landmarks
 
 MIN_FACES = 50
 MIN_POINTS = 100
@@ -35,52 +32,32 @@ MIN_POINTS = 100
 class PrepareConfig:
     """How shapes are prepared.
 
-    Parameters
-    ----------
-    nodes : NodeConfig
-    faces : int
-        Triangles of the low resolution.
-    decimate : {"fast", "meshlab"}
-        How it is made, see `meshmatch.shapes.decimate.decimate`.
-    template : name or path, optional
-        A shape of the folder, by its name, or any file. By default the first mesh where all are registered, else the
-        medoid: the shape that lies nearest to all others.
-    align : {"none", "near", "rigid"}, optional
-        How shapes are turned to the template; by default "rigid". Of registered ones correspondence says whether
-        they stand alike, which is "near"; of a hundred or more it is not asked, which is "none".
-    scale : {"area", "sphere"}
-        Which size of every shape is made that of the template.
-    landmarks : folder or suffix, optional
-        Where the landmarks of shapes are, see `meshmatch.templates.landmarks`.
-    labels : optional
-        The part of every vertex of a single shape's file, from 0; for the strategy "parts".
+    The template is a shape of the folder, by its name, or any file; by default the first mesh where all are registered,
+    else the medoid: the shape that lies nearest to all others. Shapes are turned to it by `align`, by default "rigid";
+    of registered ones correspondence says whether they stand alike, which is "near"; of a hundred or more it is not
+    asked, which is "none".
     """
 
     nodes: NodeConfig = field(default_factory=lambda: NodeConfig(strategy="geodesic"))
-    faces: int = LOW_FACES
-    decimate: Quality = "fast"
+    faces: int = LOW_FACES  # triangles of the low resolution
+    decimate: Quality = "fast"  # how it is made, see `meshmatch.shapes.decimate.decimate`
     template: str | Path | None = None
     align: Align | None = None
-    scale: Scale = "area"
-    landmarks: str | Path | None = None
-    labels: Int[Ints, " V"] | None = None
+    scale: Scale = "area"  # which size of every shape is made that of the template
+    landmarks: str | Path | None = None  # a folder or suffix: where they are, see `find_landmarks`
+    labels: Int[Ints, " V"] | None = None  # part of every vertex of a single shape's file, from 0; for "parts"
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """The template, and the shapes that share its connectivity (or none).
-
-    shapes : template vertices on every shape, in its own axes and unit, centered;
-    empty if the folder's meshes are not registered. names : their files. notes : what was found and done.
-    align : how shapes were turned to the template. landmarks : how many points are known on each.
-    """
+    """The template, and the shapes that share its connectivity (or none)."""
 
     template: Template
-    shapes: Float[Floats32, "N V 3"]
-    names: tuple[str, ...]
-    notes: tuple[str, ...]
-    align: Align = "none"
-    landmarks: int = 0
+    shapes: Float[Floats32, "N V 3"]  # its vertices on each, in own axes and unit, centered; N = 0 if not registered
+    names: tuple[str, ...]  # files of the shapes
+    notes: tuple[str, ...]  # what was found and done
+    align: Align = "none"  # how shapes were turned to the template
+    landmarks: int = 0  # how many points are known on each
 
 
 def prepare(
@@ -121,7 +98,13 @@ def prepare(
             raise OptionError(f"{name} goes with a folder of shapes", "one shape is its own template")
     make_folder(output)
     clean = _template_file(shapes)
-    labels = _repaired_labels(config.labels, clean)
+    labels = config.labels
+    if labels is not None and len(labels) != clean.original.V:
+        raise InputError(
+            f"there are {len(labels)} labels, but {clean.original.name} has {clean.original.V} vertices",
+            "give one label for every vertex of the file",
+        )
+    labels = None if labels is None else labels[clean.kept_vertex]
     low = low_mesh(clean.shape, config.faces, config.decimate)
     made = make_template(clean.shape, shapes.stem, config.nodes, labels=labels, low=low)
     made = replace(made, source=shapes.name)
@@ -135,11 +118,10 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     found, marks = _read_shapes(folder, output, config, notes, progress.between(0.0, 0.5))
     first, own = _template_shape(folder, config, found, notes)
     low = low_mesh(first.shape, config.faces, config.decimate)
-    stack = registered_stack(first, found, first.kept_vertex[low[0]], notes)
+    vertices = first.kept_vertex[low[0]]
+    stack = registered_stack(first, found, vertices, notes)
     registered = len(stack) > 0
-    how: Align = "rigid"
-    if registered:
-        how = rotation_range(stack, first.original.verts[first.kept_vertex[low[0]]])
+    how: Align = rotation_range(stack, first.original.verts[vertices]) if registered else "rigid"
     how = config.align or how
     name = folder.resolve().name
     made = make_template(first.shape, name, config.nodes, low=low)
@@ -161,17 +143,15 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     stems = [Path(clean.original.name).stem for clean in found]
     for clean, stem, frame, residual in zip(found, stems, frames, residuals, strict=True):
         label = stem if stems.count(stem) == 1 else clean.original.name
-        small = clean.shape
-        if small.F > config.faces:
-            small = decimate(small, config.faces, config.decimate)
+        large = clean.shape.F > config.faces
+        small = decimate(clean.shape, config.faces, config.decimate) if large else clean.shape
         normal = Shape(frame.apply(small.verts), small.faces, small.name)
         save_shape(output / "normalised" / f"{label}.ply", normal)
         if residual > MAX_RESIDUAL and not registered:
             notes.append(f"{clean.original.name} is not much like the template: {100 * residual:.0f} % apart")
     save_template(made, output / "template.safetensors")
     save_samples(samples, output / "points.safetensors")
-    with replace_on_success(output / "shapes.safetensors") as temporary:
-        save_file({"verts": stack}, temporary)
+    save_arrays(output / "shapes.safetensors", {"verts": stack})
     names = tuple(clean.original.name for clean in found)
     words: dict[str, Any] = {
         "names": names,
@@ -266,16 +246,6 @@ def _template_landmarks(
             "choose with --template a shape of the folder on which every landmark is known",
         )
     return own
-
-
-def _repaired_labels(labels: Int[Ints, " N"] | None, clean: Repaired) -> Int[Ints, " V"] | None:
-    """Labels of the file's vertices as labels of the repaired ones."""
-    if labels is not None and len(labels) != clean.original.V:
-        raise InputError(
-            f"there are {len(labels)} labels, but {clean.original.name} has {clean.original.V} vertices",
-            "give one label for every vertex of the file",
-        )
-    return None if labels is None else labels[clean.kept_vertex]
 
 
 def _check_size(clean: Repaired) -> Repaired:

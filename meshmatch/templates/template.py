@@ -28,32 +28,16 @@ class Template:
 
     Frame: surface area 1, area-weighted centroid at 0; human templates stand y up, face +z, left hand at +x.
 
-    Attributes
-    ----------
-    name : str
-    shape : Shape
-        Low resolution mesh: what fitting moves. V vertices.
-    dense : Shape
-        High resolution mesh of the same surface, for `register` and pictures.
-    nodes
-        Control nodes.
-    radius : float
-        Support radius of every node.
-    labels
-        Part of each vertex, an index into ``label_names``.
-    label_names : tuple of str
-    core
-        Vertices that move together as nearly one rigid piece and fix the category's frame (a torso;
-        every vertex where a category has no such part).
-    pose, source, licence : str
+    Its core are vertices that move together as nearly one rigid piece and fix the category's frame: a torso; every
+    vertex where a category has no such part.
     """
 
     name: str
-    shape: Shape
-    dense: Shape
+    shape: Shape  # low resolution mesh: what fitting moves; V vertices
+    dense: Shape  # high resolution mesh of the same surface, for `register` and pictures
     nodes: Float[Floats, "K 3"]
-    radius: float
-    labels: Int[Ints, " V"]
+    radius: float  # of support, of every node
+    labels: Int[Ints, " V"]  # part of each vertex, an index into `label_names`
     label_names: tuple[str, ...]
     core: Int[Ints, " C"]
     pose: str = ""
@@ -90,7 +74,7 @@ class Template:
 
 def save_template(template: Template, path: str | Path) -> None:
     """Write a bundle as one safetensors file (arrays, and a JSON header for the words)."""
-    arrays = {
+    arrays: dict[str, np.ndarray] = {
         "verts": template.shape.verts,
         "faces": template.shape.faces.astype(np.int32),
         "dense_verts": template.dense.verts.astype(np.float32),
@@ -99,30 +83,19 @@ def save_template(template: Template, path: str | Path) -> None:
         "labels": template.labels.astype(np.int32),
         "core": template.core.astype(np.int32),
     }
-    words = {
-        "schema": SCHEMA,
-        "name": template.name,
-        "radius": template.radius,
-        "label_names": list(template.label_names),
-        "pose": template.pose,
-        "source": template.source,
-        "licence": template.licence,
-        "hash": template.hash,
-    }
+    keys = ("name", "radius", "label_names", "pose", "source", "licence", "hash")
+    words = {"schema": SCHEMA, **{key: getattr(template, key) for key in keys}}
+    save_arrays(path, arrays, {"template": json.dumps(words)})
+
+
+def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], words: dict[str, str] | None = None) -> None:
+    """Write one safetensors file."""
     with replace_on_success(path) as temporary:
-        save_file(
-            {name: np.ascontiguousarray(a) for name, a in arrays.items()}, temporary, {"template": json.dumps(words)}
-        )
+        save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, words)
 
 
 def load_template(path: str | Path) -> Template:
-    """Read a bundle and check its hash.
-
-    Raises
-    ------
-    TemplateError
-        If the file is missing, damaged, of another schema, or does not match its hash.
-    """
+    """Read a bundle; `TemplateError` if it is missing, damaged, of another schema, or does not match its hash."""
     path = Path(path)
     if not path.is_file():
         raise TemplateError(f"no template bundle at {path}", "make one with `meshmatch prepare`")
@@ -137,7 +110,18 @@ def load_template(path: str | Path) -> Template:
     if words.get("schema") != SCHEMA:
         raise TemplateError(f"{path.name} has template schema {words.get('schema')}, not {SCHEMA}", "update meshmatch")
     try:
-        template = _template(words, arrays)
+        name = str(words["name"])
+        template = Template(
+            name=name,
+            shape=Shape(arrays["verts"].astype(np.float64), arrays["faces"].astype(np.int64), name),
+            dense=Shape(arrays["dense_verts"].astype(np.float64), arrays["dense_faces"].astype(np.int64), name),
+            nodes=arrays["nodes"].astype(np.float64),
+            radius=float(words["radius"]),
+            labels=arrays["labels"].astype(np.int64),
+            label_names=tuple(words["label_names"]),
+            core=arrays["core"].astype(np.int64),
+            **{key: words[key] for key in ("pose", "source", "licence")},
+        )
     except (KeyError, TypeError, ValueError, IndexError, InputError) as error:
         raise TemplateError(f"{path.name} is not a template bundle: {error}", "make it again") from error
     if template.hash != words.get("hash"):
@@ -146,32 +130,9 @@ def load_template(path: str | Path) -> Template:
 
 
 def read_template(name: str | Path) -> Template:
-    """A template by file, or one of the built-in ones by name (human-T, human-A, human-I).
-
-    Raises
-    ------
-    TemplateError
-        There is none, or the file is damaged.
-    """
+    """A template by file, or one of the built-in ones by name (human-T, human-A, human-I); `TemplateError` as above."""
     path = Path(name)
     if path.is_file():
         return load_template(path)
     inside = bundled_folder() / "human" / f"{name}.safetensors"
     return load_template(inside if inside.is_file() else path)
-
-
-def _template(words: dict, arrays: dict[str, np.ndarray]) -> Template:
-    name = str(words["name"])
-    return Template(
-        name=name,
-        shape=Shape(arrays["verts"].astype(np.float64), arrays["faces"].astype(np.int64), name),
-        dense=Shape(arrays["dense_verts"].astype(np.float64), arrays["dense_faces"].astype(np.int64), name),
-        nodes=arrays["nodes"].astype(np.float64),
-        radius=float(words["radius"]),
-        labels=arrays["labels"].astype(np.int64),
-        label_names=tuple(words["label_names"]),
-        core=arrays["core"].astype(np.int64),
-        pose=words["pose"],
-        source=words["source"],
-        licence=words["licence"],
-    )

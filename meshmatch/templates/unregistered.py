@@ -1,61 +1,35 @@
-"""Shapes without correspondence: brought to one frame and sampled, with the landmarks that are known on them."""
+"""Shapes without correspondence: brought to one frame and sampled, with the landmarks that are known on them.
+
+Landmarks are points that are known on each of a folder's shapes, in one order.
+"""
 
 from __future__ import annotations
 
-import json
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import load_file, save_file
 
-from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
-from meshmatch.errors import InputError
+from meshmatch.arrays import Float, Floats
+from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.outputs import replace_on_success
 from meshmatch.progress import Progress
-from meshmatch.shapes.align import ALIGNS, Align, align, residual
+from meshmatch.shapes.align import Align, align, residual
+from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.normalise import sqrt_area_frame, unit_sphere_frame
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.prepared_folder import Scale, ShapeSamples
 from meshmatch.templates.template import Template
 
-Scale = Literal["area", "sphere"]
-SCALES: tuple[Scale, ...] = get_args(Scale)
 MAX_RESIDUAL = 0.12
-"""Mean distance (units of sqrt(area), normals included) from which two aligned shapes are of different kinds.
-
-Set by hand."""
-
+"""Mean distance (units of sqrt(area), normals included) from which two aligned shapes differ in kind. Set by hand."""
 _MIN_SAMPLES, _MAX_SAMPLES = 1024, 4096  # of a shape
 _ALL_SAMPLES = 200_000  # of a folder
 _COMPARED = 40  # shapes among which the medoid is looked for
-
-
-@dataclass(frozen=True, eq=False)
-class ShapeSamples:
-    """Samples of N shapes in the template's frame, and the landmarks that are known on them.
-
-    points, normals : in random order
-    landmarks : NaN where a shape lacks one; L may be 0
-    template_landmarks : vertices of the template's low resolution
-    align, scale : how every shape was brought to the template's frame
-    """
-
-    points: Float[Floats32, "N P 3"]
-    normals: Float[Floats32, "N P 3"]
-    landmarks: Float[Floats32, "N L 3"]
-    template_landmarks: Int[Ints, " L"]
-    align: Align
-    scale: Scale
-
-
-_ARRAYS = ("points", "normals", "landmarks", "template_landmarks")
 
 
 def unit_frame(shape: Shape, scale: Scale, radius: float) -> Frame:
@@ -112,16 +86,10 @@ def collect_samples(
     seed: int,
     progress: Progress | None = None,
 ) -> tuple[ShapeSamples, list[Frame], list[float]]:
-    """Bring every shape to the template's frame and sample it.
+    """Bring every shape to the template's frame and sample it: samples, the frame of every shape (file to template),
+    and the residual of every aligned shape against the template.
 
-    Parameters
-    ----------
-    landmarks : for each shape its landmarks in its file's frame, NaN where missing; or None
-    template_landmarks : the same landmarks in the template's frame
-
-    Returns
-    -------
-    samples, frame of every shape (file to template), residual of every aligned shape against the template
+    A shape's landmarks are in its file's frame, NaN where missing; those of the template are in the template's.
     """
     progress = progress or Progress()
     target, radius = template_samples(template), template_radius(template)
@@ -150,53 +118,58 @@ def collect_samples(
     return ShapeSamples(stack[0], stack[1], known, vertices, how, scale), frames, residuals
 
 
-def save_samples(samples: ShapeSamples, path: str | Path) -> None:
-    """Write the arrays as one safetensors file."""
-    arrays = {name: np.ascontiguousarray(getattr(samples, name)) for name in _ARRAYS}
-    with replace_on_success(path) as temporary:
-        save_file(arrays, temporary, {"align": samples.align, "scale": samples.scale})
+def read_landmarks(file: Path, clean: Repaired) -> Float[Floats, "L 3"]:
+    """Landmarks of a shape, in its file's frame; NaN for a missing one.
 
-
-def read_samples(folder: str | Path, template: Template) -> ShapeSamples:
-    """Samples of a prepared folder.
-
-    Raises
-    ------
-    InputError
-        Not a prepared folder, or prepared for another template.
+    The file holds vertices (L,), -1 for a missing one, or positions (L, 3); `InputError` if it cannot be read, or names
+    a vertex that is not there.
     """
-    path = Path(folder) / "points.safetensors"
     try:
-        prepared = read_prepared(folder)
-        arrays = load_file(path)
-        with safe_open(str(path), framework="np") as file:
-            words = file.metadata() or {}
-        found = ShapeSamples(
-            **{name: arrays[name] for name in _ARRAYS},
-            align=next(how for how in ALIGNS if how == words["align"]),
-            scale=next(kind for kind in SCALES if kind == words["scale"]),
+        if file.suffix == ".npy":
+            values = read_npy(file)
+        else:
+            delimiter = "," if "," in file.read_text(encoding="utf-8") else None
+            with warnings.catch_warnings():  # of a file without numbers, which is refused below
+                warnings.simplefilter("ignore", UserWarning)
+                values = np.asarray(np.loadtxt(file, delimiter=delimiter))
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read the landmarks {file.name}", "numbers, one point a line") from error
+    if values.ndim == 2 and values.shape[1] == 3 and values.dtype.kind in "fiu":
+        return values.astype(np.float64)
+    numbers = values.dtype.kind in "fiu" and values.ndim == 1 and len(values)
+    if not numbers or not np.array_equal(values, np.round(values)):
+        raise InputError(
+            f"{file.name} holds no landmarks",
+            "either one vertex a line (-1: missing), or x, y and z of a point on each line",
         )
-        N, P, _ = found.points.shape
-        fits = found.normals.shape == (N, P, 3) and found.landmarks.shape[::2] == (N, 3)
-        at = found.template_landmarks
-        if not fits or len(at) != found.landmarks.shape[1] or (len(at) and at.max() >= template.shape.V):
-            raise KeyError("arrays that do not belong together")
-    except (OSError, ValueError, KeyError, StopIteration, SafetensorError) as error:
-        raise InputError(f"{folder} is not a prepared folder", "run `meshmatch prepare FOLDER -o OUT` first") from error
-    if prepared.get("template") != template.hash:
-        raise InputError(f"{folder} was prepared for another template", "prepare it again")
-    return found
+    outside = values[(values < -1) | (values >= clean.original.V)]
+    if len(outside):
+        raise InputError(
+            f"{file.name} names vertex {outside[0]:.0f}, but {clean.original.name} has {clean.original.V}",
+            "vertices are counted from 0; -1 is a missing one",
+        )
+    points = clean.shape.verts[clean.original_to_repaired[values.astype(np.int64)]].copy()
+    points[values < 0] = np.nan
+    return points
 
 
-def read_prepared(folder: str | Path) -> dict[str, Any]:
-    """What ``prepared.json`` says.
+def find_landmarks(where: str | Path | None, folder: Path, files: Sequence[Path]) -> list[Path | None]:
+    """The landmark file of every shape: in a folder of their own, or beside the shapes with a suffix.
 
-    Raises
-    ------
-    OSError, ValueError
-        It is missing, or not a JSON object.
+    `OptionError` if none of the shapes has one.
     """
-    words = json.loads((Path(folder) / "prepared.json").read_text(encoding="utf-8"))
-    if not isinstance(words, dict):
-        raise ValueError("not an object")
-    return words
+    if where is None:
+        return [None] * len(files)
+    place, suffixes = folder, [str(where)]
+    if Path(where).is_dir():
+        place, suffixes = Path(where), [".landmarks.npy", ".npy", ".landmarks.txt", ".txt"]
+    found = []
+    for file in files:
+        names = (place / f"{file.stem}{suffix}" for suffix in suffixes)
+        found.append(next((name for name in names if name.is_file() and name != file), None))
+    if not any(found):
+        raise OptionError(
+            f"no shape of {folder} has landmarks at {where}",
+            "give a folder of NAME.npy files, or their suffix beside the shapes, such as .landmarks.npy",
+        )
+    return found

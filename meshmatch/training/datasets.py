@@ -17,7 +17,7 @@ from meshmatch.arrays import Float, Floats, Int
 from meshmatch.fields.field import Field
 from meshmatch.fields.mls import build_field
 from meshmatch.models.encoder import BasisEncoder, PointEncoder
-from meshmatch.templates.unregistered import ShapeSamples
+from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.training.scans import (
     ScanConfig,
     bump,

@@ -10,7 +10,7 @@ from meshmatch.errors import OptionError
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.checkpoint import Storage
 from meshmatch.models.config import PAPER, NetworkConfig
-from meshmatch.templates.registered import frame_of, is_registered
+from meshmatch.templates.prepared_folder import frame_of, is_registered
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss
 from meshmatch.training.scans import ScanConfig

@@ -16,8 +16,8 @@ from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.config import NetworkConfig
 from meshmatch.models.deformer import Deformer
 from meshmatch.shapes.sampling import farthest_points
+from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import Template
-from meshmatch.templates.unregistered import ShapeSamples
 from meshmatch.training.datasets import Augmentation, BatchDataset, CloudDataset, Source, build_lattice
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import LossPoints, SurfacePoints

@@ -22,9 +22,8 @@ from meshmatch.models.registry import CARD, TEMPLATE, WEIGHTS, load_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress, ProgressCallback
-from meshmatch.templates.registered import frame_of, read_registered
+from meshmatch.templates.prepared_folder import ShapeSamples, frame_of, read_registered, read_samples
 from meshmatch.templates.template import Template, read_template, save_template
-from meshmatch.templates.unregistered import ShapeSamples, read_samples
 from meshmatch.training.bodies import Bodies, human_source
 from meshmatch.training.datasets import Source, deformed_source, registered_source
 from meshmatch.training.loop import StepReport, Trainer

@@ -12,7 +12,7 @@ from meshmatch.render import compose
 from meshmatch.render.picture import Panel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.registered import read_registered
+from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import load_template
 from tests.cli.conftest import Answer, Run
 

@@ -10,8 +10,7 @@ from meshmatch.cli import main as meshmatch
 from meshmatch.experiments import ablation_setting
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import make_template
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig, make_template
 from tests.conftest import icosphere
 from tests.training.small import NETWORK, bent_eggs
 

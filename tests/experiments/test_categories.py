@@ -14,8 +14,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import make_template
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig, make_template
 from tests.conftest import icosphere
 
 

@@ -7,7 +7,7 @@ from meshmatch.errors import OptionError, TemplateError
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
-from meshmatch.templates.nodes import (
+from meshmatch.templates.make import (
     STRATEGIES,
     NodeConfig,
     Strategy,
@@ -125,7 +125,7 @@ def test_geodesic_rejection_keeps_a_node_off_the_other_plate() -> None:
 def test_a_rejection_that_leaves_nothing_becomes_milder_or_names_the_vertices(monkeypatch: pytest.MonkeyPatch) -> None:
     fold, config = two_plates(0.1), NodeConfig(strategy="geodesic", K=60, radius=0.2, depth=0.0)
     assert badly_held(fold.verts, choose_nodes(fold, config), 0.2) == []
-    monkeypatch.setattr("meshmatch.templates.nodes._GEODESIC_SHARES", (0.2,))
+    monkeypatch.setattr("meshmatch.templates.make._GEODESIC_SHARES", (0.2,))
     with pytest.raises(TemplateError, match="vertices"):
         choose_nodes(fold, config)
 

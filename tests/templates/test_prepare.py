@@ -10,12 +10,11 @@ from safetensors.numpy import load_file
 from meshmatch.errors import InputError, OptionError, OutputError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates import registered
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates import prepared_folder
+from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, Prepared, prepare
-from meshmatch.templates.registered import frame_of, read_registered
+from meshmatch.templates.prepared_folder import frame_of, read_registered, read_samples
 from meshmatch.templates.template import load_template
-from meshmatch.templates.unregistered import read_samples
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.3)
 
@@ -204,7 +203,7 @@ def test_correspondence_says_whether_registered_shapes_stand_alike(
     assert frame_of(tmp_path / "turned") == {"orientation": "rigid", "scale": "area"}
     assert prepared(folder, tmp_path / "given", FEW, align="none").align == "none"
     assert frame_of(tmp_path / "nowhere") is None
-    monkeypatch.setattr(registered, "SMALL_DATA", 4)
+    monkeypatch.setattr(prepared_folder, "SMALL_DATA", 4)
     assert prepared(folder, tmp_path / "many", FEW).align == "none"
     assert frame_of(tmp_path / "many") is None
 

@@ -10,8 +10,7 @@ from safetensors.numpy import load_file, save_file
 
 from meshmatch.errors import TemplateError
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import low_resolution, make_template
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig, low_mesh, make_template
 from meshmatch.templates.template import Template, load_template, save_template
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.3)
@@ -28,7 +27,7 @@ def ball(sphere: Shape) -> Template:
         labels=labels,
         label_names=("south", "north"),
         core=core,
-        low=low_resolution(sphere, 500),
+        low=low_mesh(sphere, 500),
     )
     return replace(made, pose="none", source="arithmetic", licence="CC0-1.0")
 
@@ -44,14 +43,14 @@ def test_a_template_stands_in_its_own_frame(ball: Template) -> None:
 
 
 def test_labels_and_core_follow_their_vertices(ball: Template, sphere: Shape) -> None:
-    height = sphere.verts[low_resolution(sphere, 500)[0], 1]
+    height = sphere.verts[low_mesh(sphere, 500)[0], 1]
     assert np.array_equal(ball.labels, height > 0)
     assert np.array_equal(ball.core, np.flatnonzero(height < 0))
     assert 0 < len(ball.core) < ball.shape.V
 
 
-def test_low_resolution_keeps_a_subset_of_the_vertices(sphere: Shape) -> None:
-    keep, faces = low_resolution(sphere, 300)
+def test_low_mesh_keeps_a_subset_of_the_vertices(sphere: Shape) -> None:
+    keep, faces = low_mesh(sphere, 300)
     assert len(keep) < sphere.V
     assert np.array_equal(keep, np.unique(keep))
     assert len(faces) <= 306  # the target and 2 %
@@ -61,7 +60,7 @@ def test_low_resolution_keeps_a_subset_of_the_vertices(sphere: Shape) -> None:
     small = Shape(sphere.verts[keep], faces)
     assert small.area == pytest.approx(4 * np.pi, rel=0.05)  # still the sphere
     assert (np.einsum("fi,fi->f", small.face_normals, small.verts[faces].mean(1)) > 0.9).mean() > 0.98
-    same, all_faces = low_resolution(sphere, 5000)
+    same, all_faces = low_mesh(sphere, 5000)
     assert np.array_equal(same, np.arange(sphere.V))
     assert np.array_equal(all_faces, sphere.faces)
 

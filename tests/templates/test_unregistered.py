@@ -12,12 +12,11 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.landmarks import find_landmarks, read_landmarks
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, Prepared, prepare
-from meshmatch.templates.registered import is_registered
+from meshmatch.templates.prepared_folder import is_registered, read_samples
 from meshmatch.templates.template import load_template
-from meshmatch.templates.unregistered import medoid, read_samples, template_radius, unit_frame
+from meshmatch.templates.unregistered import find_landmarks, medoid, read_landmarks, template_radius, unit_frame
 from tests.conftest import icosphere
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.35)

@@ -7,8 +7,7 @@ from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.config import NetworkConfig
 from meshmatch.models.deformer import Deformer
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import make_template
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig, make_template
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import BatchDataset, Source
 from meshmatch.training.losses import LossPoints

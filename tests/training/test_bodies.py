@@ -323,7 +323,7 @@ def test_parts_follow_the_joints(rig: Rig) -> None:
 
 
 def test_a_template_of_the_rig(rig: Rig) -> None:
-    from meshmatch.templates.nodes import NodeConfig
+    from meshmatch.templates.make import NodeConfig
 
     keep = np.arange(rig.rest.shape[1])
     template = human_template(rig, "T", NodeConfig(strategy="uniform", K=300, radius=0.6), (keep, rig.faces.numpy()))

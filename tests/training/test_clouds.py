@@ -9,8 +9,8 @@ import torch
 from meshmatch.models.config import NetworkConfig
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import Template
-from meshmatch.templates.unregistered import ShapeSamples
 from meshmatch.training.datasets import Augmentation, CloudDataset, build_lattice, deformed_normals, deformed_source
 from meshmatch.training.loop import TrainConfig, Trainer
 from meshmatch.training.losses import ChamferLoss, chamfer, robust, surface_error

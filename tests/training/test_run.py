@@ -13,9 +13,9 @@ from meshmatch.models.registry import load_model, verify_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
-from meshmatch.templates.registered import read_registered
+from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import Template, read_template, save_template
 from meshmatch.training import bodies
 from meshmatch.training.datasets import Source, registered_source

@@ -14,7 +14,7 @@ from safetensors import safe_open
 from meshmatch.models.registry import verify_model
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.nodes import NodeConfig
+from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
 from tests.training.small import egg_template
 
