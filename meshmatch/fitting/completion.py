@@ -37,11 +37,20 @@ def visible_vertices(system: NodeSystem, local: OrientedPoints, vectors: Float[F
 
 
 def completed(
-    system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"], share: float, rng: np.random.Generator
+    system: NodeSystem,
+    local: OrientedPoints,
+    vectors: Float[Floats, "K 3"],
+    share: float,
+    rng: np.random.Generator,
+    visible: Bool[Bools, " V"] | None = None,
 ) -> OrientedPoints:
-    """Samples (core frame) of a ``share`` of the surface, with points of the fitted template where they show nothing."""
+    """Samples (core frame) of a ``share`` of the surface, with points of the fitted template where they show nothing.
+
+    ``visible`` says where they do, if that is known: `visible_vertices` of as many samples as are asked.
+    """
     surface = system.surface(vectors)
-    visible = visible_vertices(system, local, vectors)
+    if visible is None:
+        visible = visible_vertices(system, local, vectors)
     faces = system.faces[~visible[system.faces].any(axis=1)]
     if not len(faces):
         return local

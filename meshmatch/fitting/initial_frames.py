@@ -63,22 +63,24 @@ def _template_samples(model: TrainedModel) -> OrientedPoints:
     return template_samples(model.template)
 
 
-def frames_of_part(model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool) -> list[RigidPose]:
+def frames_of_part(
+    model: TrainedModel, samples: OrientedPoints, config: FitConfig, wide: bool
+) -> tuple[list[RigidPose], list[RigidPose]]:
     """Core frames to try for a part, whose middle is not that of the whole, and which a vote seldom knows.
 
-    Besides those of `frames_to_try`: all turns about the user's axes, or, if the search is to be ``wide``, about the
-    axes of the file; each with several places of the core along the body.
+    Those of `frames_to_try`; and, the same for any samples, all turns about the user's axes, or, if the search is to be
+    ``wide``, about the axes of the file, each with several places of the core along the body.
     """
     frames = frames_to_try(model, samples, config)
     if model.card.frame["orientation"] in ALIGNS:
-        return frames
+        return frames, []
     up, front = _axes(config)
     if up is not None or front is not None:
-        return frames + _along_body(forced_frames(up, front))
+        return frames, _along_body(forced_frames(up, front))
     if not wide:
-        return frames
+        return frames, []
     axes = np.concatenate([np.eye(3), -np.eye(3)])
-    return frames + _along_body([pose for axis in axes for pose in forced_frames(axis, None, 8)])
+    return frames, _along_body([pose for axis in axes for pose in forced_frames(axis, None, 8)])
 
 
 def _along_body(poses: list[RigidPose]) -> list[RigidPose]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +20,11 @@ from meshmatch.models.trained import TrainedModel
 
 # How many points the network sees of tilted copies, in turn: thin samples tip it either way where it is in doubt.
 _VARIANT_POINTS = (700, 1400)
+_PREDICT_POINTS = 2048  # it sees of other samples
+_BATCH = 24  # clouds that it is asked about together: more save nothing, and take memory
+
+# Of samples in the core frame and node vectors (K, 3).
+Residual = Callable[[NodeSystem, OrientedPoints, Float[Floats, "K 3"]], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,32 +72,49 @@ class Predictor:
         """The predictor of a trained model."""
         return cls(model.inference, node_system(model), model.template.core, mirror_of(model), rng)
 
-    def predict(self, samples: OrientedPoints, draws: int, points: int = 2048) -> Float[Floats, "K 3"]:
-        """Mean prediction of node vectors over several draws of samples, which lie in their core frame."""
-        clouds = [samples.points[draw(samples, points, self.rng)] for _ in range(draws)]
-        return self.network.predict(clouds).mean(0)
-
-    def fit(
-        self, samples: OrientedPoints, pose: RigidPose, rounds: int = 2, draws: int = 2, stride: int = 2
-    ) -> Candidate:
-        """Predict, move the core frame to where the prediction puts the core, predict again.
+    def fit_all(
+        self,
+        starts: Sequence[tuple[OrientedPoints, RigidPose]],
+        rounds: int = 2,
+        draws: int = 2,
+        measure: Residual | None = None,
+    ) -> list[Candidate]:
+        """For each start: predict, move the core frame to where the prediction puts the core, predict again.
 
         Parameters
         ----------
-        pose : RigidPose
-            Where the core frame is looked for first.
+        starts : sequence of (samples, pose)
+            Samples, and where their core frame is looked for first. All are asked for together, for the network's
+            weights are then read from memory once.
         rounds, draws : int
             Predictions, and how many draws of samples each is the mean of.
-        stride : int
-            The residual is that of every so many samples and vertices.
+        measure : (NodeSystem, samples in the core frame, node vectors) -> float, optional
+            The residual; `two_way_residual` if not given.
         """
+        measure, poses = measure or two_way_residual, [pose for _, pose in starts]
         for turn in range(rounds):
-            local = samples.to_local(pose)
-            vectors = self.predict(local, draws)
+            clouds = [
+                pose.to_local(samples.points[draw(samples, _PREDICT_POINTS, self.rng)])
+                for (samples, _), pose in zip(starts, poses, strict=True)
+                for _ in range(draws)
+            ]
+            answers = [self.network.predict(clouds[k : k + _BATCH]) for k in range(0, len(clouds), _BATCH)]
+            rows = np.concatenate(answers)
+            means = rows.reshape(len(poses), draws, *rows.shape[1:]).mean(1)
             if turn < rounds - 1:
-                moved = self.system.moved(vectors)
-                pose = pose @ kabsch(self.system.verts[self.core], moved[self.core])
-        return Candidate(pose, vectors, two_way_residual(self.system, local, vectors, stride))
+                resting = self.system.verts[self.core]
+                moved = [self.system.moved(vectors)[self.core] for vectors in means]
+                poses = [pose @ kabsch(resting, core) for pose, core in zip(poses, moved, strict=True)]
+        return [
+            Candidate(pose, vectors, measure(self.system, samples.to_local(pose), vectors))
+            for (samples, _), pose, vectors in zip(starts, poses, means, strict=True)
+        ]
+
+    def fit(
+        self, samples: OrientedPoints, pose: RigidPose, rounds: int = 2, draws: int = 2, measure: Residual | None = None
+    ) -> Candidate:
+        """`fit_all` of one start."""
+        return self.fit_all([(samples, pose)], rounds, draws, measure)[0]
 
     def variants(
         self, local: OrientedPoints, coarse: OrientedPoints, pose: RigidPose, count: int, degrees: float
@@ -115,7 +138,7 @@ class Predictor:
         if self.mirror is not None:
             mirrored = replace(local, points=self.mirror.points(local.points))
             found += [self.mirror.vectors(vectors) for vectors in self._tilted(mirrored, tilts)]
-        return [Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors, 1)) for vectors in found]
+        return [Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors)) for vectors in found]
 
     def _tilted(self, samples: OrientedPoints, tilts: Float[Floats, "N 3 3"]) -> list[Floats]:
         """Node vectors (K, 3) predicted from tilted samples, turned back."""

@@ -20,6 +20,7 @@ from meshmatch.fitting.system import NodeSystem
 from meshmatch.geometry.oriented import PAIR_WEIGHT, OrientedPoints, with_normals
 from meshmatch.geometry.triangles import vertex_areas
 
+_NEWTON_STEPS = 20  # at most: five are the rule, and convergence is quadratic
 _SHARERS = 16  # vertices of the template that share a point, at most
 
 # Upper triangles H_p (V, 6) and right-hand sides H_p s_p (V, 3) of data terms, see `NodeSystem.solve`.
@@ -118,11 +119,36 @@ def refine_nodes(
 
 
 def nearest_rotations(F: Float[Floats, "G 3 3"], start: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
-    """Rotations R_g that bring start_g closest to F_g (orthogonal Procrustes)."""
-    U, _, Vh = np.linalg.svd(F @ start.transpose(0, 2, 1))
-    flip = np.linalg.det(U @ Vh)
-    U[:, :, 2] *= flip[:, None]
-    return U @ Vh
+    """Rotations R_g that bring start_g closest to F_g (orthogonal Procrustes).
+
+    The orthogonal factor of F start^T by Newton's iteration with scaling (Higham, 1986), all matrices side by side: a
+    sixth of the time of singular values, which remain for those that are nearly singular or turned inside out.
+    """
+    M = F @ start.transpose(0, 2, 1)
+    X = np.ascontiguousarray(M.reshape(-1, 9).T)
+    size = np.sqrt((X * X).sum(0))
+    C = _cofactors(X)
+    hard = (X[:3] * C[:3]).sum(0) <= 1e-4 * size**3
+    X[:, hard] = np.eye(3).reshape(9, 1)
+    for _ in range(_NEWTON_STEPS):
+        C = _cofactors(X)
+        det = (X[:3] * C[:3]).sum(0)
+        scale = np.sqrt(np.sqrt((C * C).sum(0) / (X * X).sum(0)) / det)
+        last, X = X, 0.5 * (scale * X + C / (scale * det))
+        if not (np.abs(X - last) > 1e-8).any():
+            break
+    R = np.ascontiguousarray(X.T).reshape(-1, 3, 3)
+    if hard.any():
+        U, _, Vh = np.linalg.svd(M[hard])
+        U[:, :, 2] *= np.linalg.det(U @ Vh)[:, None]
+        R[hard] = U @ Vh
+    return R
+
+
+def _cofactors(X: Float[Floats, "9 G"]) -> Float[Floats, "9 G"]:
+    a, b, c, d, e, f, g, h, i = X
+    rows = (e * i - f * h, f * g - d * i, d * h - e * g, c * h - b * i, a * i - c * g, b * g - a * h)
+    return np.stack([*rows, b * f - c * e, c * d - a * f, a * e - b * d])
 
 
 def pair_terms(

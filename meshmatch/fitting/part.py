@@ -6,7 +6,7 @@ must lie on the template; what the template has besides is left to the network a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from meshmatch.fitting.task import FitTask, Registration
 from meshmatch.fitting.verdict import judge_registration
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.progress import Progress
 
 STAGE = "fitting as a part"
 # Shares of the surface that a part may show, and all that follows, were set by hand.
@@ -25,8 +26,10 @@ SHARES = (1.0, 0.8, 0.62, 0.48, 0.36)
 _MIN_SHARE = 0.2  # that a shape is taken to show
 # Residual that a share of 0 has to be better by than one of 1: rather the whole than a part.
 _SHARE_COST = 0.004
+_WIDE_SHARES = (0.8, 0.48)  # for which a wide search tries all frames
+_ROUGH = 1024  # samples by which frames are ranked
 # Candidates of each share that are fitted with care, in a narrow and in a wide search.
-_CAREFUL, _CAREFUL_IF_WIDE = 6, 16
+_CAREFUL, _CAREFUL_IF_WIDE = 6, 8
 # Candidates that are completed and fitted again: so many once, of these so many twice, and so many three times.
 _COMPLETED = (14, 7, 4)
 _VARIED = 2  # candidates of which variants are sought
@@ -81,12 +84,9 @@ def _search(task: FitTask, refine: RefinePart, wide: bool) -> Registration:
     """The best fit of a part from some orientations; each search draws the same random numbers."""
     task = replace(task, predictor=Predictor.of(task.model, np.random.default_rng(task.config.seed)))
     progress = task.progress.stage(STAGE)
-    candidates: list[PartCandidate] = []
-    for number, share in enumerate(SHARES):
-        candidates += _of_share(task, share, wide)
-        progress(0.4 * (number + 1) / len(SHARES))
+    candidates = _careful(task, wide, progress.between(0.0, 0.4))
     for number, count in enumerate(_COMPLETED):
-        candidates = [_fitted_again(task, each) for each in _best_first(candidates)[:count]]
+        candidates = _fitted_again(task, _best_first(candidates)[:count])
         progress(0.4 + 0.2 * (number + 1) / len(_COMPLETED))
     candidates = _best_first(candidates)
     for candidate in candidates[:_VARIED]:
@@ -100,37 +100,56 @@ def _best_first(candidates: list[PartCandidate]) -> list[PartCandidate]:
     return sorted(candidates, key=lambda candidate: candidate.cost)
 
 
-def _of_share(task: FitTask, share: float, wide: bool) -> list[PartCandidate]:
-    """Careful fits from the best frames, if the samples show a share of the whole."""
-    samples = sized(task.samples, share)
-    coarse = samples.first(_COARSE)
-    frames = frames_of_part(task.model, samples, task.config, wide)
-    rough = [_fit(task, coarse, pose, rounds=1, draws=1) for pose in frames]
-    rough.sort(key=lambda candidate: candidate.residual)
-    count = _CAREFUL_IF_WIDE if wide else _CAREFUL
-    return [PartCandidate(share, _fit(task, samples, each.pose, rounds=2, draws=2)) for each in rough[:count]]
+def _careful(task: FitTask, wide: bool, progress: Progress) -> list[PartCandidate]:
+    """Fits from the best frames if the samples show each of the shares.
+
+    A wide search tries all its frames for some of the shares, and the best of these frames for the others.
+    """
+    found: list[PartCandidate] = []
+    best: dict[int, float] = {}  # residuals of the frames that all shares have in common
+    order = sorted(SHARES, key=lambda share: wide and share not in _WIDE_SHARES)
+    for number, share in enumerate(order):
+        samples = sized(task.samples, share)
+        frames, others = frames_of_part(task.model, samples, task.config, wide)
+        tried = list(range(len(others)))
+        if wide and number >= len(_WIDE_SHARES):
+            tried = sorted(best, key=lambda frame: best[frame])[: len(others) // 4]
+        thin = samples.first(_ROUGH)
+        starts = [(thin, pose) for pose in [*(others[k] for k in tried), *frames]]
+        rough = task.predictor.fit_all(starts, 1, 1, one_way_residual)
+        for k, candidate in zip(tried, rough, strict=False):
+            best[k] = min(candidate.residual, best.get(k, np.inf))
+        rough.sort(key=lambda candidate: candidate.residual)
+        count = _CAREFUL_IF_WIDE if wide else _CAREFUL
+        careful = [(samples, each.pose) for each in rough[:count]]
+        found += [PartCandidate(share, fit) for fit in task.predictor.fit_all(careful, measure=one_way_residual)]
+        progress((number + 1) / len(order))
+    return found
 
 
-def _fit(task: FitTask, samples: OrientedPoints, pose: RigidPose, rounds: int, draws: int) -> Candidate:
-    found = task.predictor.fit(samples, pose, rounds, draws, stride=4)
-    local = samples.to_local(found.pose)
-    return replace(found, residual=one_way_residual(task.system, local, found.vectors))
+def _fitted_again(task: FitTask, candidates: Sequence[PartCandidate]) -> list[PartCandidate]:
+    """New fits of the samples, completed by the last fits; how much of these was visible is the new share."""
+    system, starts, shares = task.system, [], []
+    for candidate in candidates:
+        local, vectors = candidate.local(task.samples), candidate.fit.vectors
+        visible = visible_vertices(system, local.first(_COARSE), vectors)
+        shares.append(float(np.clip(area_share(system, visible), _MIN_SHARE, 1.0)))
+        whole = completed(system, local, vectors, candidate.share, task.predictor.rng, visible)
+        growth = np.sqrt(shares[-1] / candidate.share)
+        starts.append((replace(whole, points=whole.points * growth), RigidPose.identity()))
+    found = []
+    again = task.predictor.fit_all(starts, measure=_unmeasured)
+    for candidate, fit, share in zip(candidates, again, shares, strict=True):
+        last = candidate.fit.pose
+        pose = RigidPose(last.rotation, np.sqrt(share / candidate.share) * last.center) @ fit.pose
+        placed = PartCandidate(share, replace(fit, pose=pose))
+        residual = one_way_residual(system, placed.local(task.samples), fit.vectors)
+        found.append(PartCandidate(share, replace(placed.fit, residual=residual)))
+    return found
 
 
-def _fitted_again(task: FitTask, candidate: PartCandidate) -> PartCandidate:
-    """A new fit of the samples, completed by the last fit; how much of that was visible is the new share."""
-    system, last = task.system, candidate.fit
-    local = candidate.local(task.samples)
-    visible = visible_vertices(system, local.first(_COARSE), last.vectors)
-    share = float(np.clip(area_share(system, visible), _MIN_SHARE, 1.0))
-    whole = completed(system, local, last.vectors, candidate.share, task.predictor.rng)
-    growth = np.sqrt(share / candidate.share)
-    whole = replace(whole, points=whole.points * growth)
-    again = task.predictor.fit(whole, RigidPose.identity(), stride=4)
-    pose = RigidPose(last.pose.rotation, growth * last.pose.center) @ again.pose
-    found = PartCandidate(share, replace(again, pose=pose))
-    residual = one_way_residual(system, found.local(task.samples), again.vectors)
-    return replace(found, fit=replace(found.fit, residual=residual))
+def _unmeasured(*_: object) -> float:
+    return 0.0  # the residual is that of other samples, once these are placed
 
 
 def _variants(task: FitTask, candidate: PartCandidate) -> list[PartCandidate]:

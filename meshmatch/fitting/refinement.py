@@ -6,6 +6,7 @@ A new refinement is a line of `REFINEMENTS`, and its name in `meshmatch.fitting.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -19,9 +20,11 @@ from meshmatch.fitting.nodes import refine_nodes
 from meshmatch.fitting.part import STAGE, PartCandidate, RefinePart, cost
 from meshmatch.fitting.task import FitTask
 from meshmatch.fitting.whole import RefineWhole
+from meshmatch.geometry.oriented import OrientedPoints
 
 # Interpretations of a part that get a few steps each. Set by hand.
 _PART_FINALISTS = 5
+_SCREENED_SAMPLES = 4096  # enough to tell interpretations apart
 
 
 @dataclass(frozen=True)
@@ -73,9 +76,27 @@ def _interpretations(task: FitTask, candidates: list[Candidate]) -> list[Candida
     local = task.samples.to_local(pose)
     pool = task.predictor.variants(local, coarse.to_local(pose), pose, config.variants, config.tilt)
     for each in candidates:
-        residual = two_way_residual(task.system, coarse.to_local(each.pose), each.vectors, 1)
+        residual = two_way_residual(task.system, coarse.to_local(each.pose), each.vectors)
         pool.append(replace(each, residual=residual))
     return sorted(pool, key=lambda candidate: candidate.residual)
+
+
+class _View:
+    """Samples by which interpretations are refined and compared."""
+
+    def __init__(self, task: FitTask, samples: OrientedPoints, roughness: float) -> None:
+        self._task, self.samples, self._roughness = task, samples, roughness
+
+    @cached_property
+    def scorer(self) -> CandidateScorer:
+        """Of these samples."""
+        return CandidateScorer(self._task.system, self.samples, self._roughness)
+
+
+def _views(task: FitTask, roughness: float) -> dict[bool, _View]:
+    """What interpretations are refined in full with, and a little."""
+    few = task.samples.first(_SCREENED_SAMPLES)
+    return {True: _View(task, task.samples, roughness), False: _View(task, few, roughness)}
 
 
 class _WholeComparison:
@@ -83,7 +104,7 @@ class _WholeComparison:
 
     def __init__(self, task: FitTask, candidates: list[Candidate]) -> None:
         self._task, self._candidates = task, candidates
-        self._scorer = CandidateScorer(task.system, task.samples, task.roughness)
+        self._views = _views(task, task.roughness)
         self._landmarks = None
         if task.landmarks is not None:
             self._landmarks = task.landmarks[0], task.frame.apply(task.landmarks[1])
@@ -97,13 +118,14 @@ class _WholeComparison:
         fixed = None
         if self._landmarks is not None:
             fixed = self._landmarks[0], candidate.pose.to_local(self._landmarks[1])
-        local = task.samples.to_local(candidate.pose)
+        local = self._views[in_full].samples.to_local(candidate.pose)
         facing = local.facing(task.system.surface(candidate.vectors))
         vectors = refine_nodes(task.system, facing, candidate.vectors, config, fixed)
         return Candidate(candidate.pose, vectors, two_way_residual(task.system, local, vectors))
 
-    def score(self, candidate: Candidate) -> float:
-        return self._scorer.score(self._task.samples.to_local(candidate.pose), candidate)
+    def score(self, candidate: Candidate, in_full: bool) -> float:
+        view = self._views[in_full]
+        return view.scorer.score(view.samples.to_local(candidate.pose), candidate)
 
     def vertices(self, candidate: Candidate) -> Float[Floats, "V 3"]:
         return candidate.pose.to_world(self._task.system.moved(candidate.vectors))
@@ -119,21 +141,21 @@ class _PartComparison:
     """The same for interpretations of a part: what it does not show is held where the fit has it."""
 
     def __init__(self, task: FitTask) -> None:
-        self._task, self._scorer = task, CandidateScorer(task.system, task.samples)
+        self._task, self._views = task, _views(task, 0.0)
 
     def refined(self, candidate: PartCandidate, in_full: bool) -> PartCandidate:
         task, config = self._task, self._task.config.nodes
         if not in_full:
             config = replace(config, steps=task.config.screening)
-        local, vectors = candidate.local(task.samples), candidate.fit.vectors
+        local, vectors = candidate.local(self._views[in_full].samples), candidate.fit.vectors
         both = completed(task.system, local, vectors, candidate.share, np.random.default_rng(0))
         vectors = refine_nodes(task.system, both, vectors, config)
         residual = one_way_residual(task.system, local, vectors)
         return replace(candidate, fit=Candidate(candidate.fit.pose, vectors, residual))
 
-    def score(self, candidate: PartCandidate) -> float:
-        local = candidate.local(self._task.samples)
-        return cost(self._scorer.score(local, candidate.fit), candidate.share)
+    def score(self, candidate: PartCandidate, in_full: bool) -> float:
+        view = self._views[in_full]
+        return cost(view.scorer.score(candidate.local(view.samples), candidate.fit), candidate.share)
 
     def vertices(self, candidate: PartCandidate) -> Float[Floats, "V 3"]:
         moved = self._task.system.moved(candidate.fit.vectors)

@@ -12,6 +12,8 @@ from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
 
+_BEHIND = 1.1  # times the best residual: candidates further behind say nothing about a cloud's scale. Set by hand.
+
 # Of candidates, best first, to the fit.
 RefineWhole = Callable[[FitTask, list[Candidate]], Candidate]
 
@@ -28,7 +30,7 @@ def fit_whole(task: FitTask, refine: RefineWhole) -> Registration:
     candidates = _screened(task, orientation.between(0.0, 0.7))
     if task.shape.is_cloud:
         task, candidates = _rescaled(task, candidates)
-    careful = [task.predictor.fit(task.samples, each.pose) for each in candidates[: task.config.careful]]
+    careful = task.predictor.fit_all([(task.samples, each.pose) for each in candidates[: task.config.careful]])
     orientation(1.0)
     return Registration(task, refine(task, _best_first(careful)))
 
@@ -39,10 +41,9 @@ def _screened(task: FitTask, progress: Progress) -> list[Candidate]:
     frames = frames_to_try(task.model, task.samples, task.config)
     # A cloud's residual says little before its core frame is found; a second round finds it.
     care = 2 if task.shape.is_cloud else 1
-    coarse, found = task.coarse, []
-    for number, pose in enumerate(frames):
-        found.append(task.predictor.fit(coarse, pose, rounds=care, draws=care, stride=1))
-        progress((number + 1) / len(frames))
+    coarse = task.coarse
+    found = task.predictor.fit_all([(coarse, pose) for pose in frames], rounds=care, draws=care)
+    progress(1.0)
     return _best_first(found)
 
 
@@ -50,9 +51,10 @@ def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list
     """The task and the best candidates of a cloud in the scale, and without the outliers, that the best fit tells."""
 
     def fit_again(samples: OrientedPoints, pose: RigidPose) -> Candidate:
-        return task.predictor.fit(samples, pose, rounds=2, draws=2, stride=1)
+        return task.predictor.fit(samples, pose, draws=1)
 
-    best = candidates[: task.config.careful]
+    near = _BEHIND * candidates[0].residual
+    best = [each for each in candidates[: task.config.careful] if each.residual <= near]
     estimates = [estimate_scale(task.system, task.samples, candidate, fit_again) for candidate in best]
     scale, samples, first = min(estimates, key=lambda estimate: estimate[2].residual)
     others = [

@@ -5,6 +5,8 @@ A cloud of more than `LARGEST` points is judged by a random part of it, so that 
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
@@ -104,12 +106,19 @@ def _part(points: Floats) -> Floats:
 
 def _neighbourhoods(points: Floats) -> tuple[Floats, Floats, Ints]:
     """The points to judge by, and distance and index (P, k + 1) of their neighbours, themselves first."""
+    part = np.ascontiguousarray(_part(points), float)
+    return part, *_neighbours(part.tobytes())
+
+
+@lru_cache(maxsize=4)
+def _neighbours(data: bytes) -> tuple[Floats, Ints]:
+    """Of points as bytes, so that areas, normals and roughness of a cloud ask once."""
     from scipy.spatial import cKDTree
 
-    part = _part(points)
-    most = min(max(len(part) // 200, 18), len(part) - 1)
-    distance, index = cKDTree(part).query(part, most + 1)
-    return part, distance, index
+    part = np.frombuffer(data).reshape(-1, 3)
+    distance, index = cKDTree(part).query(part, min(max(len(part) // 200, 18), len(part) - 1) + 1)
+    distance.flags.writeable = index.flags.writeable = False
+    return distance, index
 
 
 def _size(part: Floats, index: Ints) -> tuple[int, float]:

@@ -124,13 +124,13 @@ def test_axes_of_the_user_leave_no_other_hypothesis(
     model: TrainedModel, egg: Shape, monkeypatch: pytest.MonkeyPatch, up: str | None, front: str | None
 ) -> None:
     tried = []
-    plain = Predictor.fit
+    plain = Predictor.fit_all
 
-    def watched(predictor: Predictor, samples: OrientedPoints, pose: RigidPose, **how: int) -> Candidate:
-        tried.append(pose.rotation)
-        return plain(predictor, samples, pose, **how)
+    def watched(predictor: Predictor, starts: list[tuple[OrientedPoints, RigidPose]], **how: int) -> list[Candidate]:
+        tried.extend(pose.rotation for _, pose in starts)
+        return plain(predictor, starts, **how)
 
-    monkeypatch.setattr(Predictor, "fit", watched)
+    monkeypatch.setattr(Predictor, "fit_all", watched)
     Fitter(model, replace(QUICK, refine="none", up=up, front=front, careful=1)).fit(egg)
     asked = np.stack(tried[:-1])  # the last is the best one again, with care
     for name, column in ((up, 1), (front, 2)):

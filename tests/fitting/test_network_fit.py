@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from meshmatch.fitting import network_fit
 from meshmatch.fitting.network_fit import Predictor, one_way_residual, two_way_residual
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
@@ -45,8 +46,14 @@ def test_the_residual_is_that_of_a_plain_loop(system: NodeSystem, scan: Oriented
     assert two_way_residual(system, OrientedPoints(scan.points + 9, scan.normals), vectors) == pytest.approx(0.1)
 
 
-def test_predictions_are_means_of_seeded_draws(model: TrainedModel, scan: OrientedPoints) -> None:
-    one, again, other = (Predictor.of(model, np.random.default_rng(k)).predict(scan, 3, 100) for k in (0, 0, 1))
+def test_predictions_are_means_of_seeded_draws(
+    model: TrainedModel, scan: OrientedPoints, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(network_fit, "_PREDICT_POINTS", 100)
+    still = RigidPose.identity()
+    one, again, other = (
+        Predictor.of(model, np.random.default_rng(k)).fit(scan, still, rounds=1, draws=3).vectors for k in (0, 0, 1)
+    )
     assert np.array_equal(one, again)
     assert not np.array_equal(one, other)
     rng = np.random.default_rng(0)
@@ -56,8 +63,27 @@ def test_predictions_are_means_of_seeded_draws(model: TrainedModel, scan: Orient
             for _ in range(3)
         ]
     assert np.allclose(one, torch.stack(draws).mean(0), atol=1e-5)
-    all_of_it = Predictor.of(model, np.random.default_rng(5)).predict(scan, 2, 10**6)  # more than there are
-    assert all_of_it.shape == (model.template.K, 3)
+    monkeypatch.setattr(network_fit, "_PREDICT_POINTS", 10**6)  # more than there are
+    assert Predictor.of(model, np.random.default_rng(5)).fit(scan, still).vectors.shape == (model.template.K, 3)
+
+
+def test_starts_asked_together_are_fitted_as_each_alone(
+    model: TrainedModel, scan: OrientedPoints, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(network_fit, "_BATCH", 2)  # three starts are asked in two batches
+    few = scan.first(200)  # so few that every draw is all of them
+    poses = [RigidPose(Rotation.from_rotvec([0, angle, 0]).as_matrix(), np.zeros(3)) for angle in (0.0, 0.4, -0.7)]
+    starts = [(few, pose) for pose in poses]
+    together = Predictor.of(model, np.random.default_rng(0)).fit_all(starts, draws=1)
+    for start, found in zip(starts, together, strict=True):
+        alone = Predictor.of(model, np.random.default_rng(1)).fit(*start, draws=1)
+        assert np.allclose(found.vectors, alone.vectors, atol=1e-5)
+        assert np.allclose(found.pose.rotation, alone.pose.rotation, atol=1e-5)
+        assert found.residual == pytest.approx(alone.residual, abs=1e-5)
+    measured = Predictor.of(model, np.random.default_rng(0)).fit_all(starts, measure=one_way_residual)
+    assert measured[1].residual == one_way_residual(
+        node_system(model), few.to_local(measured[1].pose), measured[1].vectors
+    )
 
 
 def test_laying_on_again_moves_the_frame_to_where_the_core_went(model: TrainedModel, system: NodeSystem) -> None:
@@ -89,7 +115,7 @@ def test_without_a_tilt_every_reading_is_the_networks_own(
         found = predictor.variants(few, few, pose, count, degrees)
         assert len(found) == count
         for each in found:
-            assert each.residual == two_way_residual(system, few, each.vectors, 1)
+            assert each.residual == two_way_residual(system, few, each.vectors)
             assert each.pose is pose
             assert np.allclose(each.vectors, plain, atol=1e-5) == (degrees == 0)
 
@@ -138,5 +164,9 @@ def test_residuals_and_predictions_follow_the_weights_of_samples(
     everywhere = replace(scan, weights=np.full(len(scan.points), 0.3))
     assert two_way_residual(system, everywhere, vectors) == pytest.approx(two_way_residual(system, scan, vectors))
     moved = replace(masked, points=np.where(half[:, None], scan.points, scan.points + 9))
-    first, second = (Predictor.of(model, np.random.default_rng(0)).predict(each, 1, 300) for each in (masked, moved))
+    still = RigidPose.identity()
+    first, second = (
+        Predictor.of(model, np.random.default_rng(0)).fit(each, still, rounds=1, draws=1).vectors
+        for each in (masked, moved)
+    )
     assert np.array_equal(first, second)
