@@ -49,7 +49,7 @@ def _is_list(file: Path) -> bool:
 
 
 def _shape(file: Path) -> Json:
-    from meshmatch.geometry.topology import edges_of, face_parts
+    from meshmatch.geometry.topology import face_parts
     from meshmatch.shapes.files import load_shape
     from meshmatch.shapes.normalise import guess_unit, long_axis
     from meshmatch.shapes.repair import repair
@@ -59,7 +59,7 @@ def _shape(file: Path) -> Json:
     clean = repair(shape)
     edges, parts = {}, {}
     if not shape.is_cloud:
-        border, crowded = edges_of(shape.faces).counts
+        border, crowded = shape.edges.counts
         edges = {"watertight": border == crowded == 0, "open_edges": border, "non_manifold_edges": crowded}
         # of the repaired mesh: the seams of texture and the corners of an stl are joined
         parts = {"parts": int(face_parts(clean.shape.faces, clean.shape.V).max()) + 1}

@@ -14,7 +14,6 @@ from meshmatch.fitting.samples import Landmarks
 from meshmatch.fitting.task import FitTask, Registration
 from meshmatch.fitting.verdict import FAIR_RESIDUAL, empty_share, judge_registration
 from meshmatch.fitting.whole import fit_whole
-from meshmatch.geometry.topology import open_edges
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.shape import Shape
@@ -119,5 +118,5 @@ def _as_fit(found: Registration, partial: bool, began: float) -> Fit:
 
 def boundary_length(shape: Shape) -> float:
     """Length of the edges with one face, in the unit of the file."""
-    ends = shape.verts[open_edges(shape.faces)]  # N 2 3
+    ends = shape.verts[shape.edges.vertices[shape.edges.sizes == 1]]  # N 2 3
     return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum())

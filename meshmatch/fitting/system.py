@@ -188,7 +188,9 @@ def _pair_products(phi: Any) -> tuple[Ints, Ints, Any]:
     keep = phi.indices[first] <= phi.indices[second]
     row, first, second = row[keep], first[keep], second[keep]
     code = phi.indices[first].astype(np.int64) * K + phi.indices[second]
-    pairs, place = np.unique(code, return_inverse=True)
+    met = np.zeros(K * K, bool)
+    met[code] = True
+    pairs, place = np.flatnonzero(met), (np.cumsum(met) - 1)[code]
     products = csr_matrix((phi.data[first] * phi.data[second], (place, row)), shape=(len(pairs), V))
     return pairs // K, pairs % K, products
 

@@ -147,4 +147,5 @@ def is_discontinuous(
 
     ``length`` is the distance of the neighbours; all are in units of sqrt(area).
     """
-    return np.asarray(np.linalg.norm(here - there, axis=1) >= _GAP + _STRETCH * length)
+    apart = here - there
+    return np.asarray(np.einsum("ni,ni->n", apart, apart) >= np.square(_GAP + _STRETCH * length))

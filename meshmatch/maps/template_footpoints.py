@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.fitting.fit import Fit
-from meshmatch.geometry.topology import edges_of, is_discontinuous
+from meshmatch.geometry.topology import is_discontinuous
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.shapes.shape import Shape
@@ -52,7 +52,7 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
         def search(rows: Ints, near: Floats) -> Footpoints:
             return surface.query(points[rows], normals[rows], workers, near)
 
-        return reassign_islands(points, shape.faces, shape.vertex_areas, found, resting, search, _ROUNDS)
+        return reassign_islands(points, shape.edges.vertices, shape.vertex_areas, found, resting, search, _ROUNDS)
     near = neighbours(points, shape.roughness)
     for _ in range(_ROUNDS):
         found = surface.query(points, normals, workers, neighbour_medians(resting(found), near))
@@ -88,7 +88,7 @@ def in_core_frame(shape: Shape, fit: Fit) -> tuple[Float[Floats, "V 3"], Float[F
 
 def reassign_islands(
     verts: Float[Floats, "V 3"],
-    faces: Int[Ints, "F 3"],
+    edges: Int[Ints, "E 2"],
     areas: Float[Floats, " V"],
     found: Found,
     images: Callable[[Found], Float[Floats, "N 3"]],
@@ -101,7 +101,6 @@ def reassign_islands(
     `found`; `images` are the points themselves, in units of their own surface's sqrt(area), and `search` gives
     footpoints of some vertices near such points. Returns the footpoints and their images.
     """
-    edges = edges_of(faces).vertices
     length = np.linalg.norm(verts[edges[:, 0]] - verts[edges[:, 1]], axis=1)
     image = images(found)
     for _ in range(rounds):

@@ -118,7 +118,7 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     _note(notes, far, "part", f"{what}: two objects in one file?")
     kept, touched = (np.bincount(each.ravel(), minlength=shape.V) > 0 for each in (faces, shape.faces))
     _note(notes, int((valid & ~touched).sum()), "vertex", "that no face uses dropped")
-    edges = edges_of(faces)
+    edges = shape.edges if np.array_equal(faces, shape.faces) else edges_of(faces)
     faces, turned = turn_faces(shape.verts, faces, cross, edges)
     if turned == len(faces):
         notes.append("turned all faces: the shape was inside out")

@@ -12,6 +12,7 @@ import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, frozen, read_only
 from meshmatch.errors import InputError
+from meshmatch.geometry.topology import Edges, edges_of
 from meshmatch.geometry.triangles import average_normals, share_areas, squared_lengths, triangle_vectors, unit
 from meshmatch.shapes.cloud import estimate_normals, local_areas, roughness
 
@@ -172,6 +173,11 @@ class Shape:
         if self.is_cloud:
             return self._estimated(estimate_normals)
         return frozen(average_normals(self.face_vectors, self.faces, self.V))
+
+    @cached_property
+    def edges(self) -> Edges:
+        """The edges of the faces."""
+        return edges_of(self.faces)
 
     @cached_property
     def area(self) -> float:

@@ -12,7 +12,6 @@ from scipy.sparse import csr_array
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.geometry.topology import edges_of
 from meshmatch.geometry.triangles import triangle_areas
 from meshmatch.maps.map_checks import corners_of
 from meshmatch.maps.vertex_map import VertexMap
@@ -56,7 +55,7 @@ def pull_directions(
     if directions.shape != (source.V, 3):
         raise InputError(f"directions must be an array of ({source.V}, 3), not {directions.shape}")
     points = back.points(source)
-    edges = edges_of(target.faces).vertices
+    edges = target.edges.vertices
     here, there = (place[edges[:, 1]] - place[edges[:, 0]] for place in (target.verts, points))
     unit = np.sqrt(target.area * source.area) or 1.0
     products = np.einsum("ni,nj->nij", here, there) / unit

@@ -14,7 +14,7 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
-from meshmatch.geometry.topology import edges_of, same_rows
+from meshmatch.geometry.topology import same_rows
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import NO_LABEL, largest_weights
 
@@ -43,7 +43,7 @@ def vertex_graph(shape: Shape) -> csr_array:
         near = cKDTree(shape.verts).query(shape.verts, min(_NEIGHBOURS + 1, shape.V))[1].reshape(shape.V, -1)
         pairs = np.stack([np.repeat(near[:, 0], near.shape[1] - 1), near[:, 1:].ravel()], axis=1)
     else:
-        pairs = edges_of(shape.faces).vertices
+        pairs = shape.edges.vertices
     first = same_rows(shape.verts)
     twins = np.flatnonzero(first != np.arange(shape.V))
     return _graph(shape.verts, np.concatenate([pairs, np.stack([first[twins], twins], axis=1)]))

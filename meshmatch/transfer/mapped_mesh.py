@@ -18,7 +18,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.geometry.topology import edges_of
 from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths, unit
 from meshmatch.maps.map_checks import corners_of
 from meshmatch.maps.surface import Footpoints
@@ -212,7 +211,7 @@ def _edge_lengths(shape: Shape) -> Floats:
     """(V,) mean length of the edges at each vertex; of a cloud, of the gaps between its points."""
     if shape.is_cloud:
         return np.sqrt(shape.vertex_areas)
-    edges = edges_of(shape.faces).vertices
+    edges = shape.edges.vertices
     length = np.linalg.norm(shape.verts[edges[:, 0]] - shape.verts[edges[:, 1]], axis=1)
     ends = edges.T.ravel()
     total = np.bincount(ends, np.tile(length, 2), shape.V)
@@ -250,7 +249,7 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
         length, source_length = (float(np.sqrt(shape.area)) or 1.0 for shape in (target, source))
         found, _ = reassign_islands(
             target.verts / length,
-            target.faces,
+            target.edges.vertices,
             target.vertex_areas,
             found,
             lambda places: places.values(source.faces, source.verts) / source_length,

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.geometry.topology import edges_of
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import Rotations, facing, facing_matched
 from meshmatch.shapes.debris import seams
@@ -148,7 +147,7 @@ def relative_size(source: Shape, target: Shape, there: VertexMap) -> float:
         near = cKDTree(source.verts).query(source.verts[some], k=min(9, source.V))[1].reshape(len(some), -1)
         pairs = np.stack([some, near[:, -1]], axis=1)
     else:
-        pairs = edges_of(source.faces).vertices
+        pairs = source.edges.vertices
         pairs = pairs[:: max(1, len(pairs) // _PAIRS)]
     points = there.points(target)
     own = np.linalg.norm(source.verts[pairs[:, 0]] - source.verts[pairs[:, 1]], axis=1)
