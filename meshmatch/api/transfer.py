@@ -17,11 +17,11 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
-from meshmatch.transfer import colors as vertex_colors
 from meshmatch.transfer.attributes import pull_directions, pull_face_labels, pull_labels, pull_values, pull_weights
 from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, named
 from meshmatch.transfer.landmarks import Landmarks, at_points, at_vertices, load_landmarks, push_landmarks
 from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels, replace_low_values, replace_low_weights
+from meshmatch.transfer.value_files import checked_colors, light, light_of, seen
 from meshmatch.transfer.weight_files import SkinWeights, load_weights, weights_of
 
 if TYPE_CHECKING:
@@ -112,11 +112,11 @@ def transfer_colors(
     from meshmatch.shapes.appearance import Appearance
 
     source = as_shape(source, "source")
-    given = None if isinstance(colors, Appearance) else vertex_colors.light_of(source, colors)
+    given = None if isinstance(colors, Appearance) else light_of(source, colors)
     blank = None
     if rule.blank is not None:
-        chosen = vertex_colors.checked(as_numbers(rule.blank, "blank"))
-        blank = vertex_colors.light(np.append(chosen, 1.0)[:4])  # opaque unless it says otherwise
+        chosen = checked_colors(as_numbers(rule.blank, "blank"))
+        blank = light(np.append(chosen, 1.0)[:4])  # opaque unless it says otherwise
     maps = find_maps(source, target, match)
     with thread_limit(1):
         if given is not None:
@@ -128,7 +128,7 @@ def transfer_colors(
             found = colors_of_vertices(maps.source, colors, maps.target, maps.backward)
         confidence = _confidence(maps.backward)
         found, low = replace_low_values(found, confidence, maps.target, rule.minimum, blank, rule.fill)
-    return Transferred(vertex_colors.seen(found), confidence, low, maps)
+    return Transferred(seen(found), confidence, low, maps)
 
 
 def transfer_labels(

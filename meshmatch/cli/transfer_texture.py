@@ -63,12 +63,12 @@ def transfer_texture(
     TGT in their order, and copies at texture seams follow; an obj has exactly the vertices and faces of TGT.
     """
     from meshmatch.shapes import textured_files
-    from meshmatch.transfer import colors
     from meshmatch.transfer.bake import check_bake_options
+    from meshmatch.transfer.value_files import parse_color, save_colors
 
     transfer = Transfer(source, target, output, maps, run, picture)
     size, uv, image = texture.size, texture.uv, texture.image
-    blank = colors.parse_color(rules.blank)
+    blank = parse_color(rules.blank)
     rule = rules.rule(blank)
     baking = meshmatch.BakeOptions(
         size, texture.samples, texture.padding, rules.min_confidence, rules.fill, blank, run.threads
@@ -87,7 +87,7 @@ def transfer_texture(
         look = textured_files.load_appearance(source, a, image)
         if painted:
             done = meshmatch.transfer_colors(a, b, transfer, colors=look, rule=rule)
-            colors.save(temporary[0], b, done.data)
+            save_colors(temporary[0], b, done.data)
             record, pair = transfer.tell_low(done.low, rule.minimum), done.maps
         else:
             with transfer.console.progress() as report:

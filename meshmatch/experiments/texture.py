@@ -48,8 +48,8 @@ from meshmatch.templates.location import bundled_folder
 from meshmatch.threads import set_threads
 from meshmatch.transfer.bake import Baked, BakeOptions, transfer_texture
 from meshmatch.transfer.mapped_mesh import MappedMesh
-from meshmatch.transfer.material_sampler import MaterialSampler
 from meshmatch.transfer.surface_walk import SurfaceWalker
+from meshmatch.transfer.texel_colors import MaterialSampler
 from meshmatch.transfer.unwrap import atlas_of
 
 POINTS = 200_000

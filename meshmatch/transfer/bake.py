@@ -21,9 +21,8 @@ from meshmatch.shapes.appearance import Alpha, Appearance, Pixels
 from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.material_sampler import MaterialSampler
 from meshmatch.transfer.surface_walk import SurfaceWalker, walker_of
-from meshmatch.transfer.texel_locator import TexelLocator, images_of
+from meshmatch.transfer.texel_colors import MaterialSampler, TexelLocator, images_of
 from meshmatch.transfer.texels import beside_another, faces_on, fill, grown
 from meshmatch.transfer.unwrap import Atlas
 

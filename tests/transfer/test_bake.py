@@ -13,7 +13,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.colors import bytes_of, to_linear, to_srgb
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer import texel_locator
+from meshmatch.transfer import texel_colors
 from meshmatch.transfer.bake import Baked, BakeOptions, colors_of_vertices, transfer_texture
 from meshmatch.transfer.texels import faces_on
 from meshmatch.transfer.unwrap import Atlas, atlas_of, unwrapped
@@ -437,7 +437,7 @@ def test_nothing_is_smeared_where_a_map_tears(monkeypatch: pytest.MonkeyPatch) -
     assert found.torn == pytest.approx(1 / 12, abs=1e-9)
     assert found.image[..., 1].max() == 0  # what lies between is nowhere to be seen
     assert (found.image[40, 10, :3] == (255, 0, 0)).all() and (found.image[40, 90, :3] == (0, 0, 255)).all()
-    monkeypatch.setattr(texel_locator, "_STRETCH", 1e9)
+    monkeypatch.setattr(texel_colors, "_STRETCH", 1e9)
     smeared = worn(source, look, target, back, uv, replace(SMALL, size=96))
     assert smeared.image[..., 1].max() == 255  # the check sees a smear
 

@@ -10,8 +10,7 @@ import pytest
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer import colors
-from meshmatch.transfer.value_files import Values, load_values, parse_blank, save_values
+from meshmatch.transfer.value_files import Values, light_of, load_values, parse_blank, save_colors, save_values, seen
 from tests.conftest import icosphere
 
 SHAPE = icosphere(1)
@@ -129,7 +128,7 @@ def painted() -> Shape:
 def test_colours_are_written_as_they_were(tmp_path: Path, suffix: str) -> None:
     shape = painted()
     path = tmp_path / f"c{suffix}"
-    colors.save(path, shape, colors.seen(colors.light_of(shape)))
+    save_colors(path, shape, seen(light_of(shape)))
     assert shape.colors is not None
     table = suffix in (".npy", ".csv")
     found = load_values(path, shape).numbers if table else load_shape(path).colors
@@ -142,13 +141,13 @@ def test_gltf_holds_light_and_the_others_colours(tmp_path: Path) -> None:
     """Middle grey on a screen, 188 of 255, is half the light of white."""
     grey = np.full((SHAPE.V, 4), 0.5)
     grey[:, 3] = 1
-    colors.save(tmp_path / "c.glb", SHAPE, colors.seen(grey))
-    colors.save(tmp_path / "c.ply", SHAPE, colors.seen(grey))
+    save_colors(tmp_path / "c.glb", SHAPE, seen(grey))
+    save_colors(tmp_path / "c.ply", SHAPE, seen(grey))
     for name in ("c.glb", "c.ply"):
         again = load_shape(tmp_path / name)
         assert again.colors is not None
         assert np.abs(again.colors[:, :3] - 188 / 255).max() < 0.003  # read, both are as a screen has them
-        assert np.abs(colors.light_of(again) - grey).max() < 0.005
+        assert np.abs(light_of(again) - grey).max() < 0.005
     import trimesh
 
     stored: Any = trimesh.load(tmp_path / "c.glb", force="mesh")  # as the file has them
@@ -158,10 +157,10 @@ def test_gltf_holds_light_and_the_others_colours(tmp_path: Path) -> None:
 def test_no_colours_is_told_with_what_to_do(tmp_path: Path) -> None:
     save_shape(tmp_path / "a.ply", SHAPE)
     with pytest.raises(InputError, match=r"a\.ply has no vertex colours") as told:
-        colors.light_of(load_shape(tmp_path / "a.ply"))
+        light_of(load_shape(tmp_path / "a.ply"))
     assert "--values" in told.value.hint
 
 
 def test_colours_have_their_suffixes(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"c\.stl: '\.stl' is not a format for vertex colours"):
-        colors.save(tmp_path / "c.stl", SHAPE, np.ones((SHAPE.V, 4)))
+        save_colors(tmp_path / "c.stl", SHAPE, np.ones((SHAPE.V, 4)))
