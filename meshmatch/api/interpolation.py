@@ -20,14 +20,13 @@ from meshmatch.fitting.blend import WAYS, Blend, Deviation, Way
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.surface import Surface
-from meshmatch.maps.template_footpoints import in_core_frame
+from meshmatch.maps.template_footpoints import SurfaceBinding, in_core_frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shapes, save_shape
 from meshmatch.shapes.shape import Floats, Shape
 from meshmatch.threads import thread_limit
-from meshmatch.transfer.surface_binding import SurfaceBinding
 
 Mesh = Literal["source", "template"]
 Place = Literal["auto", "files", "source"]

@@ -26,8 +26,7 @@ from meshmatch.transfer.texel_colors import MaterialSampler, TexelLocator, image
 from meshmatch.transfer.texels import beside_another, faces_on, fill, grown
 from meshmatch.transfer.unwrap import Atlas
 
-LARGEST = 8192
-"""Texels along a side."""
+_LARGEST = 8192  # texels along a side
 # So many texels past a seam show the surface that goes on there; further out, the nearest mean (see `fill`).
 _OVERHANG = 2
 # Texels that cover more than this of the source's are sampled several times.
@@ -39,22 +38,13 @@ _CHUNK = 1 << 16
 class BakeOptions:
     """How a texture is baked.
 
-    Parameters
-    ----------
-    size : int
-        Texels along each side.
-    samples : int
-        ``samples x samples`` points in a texel that covers a seam or much detail of the source; one elsewhere.
-    padding : int
-        Texels between charts of a new atlas; 0 also leaves the texels past the seams empty.
-    min_confidence : float
-        Texels with less are of low confidence.
-    fill : bool
-        Give those the colours of their neighbours in the atlas.
-    blank : 4 numbers, optional
-        Give them this colour: sRGB and alpha in 0..1.
-    workers : int
-        Threads.
+    size : texels along each side
+    samples : ``samples x samples`` points in a texel that covers a seam or much detail of the source; one elsewhere
+    padding : texels between charts of a new atlas; 0 also leaves the texels past the seams empty
+    min_confidence : texels with less are of low confidence
+    fill : give those the colours of their neighbours in the atlas
+    blank : give them this colour, sRGB and alpha in 0..1
+    workers : threads
     """
 
     size: int = 2048
@@ -88,8 +78,8 @@ def check_bake_options(options: BakeOptions) -> None:
         raise OptionError(f"workers must be 1 or more, not {options.workers}")
     if options.fill and options.blank is not None:
         raise OptionError("fill and blank contradict each other", "choose one of them")
-    if not 16 <= options.size <= LARGEST:
-        raise OptionError(f"a texture has 16 to {LARGEST} texels a side, not {options.size}", "1024 or 2048 suit most")
+    if not 16 <= options.size <= _LARGEST:
+        raise OptionError(f"a texture has 16 to {_LARGEST} texels a side, not {options.size}", "1024 or 2048 suit most")
     if not 1 <= options.samples <= 8:
         raise OptionError(f"a texel takes 1 to 8 samples each way, not {options.samples}", "2 or 3 suit most")
     if not 0 <= options.padding <= options.size // 4:

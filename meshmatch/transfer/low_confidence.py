@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
@@ -65,8 +65,8 @@ def _graph(points: Floats, pairs: Ints) -> csr_array:
     length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     # A length of 0 would be no edge at all.
     length = np.maximum(length, max(1e-3 * float(np.median(length)), 1e-30) if len(length) else 1.0)
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    return csr_array(coo_array((np.tile(length, 2), (both[:, 0], both[:, 1])), shape=(len(points), len(points))))
+    places = np.concatenate([pairs, pairs[:, ::-1]]).T
+    return csr_array((np.tile(length, 2), tuple(places)), shape=(len(points), len(points)))
 
 
 def _with_neighbours(graph: csr_array, some: Bools) -> Ints:

@@ -93,8 +93,8 @@ class SurfaceWalker:
         ended: list[Ints] = []
         for step in range(steps):
             away = [at[k] - self._table[k].take(standing) for k in range(3)]
-            second = _product(away, [column.take(standing) for column in self._table[3:6]])
-            third = _product(away, [column.take(standing) for column in self._table[6:9]])
+            second = weighted(away, [column.take(standing) for column in self._table[3:6]])
+            third = weighted(away, [column.take(standing) for column in self._table[6:9]])
             held = [1 - second - third, second, third]
             here = np.s_[:] if step == 0 else active
             for k in range(3):
@@ -158,7 +158,8 @@ def walker_of(shape: Shape) -> SurfaceWalker:
     return PointWalker(shape) if shape.is_cloud else SurfaceWalker(shape)
 
 
-def _product(a: list[Floats32], b: list[Floats32]) -> Floats32:
+def weighted(a: list[Floats32] | Floats32, b: list[Floats32]) -> Floats32:
+    """(N,) products of columns, three each, added up."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

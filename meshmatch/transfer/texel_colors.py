@@ -15,7 +15,7 @@ from meshmatch.geometry.triangles import cross_product, squared_lengths
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Alpha, Appearance, Material
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.surface_walk import SurfaceWalker, duals
+from meshmatch.transfer.surface_walk import SurfaceWalker, duals, weighted
 from meshmatch.transfer.texels import MOST_ROWS, Pyramid, rows_of, spans, wrapped
 
 # The map is discontinuous on a triangle if an edge of its image is this many times as long as usual, and a little
@@ -78,23 +78,19 @@ class MaterialSampler:
         made = self.materials[number]
         out = np.ones((4, len(face)), np.float32)
         if number in self._pyramids:
-            u, v = (_mean(weights, [column.take(face) for column in columns]) for columns in self._uv)
+            u, v = (weighted(weights, [column.take(face) for column in columns]) for columns in self._uv)
             out = self._pyramids[number].look(u, v, footprint)
         if made.factor != (1.0, 1.0, 1.0, 1.0):
             out *= np.array(made.factor, np.float32)[:, None]
         if self._colors is not None:
             corners = self._faces[face].T
             for k in range(4):
-                out[k] *= _mean(weights, [self._colors[k].take(corner) for corner in corners])
+                out[k] *= weighted(weights, [self._colors[k].take(corner) for corner in corners])
         if made.alpha == "opaque":
             out[3] = 1.0
         elif made.alpha == "mask" and self._hard:
             out[3] = out[3] >= made.cutoff
         return out
-
-
-def _mean(weights: Floats32, values: list[Floats32]) -> Floats32:
-    return weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2]
 
 
 def _folded(uv: Floats) -> Floats:
@@ -267,8 +263,7 @@ class TexelLocator:
 
     def _begin(self, face: Ints32, corner: Ints) -> Ints32:
         """Where the images of the corners lie: faces of the source."""
-        start = [column.take(face) for column in self._start]
-        return np.where(corner == 0, start[0], np.where(corner == 1, start[1], start[2]))
+        return np.choose(corner, [column.take(face) for column in self._start])
 
     def confidence(self, face: Ints32, weights: Floats32) -> Floats32:
         """(N,) of the map at points (3, N) of triangles (N,)."""

@@ -39,11 +39,6 @@ class Spans:
     first: Ints  # N: columns
     length: Ints  # N
 
-    @property
-    def texels(self) -> int:
-        """How many there are in all, those that several triangles hold counted each time."""
-        return int(self.length.sum())
-
     def expanded(self) -> Iterator[tuple[Ints, Ints, Ints]]:
         """Face, column and row of every texel, some millions at a time."""
         ends = np.cumsum(self.length)

@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.frames import Frame
+from meshmatch.maps.template_footpoints import SurfaceBinding
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.surface_binding import SurfaceBinding
 from tests.conftest import icosphere
 
 TURN = Rotation.from_euler("xyz", [20, 50, -30], degrees=True).as_matrix()
