@@ -18,8 +18,7 @@ from scipy.sparse import csr_matrix
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import TemplateError
 from meshmatch.fields.shape_functions import ShapeFunctions
-from meshmatch.geometry.kernels import KERNELS, Kernel
-from meshmatch.templates.support import MINIMUM_EIGENVALUE, support_pairs
+from meshmatch.geometry.kernels import KERNELS, MINIMUM_EIGENVALUE, Kernel, support_pairs
 
 
 def build_field(

@@ -21,11 +21,11 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.errors import OptionError, TemplateError
+from meshmatch.geometry.kernels import poorly_supported
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import Samples, farthest_points, sample_surface, triangulate_cloud
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.support import poorly_supported
 from meshmatch.templates.template import Template
 
 LOW_FACES = 10_000

@@ -72,17 +72,9 @@ def prepare(
     (samples of all shapes in the template's frame), ``normalised/NAME.ply`` and, last, ``prepared.json``. Shapes are
     registered if all have the vertex count and triangles of the template's file.
 
-    Raises
-    ------
-    InputError
-        No usable shape (files of a folder that cannot be read are named in the notes instead), or a template that
-        is nothing like the shapes.
-    OptionError
-        No landmarks where they should be, or choices that do not go together.
-    TemplateError
-        The nodes do not reach every vertex.
-    OutputError
-        The output folder cannot be written.
+    `InputError` if no shape is usable (files of a folder that cannot be read are named in the notes instead), or the
+    template is nothing like the shapes; `OptionError` if there are no landmarks where they should be, or choices do not
+    go together; `TemplateError` if the nodes do not reach every vertex; `OutputError` if the folder cannot be written.
     """
     shapes, output, config = Path(shapes), Path(output), config or PrepareConfig()
     if (config.nodes.strategy == "parts") != (config.labels is not None):
@@ -99,12 +91,13 @@ def prepare(
     make_folder(output)
     clean = _template_file(shapes)
     labels = config.labels
-    if labels is not None and len(labels) != clean.original.V:
-        raise InputError(
-            f"there are {len(labels)} labels, but {clean.original.name} has {clean.original.V} vertices",
-            "give one label for every vertex of the file",
-        )
-    labels = None if labels is None else labels[clean.kept_vertex]
+    if labels is not None:
+        if len(labels) != clean.original.V:
+            raise InputError(
+                f"there are {len(labels)} labels, but {clean.original.name} has {clean.original.V} vertices",
+                "give one label for every vertex of the file",
+            )
+        labels = labels[clean.kept_vertex]
     low = low_mesh(clean.shape, config.faces, config.decimate)
     made = make_template(clean.shape, shapes.stem, config.nodes, labels=labels, low=low)
     made = replace(made, source=shapes.name)
@@ -221,12 +214,11 @@ def _template_shape(
             if wanted & {clean.original.name, Path(clean.original.name).stem}:
                 return clean, number
         return _template_file(path), None
-    number = next((k for k, clean in enumerate(found) if not clean.shape.is_cloud), 0)
+    number, why = next((k for k, clean in enumerate(found) if not clean.shape.is_cloud), 0), ""
     if len(found) > 1 and not same_faces(found[number], found):
         number = medoid(found, config.align or "rigid", config.scale, config.nodes.seed)
-        notes.append(f"template: {found[number].original.name}, which lies nearest to all others on average")
-    else:
-        notes.append(f"template: {found[number].original.name}")
+        why = ", which lies nearest to all others on average"
+    notes.append(f"template: {found[number].original.name}{why}")
     return found[number], number
 
 

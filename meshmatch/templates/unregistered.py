@@ -63,12 +63,8 @@ def medoid(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int) -> i
     aligned: list[OrientedPoints] = []
     for k in pool:
         shape = shapes[k].shape
-        samples = sample_surface(shape, 800, np.random.default_rng(seed))
-        part = samples.in_frame(unit_frame(shape, scale, 0.5))
-        if aligned:
-            best = align(part, aligned[0], how)[0]
-            part = part.to_local(best.pose)
-        aligned.append(part)
+        part = sample_surface(shape, 800, np.random.default_rng(seed)).in_frame(unit_frame(shape, scale, 0.5))
+        aligned.append(part.to_local(align(part, aligned[0], how)[0].pose) if aligned else part)
     distance = np.zeros((len(aligned), len(aligned)))
     for i in range(len(aligned)):
         for j in range(i):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import OptionError, TemplateError
+from meshmatch.geometry.kernels import poorly_supported, support_pairs
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
@@ -16,7 +17,6 @@ from meshmatch.templates.make import (
     farthest_points_any,
     spectral_clusters,
 )
-from meshmatch.templates.support import poorly_supported, support_pairs
 from meshmatch.templates.template import Template, load_template
 
 
