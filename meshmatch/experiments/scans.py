@@ -25,7 +25,7 @@ from meshmatch.maps.template_footpoints import template_footpoints
 from meshmatch.outputs import make_folder
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
-from meshmatch.render.scales import label_colors
+from meshmatch.shapes.colors import label_colors
 from meshmatch.shapes.shape import Shape
 
 _IN_A_PICTURE = 5

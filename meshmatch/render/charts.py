@@ -17,7 +17,7 @@ import numpy as np
 from meshmatch.errors import OptionError
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
 from meshmatch.outputs import replace_on_success
-from meshmatch.render.lettering import readable
+from meshmatch.render.legend import readable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,14 +17,13 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.render.colors import CLAY, position_colors
 from meshmatch.render.facing import Rotations, same_side, upright
 from meshmatch.render.figures import Panel
 from meshmatch.render.legend import Legend
 from meshmatch.render.picture import Look, render_shapes
-from meshmatch.render.scales import UNKNOWN, Scale, label_colors, label_swatches
+from meshmatch.render.scales import CLAY, Scale, label_swatches, position_colors
 from meshmatch.shapes.appearance import Appearance
-from meshmatch.shapes.colors import to_srgb
+from meshmatch.shapes.colors import UNKNOWN, label_colors, to_srgb
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 from meshmatch.transfer.attributes import pull_values

@@ -1,8 +1,12 @@
-"""What a panel of a picture holds, as surfaces that stand on their ground."""
+"""What a panel of a picture holds, as surfaces that stand on their ground.
+
+A figure is a shape on its own ground: rotated to face the viewer, the middle of its footprint at the origin, its lowest
+point at height 0, the square root of its surface area 1 long (bodies of one kind are then of one size, whatever their
+pose and unit).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,12 +15,11 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
-from meshmatch.render.colors import CLAY, to_linear
 from meshmatch.render.facing import facing
-from meshmatch.render.layout import GroundPose, ground_pose, rotation_about_x, rotation_about_y
-from meshmatch.render.surface import FacePaint, Paint, Surface, VertexPaint, balls, discs, mesh_surface
-from meshmatch.render.texture import TexturePaint
+from meshmatch.render.scales import CLAY, Color
+from meshmatch.render.surface import Paint, Surface, TexturePaint, VertexPaint, balls, discs, face_paint, mesh_surface
 from meshmatch.shapes.appearance import Appearance
+from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.shape import Shape
 
 MOST_POINTS = 60_000
@@ -77,14 +80,8 @@ class Panel:
 class Figure:
     """A panel in view coordinates, its foot at the origin.
 
-    Parameters
-    ----------
-    box
-        Left, bottom; right, top of all that is seen.
-    spot
-        Where its shadow falls: x, y, half width, half height of an ellipse in the picture plane.
-    hollow
-        Whether the shape itself is glass.
+    ``box`` is left, bottom; right, top of all that is seen. ``spot`` is where its shadow falls: x, y, half width, half
+    height of an ellipse in the picture plane. ``hollow``: the shape itself is glass.
     """
 
     solid: list[Surface]
@@ -94,44 +91,63 @@ class Figure:
     hollow: bool
 
 
-def build_figures(panels: Sequence[Panel], up: str | None, front: str | None, turn: float, tilt: float) -> list[Figure]:
-    """Build the surfaces of all panels, all seen from the same side (`Look` has the parameters).
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    """How a shape of a file becomes a figure: turned, then set on its ``foot`` and scaled, then tilted."""
+
+    rotation: Float[Floats, "3 3"]
+    foot: Float[Floats, " 3"]
+    scale: float
+    camera: Float[Floats, "3 3"]
+
+    def view(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
+        return np.asarray((points @ self.rotation.T - self.foot) / self.scale @ self.camera.T)
+
+
+def rotation_about_x(degrees: float) -> Float[Floats, "3 3"]:
+    """Rotation that tilts the top towards the viewer."""
+    b = np.radians(degrees)
+    return np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
+
+
+def build_figure(panel: Panel, up: str | None, front: str | None, turn: float, tilt: float) -> Figure:
+    """The surfaces of a panel as they are seen (`Look` has the parameters).
 
     Raises
     ------
     OptionError
         An invalid axis, or colors of the wrong shape.
     """
-    return [_figure(panel, up, front, turn, tilt) for panel in panels]
-
-
-def _figure(panel: Panel, up: str | None, front: str | None, turn: float, tilt: float) -> Figure:
     shape = panel.shape
     towards = facing(shape, up, front) if panel.rotation is None else np.asarray(panel.rotation, np.float64)
     points = np.empty((0, 3)) if panel.points is None else np.asarray(panel.points, dtype=np.float64)
-    drawn = [drawn_points(shape), points, *([] if panel.over is None else [drawn_points(panel.over)])]
-    pose = ground_pose(shape, np.concatenate(drawn), rotation_about_y(turn) @ towards)
-    camera = rotation_about_x(tilt)
-
-    def view(positions: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
-        return np.asarray(pose.apply(positions) @ camera.T)
-
-    skin = _skin(shape, _paint(panel, pose.scale), view, pose, camera)
+    a = np.radians(turn)
+    rotation = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]) @ towards
+    drawn = [_drawn_points(shape), points, *([] if panel.over is None else [_drawn_points(panel.over)])]
+    rotated = np.concatenate(drawn) @ rotation.T
+    low, high = rotated.min(axis=0), rotated.max(axis=0)
+    longest = float((high - low).max())
+    scale = float(np.sqrt(shape.area))
+    # A flat scrap or a lone point has no area to speak of; outliers far away would shrink everything else.
+    if not 0.2 * longest < scale < 2 * longest:
+        scale = longest if longest > 0 else 1.0
+    foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+    pose = _Pose(rotation, foot, scale, rotation_about_x(tilt))
+    skin = _skin(shape, _paint(panel, scale), pose)
     solid, glass = ([], [skin]) if panel.glass else ([skin], [])
     if len(points):
-        radius = 0.011 if panel.point_radius is None else panel.point_radius / pose.scale
-        solid.append(balls(view(points), radius, _linear(panel.point_colors, len(points), _NODE_COLOR)))
+        radius = 0.011 if panel.point_radius is None else panel.point_radius / scale
+        solid.append(balls(pose.view(points), radius, _linear(panel.point_colors, len(points), _NODE_COLOR)))
     if panel.over is not None:
         veil = VertexPaint(_linear(None, panel.over.V, _VEIL_COLOR), panel.over.faces)
-        glass.append(_skin(panel.over, veil, view, pose, camera))
+        glass.append(_skin(panel.over, veil, pose))
     used = np.concatenate([part.extent for part in [*solid, *glass]])[:, :2]
-    width, _, depth = pose.half
-    flat = max(np.sin(np.radians(tilt)), 0.0)
-    spot = np.array([0.0, 0.0, width + _SHADOW, (depth + _SHADOW) * flat])
+    width, _, depth = (high - low) / scale / 2
+    spot = np.array([0.0, 0.0, width + _SHADOW, (depth + _SHADOW) * max(np.sin(np.radians(tilt)), 0.0)])
     return Figure(solid, glass, np.stack([used.min(axis=0), used.max(axis=0)]), spot, panel.glass)
 
 
-def drawn_points(shape: Shape) -> Float[Floats, "N 3"]:
+def _drawn_points(shape: Shape) -> Float[Floats, "N 3"]:
     """The vertices that will be seen: neither those without a position nor those that no face uses."""
     if shape.is_cloud:
         return shape.verts if shape.invalid is None else shape.verts[~shape.invalid]
@@ -150,7 +166,7 @@ def _valid_faces(shape: Shape) -> Int[Ints, " N"]:
 def _paint(panel: Panel, scale: float) -> Paint:
     shape = panel.shape
     if panel.face_colors is not None:
-        return FacePaint(_linear(panel.face_colors, shape.F, CLAY))
+        return face_paint(_linear(panel.face_colors, shape.F, CLAY))
     look = panel.appearance
     if panel.colors is None and look is not None and not shape.is_cloud:
         return TexturePaint(look, shape, scale)
@@ -160,32 +176,27 @@ def _paint(panel: Panel, scale: float) -> Paint:
     return VertexPaint(_linear(given, shape.V, CLAY), shape.faces, panel.sharp)
 
 
-def _skin(
-    shape: Shape,
-    paint: Paint,
-    view: Callable[[Float[Floats, "N 3"]], Float[Floats, "N 3"]],
-    pose: GroundPose,
-    camera: Float[Floats, "3 3"],
-) -> Surface:
-    verts = view(shape.verts)
+def _skin(shape: Shape, paint: Paint, pose: _Pose) -> Surface:
+    verts = pose.view(shape.verts)
     if not shape.is_cloud:
         valid = _valid_faces(shape)
         if not len(valid):  # embree needs a triangle even for an empty scene
-            return mesh_surface(verts[:1], np.zeros((1, 3), np.int64), FacePaint(np.ones((1, 3))))
+            return mesh_surface(verts[:1], np.zeros((1, 3), np.int64), face_paint(np.ones((1, 3))))
         return mesh_surface(verts, shape.faces, paint, None if len(valid) == shape.F else valid)
     colors = paint.colors if isinstance(paint, VertexPaint) else np.tile(to_linear(np.array(CLAY)), (shape.V, 1))
     drawn = np.arange(shape.V) if shape.invalid is None else np.flatnonzero(~shape.invalid)
-    step = max(1, -(-len(drawn) // MOST_POINTS))
-    drawn = drawn[::step]
-    spacing = _spacing(verts[drawn])
+    drawn = drawn[:: max(1, -(-len(drawn) // MOST_POINTS))]
+    # The distance of each point to its fifth neighbor: discs as large nearly close the surface.
+    near = cKDTree(verts[drawn]).query(verts[drawn], k=min(6, len(drawn)))[0].reshape(len(drawn), -1)
+    spacing = near[:, -1] if len(drawn) > 1 else np.full(len(drawn), 0.05)
     typical = float(np.clip(np.median(spacing), 1e-3, 0.06))
     if len(drawn) < _SPARSE:
         return balls(verts[drawn], 0.5 * typical, colors[drawn])
-    normals = shape.vertex_normals[drawn] @ (camera @ pose.rotation).T
+    normals = shape.vertex_normals[drawn] @ (pose.camera @ pose.rotation).T
     return discs(verts[drawn], normals, 1.1 * np.clip(spacing, 0.4 * typical, 1.6 * typical), colors[drawn])
 
 
-def _linear(colors: ArrayLike | None, count: int, plain: tuple[float, float, float]) -> Float[Floats, "count 3"]:
+def _linear(colors: ArrayLike | None, count: int, plain: Color) -> Float[Floats, "count 3"]:
     """Linear colors of sRGB ones, or of the plain one if none are given."""
     if colors is None:
         return np.tile(to_linear(np.array(plain)), (count, 1))
@@ -193,10 +204,3 @@ def _linear(colors: ArrayLike | None, count: int, plain: tuple[float, float, flo
     if array.shape not in ((count, 3), (count, 4)):
         raise OptionError(f"colors must be an array of ({count}, 3) or ({count}, 4), not {array.shape}")
     return to_linear(np.clip(np.nan_to_num(array[:, :3]), 0.0, 1.0))
-
-
-def _spacing(points: Float[Floats, "N 3"]) -> Float[Floats, " N"]:
-    """Distance of each point of a cloud to its fifth neighbor: discs as large nearly close the surface."""
-    if len(points) < 2:
-        return np.full(len(points), 0.05)
-    return np.asarray(cKDTree(points).query(points, k=min(6, len(points)))[0][:, -1])

@@ -14,12 +14,11 @@ from meshmatch.arrays import UInts8
 from meshmatch.errors import OptionError
 from meshmatch.outputs import replace_on_success
 from meshmatch.render import raster
-from meshmatch.render.colors import to_linear, to_srgb
-from meshmatch.render.figures import Figure, Panel, build_figures
-from meshmatch.render.layout import VIEWS, Page, lay_out, rotation_about_x
-from meshmatch.render.legend import Legend, draw_legend
-from meshmatch.render.lettering import Ink, fitting, write
+from meshmatch.render.figures import Figure, Panel, build_figure, rotation_about_x
+from meshmatch.render.layout import VIEWS, Page, lay_out
+from meshmatch.render.legend import Ink, Legend, draw_legend, fitting, write
 from meshmatch.render.scene import Ground, Scene
+from meshmatch.shapes.colors import to_linear, to_srgb
 
 MAX_SIDE, MAX_PIXELS = 8192, 36_000_000
 _GLASS = 0.34  # opacity of glass seen straight on
@@ -129,7 +128,7 @@ def render_shapes(
 
 
 def _image(panels: list[Panel], look: Look) -> Image.Image:
-    figures = build_figures(panels, look.up, look.front, look.turn, look.tilt)
+    figures = [build_figure(panel, look.up, look.front, look.turn, look.tilt) for panel in panels]
     names = [panel.label for panel in panels]
     page = lay_out([figure.box for figure in figures], any(names), look.legend, look.size)
     background = background_color(look.background)

@@ -51,16 +51,10 @@ class Ground:
 class Hits:
     """What N rays met. Rows of misses hold nothing of use.
 
-    Parameters
-    ----------
-    face
-        Triangle in the whole scene; -1 for a miss, -2 for the ground.
-    flat, normal
-        Normal of the facet, and the smooth one; both face the viewer.
-    color
-        Linear; of the ground the strength of its shadows, three times.
-    lift
-        Height above the surface from which light is looked for, so that a surface does not shade itself.
+    ``face`` is the triangle in the whole scene, -1 for a miss, -2 for the ground. ``flat`` and ``normal`` are that of
+    the facet and the smooth one; both face the viewer. ``color`` is linear; of the ground the strength of its shadows,
+    three times. ``lift`` is the height above the surface from which light is looked for, so that it does not shade
+    itself.
     """
 
     face: Int[Ints, " N"]
@@ -69,12 +63,6 @@ class Hits:
     normal: Float[Floats32, "N 3"]
     color: Float[Floats32, "N 3"]
     lift: Float[Floats32, " N"]
-
-    @classmethod
-    def none(cls, face: Int[Ints, " N"]) -> Hits:
-        """No hits yet: ``face`` is -1 everywhere."""
-        place, flat, normal, color = np.zeros((4, len(face), 3), np.float32)
-        return cls(face, place, flat, normal, color, np.full(len(face), _LIFT, np.float32))
 
 
 class Scene:
@@ -85,9 +73,8 @@ class Scene:
         starts = np.cumsum([0, *(len(part.verts) for part in surfaces[:-1])])
         self._first = np.cumsum([0, *(len(part.faces) for part in surfaces)])
         self.verts = np.concatenate([part.verts for part in surfaces]).astype(np.float32)
-        self.faces = np.concatenate([part.faces + start for part, start in zip(surfaces, starts, strict=True)]).astype(
-            np.int32
-        )
+        faces = [part.faces + start for part, start in zip(surfaces, starts, strict=True)]
+        self.faces = np.concatenate(faces).astype(np.int32)
         self._normals = np.concatenate([part.normals for part in surfaces]).astype(np.float32)
         corners = self.verts[self.faces]
         flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -121,7 +108,8 @@ class Scene:
         """What is seen at points of the picture plane; ``pixel`` is the size of a pixel, for textures."""
         count = len(x)
         face = np.full(count, -1, np.int64)
-        hits = Hits.none(face)
+        place, flat, normal, color = np.zeros((4, count, 3), np.float32)
+        hits = Hits(face, place, flat, normal, color, np.full(count, _LIFT, np.float32))
         rows, depth = np.arange(count), np.full(count, self._before, np.float32)
         for _ in range(_LAYERS):  # again where a ray went through a hole that a texture cuts out
             origins = np.stack([x[rows], y[rows], depth], axis=1).astype(np.float32)
@@ -174,7 +162,7 @@ class Scene:
             own = np.flatnonzero((face >= first) & (face < last))
             if not len(own):
                 continue
-            color = surface.paint.at(face[own] - first, weights[own], pixel)
+            color = surface.paint(face[own] - first, weights[own], pixel)
             hits.color[rows[own]] = color[:, :3]
             if color.shape[1] == 4:
                 holes[own] = color[:, 3] < 0.5

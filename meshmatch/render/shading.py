@@ -18,6 +18,7 @@ _KEY_RAYS = 4  # a pixel
 _SKY_RAYS = 8
 _REACH = 0.75  # how far away something may be and still occlude the sky
 _SHADOW_REACH = 1.6
+Vectors = Float[Floats32, "N 3"]
 _AT_ONCE = 20_000  # rows: what belongs to them then stays in the processor's cache
 
 
@@ -42,15 +43,10 @@ def _key_directions() -> tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]
     numbers = _spread(_SUBSETS * _KEY_RAYS)
     side = np.cross(_KEY, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
-    up = np.cross(side, _KEY)
     angle, radius = 2 * np.pi * numbers[:, 0], _LAMP * np.sqrt(numbers[:, 1])
-    aim = _KEY + (radius * np.cos(angle))[:, None] * side + (radius * np.sin(angle))[:, None] * up
+    aim = _KEY + (radius * np.cos(angle))[:, None] * side + (radius * np.sin(angle))[:, None] * np.cross(side, _KEY)
     aim /= np.linalg.norm(aim, axis=1, keepdims=True)
-    reach = _SHADOW_REACH * (0.15 + 0.85 * numbers[:, 2])
-    return (
-        aim.reshape(_SUBSETS, _KEY_RAYS, 3).astype(np.float32),
-        reach.reshape(_SUBSETS, _KEY_RAYS).astype(np.float32),
-    )
+    return _in_subsets(aim, _SHADOW_REACH * (0.15 + 0.85 * numbers[:, 2]))
 
 
 def _sky_directions() -> tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]:
@@ -58,11 +54,13 @@ def _sky_directions() -> tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]
     numbers = _spread(_SUBSETS * _SKY_RAYS)
     angle, radius = 2 * np.pi * numbers[:, 0], np.sqrt(numbers[:, 1])
     local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)
-    reach = _REACH * (0.06 + 0.94 * numbers[:, 2] ** 1.5)
-    return (
-        local.reshape(_SUBSETS, _SKY_RAYS, 3).astype(np.float32),
-        reach.reshape(_SUBSETS, _SKY_RAYS).astype(np.float32),
-    )
+    return _in_subsets(local, _REACH * (0.06 + 0.94 * numbers[:, 2] ** 1.5))
+
+
+def _in_subsets(
+    aims: Float[Floats, "N 3"], reaches: Float[Floats, " N"]
+) -> tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]:
+    return (aims.reshape(_SUBSETS, -1, 3).astype(np.float32), reaches.reshape(_SUBSETS, -1).astype(np.float32))
 
 
 _KEY_SET, _KEY_FAR = _key_directions()
@@ -86,54 +84,37 @@ def visibility(
         own = order[ends[number - 1] if number else 0 : end]
         subset = number % _SUBSETS
         few = slice(None, None, 2 if number >= _SUBSETS else 1)  # the larger blocks of the ground need fewer per pixel
-        lamp = _KEY_SET[subset, few], _KEY_FAR[subset, few]
-        sky = _SKY_SET[subset, few], _SKY_FAR[subset, few]
         for first in range(0, len(own), _AT_ONCE):
             part = own[first : first + _AT_ONCE]
-            flat, normal = hits.flat[rows[part]], hits.normal[rows[part]]
+            flat = hits.flat[rows[part]]
             places = hits.place[rows[part]] + hits.lift[rows[part], None] * flat
-            result[part, 0] = _lamp_seen(scene, places, flat, normal, *lamp)
-            result[part, 1] = _sky_seen(scene, places, flat, normal, *sky)
+            result[part] = _seen(scene, places, flat, hits.normal[rows[part]], subset, few)
     return result
 
 
-def _lamp_seen(
-    scene: Scene,
-    places: Float[Floats32, "N 3"],
-    flat: Float[Floats32, "N 3"],
-    normal: Float[Floats32, "N 3"],
-    aims: Float[Floats32, "R 3"],
-    reaches: Float[Floats32, " R"],
-) -> Float[Floats32, " N"]:
+def _seen(
+    scene: Scene, places: Vectors, flat: Vectors, normal: Vectors, subset: int, few: slice
+) -> Float[Floats32, "N 2"]:
+    """Shares of lamp and sky at places on a surface, by ``few`` of the rays of a subset."""
     # At a grazing angle a facet shades its neighbors although the smooth surface is lit: shadows fade there.
     grazing = np.clip((flat @ _KEY) / np.float32(0.3), 0.0, 1.0)
     facing = np.flatnonzero((normal @ _KEY > -0.2) & (grazing > 0))
-    hidden = np.zeros(len(places), np.float32)
+    hidden, taken = np.zeros((2, len(places)), np.float32)
+    lamp = _KEY_SET[subset, few]
     asked = places[facing]
-    for aim, reach in zip(aims, reaches, strict=True):
+    for aim, reach in zip(lamp, _KEY_FAR[subset, few], strict=True):
         hidden[facing] += scene.blocked(asked, np.broadcast_to(aim, asked.shape), reach)
-    return np.asarray(1.0 - grazing * hidden / len(aims), np.float32)
-
-
-def _sky_seen(
-    scene: Scene,
-    places: Float[Floats32, "N 3"],
-    flat: Float[Floats32, "N 3"],
-    normal: Float[Floats32, "N 3"],
-    aims: Float[Floats32, "R 3"],
-    reaches: Float[Floats32, " R"],
-) -> Float[Floats32, " N"]:
     side, up = _tangents(normal)
-    taken = np.zeros(len(places), np.float32)
-    for (x, y, z), reach in zip(aims, reaches, strict=True):
+    sky = _SKY_SET[subset, few]
+    for (x, y, z), reach in zip(sky, _SKY_FAR[subset, few], strict=True):
         aim = x * side + y * up + z * normal
         below = np.minimum(2 * np.einsum("ni,ni->n", aim, flat), 0)
         aim -= below[:, None] * flat  # a ray into the facet is reflected out
         taken += scene.blocked(places, aim, reach)
-    return np.asarray(1.0 - taken / len(aims), np.float32)
+    return np.stack([1.0 - grazing * hidden / len(lamp), 1.0 - taken / len(sky)], axis=1).astype(np.float32)
 
 
-def _tangents(normal: Float[Floats32, "N 3"]) -> tuple[Float[Floats32, "N 3"], Float[Floats32, "N 3"]]:
+def _tangents(normal: Vectors) -> tuple[Vectors, Vectors]:
     """Two unit tangents of each normal (z > -1) that change smoothly with it (Duff et al. 2017)."""
     x, y, z = normal[:, 0], normal[:, 1], np.maximum(normal[:, 2], -0.999)
     a = -1.0 / (1.0 + z)
@@ -144,7 +125,7 @@ def _tangents(normal: Float[Floats32, "N 3"]) -> tuple[Float[Floats32, "N 3"], F
     )
 
 
-def shade(hits: Hits, rows: Int[Ints, " N"], seen: Float[Floats32, "N 2"]) -> Float[Floats32, "N 3"]:
+def shade(hits: Hits, rows: Int[Ints, " N"], seen: Float[Floats32, "N 2"]) -> Vectors:
     """Linear light that rows of the hits send to the viewer; ``seen`` as from `visibility`."""
     normal, color = hits.normal[rows], hits.color[rows]
     lamp, sky = seen[:, 0], seen[:, 1]

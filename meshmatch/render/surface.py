@@ -5,30 +5,28 @@ View coordinates: x to the right, y up, z towards the viewer, lengths of about 1
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.geometry.topology import same_rows
 from meshmatch.geometry.triangles import vertex_normals
+from meshmatch.shapes.appearance import Appearance, Material
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.texels import Pyramid
 
 AnyFloats = NDArray[np.floating[Any]]
-
-
-class Paint(Protocol):
-    """What gives a triangle its color at each of its points."""
-
-    def at(self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float) -> Float[AnyFloats, "N C"]:
-        """Colors, three or four columns, at points of triangles given by barycentric weights; a fourth value below a
-        half is a hole.
-
-        ``footprint`` is the size of a pixel in view coordinates: finer detail is averaged.
-        """
-        ...
+Paint = Callable[[Int[Ints, " N"], Float[AnyFloats, "N 3"], float], Float[AnyFloats, "N C"]]
+"""What gives triangles their color: at points of these faces, given by barycentric weights, three or four columns, of
+which a fourth below a half is a hole. The last argument is the size of a pixel in view coordinates: finer detail is
+averaged.
+"""
+_INVISIBLE = 0.05  # an alpha below this is meant to be invisible
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,39 +43,85 @@ class VertexPaint:
     def __post_init__(self) -> None:
         object.__setattr__(self, "colors", np.asarray(self.colors, np.float32))
 
-    def at(self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float) -> Float[AnyFloats, "N C"]:
+    def __call__(
+        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
+    ) -> Float[AnyFloats, "N C"]:
         corners = self.faces[faces]
         if self.sharp:
             return self.colors[np.take_along_axis(corners, weights.argmax(axis=1)[:, None], axis=1)[:, 0]]
         return np.asarray(np.einsum("nk,nkc->nc", weights, self.colors[corners]))
 
 
-@dataclass(frozen=True, eq=False)
-class FacePaint:
+def face_paint(colors: Float[AnyFloats, "F 3"]) -> Paint:
     """One color per triangle."""
+    return lambda faces, weights, footprint: colors[faces]
 
-    colors: Float[AnyFloats, "F 3"]
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "colors", np.asarray(self.colors, np.float32))
+class TexturePaint:
+    """Paint by the materials of a file: image times factor times vertex color, as glTF defines it.
 
-    def at(self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float) -> Float[AnyFloats, "N C"]:
-        return self.colors[faces]
+    ``shape`` is of the same file, and ``scale`` the length in it that is 1 in view coordinates.
+    """
+
+    def __init__(self, look: Appearance, shape: Shape, scale: float) -> None:
+        self._look, self._faces = look, shape.faces
+        self._colors = None if look.colors is None else np.nan_to_num(look.colors).astype(np.float32)
+        self._pyramids: dict[int, Pyramid] = {}
+        shared: dict[tuple[int, tuple[str, str], bool, bool], Pyramid] = {}
+        texels = np.zeros(len(look.materials))
+        for number in np.unique(look.material).tolist():
+            material = look.materials[number]
+            if material.image is not None:
+                texels[number] = material.image.shape[0] * material.image.shape[1]
+                key = (id(material.image), material.wrap, material.nearest, material.alpha == "opaque")
+                if key not in shared:
+                    shared[key] = Pyramid.of(material)
+                self._pyramids[number] = shared[key]
+        # Texels per unit of length on each face: a pixel averages as many as it is wide.
+        a, b = look.uv[:, 1] - look.uv[:, 0], look.uv[:, 2] - look.uv[:, 0]
+        flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        solid = 2.0 * shape.face_areas / scale**2
+        self._density = np.sqrt(flat * texels[look.material] / np.maximum(solid, 1e-20)).astype(np.float32)
+
+    def __call__(
+        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
+    ) -> Float[Floats32, "N 4"]:
+        weights = np.asarray(weights, np.float32)
+        out, tint = np.ones((2, len(faces), 4), np.float32)
+        materials = self._look.material[faces]
+        if self._colors is not None:
+            tint = np.einsum("nk,nkc->nc", weights, self._colors[self._faces[faces]])
+        for number in np.unique(materials).tolist():
+            rows = np.flatnonzero(materials == number)
+            material = self._look.materials[number]
+            if number in self._pyramids:
+                uv = np.einsum("nk,nkc->nc", weights[rows], self._look.uv[faces[rows]]).astype(np.float32)
+                wide = np.float32(footprint) * self._density[faces[rows]]
+                out[rows] = self._pyramids[number].look(uv[:, 0], uv[:, 1], wide).T
+            own = tint[rows] * np.array(material.factor, np.float32)
+            out[rows, :3] *= own[:, :3]
+            out[rows, 3] = _solid(material, out[rows, 3], own[:, 3])
+        return out
+
+
+def _solid(material: Material, image: Float[Floats32, " N"], factor: Float[Floats32, " N"]) -> Bool[Bools, " N"]:
+    """Whether there is anything, by the alpha of the image and of its factor.
+
+    Half-transparent glass is drawn as if it were solid; what an image cuts out, such as hair from its card, is not.
+    """
+    if material.alpha == "opaque":
+        return np.ones(len(image), bool)
+    if material.alpha == "mask":
+        return np.asarray(image * factor >= material.cutoff)
+    return np.asarray((image >= 0.5) & (factor >= _INVISIBLE))
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles in view coordinates with their paint.
+    """Triangles in view coordinates with their paint, which is called with indices of these faces.
 
-    Parameters
-    ----------
-    normals
-        Unit, or zero where the triangle's own is to be used.
-    paint
-        Called with indices of these faces.
-    loose
-        How far triangles that belong to one surface may lie above each other, as the discs of a cloud do; their
-        normals are then used as they are.
+    ``normals`` are unit, or zero where the triangle's own is to be used. ``loose`` is how far triangles that belong to
+    one surface may lie above each other, as the discs of a cloud do; their normals are then used as they are.
     """
 
     verts: Float[AnyFloats, "V 3"]
@@ -99,28 +143,17 @@ class Surface:
         return replace(self, verts=self.verts + shift)
 
 
-@dataclass(frozen=True, eq=False)
-class SomeFaces:
-    """The paint of a mesh of which only some triangles are drawn."""
-
-    paint: Paint
-    chosen: Int[Ints, " N"]
-
-    def at(self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float) -> Float[AnyFloats, "N C"]:
-        return self.paint.at(self.chosen[faces], weights, footprint)
-
-
 def mesh_surface(
     verts: Float[AnyFloats, "V 3"], faces: Int[Ints, "F 3"], paint: Paint, chosen: Int[Ints, " N"] | None = None
 ) -> Surface:
     """A mesh, or the ``chosen`` of its triangles; normals are smooth, also across the duplicate vertices of texture
     seams and stl files.
     """
-    if chosen is not None:
-        faces, paint = faces[chosen], SomeFaces(paint, chosen)
     twin = same_rows(np.asarray(verts, np.float64))
-    normals = vertex_normals(verts, twin[faces])[twin]
-    return Surface(verts, faces, normals, paint)
+    if chosen is None:
+        return Surface(verts, faces, vertex_normals(verts, twin[faces])[twin], paint)
+    normals = vertex_normals(verts, twin[faces[chosen]])[twin]
+    return Surface(verts, faces[chosen], normals, lambda some, *where: paint(chosen[some], *where))
 
 
 def balls(centers: Float[AnyFloats, "K 3"], radius: float, colors: Float[AnyFloats, "K 3"]) -> Surface:
@@ -131,7 +164,7 @@ def balls(centers: Float[AnyFloats, "K 3"], radius: float, colors: Float[AnyFloa
         (centers[:, None] + radius * verts).reshape(-1, 3),
         (faces + len(verts) * np.arange(count)[:, None, None]).reshape(-1, 3),
         np.tile(verts, (count, 1)),
-        FacePaint(np.repeat(colors, len(faces), axis=0)),
+        face_paint(np.repeat(colors, len(faces), axis=0)),
     )
 
 
@@ -150,11 +183,9 @@ def discs(
     around = np.cos(turn)[:, None] * first[:, None] + np.sin(turn)[:, None] * second[:, None]
     rim = centers[:, None] + radius[:, None, None] * around
     fan = np.array([[0, k, k + 1] for k in range(1, 7)])
-    count = len(centers)
-    faces = (fan + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
-    paint = FacePaint(np.repeat(colors, len(fan), axis=0))
-    loose = 0.6 * float(np.median(radius))
-    return Surface(rim.reshape(-1, 3), faces, np.repeat(normals, 8, axis=0), paint, loose)
+    faces = (fan + 8 * np.arange(len(centers))[:, None, None]).reshape(-1, 3)
+    paint = face_paint(np.repeat(colors, len(fan), axis=0))
+    return Surface(rim.reshape(-1, 3), faces, np.repeat(normals, 8, axis=0), paint, 0.6 * float(np.median(radius)))
 
 
 def _ball(subdivisions: int) -> tuple[Float[Floats, "V 3"], Int[Ints, "F 3"]]:

@@ -18,7 +18,8 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render import compose as drawing
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look
-from meshmatch.render.scales import UNKNOWN, Scale, Swatches
+from meshmatch.render.scales import Scale, Swatches
+from meshmatch.shapes.colors import UNKNOWN
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder

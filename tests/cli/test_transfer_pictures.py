@@ -13,7 +13,8 @@ from meshmatch.maps.files import load_map, save_map
 from meshmatch.render import compose
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look
-from meshmatch.render.scales import UNKNOWN, Scale, Swatches, label_colors
+from meshmatch.render.scales import Scale, Swatches
+from meshmatch.shapes.colors import UNKNOWN, label_colors
 from meshmatch.shapes.files import load_shape, save_shape
 from tests.cli.conftest import FakeMatching, Run, fake_fit
 from tests.cli.test_transfer_verbs import call, pair, well  # noqa: F401  (pair is a fixture)

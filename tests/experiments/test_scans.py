@@ -9,7 +9,7 @@ import pytest
 from meshmatch.api.matching import Matcher
 from meshmatch.experiments.scans import main, scan_panels
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.render.scales import label_colors
+from meshmatch.shapes.colors import label_colors
 
 DANCER = Path(__file__).parents[2] / "templates" / "samples" / "dancer.ply"
 

@@ -9,7 +9,6 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render import compose
-from meshmatch.render.colors import CLAY, position_colors
 from meshmatch.render.compose import (
     Composition,
     compose_confidence,
@@ -23,7 +22,8 @@ from meshmatch.render.compose import (
     merge_labels,
 )
 from meshmatch.render.picture import Look
-from meshmatch.render.scales import UNKNOWN, Scale
+from meshmatch.render.scales import CLAY, Scale, position_colors
+from meshmatch.shapes.colors import UNKNOWN
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import load_template

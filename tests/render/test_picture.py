@@ -10,9 +10,9 @@ from PIL import Image
 from meshmatch.errors import OptionError, OutputError
 from meshmatch.render import Look, Panel, layout, position_colors, render_shapes
 from meshmatch.render import picture as module
-from meshmatch.render.colors import to_linear, to_srgb
-from meshmatch.render.scales import Scale, label_colors, label_swatches
+from meshmatch.render.scales import Scale, label_swatches
 from meshmatch.shapes.appearance import vertex_colors_alone
+from meshmatch.shapes.colors import label_colors, to_linear, to_srgb
 from meshmatch.shapes.shape import Shape
 
 SMALL = Look(size=(96, 96), up="y", front="z", turn=0.0, tilt=0.0)

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from meshmatch.render import raster, shading, slivers
-from meshmatch.render.layout import Viewport, rotation_about_x
+from meshmatch.render import raster, shading
+from meshmatch.render.figures import rotation_about_x
+from meshmatch.render.layout import Viewport
 from meshmatch.render.raster import Layer, composite, draw
 from meshmatch.render.scene import Ground, Scene
-from meshmatch.render.surface import FacePaint, Surface, VertexPaint, balls, discs, mesh_surface
+from meshmatch.render.surface import Surface, VertexPaint, balls, discs, face_paint, mesh_surface
 
 WINDOW = Viewport(90, 70, -0.45, 0.35, 0.01)
 GREY = np.array([0.5, 0.5, 0.5])
@@ -15,7 +16,7 @@ GREY = np.array([0.5, 0.5, 0.5])
 
 def surface(verts: object, faces: object, color: np.ndarray = GREY) -> Surface:
     points, corners = np.array(verts, dtype=float), np.array(faces)
-    return mesh_surface(points, corners, FacePaint(np.tile(color, (len(corners), 1))))
+    return mesh_surface(points, corners, face_paint(np.tile(color, (len(corners), 1))))
 
 
 def square(side: float, z: float = 0.0, color: np.ndarray = GREY, at: tuple[float, float] = (0, 0)) -> Surface:
@@ -179,7 +180,7 @@ def test_the_nearest_corner_gives_a_sharp_colour() -> None:
     triangle = np.array([[-0.3, -0.3, 0], [0.3, -0.3, 0], [0, 0.3, 0]])
     paint = VertexPaint(np.eye(3), np.array([[0, 1, 2]]), sharp=True)
     weights = np.array([[0.5, 0.3, 0.2], [0.1, 0.2, 0.7], [0.3, 0.4, 0.3]])
-    assert np.array_equal(paint.at(np.zeros(3, int), weights, 0.1), np.eye(3)[[0, 2, 1]])
+    assert np.array_equal(paint(np.zeros(3, int), weights, 0.1), np.eye(3)[[0, 2, 1]])
     image = draw(Scene([mesh_surface(triangle, np.array([[0, 1, 2]]), paint)]), WINDOW)
     light_of = image.light / np.maximum(image.light.max(axis=2, keepdims=True), 1e-6)
     pure = (light_of < 0.2).sum(axis=2) == 2
@@ -188,7 +189,7 @@ def test_the_nearest_corner_gives_a_sharp_colour() -> None:
 
 def test_holes_of_a_texture_show_what_is_behind() -> None:
     class Holed:
-        def at(self, faces: np.ndarray, weights: np.ndarray, footprint: float) -> np.ndarray:
+        def __call__(self, faces: np.ndarray, weights: np.ndarray, footprint: float) -> np.ndarray:
             return np.column_stack([np.tile([1.0, 0, 0], (len(faces), 1)), np.where(weights[:, 1] > 0.5, 0.0, 1.0)])
 
     triangle = np.array([[-0.4, -0.3, 0.2], [0.4, -0.3, 0.2], [-0.4, 0.3, 0.2]])
@@ -219,8 +220,8 @@ def test_glass_is_drawn_over_what_it_does_not_lie_behind() -> None:
 
 def test_edges_are_thinned_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene([square(0.8)])
-    monkeypatch.setattr(slivers, "MOST_POINTS", 10)
-    points = slivers.edge_points(scene, WINDOW)
+    monkeypatch.setattr(raster, "MOST_POINTS", 10)
+    points = raster.edge_points(scene, WINDOW)
     assert len(points) <= 4 + 3 * 10
     monkeypatch.undo()
-    assert len(slivers.edge_points(scene, WINDOW)) > 6 * 79
+    assert len(raster.edge_points(scene, WINDOW)) > 6 * 79

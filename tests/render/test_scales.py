@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import OptionError
-from meshmatch.render.scales import UNKNOWN, Scale, label_colors, label_swatches, nice_step
+from meshmatch.render.scales import Scale, label_swatches, nice_step
+from meshmatch.shapes.colors import UNKNOWN, label_colors
 
 LIGHT = np.array([0.2126, 0.7152, 0.0722])
 

@@ -6,8 +6,7 @@ import pytest
 from meshmatch.render.layout import Viewport
 from meshmatch.render.raster import draw
 from meshmatch.render.scene import Scene
-from meshmatch.render.surface import mesh_surface
-from meshmatch.render.texture import TexturePaint
+from meshmatch.render.surface import TexturePaint, mesh_surface
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.shape import Shape
@@ -35,7 +34,7 @@ def look(*materials: Material, which: tuple[int, int] = (0, 0), colors: np.ndarr
 
 def paint(appearance: Appearance, footprint: float = 0.01, places: np.ndarray = PLACES) -> np.ndarray:
     face, weights = weights_at(places)
-    return np.asarray(TexturePaint(appearance, SQUARE, 1.0).at(face, weights, footprint))
+    return np.asarray(TexturePaint(appearance, SQUARE, 1.0)(face, weights, footprint))
 
 
 def test_each_quarter_of_the_image_lies_where_it_should() -> None:

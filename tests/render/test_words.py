@@ -6,9 +6,9 @@ from PIL import Image
 
 from meshmatch.render import legend as module
 from meshmatch.render.layout import lay_out
-from meshmatch.render.legend import draw_legend, legend_height
-from meshmatch.render.lettering import fitting, readable, width_of, write
-from meshmatch.render.scales import Scale, Swatches, label_colors
+from meshmatch.render.legend import draw_legend, fitting, legend_height, readable, width_of, write
+from meshmatch.render.scales import Scale, Swatches
+from meshmatch.shapes.colors import label_colors
 
 INK = (10, 20, 30)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
-from meshmatch.render.colors import CLAY
+from meshmatch.render.scales import CLAY
 from meshmatch.render.viewer.assembly import check_page, plain_text, scaled, small_integers, write_html
 from meshmatch.render.viewer.drawn import MOST, draw
 from meshmatch.shapes.debris import seams

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Floats
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.render.colors import position_colors
 from meshmatch.render.compose import matched_colors
 from meshmatch.render.facing import Rotations
-from meshmatch.render.scales import Scale
+from meshmatch.render.scales import Scale, position_colors
 from meshmatch.render.viewer.assembly import check_page, plain_text, scaled, small_integers, write_html
 from meshmatch.render.viewer.drawn import MOST, Box, Drawn, boxes, draw, upright
 from meshmatch.render.viewer.looks import Looks, dress
