@@ -97,7 +97,6 @@ def transfer_texture(
         The source has neither a texture nor colours, the target is a point cloud, its texture coordinates are to be
         kept and are not valid; or as `meshmatch.match`.
     """
-    bake.check_bake_options(options)
     if uv not in get_args(Keep):
         raise OptionError(f"invalid uv {uv!r}", f"choose one of {', '.join(get_args(Keep))}")
     own = None

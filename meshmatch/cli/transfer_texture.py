@@ -63,7 +63,6 @@ def transfer_texture(
     TGT in their order, and copies at texture seams follow; an obj has exactly the vertices and faces of TGT.
     """
     from meshmatch.shapes import textured_files
-    from meshmatch.transfer.bake import check_bake_options
     from meshmatch.transfer.value_files import parse_color, save_colors
 
     transfer = Transfer(source, target, output, maps, run, picture)
@@ -73,7 +72,6 @@ def transfer_texture(
     baking = meshmatch.BakeOptions(
         size, texture.samples, texture.padding, rules.min_confidence, rules.fill, blank, run.threads
     )
-    check_bake_options(baking)
     textured_files.check_textured(output, _COLORS)
     a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
     painted = b.is_cloud or output.suffix.lower() in _COLORS

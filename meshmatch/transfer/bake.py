@@ -36,7 +36,7 @@ _CHUNK = 1 << 16
 
 @dataclass(frozen=True)
 class BakeOptions:
-    """How a texture is baked.
+    """How a texture is baked. `OptionError` for sizes that are out of range, and choices that contradict each other.
 
     size : texels along each side
     samples : ``samples x samples`` points in a texel that covers a seam or much detail of the source; one elsewhere
@@ -55,6 +55,25 @@ class BakeOptions:
     blank: tuple[float, float, float, float] | None = None
     workers: int = 2
 
+    def __post_init__(self) -> None:
+        for name in ("size", "samples", "padding", "workers"):
+            if not isinstance(getattr(self, name), Integral):
+                raise OptionError(f"{name} must be an integer, not {getattr(self, name)!r}")
+        if self.workers < 1:
+            raise OptionError(f"workers must be 1 or more, not {self.workers}")
+        if self.fill and self.blank is not None:
+            raise OptionError("fill and blank contradict each other", "choose one of them")
+        if not 16 <= self.size <= _LARGEST:
+            raise OptionError(
+                f"a texture has 16 to {_LARGEST} texels a side, not {self.size}", "1024 or 2048 suit most"
+            )
+        if not 1 <= self.samples <= 8:
+            raise OptionError(f"a texel takes 1 to 8 samples each way, not {self.samples}", "2 or 3 suit most")
+        if not 0 <= self.padding <= self.size // 4:
+            raise OptionError(
+                f"padding of {self.padding} texels does not go with {self.size}", f"choose 0 to {self.size // 4}"
+            )
+
 
 @dataclass(frozen=True, eq=False)
 class Baked:
@@ -69,25 +88,6 @@ class Baked:
     torn: float  # share on triangles where the map is discontinuous
 
 
-def check_bake_options(options: BakeOptions) -> None:
-    """Refuse sizes that are out of range, and choices that contradict each other (`OptionError`)."""
-    for name in ("size", "samples", "padding", "workers"):
-        if not isinstance(getattr(options, name), Integral):
-            raise OptionError(f"{name} must be an integer, not {getattr(options, name)!r}")
-    if options.workers < 1:
-        raise OptionError(f"workers must be 1 or more, not {options.workers}")
-    if options.fill and options.blank is not None:
-        raise OptionError("fill and blank contradict each other", "choose one of them")
-    if not 16 <= options.size <= _LARGEST:
-        raise OptionError(f"a texture has 16 to {_LARGEST} texels a side, not {options.size}", "1024 or 2048 suit most")
-    if not 1 <= options.samples <= 8:
-        raise OptionError(f"a texel takes 1 to 8 samples each way, not {options.samples}", "2 or 3 suit most")
-    if not 0 <= options.padding <= options.size // 4:
-        raise OptionError(
-            f"padding of {options.padding} texels does not go with {options.size}", f"choose 0 to {options.size // 4}"
-        )
-
-
 def transfer_texture(
     source: Shape,
     look: Appearance,
@@ -100,9 +100,8 @@ def transfer_texture(
     """Bake the look of a source's file (`load_appearance`) for a target mesh, along a map from target to source.
 
     The atlas is one for the size and padding of the options (`atlas_of`); `progress` is called with the share that is
-    done. `OptionError` as `check_bake_options`.
+    done.
     """
-    check_bake_options(options)
     walker, sampler = _arranged(source, look)
     uv = atlas.uv
     if target.invalid is not None:  # faces with a corner that has no position

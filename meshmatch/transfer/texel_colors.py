@@ -16,7 +16,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Alpha, Appearance, Material
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.surface_walk import SurfaceWalker, duals, weighted
-from meshmatch.transfer.texels import MOST_ROWS, Pyramid, rows_of, spans, wrapped
+from meshmatch.transfer.texels import MOST_ROWS, Pyramid, rows_of, texels_in, wrapped
 
 # The map is discontinuous on a triangle if an edge of its image is this many times as long as usual, and a little
 # more (sqrt(area)). Set by hand, as in `mapped_mesh`.
@@ -122,13 +122,11 @@ def known_texels(material: Material, uv: Floats) -> Bools | None:
     size = corners.max(axis=1) - corners.min(axis=1) + 1.0
     if np.prod(size, axis=1).sum() > 16.0 * width * height + 64.0 * len(uv) or rows_of(corners).sum() > MOST_ROWS:
         return None
-    known = np.zeros((height, width), bool)
-    found = spans(corners)
-    for _, column, row in found.expanded():
+    known, small = np.zeros((height, width), bool), np.ones(len(uv), bool)
+    for face, column, row in texels_in(corners):
         known[wrapped(row, height, material.wrap[1]), wrapped(column, width, material.wrap[0])] = True
+        small[face] = False
     # Triangles that hold no center of a texel still name some; they count where nothing near is known.
-    small = np.ones(len(uv), bool)
-    small[found.face] = False
     at = _texels_at(corners[small].mean(axis=1), material, known.shape)
     alone = ~maximum_filter(known, 3)[at]
     known[_texels_at(corners[small][alone].reshape(-1, 2), material, known.shape)] = True

@@ -27,39 +27,18 @@ _AROUND = ((1, 0), (0, 1), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 _SHARE: Floats32 = (np.arange(256) / 255.0).astype(np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class Spans:
-    """Runs of texels whose centers lie in a triangle. Rows and columns are not bounded.
-
-    A center on an edge belongs to one of the two triangles that share it.
-    """
-
-    face: Ints  # N
-    row: Ints  # N
-    first: Ints  # N: columns
-    length: Ints  # N
-
-    def expanded(self) -> Iterator[tuple[Ints, Ints, Ints]]:
-        """Face, column and row of every texel, some millions at a time."""
-        ends = np.cumsum(self.length)
-        low, done = 0, 0
-        while low < len(ends):
-            high = max(int(np.searchsorted(ends, done + _AT_ONCE, side="right")), low + 1)
-            length = self.length[low:high]
-            span = np.repeat(np.arange(low, high), length)
-            column = self.first[span] + np.arange(len(span)) - np.repeat(np.cumsum(length) - length, length)
-            yield self.face[span], column, self.row[span]
-            low, done = high, int(ends[high - 1])
-
-
 def rows_of(corners: Floats) -> Ints:
     """(F,) how many rows of texel centers each triangle (F, 3, 2) crosses."""
     y = corners[:, :, 1]
     return np.asarray(np.ceil(y.max(axis=1) - 0.5) - np.ceil(y.min(axis=1) - 0.5), np.int64)
 
 
-def spans(corners: Floats) -> Spans:
-    """The texels of triangles (F, 3, 2), whose coordinates count texels: column, row."""
+def texels_in(corners: Floats) -> Iterator[tuple[Ints, Ints, Ints]]:
+    """Face, column and row of each texel whose center lies in one of the triangles (F, 3, 2), some millions at a time.
+
+    The triangles' coordinates count texels: column, row. A center on an edge belongs to one of the two triangles that
+    share it. Rows and columns are not bounded.
+    """
     order = np.lexsort((corners[:, :, 0], corners[:, :, 1]), axis=1)
     top, middle, low = (np.take_along_axis(corners, order[:, k, None, None], axis=1)[:, 0] for k in range(3))
     first_row = np.ceil(top[:, 1] - 0.5).astype(np.int64)
@@ -73,7 +52,15 @@ def spans(corners: Floats) -> Spans:
     first = np.ceil(np.minimum(long_edge, short_edge) - 0.5).astype(np.int64)
     length = np.ceil(np.maximum(long_edge, short_edge) - 0.5).astype(np.int64) - first
     some = length > 0
-    return Spans(face[some], row[some], first[some], length[some])
+    face, row, first, length = face[some], row[some], first[some], length[some]
+    ends = np.cumsum(length)
+    begin, done = 0, 0
+    while begin < len(ends):
+        end = max(int(np.searchsorted(ends, done + _AT_ONCE, side="right")), begin + 1)
+        run = np.repeat(np.arange(begin, end), length[begin:end])
+        column = first[run] + np.arange(done, ends[end - 1]) - (ends - length)[run]
+        yield face[run], column, row[run]
+        begin, done = end, int(ends[end - 1])
 
 
 def _crossing(begin: Floats, end: Floats, y: Floats) -> Floats:
@@ -89,7 +76,7 @@ def faces_on(corners: Floats, size: int) -> tuple[Ints32, int]:
     """
     found = np.full(size * size, -1, np.int32)
     total = 0
-    for face, column, row in spans(corners).expanded():
+    for face, column, row in texels_in(corners):
         inside = (column >= 0) & (column < size) & (row >= 0) & (row < size)
         found[(row * size + column)[inside]] = face[inside]
         total += int(inside.sum())
