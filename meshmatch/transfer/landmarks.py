@@ -27,7 +27,6 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps import table_files
 from meshmatch.maps.map_checks import corners_of
-from meshmatch.maps.table_files import load_points
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.shape import Shape
@@ -39,8 +38,8 @@ LANDMARK_SUFFIXES = (".csv", ".json", ".pp")
 check_landmarks_suffix = partial(table_files.check_suffix, suffixes=LANDMARK_SUFFIXES, what="landmarks")
 _COLUMNS = ("name", "vertex", "x", "y", "z", "face", "w0", "w1", "w2", "confidence")
 _PLACES = ({"vertex"}, {"x", "y", "z"}, {"face", "w0", "w1", "w2"})
-# Name, kind and place of one as a file has it: a "vertex", a "face" with three weights, or a "position".
-_Entry = tuple[str, str, Any]
+# One as a file has it: name; vertex, face and barycentric, or position. What is missing may be left out.
+_Record = dict[str, Any]
 _HINT = "a row each: name,vertex or name,x,y,z; or MeshLab's .pp, or .json"
 
 
@@ -167,20 +166,19 @@ def load_landmarks(path: str | Path, shape: Shape) -> tuple[Landmarks, float]:
 
     `InputError` if the file is missing or damaged, holds no landmark, or one that is not on `shape`.
     """
-    readers: dict[str, Callable[[Path], tuple[Landmarks, float]]] = {
-        ".csv": lambda path: _on_shape(_read_csv(path), shape),
-        ".json": lambda path: _on_shape(_read_json(path), shape),
-        ".pp": lambda path: _on_shape(_read_pp(path), shape),
-        ".txt": lambda path: (at_vertices(shape, load_points(path)), 0.0),
-        ".npy": lambda path: (at_vertices(shape, load_points(path)), 0.0),
-    }
-    return table_files.read_by_suffix(path, readers, "landmarks", _HINT)
+    readers = {".csv": _read_csv, ".json": _read_json, ".pp": _read_pp, ".txt": _read_vertices, ".npy": _read_vertices}
+
+    def on_shape(path: Path) -> tuple[Landmarks, float]:
+        records = readers[path.suffix.lower()](path)
+        if not records:
+            raise InputError("it holds no landmark")
+        return _on_shape([_named_place(record, k) for k, record in enumerate(records)], shape)
+
+    return table_files.read_by_suffix(path, dict.fromkeys(readers, on_shape), "landmarks", _HINT)
 
 
-def _on_shape(entries: Sequence[_Entry], shape: Shape) -> tuple[Landmarks, float]:
+def _on_shape(entries: Sequence[tuple[str, str, Any]], shape: Shape) -> tuple[Landmarks, float]:
     """Landmarks in the order of the entries; and the largest distance of a position from the surface."""
-    if not entries:
-        raise InputError("it holds no landmark")
     parts: list[Landmarks] = []
     rows: list[int] = []
     largest = 0.0
@@ -202,7 +200,11 @@ def _on_shape(entries: Sequence[_Entry], shape: Shape) -> tuple[Landmarks, float
     return joined(parts, np.argsort(rows)), largest
 
 
-def _read_csv(path: Path) -> list[_Entry]:
+def _read_vertices(path: Path) -> list[_Record]:
+    return [{"vertex": vertex} for vertex in table_files.load_points(path).tolist()]
+
+
+def _read_csv(path: Path) -> list[_Record]:
     rows = [row for row in table_files.read_rows(path) if not row[0].startswith("#")]
     if not rows:
         return []
@@ -214,41 +216,38 @@ def _read_csv(path: Path) -> list[_Entry]:
         if width not in (1, 2, 3, 4) or (width == 2 and head[0].lstrip("-").isdigit()):
             raise InputError("its first row names no columns")
         head = {1: ["vertex"], 2: ["name", "vertex"], 3: ["x", "y", "z"], 4: ["name", "x", "y", "z"]}[width]
-    entries = []
+    records = []
     for number, row in enumerate(rows):
         if len(row) != len(head):
             raise InputError(f"row {number} has {len(row)} cells, not {len(head)}")
         cell = dict(zip(head, row, strict=True))
-        record: dict[str, Any] = {"name": cell.get("name")}
+        record: _Record = {"name": cell.get("name")}
         # The most exact of what a row has: a face with weights, then a vertex, then a position.
         if cell.get("face", "") not in ("", "-1") and {"w0", "w1", "w2"} <= set(cell):
-            record["face"] = int(cell["face"])
-            record["barycentric"] = [float(cell[name]) for name in ("w0", "w1", "w2")]
+            record |= {"face": int(cell["face"]), "barycentric": [float(cell[name]) for name in ("w0", "w1", "w2")]}
         elif cell.get("vertex", "") != "":
             record["vertex"] = int(cell["vertex"])
         else:
             record["position"] = [float(cell.get(axis, "nan")) for axis in "xyz"]
-        entries.append(_entry(record, number))
-    return entries
+        records.append(record)
+    return records
 
 
-def _read_json(path: Path) -> list[_Entry]:
-    record = table_files.read_json(path)
-    if isinstance(record, dict) and isinstance(record.get("landmarks"), list | dict):
-        record = record["landmarks"]
-    if not isinstance(record, list | dict):
+def _read_json(path: Path) -> list[_Record]:
+    found = table_files.read_json(path)
+    if isinstance(found, dict) and isinstance(found.get("landmarks"), list | dict):
+        found = found["landmarks"]
+    if not isinstance(found, list | dict):
         raise InputError("it holds no list of landmarks")
-    entries = []
-    for number, item in enumerate(record):
-        name, value = (item, record[item]) if isinstance(record, dict) else (str(number), item)
-        if not isinstance(value, dict):
-            value = {"vertex" if isinstance(value, int) else "position": value}
-        named = {"name": name, **value} if isinstance(record, dict) else value
-        entries.append(_entry(named, number))
-    return entries
+    named = [({"name": name}, found[name]) for name in found] if isinstance(found, dict) else [({}, it) for it in found]
+    return [
+        name | (it if isinstance(it, dict) else {"vertex" if isinstance(it, int) else "position": it})
+        for name, it in named
+    ]
 
 
-def _entry(record: dict[str, Any], number: int) -> _Entry:
+def _named_place(record: _Record, number: int) -> tuple[str, str, Any]:
+    """The name, and a "vertex", a "face" with three weights, or a "position"."""
     words = "".join(c if c.isprintable() else " " for c in str(record.get("name") or number))
     name = plain_text(" ".join(words.split()))
     face, weights = record.get("face"), record.get("barycentric")
@@ -273,7 +272,7 @@ def _three(values: Any, name: str) -> list[float]:
     return [float(value) for value in values]
 
 
-def _read_pp(path: Path) -> list[_Entry]:
+def _read_pp(path: Path) -> list[_Record]:
     data = path.read_bytes()
     if b"<!ENTITY" in data:
         raise InputError("it defines XML entities, which a file of picked points has no use for")
@@ -283,28 +282,21 @@ def _read_pp(path: Path) -> list[_Entry]:
         raise InputError(f"it is not XML: {error}") from error
     if root.tag != "PickedPoints":
         raise InputError(f"it is not a file of MeshLab's picked points: its root is '{root.tag}'")
-    entries: list[_Entry] = []
-    for point in root.iter("point"):
-        if point.get("active", "1") != "0":  # else a name of a template that nobody has placed
-            position = [float(point.get(axis, "nan")) for axis in "xyz"]
-            entries.append(_entry({"name": point.get("name"), "position": position}, len(entries)))
-    return entries
+    return [
+        {"name": point.get("name"), "position": [float(point.get(axis, "nan")) for axis in "xyz"]}
+        for point in root.iter("point")
+        if point.get("active", "1") != "0"  # the name of a template that nobody has placed
+    ]
 
 
 def save_landmarks(path: Path, landmarks: Landmarks) -> None:
     """Write landmarks; `OptionError` if the suffix is not one of `LANDMARK_SUFFIXES`."""
     suffix = check_landmarks_suffix(path)
     columns = (landmarks.vertex, landmarks.points, landmarks.face, landmarks.barycentric)
-    rows = list(
-        zip(
-            landmarks.names,
-            *(column.tolist() for column in columns),
-            table_files.short_floats(landmarks.confidence),
-            strict=True,
-        )
-    )
+    sure = table_files.short_floats(landmarks.confidence)
+    rows = list(zip(landmarks.names, *(column.tolist() for column in columns), sure, strict=True))
     if suffix == ".csv":
-        cells = ([name, vertex, *xyz, face, *weights, sure] for name, vertex, xyz, face, weights, sure in rows)
+        cells = ([name, vertex, *xyz, face, *weights, trust] for name, vertex, xyz, face, weights, trust in rows)
         table_files.write_rows(path, _COLUMNS, cells)
     elif suffix == ".json":
         keys = ("name", "vertex", "position", "face", "barycentric", "confidence")
@@ -313,8 +305,7 @@ def save_landmarks(path: Path, landmarks: Landmarks) -> None:
     else:
         root = ElementTree.Element("PickedPoints")
         for name, _, (x, y, z), *_ in rows:
-            place = {"x": repr(x), "y": repr(y), "z": repr(z), "name": name, "active": "1"}
-            ElementTree.SubElement(root, "point", place)
+            ElementTree.SubElement(root, "point", x=repr(x), y=repr(y), z=repr(z), name=name, active="1")
         ElementTree.indent(root, " ")
         text = ElementTree.tostring(root, encoding="unicode")
         path.write_text(f"<!DOCTYPE PickedPoints>\n{text}\n", encoding="utf-8")
