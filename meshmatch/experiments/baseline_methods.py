@@ -28,9 +28,8 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.surface import Surface
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.align import align
 from meshmatch.shapes.decimate import decimate
-from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.normalise import align, sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 

@@ -26,8 +26,8 @@ from meshmatch.fitting.fitter import Fitter
 from meshmatch.maps.build import build_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.picture import Look, Panel, render_shapes
-from meshmatch.shapes.align import Align, align
 from meshmatch.shapes.colors import label_colors
+from meshmatch.shapes.normalise import Align, align
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig

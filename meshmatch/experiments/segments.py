@@ -41,8 +41,8 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.outputs import make_folder
 from meshmatch.render.picture import Look
-from meshmatch.shapes.align import Align
 from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.normalise import Align
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
 

@@ -10,7 +10,7 @@ from meshmatch.fitting.orientation import axis_vector, forced_frames, propose, s
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel, once_per_model
-from meshmatch.shapes.align import ALIGNS, align
+from meshmatch.shapes.normalise import ALIGNS, align
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.prepared_folder import SCALES
 from meshmatch.templates.unregistered import template_radius, template_samples, unit_frame

@@ -1,12 +1,34 @@
-"""Position, size and unit: frames that bring every shape to one size, and guesses at what its file does not say."""
+"""Position, size, unit and orientation: frames that bring every shape to one size, guesses at what its file does not
+say, and rigid alignment of one sampled shape to another: from the orientation that is given, or from any.
+
+The alignment is by iterative closest points (Besl and McKay 1992) with normals, both ways and with robust weights. It
+finds the nearest minimum, so a search begins from many turns: the axes of both files, and the principal axes of both
+shapes, in all 24 ways. Where several fit nearly as well, the orientation that the file has is believed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Literal, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Floats
 from meshmatch.errors import InputError
-from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.frames import Frame, RigidPose, kabsch
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.shape import Shape
 
+Align = Literal["none", "near", "rigid"]
+ALIGNS: tuple[Align, ...] = get_args(Align)
+
+# Set by hand.
+_SCALE = 0.1  # of the robust weight, units of sqrt(area)
+_CAP = 0.2  # of a distance in the residual
+_CLEARLY = 0.9  # a turn must fit better than the given orientation by this factor
+_CLOSE = 15.0  # degrees: two alignments nearer than that are one
 # Standing people are 1.2 to 2.2 m tall; a unit fits if it makes that of the longest extent.
 _SMALL, _TALL = 1.2, 2.2
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048}
@@ -57,3 +79,74 @@ def guess_unit(shape: Shape) -> str | None:
     """The unit in which the shape would be as long as a standing person; None if there is none."""
     length = float((shape.bounds[1] - shape.bounds[0]).max())
     return next((name for name, metres in _UNITS.items() if _SMALL <= length * metres <= _TALL), None)
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """shape = pose.to_world(target), as in a core frame; residual: mean capped distance both ways, normals included."""
+
+    pose: RigidPose
+    residual: float
+
+
+def align(shape: OrientedPoints, target: OrientedPoints, how: Align, keep: int = 1) -> list[Alignment]:
+    """Rigid motions that bring a target onto a shape, the best one first; at most `keep`, and one but for "rigid".
+
+    Both are centered, of one scale, their points in random order. "none" takes the orientation as it is, "near"
+    improves it, "rigid" searches all orientations.
+    """
+    coarse_shape, coarse_target = shape.thinned(200), target.thinned(300)
+    fine_shape, fine_target = shape.thinned(1200), target.thinned(1200)
+    if how == "none":
+        return [Alignment(RigidPose.identity(), residual(fine_shape, fine_target))]
+    given = _icp(fine_shape, fine_target, RigidPose.identity(), 25)
+    if how == "near":
+        return [given]
+    # the 24 turns of a cube in the files' own axes, and in the principal axes of both
+    turns = Rotation.create_group("O").as_matrix()
+    own, theirs = _principal_axes(shape.points), _principal_axes(target.points)
+    starts = [RigidPose(start, np.zeros(3)) for start in (*turns, *(own @ turn @ theirs.T for turn in turns))]
+    rough = sorted((_icp(coarse_shape, coarse_target, start, 6) for start in starts), key=attrgetter("residual"))
+    chosen = _distinct(rough)[: max(keep, 4)]
+    fine = sorted((_icp(fine_shape, fine_target, each.pose, 25) for each in chosen), key=attrgetter("residual"))
+    fine.insert(0 if fine[0].residual > _CLEARLY * given.residual else len(fine), given)
+    return _distinct(fine)[:keep]
+
+
+def _distinct(found: list[Alignment]) -> list[Alignment]:
+    """Those that are not near an earlier one."""
+    distinct: list[Alignment] = []
+    for each in found:
+        if all(each.pose.angle_to(other.pose) > _CLOSE for other in distinct):
+            distinct.append(each)
+    return distinct
+
+
+def residual(shape: OrientedPoints, target: OrientedPoints, cap: float = _CAP) -> float:
+    """Mean of the capped six-dimensional nearest distances, one way and back; of where both lie."""
+    forward = target.tree.query(shape.tree.data)[0]
+    back = shape.tree.query(target.tree.data)[0]
+    return float(0.5 * np.minimum(forward, cap).mean() + 0.5 * np.minimum(back, cap).mean())
+
+
+def _icp(shape: OrientedPoints, target: OrientedPoints, pose: RigidPose, steps: int) -> Alignment:
+    for _ in range(steps):
+        here = shape.to_local(pose)
+        to_target = target.tree.query(here.tree.data)[1]
+        to_shape = here.tree.query(target.tree.data)[1]
+        source = np.concatenate([target.points[to_target], target.points])
+        place = np.concatenate([here.points, here.points[to_shape]])
+        weights = 1.0 / np.square(1.0 + np.square(source - place).sum(1) / _SCALE**2)
+        weights[: len(here.points)] /= len(here.points)
+        weights[len(here.points) :] /= len(target.points)
+        step = kabsch(source, place, weights)
+        pose = pose @ step
+        if np.abs(step.rotation - np.eye(3)).max() < 1e-4 and np.abs(step.center).max() < 1e-4:
+            break
+    return Alignment(pose, residual(shape.to_local(pose), target))
+
+
+def _principal_axes(points: Floats) -> Floats:
+    axes = np.linalg.eigh(np.cov(points.T))[1]
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return np.asarray(axes)

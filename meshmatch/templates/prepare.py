@@ -13,10 +13,9 @@ from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.progress import Progress, ProgressCallback
-from meshmatch.shapes.align import Align
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
-from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.normalise import Align, sqrt_area_frame
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import LOW_FACES, NodeConfig, low_mesh, make_template

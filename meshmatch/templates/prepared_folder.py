@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.frames import kabsch
-from meshmatch.shapes.align import ALIGNS, Align
+from meshmatch.shapes.normalise import ALIGNS, Align
 from meshmatch.shapes.repair import Repaired
 from meshmatch.templates.template import Template, save_arrays
 

@@ -16,9 +16,8 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
-from meshmatch.shapes.align import Align, align, residual
 from meshmatch.shapes.input_files import read_npy
-from meshmatch.shapes.normalise import sqrt_area_frame, unit_sphere_frame
+from meshmatch.shapes.normalise import Align, align, residual, sqrt_area_frame, unit_sphere_frame
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape

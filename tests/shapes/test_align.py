@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.shapes.align import ALIGNS, align, residual
+from meshmatch.shapes.normalise import ALIGNS, align, residual
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 

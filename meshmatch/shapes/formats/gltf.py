@@ -95,12 +95,10 @@ class Document:
             total += self.count(primitive["attributes"]["POSITION"])
             total += self.count(primitive["indices"]) if "indices" in primitive else 0
             if total > MOST_CORNERS:
-                raise InputError(
-                    f"the scene of {self.name} has over {MOST_CORNERS} vertices and corners of faces",
-                    "export it with fewer copies of its meshes",
-                )
+                many = f"the scene of {self.name} has over {MOST_CORNERS} vertices and corners of faces"
+                raise InputError(many, "export it with fewer copies of its meshes")
             own = self._placed(node, primitive)
-            triangles = self.triangles(primitive, len(own))
+            triangles = self.triangles(primitive)
             if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
                 raise damaged(self.name, f"a face refers to vertex {int(triangles.max())} of {len(own)}")
             faces.append(triangles + seen)
@@ -129,7 +127,6 @@ class Document:
             roots = scenes[self.json.get("scene", 0)].get("nodes", [])
         else:
             roots = sorted(set(range(len(self.nodes))) - {c for n in self.nodes for c in n.get("children", [])})
-        order: list[int] = []
         stack = [(node, np.eye(4)) for node in reversed(roots)]
         while stack:
             node, parent = stack.pop()
@@ -137,9 +134,8 @@ class Document:
                 raise damaged(self.name, f"node {node} has two parents")
             with np.errstate(all="ignore"):  # what is not finite is judged with the positions
                 self.world[node] = parent @ _local(self.nodes[node])
-            order.append(node)
             stack += [(child, self.world[node]) for child in reversed(self.nodes[node].get("children", []))]
-        return order
+        return list(self.world)
 
     def _placed(self, number: int, primitive: dict[str, Any]) -> Floats:
         """(V, 3) positions in the scene."""
@@ -170,14 +166,14 @@ class Document:
             numbers = self.accessor(attributes[f"JOINTS_{k}"], whole=True)
             yield numbers, self.accessor(attributes[f"WEIGHTS_{k}"])
 
-    def triangles(self, primitive: dict[str, Any], V: int) -> Int[Ints, "F 3"]:
+    def triangles(self, primitive: dict[str, Any]) -> Int[Ints, "F 3"]:
         mode = primitive.get("mode", _TRIANGLES)
         if mode == _POINTS:
             return NO_FACES
         if "indices" in primitive:
             corners = self.accessor(primitive["indices"], whole=True).astype(np.int64).ravel()
         else:
-            corners = np.arange(V)
+            corners = np.arange(self.count(primitive["attributes"]["POSITION"]))
         if mode == _TRIANGLES:
             return corners[: len(corners) // 3 * 3].reshape(-1, 3)
         if len(corners) < 3:

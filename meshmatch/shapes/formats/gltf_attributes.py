@@ -50,7 +50,7 @@ def _coordinates(document: Document) -> Floats | None:
     parts = [np.empty((0, 3, 2))]
     for _, primitive in document.primitives():
         attributes = primitive["attributes"]
-        faces = document.triangles(primitive, document.count(attributes["POSITION"]))
+        faces = document.triangles(primitive)
         if len(faces) and "TEXCOORD_0" not in attributes:
             return None
         if len(faces):
@@ -72,7 +72,7 @@ class _Look:
         for _, primitive in self.document.primitives():
             counts.append(self.document.count(primitive["attributes"]["POSITION"]))
             colors.append(self.document.colors(primitive))
-            faces = self.document.triangles(primitive, counts[-1])
+            faces = self.document.triangles(primitive)
             uv = self._coordinates(primitive) if len(faces) else None
             key = primitive.get("material", -1), uv is not None
             if key not in self.materials:

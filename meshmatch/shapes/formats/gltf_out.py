@@ -19,55 +19,25 @@ from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
 
+# Coincident vertices whose normals are further than this cosine (32 degrees) from their mean are an edge of the shape,
+# not a seam; a cube stays one. Set by hand.
+_SHARP = 0.85
 _POINTS, _TRIANGLES = 0, 4
 _FLOAT, _UNSIGNED = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
 _LINEAR, _LINEAR_MIPS = 9729, 9987
-# Coincident vertices whose normals are further than this cosine (32 degrees) from their mean are an edge of the shape,
-# not a seam; a cube stays one. Set by hand.
-_SHARP = 0.85
-_WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
-
-
-class _Buffer:
-    """Arrays and images one after the other, each at a multiple of four bytes, and what describes them."""
-
-    def __init__(self) -> None:
-        self.parts: list[bytes] = []
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
-        self.at = 0
-
-    def view(self, data: bytes, **rest: Any) -> int:
-        """The number of a new view of `data`."""
-        self.views.append({"buffer": 0, "byteOffset": self.at, "byteLength": len(data), **rest})
-        self.parts.append(data + b"\0" * (-len(data) % 4))
-        self.at += len(self.parts[-1])
-        return len(self.views) - 1
-
-    def array(self, values: NDArray[Any], kind: str, target: int = _VERTICES, box: bool = False) -> int:
-        """The number of a new accessor of (N, width) floats, or of (N,) whole numbers; positions need their box."""
-        component = _UNSIGNED if values.dtype.kind == "u" else _FLOAT
-        entry: dict[str, Any] = {"componentType": component, "type": kind, "count": len(values)}
-        if box:
-            entry |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
-        self.accessors.append({"bufferView": self.view(values.tobytes(), target=target), **entry})
-        return len(self.accessors) - 1
+_WRAPS = {"repeat": 10497, "clamp": 33071}
+_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
 def write(path: Path, shape: Shape) -> None:
     """A mesh or a cloud; 32-bit floats, 32-bit indices, linear vertex colours."""
-    buffer = _Buffer()
-    attributes = {"POSITION": buffer.array(shape.verts.astype("<f4"), "VEC3", box=True)}
+    attributes = {"POSITION": shape.verts}
     if not shape.is_cloud:
-        attributes["NORMAL"] = buffer.array(smooth_normals(shape.verts, shape.faces).astype("<f4"), "VEC3")
+        attributes["NORMAL"] = smooth_normals(shape.verts, shape.faces)
     if shape.colors is not None:
-        light = np.concatenate([to_linear(shape.colors[:, :3]), shape.colors[:, 3:]], axis=1)
-        attributes["COLOR_0"] = buffer.array(light.astype("<f4"), "VEC4")
-    primitive: dict[str, Any] = {"attributes": attributes, "mode": _POINTS if shape.is_cloud else _TRIANGLES}
-    if not shape.is_cloud:
-        primitive["indices"] = buffer.array(shape.faces.astype("<u4").reshape(-1), "SCALAR", _INDICES)
-    _write(path, shape.name, primitive, buffer, {})
+        attributes["COLOR_0"] = np.concatenate([to_linear(shape.colors[:, :3]), shape.colors[:, 3:]], axis=1)
+    _write(path, shape.name, attributes, shape.faces)
 
 
 def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
@@ -76,18 +46,7 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
     The material is plain paint (metallic 0, roughness 1), seen from both sides; the sampler asks for mip levels.
     """
     vertex, uv, faces = split_at_seams(mesh)
-    buffer = _Buffer()
-    primitive = {
-        "attributes": {
-            "POSITION": buffer.array(mesh.verts[vertex].astype("<f4"), "VEC3", box=True),
-            "NORMAL": buffer.array(smooth_normals(mesh.verts, mesh.faces)[vertex].astype("<f4"), "VEC3"),
-            "TEXCOORD_0": buffer.array(uv.astype("<f4"), "VEC2"),
-        },
-        "indices": buffer.array(faces.astype("<u4").reshape(-1), "SCALAR", _INDICES),
-        "material": 0,
-        "mode": _TRIANGLES,
-    }
-    image = buffer.view(png)
+    normals = smooth_normals(mesh.verts, mesh.faces)
     material: dict[str, Any] = {
         "name": name,
         "doubleSided": True,
@@ -101,10 +60,58 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
     look = {
         "materials": [material],
         "textures": [{"sampler": 0, "source": 0}],
-        "images": [{"bufferView": image, "mimeType": "image/png", "name": name}],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPS, **wrap}],
     }
-    _write(path, name, primitive, buffer, look)
+    attributes = {"POSITION": mesh.verts[vertex], "NORMAL": normals[vertex], "TEXCOORD_0": uv}
+    _write(path, name, attributes, faces, look, png)
+
+
+def _write(
+    path: Path,
+    name: str,
+    attributes: dict[str, Floats],
+    faces: Ints,
+    look: dict[str, Any] | None = None,
+    png: bytes = b"",
+) -> None:
+    """Arrays and an image one after the other, each at a multiple of four bytes, behind what describes them."""
+    arrays: list[NDArray[Any]] = [values.astype("<f4") for values in attributes.values()]
+    primitive: dict[str, Any] = {"attributes": {key: k for k, key in enumerate(attributes)}, "mode": _POINTS}
+    if len(faces):
+        primitive |= {"mode": _TRIANGLES, "indices": len(arrays)}
+        arrays.append(faces.astype("<u4").reshape(-1, 1))
+    chunks = [*(values.tobytes() for values in arrays), *([png] if png else [])]
+    padded = [chunk + b"\0" * (-len(chunk) % 4) for chunk in chunks]
+    starts = np.cumsum([0, *map(len, padded)]).tolist()
+    views: list[dict[str, Any]] = [
+        {"buffer": 0, "byteOffset": start, "byteLength": len(chunk)}
+        for chunk, start in zip(chunks, starts, strict=False)
+    ]
+    accessors: list[dict[str, Any]] = []
+    for k, values in enumerate(arrays):
+        whole = values.dtype.kind == "u"
+        views[k]["target"] = _INDICES if whole else _VERTICES
+        kinds = {"componentType": _UNSIGNED if whole else _FLOAT, "type": _TYPES[values.shape[1]]}
+        accessors.append({"bufferView": k, **kinds, "count": len(values)})
+    accessors[0] |= {"min": arrays[0].min(0).tolist(), "max": arrays[0].max(0).tolist()}  # positions need their box
+    document = {
+        "asset": {"version": "2.0", "generator": "meshmatch"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": name}],
+        "meshes": [{"primitives": [primitive], "name": name}],
+        **(look or {}),
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    if png:
+        primitive["material"] = 0
+        document["images"] = [{"bufferView": len(arrays), "mimeType": "image/png", "name": name}]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = b"glTF" + np.array([2, 28 + len(text) + starts[-1], len(text)], "<u4").tobytes() + b"JSON"
+    path.write_bytes(b"".join([head, text, np.array([starts[-1]], "<u4").tobytes(), b"BIN\0", *padded]))
 
 
 def smooth_normals(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Float[Floats, "V 3"]:
@@ -139,21 +146,3 @@ def split_at_seams(mesh: Textured) -> tuple[Int[Ints, " N"], Float[Floats, "N 2"
     uv = np.zeros((V + int(copies.sum()), 2), np.float64)
     uv[new] = pairs
     return np.concatenate([np.arange(V), corner[order][copies]]), uv, new.reshape(-1, 3)
-
-
-def _write(path: Path, name: str, primitive: dict[str, Any], buffer: _Buffer, rest: dict[str, Any]) -> None:
-    document = {
-        "asset": {"version": "2.0", "generator": "meshmatch"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": name}],
-        "meshes": [{"primitives": [primitive], "name": name}],
-        **rest,
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
-        "buffers": [{"byteLength": buffer.at}],
-    }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    head = b"glTF" + np.array([2, 28 + len(text) + buffer.at, len(text)], "<u4").tobytes() + b"JSON"
-    path.write_bytes(b"".join([head, text, np.array([buffer.at], "<u4").tobytes(), b"BIN\0", *buffer.parts]))

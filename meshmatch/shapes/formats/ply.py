@@ -199,10 +199,7 @@ class _Body:
         """By property: its numbers, or, of lists, all their items and the size of each."""
         kinds = [self._dtype(p.count_kind or p.kind) for p in element.properties]
         self._check(element, self.at + element.count * sum(kind.itemsize for kind in kinds))
-        if element.count == 0:
-            nothing = np.empty(0, np.int64)
-            return {p.name: (nothing, nothing) if p.count_kind else nothing for p in element.properties}
-        table = self._equal_rows(element)
+        table = self._equal_rows(element) if element.count else None
         return table if table is not None else self._walk(element)
 
     def _check(self, element: _Element, end: int) -> None:
