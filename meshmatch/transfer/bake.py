@@ -21,7 +21,7 @@ from meshmatch.shapes.appearance import Alpha, Appearance, Pixels
 from meshmatch.shapes.colors import bytes_of
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.surface_walk import SurfaceWalker, walker_of
+from meshmatch.transfer.surface_walk import PointWalker, SurfaceWalker
 from meshmatch.transfer.texel_colors import MaterialSampler, TexelLocator, images_of
 from meshmatch.transfer.texels import beside_another, faces_on, fill, grown
 from meshmatch.transfer.unwrap import Atlas
@@ -134,7 +134,7 @@ def colors_of_vertices(source: Shape, look: Appearance, target: Shape, back: Ver
 
 def _arranged(source: Shape, look: Appearance) -> tuple[SurfaceWalker, MaterialSampler]:
     """A source and its look, ready to be looked up; each point of a cloud is a face."""
-    walker = walker_of(source)
+    walker = PointWalker(source) if source.is_cloud else SurfaceWalker(source)
     if source.is_cloud:
         look = Appearance(look.materials, np.zeros(source.V, np.int64), np.zeros((source.V, 3, 2)), look.colors)
     return walker, MaterialSampler(look, walker)

@@ -37,16 +37,12 @@ class SurfaceWalker:
         self._flat = (first == 0).all(axis=1) & (second == 0).all(axis=1)
         self._table = list(np.concatenate([a, first, second], axis=1).T.astype(np.float32, order="C"))
         self._opposite = list(np.ascontiguousarray(self.opposite.T))
-        self._around = np.full(shape.V, -1, np.int64)
-        self._around[shape.faces[::-1].ravel()] = np.repeat(np.arange(shape.F - 1, -1, -1), 3)
+        self.face_of_vertex = np.full(shape.V, -1, np.int64)  # a face at each vertex; -1 where there is none
+        self.face_of_vertex[shape.faces[::-1].ravel()] = np.repeat(np.arange(shape.F - 1, -1, -1), 3)
         self._broken = np.zeros(shape.F, bool)
         if shape.invalid is not None:
             self._broken |= shape.invalid[shape.faces].any(axis=1)
         self._tree: cKDTree | None = None
-
-    def face_of_vertex(self, vertex: Ints) -> Ints:
-        """A face at each vertex; -1 where there is none."""
-        return self._around[vertex]
 
     def places(self, face: NDArray[np.integer], weights: NDArray[np.floating]) -> Floats:
         """(N, 3) points of faces (N,) by weights (N, 3)."""
@@ -139,11 +135,8 @@ class PointWalker(SurfaceWalker):
         self.unit = length_of(shape)
         self.verts = (shape.verts - self.center) / self.unit
         self.areas = shape.vertex_areas / self.unit**2
+        self.face_of_vertex = np.arange(shape.V)
         self._valid, self._points = valid, cKDTree(self.verts[valid])
-
-    def face_of_vertex(self, vertex: Ints) -> Ints:
-        """The face of a point has its number."""
-        return vertex
 
     def closest(self, points: Floats32, face: Ints32) -> tuple[Ints32, Floats32, Floats32]:
         """The nearest points, wherever the search began; see `SurfaceWalker.closest`."""
@@ -151,11 +144,6 @@ class PointWalker(SurfaceWalker):
         away = self.verts[self.faces[place]] - points.T[:, None]
         near = 1.0 / np.maximum(np.einsum("nkd,nkd->kn", away, away), 1e-18)
         return place, (near / near.sum(axis=0)).astype(np.float32), np.zeros(len(place), np.float32)
-
-
-def walker_of(shape: Shape) -> SurfaceWalker:
-    """The walker of a mesh or a cloud."""
-    return PointWalker(shape) if shape.is_cloud else SurfaceWalker(shape)
 
 
 def weighted(a: list[Floats32] | Floats32, b: list[Floats32]) -> Floats32:

@@ -286,7 +286,7 @@ def images_of(walker: SurfaceWalker, back: VertexMap) -> tuple[Floats, Ints]:
     image = walker.verts[back.index]
     inside = np.flatnonzero(back.face >= 0)
     image[inside] = walker.places(back.face[inside], back.barycentric[inside])
-    return image, np.where(back.face >= 0, back.face, walker.face_of_vertex(back.index))
+    return image, np.where(back.face >= 0, back.face, walker.face_of_vertex[back.index])
 
 
 def _inverse(corners: Floats) -> Floats:

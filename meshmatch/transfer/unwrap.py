@@ -58,8 +58,7 @@ def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Ke
         raise InputError(f"{name} has no triangle with an area", "is it a mesh?")
     words, note = f"{name} has no texture coordinates to keep", ""
     if own is not None and keep != "new":
-        within, problem = _within(own, shape)
-        problem = problem or _problem(within, shape, size)
+        within, problem = _checked(own, shape, size)
         if not problem:
             return Atlas(within, True)
         words = f"{name}: its own texture coordinates cannot be used: {problem}"
@@ -69,9 +68,9 @@ def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Ke
     return Atlas(unwrapped(shape, size, padding), False, note)
 
 
-def _within(uv: Floats, shape: Shape) -> tuple[Floats, str]:
+def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str]:
     """Coordinates brought into 0..1 by whole numbers, a triangle at a time, which changes nothing on a repeated
-    image; and what is wrong with them.
+    image; and why they are not an atlas, empty if they are.
     """
     real = shape.face_areas > 0
     if not np.isfinite(uv[real]).all():
@@ -83,23 +82,19 @@ def _within(uv: Floats, shape: Shape) -> tuple[Floats, str]:
     beyond = int((out.max(axis=(1, 2)) > 1.0 + 1e-5).sum())
     if beyond:
         return out, f"{beyond} faces reach out of range, over the edge of the image"
-    return np.clip(out, 0.0, 1.0), ""
-
-
-def _problem(uv: Floats, shape: Shape, size: int) -> str:
-    """Why coordinates within 0..1 are not an atlas; empty if they are."""
+    uv = np.clip(out, 0.0, 1.0)
     room = _flat_areas(uv)
     if room.sum() < _MIN_USED:
-        return f"they use only {100 * room.sum():.1f} % of the image"
+        return uv, f"they use only {100 * room.sum():.1f} % of the image"
     if room.sum() > 1.0 + _OVERLAP or rows_of(uv * size).sum() > MOST_ROWS:
-        return f"they overlap ({room.sum():.1f} times the image)"
+        return uv, f"they overlap ({room.sum():.1f} times the image)"
     deserved = shape.face_areas / shape.face_areas.sum()
     starved = float(deserved[room < _STARVED * deserved].sum())
     if starved > _MAX_STARVED:
-        return f"{100 * starved:.0f} % of the surface has no room in the image"
+        return uv, f"{100 * starved:.0f} % of the surface has no room in the image"
     found, twice = faces_on(uv * size, size)
     share = twice / max(int((found >= 0).sum()), 1)
-    return f"they overlap on {100 * share:.1f} % of their texels" if share > _OVERLAP else ""
+    return uv, f"they overlap on {100 * share:.1f} % of their texels" if share > _OVERLAP else ""
 
 
 def _flat_areas(corners: Floats) -> Floats:

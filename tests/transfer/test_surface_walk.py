@@ -6,7 +6,7 @@ import numpy as np
 
 from meshmatch.geometry.triangles import closest_on_triangles
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.surface_walk import PointWalker, SurfaceWalker, duals, walker_of
+from meshmatch.transfer.surface_walk import PointWalker, SurfaceWalker, duals
 
 
 def walked(walker: SurfaceWalker, points: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -121,7 +121,7 @@ def test_a_face_without_area_lets_points_pass() -> None:
 
 def test_a_face_of_each_vertex(cube: Shape) -> None:
     lonely = Shape(np.concatenate([cube.verts, [[5, 5, 5]]]), cube.faces)
-    face = SurfaceWalker(lonely).face_of_vertex(np.arange(9))
+    face = SurfaceWalker(lonely).face_of_vertex
     assert face[8] == -1
     assert all(vertex in cube.faces[face[vertex]] for vertex in range(8))
 
@@ -129,8 +129,7 @@ def test_a_face_of_each_vertex(cube: Shape) -> None:
 def test_a_cloud_gives_the_nearest_points() -> None:
     rng = np.random.default_rng(3)
     shape = Shape(rng.normal(size=(50, 3)), np.empty((0, 3), int))
-    walker = walker_of(shape)
-    assert isinstance(walker, PointWalker)
+    walker = PointWalker(shape)
     face, places, _ = walked(walker, walker.verts, np.full(50, -1))
     np.testing.assert_array_equal(face, np.arange(50))
     np.testing.assert_allclose(places, walker.verts, atol=1e-5)
