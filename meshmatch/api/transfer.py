@@ -77,7 +77,7 @@ def transfer_values(
         else:
             found = pull_values(maps.backward, numbers)
         confidence = _confidence(maps.backward)
-        found, low = replace_low_values(found, confidence, maps.target, rule.minimum, blank, rule.fill)
+        found, low = replace_low_values(found, confidence < rule.minimum, maps.target, blank, rule.fill)
     return Transferred(found, confidence, low, maps)
 
 
@@ -127,7 +127,7 @@ def transfer_colors(
             assert isinstance(colors, Appearance)
             found = colors_of_vertices(maps.source, colors, maps.target, maps.backward)
         confidence = _confidence(maps.backward)
-        found, low = replace_low_values(found, confidence, maps.target, rule.minimum, blank, rule.fill)
+        found, low = replace_low_values(found, confidence < rule.minimum, maps.target, blank, rule.fill)
     return Transferred(seen(found), confidence, low, maps)
 
 
@@ -184,9 +184,8 @@ def transfer_labels(
             confidence = confidence[target.faces].mean(axis=1)
         else:
             found = pull_labels(back, source, given.codes, of_face)
-        found, low = replace_low_labels(
-            found, confidence, target, rule.minimum, blank is not None, rule.fill, kind == "faces"
-        )
+        doubted = confidence < rule.minimum
+        found, low = replace_low_labels(found, doubted, target, blank is not None, rule.fill, kind == "faces")
     return Transferred(named(found, given, kind, blank), confidence, low, maps)
 
 
@@ -234,7 +233,7 @@ def transfer_weights(
     with thread_limit(1):
         confidence = _confidence(maps.backward)
         found = pull_weights(maps.backward, given.matrix, influences)
-        found, low = replace_low_weights(found, confidence, maps.target, rule.minimum, rule.fill, influences)
+        found, low = replace_low_weights(found, confidence < rule.minimum, maps.target, rule.fill, influences)
     return Transferred(SkinWeights(found, given.names), confidence, low, maps)
 
 

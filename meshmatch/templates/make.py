@@ -226,7 +226,7 @@ def _geodesic_allowed(shape: Shape, touched: list, own: Int[Ints, " N"], share: 
 
 def edge_graph(shape: Shape) -> coo_matrix:
     """Symmetric sparse graph (V, V) of edge lengths."""
-    edges = np.unique(np.sort(shape.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    edges = shape.edges.vertices
     length = np.maximum(np.linalg.norm(shape.verts[edges[:, 0]] - shape.verts[edges[:, 1]], axis=1), 1e-12)
     places = edges.T.reshape(-1), edges[:, ::-1].T.reshape(-1)
     return coo_matrix((np.tile(length, 2), places), (shape.V, shape.V)).tocsr()

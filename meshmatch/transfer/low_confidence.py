@@ -1,6 +1,6 @@
 """What to do where a map has little confidence: leave blank, or fill in from the neighbours.
 
-Entries without a value count as of low confidence: the source had none there.
+`low` (N,) are entries of low confidence. Those without a value count as such too: the source had none there.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Bools, Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Floats, Int, Ints
 from meshmatch.geometry.topology import same_rows
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import NO_LABEL, largest_weights
@@ -114,16 +114,11 @@ def diffuse(graph: csr_array, known: Bools, values: Floats) -> tuple[Floats, Boo
 
 
 def replace_low_values(
-    values: Floats,
-    confidence: Float[Floats, " V"],
-    target: Shape,
-    min_confidence: float,
-    blank: Floats | float | None = None,
-    fill: bool = False,
+    values: Floats, low: Bool[Bools, " V"], target: Shape, blank: Floats | float | None = None, fill: bool = False
 ) -> tuple[Floats, LowConfidence]:
     """Values (V,) or (V, D) of the target; those of low confidence, or nan, are left blank, filled in, or kept."""
     table = values if values.ndim == 2 else values[:, None]
-    low = (confidence < min_confidence) | ~np.isfinite(table).all(axis=1)
+    low = low | ~np.isfinite(table).all(axis=1)
     N, count = len(low), int(low.sum())
     if fill:
         out, filled = diffuse(vertex_graph(target), ~low, table)
@@ -136,15 +131,10 @@ def replace_low_values(
 
 
 def replace_low_weights(
-    weights: csr_array,
-    confidence: Float[Floats, " V"],
-    target: Shape,
-    min_confidence: float,
-    fill: bool,
-    max_joints: int,
+    weights: csr_array, low: Bool[Bools, " V"], target: Shape, fill: bool, max_joints: int
 ) -> tuple[csr_array, LowConfidence]:
     """Skin weights (V, J) of the target; those of low confidence are filled in, or kept. Rows still sum to 1."""
-    low = (confidence < min_confidence) | (np.diff(weights.indptr) == 0)
+    low = low | (np.diff(weights.indptr) == 0)
     N, count = len(low), int(low.sum())
     if not fill or not count:
         return weights, LowConfidence(N, count)
@@ -160,18 +150,12 @@ def replace_low_weights(
 
 
 def replace_low_labels(
-    labels: Int[Ints, " N"],
-    confidence: Float[Floats, " N"],
-    target: Shape,
-    min_confidence: float,
-    blank: bool,
-    fill: bool,
-    on_faces: bool,
+    labels: Int[Ints, " N"], low: Bool[Bools, " N"], target: Shape, blank: bool, fill: bool, on_faces: bool
 ) -> tuple[Int[Ints, " N"], LowConfidence]:
     """Labels of the target's vertices or faces; those of low confidence are left blank (-1), taken from the nearest
     other vertex or face along the surface, or kept.
     """
-    low = (confidence < min_confidence) | (labels < 0)
+    low = low | (labels < 0)
     out, filled = labels.copy(), 0
     if fill:
         nearest = nearest_known(face_graph(target) if on_faces else vertex_graph(target), ~low)

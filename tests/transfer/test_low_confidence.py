@@ -86,7 +86,7 @@ def test_filling_is_smooth_and_keeps_what_is_sure() -> None:
     truth = SHEET.verts[:, 0]
     confidence = np.where((truth > 2) & (truth < 8), 0.1, 0.9)
     spoiled = np.where(confidence < 0.5, -50.0, truth)
-    out, doubt = replace_low_values(spoiled, confidence, SHEET, 0.5, fill=True)
+    out, doubt = replace_low_values(spoiled, confidence < 0.5, SHEET, fill=True)
     assert doubt == LowConfidence(SHEET.V, 25, 0, 25)
     assert np.array_equal(out[confidence > 0.5], truth[confidence > 0.5])
     assert np.abs(out - truth).max() < 0.8
@@ -97,14 +97,14 @@ def test_filling_is_smooth_and_keeps_what_is_sure() -> None:
 @pytest.mark.parametrize(("blank", "shown"), [(np.nan, np.nan), (-7.0, -7.0)])
 def test_blank_values(blank: float, shown: float) -> None:
     confidence = np.where(np.arange(SHEET.V) < 4, 0.0, 1.0)
-    out, doubt = replace_low_values(SHEET.verts, confidence, SHEET, 0.3, blank=blank)
+    out, doubt = replace_low_values(SHEET.verts, confidence < 0.3, SHEET, blank=blank)
     assert doubt == LowConfidence(SHEET.V, 4, 4, 0)
     assert np.array_equal(out[:4], np.full((4, 3), shown), equal_nan=True)
     assert np.array_equal(out[4:], SHEET.verts[4:])
 
 
 def test_values_are_kept_if_nothing_is_asked_for() -> None:
-    out, doubt = replace_low_values(SHEET.verts, np.zeros(SHEET.V), SHEET, 0.3)
+    out, doubt = replace_low_values(SHEET.verts, np.zeros(SHEET.V) < 0.3, SHEET)
     assert np.array_equal(out, SHEET.verts)
     assert doubt == LowConfidence(SHEET.V, SHEET.V)
 
@@ -112,7 +112,7 @@ def test_values_are_kept_if_nothing_is_asked_for() -> None:
 def test_values_that_the_source_does_not_have_are_in_doubt() -> None:
     values = SHEET.verts[:, 0].copy()
     values[20] = np.nan
-    out, doubt = replace_low_values(values, np.ones(SHEET.V), SHEET, 0.3, fill=True)
+    out, doubt = replace_low_values(values, np.ones(SHEET.V) < 0.3, SHEET, fill=True)
     assert doubt.filled == 1
     assert np.isfinite(out).all()
 
@@ -121,7 +121,7 @@ def test_labels_are_filled_by_the_nearest_never_by_a_mean() -> None:
     labels = np.where(SHEET.verts[:, 0] < 5, 0, 6)
     confidence = np.where(np.abs(SHEET.verts[:, 0] - 5) < 2, 0.0, 1.0)
     spoiled = np.where(confidence > 0, labels, 3)
-    out, doubt = replace_low_labels(spoiled, confidence, SHEET, 0.3, blank=False, fill=True, on_faces=False)
+    out, doubt = replace_low_labels(spoiled, confidence < 0.3, SHEET, blank=False, fill=True, on_faces=False)
     assert set(out) == {0, 6}
     sure = SHEET.verts[:, 0] != 5
     assert np.array_equal(out[sure], labels[sure])
@@ -133,17 +133,17 @@ def test_labels_of_faces_are_filled_across_edges() -> None:
     labels = np.where(middle[:, 1] < 2, 0, 1)
     confidence = np.where(np.abs(middle[:, 0] - 5) < 0.5, 0.0, 1.0)
     spoiled = np.where(confidence > 0, labels, 9)
-    out, _ = replace_low_labels(spoiled, confidence, SHEET, 0.3, blank=False, fill=True, on_faces=True)
+    out, _ = replace_low_labels(spoiled, confidence < 0.3, SHEET, blank=False, fill=True, on_faces=True)
     assert np.array_equal(out, labels)
 
 
 def test_blank_labels_and_kept_ones() -> None:
     labels = np.array([0, 1, -1, 0] + [0] * (SHEET.V - 4))
     confidence = np.array([0.0, 1, 1, 1] + [1] * (SHEET.V - 4))
-    out, doubt = replace_low_labels(labels, confidence, SHEET, 0.3, blank=True, fill=False, on_faces=False)
+    out, doubt = replace_low_labels(labels, confidence < 0.3, SHEET, blank=True, fill=False, on_faces=False)
     assert out[:4].tolist() == [-1, 1, -1, 0]
     assert doubt == LowConfidence(SHEET.V, 2, 2, 0)
-    out, doubt = replace_low_labels(labels, confidence, SHEET, 0.3, blank=False, fill=False, on_faces=False)
+    out, doubt = replace_low_labels(labels, confidence < 0.3, SHEET, blank=False, fill=False, on_faces=False)
     assert np.array_equal(out, labels)
     assert doubt == LowConfidence(SHEET.V, 2, 1, 0)
 
@@ -152,13 +152,13 @@ def test_weights_are_filled_and_still_sum_to_one() -> None:
     rng = np.random.default_rng(0)
     weights = largest_weights(csr_array(rng.random((SHEET.V, 6))), 4)
     confidence = np.where(SHEET.verts[:, 0] > 6, 0.0, 1.0)
-    out, doubt = replace_low_weights(weights, confidence, SHEET, 0.3, True, 3)
+    out, doubt = replace_low_weights(weights, confidence < 0.3, SHEET, True, 3)
     assert doubt.filled == doubt.low == 20
     assert np.diff(out.indptr).max() <= 4
     low = confidence == 0
     assert np.diff(out.indptr)[low].max() <= 3
     assert np.allclose(np.asarray(out.sum(axis=1)), 1)
-    same = replace_low_weights(weights, confidence, SHEET, 0.3, False, 3)
+    same = replace_low_weights(weights, confidence < 0.3, SHEET, False, 3)
     assert same[0] is weights
     assert same[1] == LowConfidence(SHEET.V, 20)
 
@@ -167,7 +167,7 @@ def test_vertices_without_weights_get_their_neighbours() -> None:
     dense = np.zeros((SHEET.V, 2))
     dense[:, 1] = 1
     dense[13] = 0
-    out, doubt = replace_low_weights(csr_array(dense), np.ones(SHEET.V), SHEET, 0.3, True, 4)
+    out, doubt = replace_low_weights(csr_array(dense), np.ones(SHEET.V) < 0.3, SHEET, True, 4)
     assert doubt == LowConfidence(SHEET.V, 1, 0, 1)
     assert np.allclose(out.toarray(), [[0, 1]] * SHEET.V)
 
