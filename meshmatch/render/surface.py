@@ -75,7 +75,7 @@ class TexturePaint:
                 texels[number] = material.image.shape[0] * material.image.shape[1]
                 key = (id(material.image), material.wrap, material.nearest, material.alpha == "opaque")
                 if key not in shared:
-                    shared[key] = Pyramid.of(material)
+                    shared[key] = Pyramid(material)
                 self._pyramids[number] = shared[key]
         # Texels per unit of length on each face: a pixel averages as many as it is wide.
         a, b = look.uv[:, 1] - look.uv[:, 0], look.uv[:, 2] - look.uv[:, 0]

@@ -237,13 +237,16 @@ def _read_json(path: Path) -> list[_Record]:
     found = table_files.read_json(path)
     if isinstance(found, dict) and isinstance(found.get("landmarks"), list | dict):
         found = found["landmarks"]
-    if not isinstance(found, list | dict):
-        raise InputError("it holds no list of landmarks")
-    named = [({"name": name}, found[name]) for name in found] if isinstance(found, dict) else [({}, it) for it in found]
-    return [
-        name | (it if isinstance(it, dict) else {"vertex" if isinstance(it, int) else "position": it})
-        for name, it in named
-    ]
+    if isinstance(found, dict):
+        return [{"name": name, **_record(value)} for name, value in found.items()]
+    if isinstance(found, list):
+        return [_record(value) for value in found]
+    raise InputError("it holds no list of landmarks")
+
+
+def _record(value: Any) -> _Record:
+    """A vertex, a position or a description."""
+    return value if isinstance(value, dict) else {"vertex" if isinstance(value, int) else "position": value}
 
 
 def _named_place(record: _Record, number: int) -> tuple[str, str, Any]:

@@ -56,7 +56,7 @@ class MaterialSampler:
             if material.image is not None:
                 if key not in made:
                     alike = np.array([other == key for other in keys])
-                    made[key] = Pyramid.of(material, known_texels(material, look.uv[alike[look.material]]))
+                    made[key] = Pyramid(material, known_texels(material, look.uv[alike[look.material]]))
                 self._pyramids[number] = made[key]
 
     def footprint(self, face: NDArray[np.integer], reach: Floats32) -> Floats32:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,22 +156,13 @@ def _sum_of_fours(values: Floats32) -> Floats32:
     return (values[0::2, 0::2] + values[1::2, 0::2]) + (values[0::2, 1::2] + values[1::2, 1::2])
 
 
-@dataclass(frozen=True, eq=False)
 class Pyramid:
-    """An image with its smaller levels, ready to be looked up."""
+    """The image of a material with its smaller levels, ready to be looked up.
 
-    texels: NDArray[np.uint32]  # all levels one after the other: red, green, blue and alpha in one number
-    starts: Ints  # of each level
-    widths: Ints
-    heights: Ints
-    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
-    nearest: bool = False  # True: the largest level is not blended
+    What is not `known` (H, W), or fully transparent, is made up from its surroundings.
+    """
 
-    @classmethod
-    def of(cls, material: Material, known: Bools | None = None) -> Pyramid:
-        """The pyramid of a material's image; what is not `known` (H, W), or fully transparent, is made up from
-        its surroundings.
-        """
+    def __init__(self, material: Material, known: Bools | None = None) -> None:
         assert material.image is not None
         pixels = material.image.copy()
         weight = np.ones(pixels.shape[:2], np.float32) if known is None else known.astype(np.float32)
@@ -188,10 +178,11 @@ class Pyramid:
             for level in levels[1:]:
                 means, share = _halved(means, share)
                 level[..., 3] = np.round(means[..., 0])
-        heights, widths = np.array([level.shape[:2] for level in levels]).T
-        starts = np.cumsum(heights * widths) - heights * widths
-        flat = np.concatenate([np.ascontiguousarray(level).view(np.uint32).ravel() for level in levels])
-        return cls(flat, starts, widths, heights, material.wrap, material.nearest)
+        self.heights, self.widths = np.array([level.shape[:2] for level in levels]).T
+        # All levels one after the other: red, green, blue and alpha in one number.
+        self.texels = np.concatenate([np.ascontiguousarray(level).view(np.uint32).ravel() for level in levels])
+        self.starts = np.cumsum(self.heights * self.widths) - self.heights * self.widths
+        self.wrap, self.nearest = material.wrap, material.nearest
 
     def look(self, u: Floats32, v: Floats32, footprint: Floats32) -> Floats32:
         """Linear colours and alpha (4, N) at (N,), (N,), as wide as `footprint` (N,) texels of the largest level."""

@@ -120,7 +120,7 @@ def test_trimesh_sees_the_same_colours(tmp_path: Path, ball: tuple[Textured, np.
     ours = np.einsum("nk,nkd->nd", weights, mesh.uv[own])
     np.testing.assert_allclose(ours, uv * (1, -1) + (0, 1), atol=1e-4)
     look = load_appearance(path, load_shape(path))
-    pyramid = Pyramid.of(look.materials[0])
+    pyramid = Pyramid(look.materials[0])
     # it mixes bytes where we mix light: compare at the centers of texels, where there is nothing to mix
     middle = (np.floor(ours * 16) + 0.5) / 16
     light = pyramid.look(*middle.T.astype(np.float32), np.zeros(500, np.float32))

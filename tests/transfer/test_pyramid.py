@@ -80,7 +80,7 @@ def test_texel_centres_give_their_texels() -> None:
     rng = np.random.default_rng(1)
     image = rng.integers(0, 256, (5, 7, 4), dtype=np.uint8)
     image[..., 3] = 255
-    pyramid = Pyramid.of(Material(image=image))
+    pyramid = Pyramid(Material(image=image))
     for y in range(5):
         for x in range(7):
             found = look(pyramid, (x + 0.5) / 7, (y + 0.5) / 5)
@@ -89,7 +89,7 @@ def test_texel_centres_give_their_texels() -> None:
 
 def test_halfway_between_two_texels_is_half_the_light_of_both() -> None:
     image = np.array([[[255, 0, 0, 255], [0, 0, 255, 255]]], np.uint8)
-    pyramid = Pyramid.of(Material(image=image, wrap=("clamp", "clamp")))
+    pyramid = Pyramid(Material(image=image, wrap=("clamp", "clamp")))
     half = float(to_srgb(0.5))
     np.testing.assert_allclose(look(pyramid, 0.5, 0.5), [half, 0, half, 1], atol=1e-4)
     np.testing.assert_allclose(look(pyramid, 0.0, 0.1), [1, 0, 0, 1], atol=1e-4)
@@ -107,9 +107,9 @@ def test_what_lies_outside_an_image(wrap: Wrap, u: float, want: str) -> None:
     image = np.array([[[255, 0, 0, 255], [0, 0, 255, 255]]], np.uint8)  # red on the left, blue on the right
     half = float(to_srgb(0.5))
     colors = {"left": [1, 0, 0, 1], "right": [0, 0, 1, 1], "both": [half, 0, half, 1]}
-    across = Pyramid.of(Material(image=image, wrap=(wrap, "clamp")))
+    across = Pyramid(Material(image=image, wrap=(wrap, "clamp")))
     np.testing.assert_allclose(look(across, u, 0.3), colors[want], atol=1e-4)
-    down = Pyramid.of(Material(image=image.swapaxes(0, 1), wrap=("clamp", wrap)))
+    down = Pyramid(Material(image=image.swapaxes(0, 1), wrap=("clamp", wrap)))
     np.testing.assert_allclose(look(down, 0.3, u), colors[want], atol=1e-4)
 
 
@@ -127,7 +127,7 @@ def test_a_wide_step_sees_the_mean() -> None:
     image = np.zeros((4, 4, 4), np.uint8)
     image[..., 3] = 255
     image[::2, :, :3] = 255  # stripes
-    pyramid = Pyramid.of(Material(image=image))
+    pyramid = Pyramid(Material(image=image))
     half = float(to_srgb(0.5))
     for footprint in (2.0, 3.0, 4.0, 1000.0):
         np.testing.assert_allclose(look(pyramid, 0.3, 0.1, footprint), [half, half, half, 1], atol=3e-3)
@@ -137,15 +137,15 @@ def test_a_wide_step_sees_the_mean() -> None:
 
 
 def test_squares_where_a_file_wants_squares() -> None:
-    sharp = Pyramid.of(Material(image=quarters(2), nearest=True))
+    sharp = Pyramid(Material(image=quarters(2), nearest=True))
     np.testing.assert_allclose(look(sharp, 0.49, 0.49), [1, 0, 0, 1], atol=1e-4)
     np.testing.assert_allclose(look(sharp, 0.51, 0.49), [0, 1, 0, 1], atol=1e-4)
 
 
 def test_alpha_counts_unless_the_material_is_opaque() -> None:
     image = np.array([[[255, 0, 0, 0], [0, 0, 255, 128]]], np.uint8)
-    assert look(Pyramid.of(Material(image=image)), 0.25, 0.5) == pytest.approx([1, 0, 0, 1], abs=1e-4)
-    seen = Pyramid.of(Material(image=image, alpha="blend"))
+    assert look(Pyramid(Material(image=image)), 0.25, 0.5) == pytest.approx([1, 0, 0, 1], abs=1e-4)
+    seen = Pyramid(Material(image=image, alpha="blend"))
     assert look(seen, 0.75, 0.5)[3] == pytest.approx(128 / 255)
     # nobody sees the red: it must not colour its surroundings
     np.testing.assert_allclose(look(seen, 0.25, 0.5), [0, 0, 1, 0], atol=1e-4)
@@ -156,6 +156,6 @@ def test_texels_off_the_surface_do_not_count() -> None:
     image = np.zeros((4, 4, 4), np.uint8)
     image[:2, :2] = (200, 150, 100, 255)
     known = image[..., 3] > 0
-    pyramid = Pyramid.of(Material(image=image), known)
+    pyramid = Pyramid(Material(image=image), known)
     for footprint in (0.0, 2.0, 16.0):
         np.testing.assert_allclose(look(pyramid, 0.5, 0.5, footprint)[:3], np.array([200, 150, 100]) / 255, atol=1e-4)
