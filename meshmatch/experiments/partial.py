@@ -22,7 +22,7 @@ from typer import Option
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench import OurMethod
-from meshmatch.experiments.scores import TruthDistances, area_under_curve, summary
+from meshmatch.experiments.scores import TruthDistances, area_under_curve, joined_errors, summary
 from meshmatch.experiments.sets import SET_NAMES, BenchSet, load_set
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import Partial
@@ -90,7 +90,7 @@ def measure(
         truth = TruthDistances(bench.shape(target), bench.landmarks(target), cache)
         errors.append(Errors(truth.errors([answers])[0][left]))
         confidence.append(found.confidence[at])
-    joined = Errors.joined(errors)
+    joined = joined_errors(errors)
     return {
         "set": bench.name,
         "part": kind,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -111,9 +111,14 @@ class TruthDistances:
         return results
 
 
+def joined_errors(several: Iterable[Errors]) -> Errors:
+    """All points of several maps together."""
+    return Errors(np.concatenate([errors.values for errors in several]))
+
+
 def summary(errors: Sequence[Errors]) -> dict[str, float]:
     """Errors of pairs in centimeters, unrounded: means and medians over points and over pairs, lost points, flips."""
-    joined, means = Errors.joined(list(errors)), [each.mean_cm for each in errors]
+    joined, means = joined_errors(errors), [each.mean_cm for each in errors]
     return {
         "mean_cm": joined.mean_cm,
         "median_cm": joined.median_cm,
@@ -158,7 +163,7 @@ class SetScores:
     @property
     def joined(self) -> Errors:
         """All points of all pairs."""
-        return Errors.joined(list(self.errors.values()))
+        return joined_errors(self.errors.values())
 
     def groups(self) -> list[SetScores]:
         """The same for each kind of pair, where a set has several."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,11 +65,6 @@ class Errors:
         ordered = np.sort(self.values.astype(np.float64))
         shares: Floats = np.searchsorted(ordered, np.asarray(thresholds), side="right") / len(ordered)
         return shares
-
-    @classmethod
-    def joined(cls, several: Sequence[Errors]) -> Errors:
-        """All points of several maps together."""
-        return cls(np.concatenate([errors.values for errors in several]))
 
 
 @dataclass(frozen=True)

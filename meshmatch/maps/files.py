@@ -39,12 +39,7 @@ _FORMAT = "meshmatch map 1"
 def save_map(path: str | Path, vertex_map: VertexMap) -> None:
     """Write a map in the format of the suffix, whole or not at all.
 
-    Raises
-    ------
-    OptionError
-        Unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`.
-    OutputError
-        The file cannot be written.
+    `OptionError`: unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`. `OutputError`: the file cannot be written.
     """
     write = _FORMATS[check_suffix(path)][0]
     with replace_on_success(path) as temporary:
@@ -61,13 +56,8 @@ def load_map(path: str | Path, source: ShapeLike | None = None, target: ShapeLik
 
     What the file does not contain is filled in from the shapes (names, counts, hashes) or stays unknown.
 
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, or holds no map; or the map was made for other shapes, or runs from
-        `target` to `source`.
-    OptionError
-        Unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`.
+    `InputError`: the file is missing or damaged, or holds no map; or the map was made for other shapes, or runs from
+    `target` to `source`. `OptionError`: unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`.
     """
     check_suffix(path)
     readers = dict.fromkeys(_FORMATS, _read)

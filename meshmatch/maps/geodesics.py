@@ -141,9 +141,7 @@ class GeodesicDistances:
         ends, end_column = np.unique(other, return_inverse=True)
         if len(ends) < len(starts):
             starts, column, other = ends, end_column, a[differ]
-        order = np.argsort(column, kind="stable")
-        bounds = np.searchsorted(column[order], np.arange(len(starts) + 1))
         for first, rows in self.chunks(starts):
-            mine = order[bounds[first] : bounds[first + len(rows)]]
+            mine = np.flatnonzero((column >= first) & (column < first + len(rows)))
             result[differ[mine]] = rows[column[mine] - first, other[mine]]
         return result

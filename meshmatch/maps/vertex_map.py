@@ -57,11 +57,8 @@ class VertexMap:
     target_faces
         The target's triangles, whose corners ``barycentric`` weights; not written to files.
 
-    Raises
-    ------
-    InputError
-        Arrays of the wrong shape or kind, an index outside the target, weights that do not sum to 1, or an
-        unknown verdict.
+    `InputError`: arrays of the wrong shape or kind, an index outside the target, weights that do not sum to 1, or an
+    unknown verdict.
     """
 
     source: str
@@ -114,11 +111,8 @@ class VertexMap:
         Vertex counts must agree, and hashes where the map has them: a map of another pose, or of a mesh that was
         edited since, is refused. A shape that is None is not checked.
 
-        Raises
-        ------
-        InputError
-            The map was made for another mesh, runs from target to source, or names a vertex or a face that the
-            target does not have. The message calls it `label`.
+        `InputError`: the map was made for another mesh, runs from target to source, or names a vertex or a face that
+        the target does not have. The message calls it `label`.
         """
         sides = [(side, shape) for side, shape in (("source", source), ("target", target)) if shape is not None]
         misfits = [self._misfit(side, shape) for side, shape in sides]
@@ -170,10 +164,8 @@ class VertexMap:
         `InputError` if `target` has other vertices or faces than the shape that this map leads to.
         """
         if self.target_vertices not in (UNKNOWN, target.V):
-            raise InputError(
-                f"the map leads to {self.target} with {self.target_vertices} vertices, "
-                f"but {target.name or 'the target'} has {target.V}"
-            )
+            led = f"the map leads to {self.target} with {self.target_vertices} vertices"
+            raise InputError(f"{led}, but {target.name or 'the target'} has {target.V}")
         check_range(self.index, target.V, f"the map {_way(self)}")
         check_faces(self.face, target.F, f"the map {_way(self)}")
         return interpolate(target.verts, corners_of(target.faces, self.face, self.index), self.barycentric)
@@ -203,10 +195,8 @@ class VertexMap:
         numbers = as_numbers(values, "values")
         matrix = self.sparse()
         if numbers.ndim not in (1, 2) or len(numbers) != matrix.shape[1]:
-            raise InputError(
-                f"the map {_way(self)} needs values (V,) or (V, D) of the {matrix.shape[1]} vertices of its target, "
-                f"not an array of {numbers.shape}"
-            )
+            needed = f"values (V,) or (V, D) of the {matrix.shape[1]} vertices of its target"
+            raise InputError(f"the map {_way(self)} needs {needed}, not an array of {numbers.shape}")
         return np.asarray(matrix @ numbers)
 
     def functional(self, basis_source: ArrayLike, basis_target: ArrayLike) -> Float[Floats, "K_source K_target"]:
@@ -222,10 +212,7 @@ class VertexMap:
         basis_target : (V_target, K_target)
             The same on the target.
 
-        Raises
-        ------
-        InputError
-            As `apply`; the source's functions do not have a row for each vertex; or a value is not finite.
+        `InputError`: as `apply`; the source's functions do not have a row for each vertex; or a value is not finite.
         """
         basis = as_numbers(basis_source, "a basis", finite=True)
         V = self.source_vertices

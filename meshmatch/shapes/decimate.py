@@ -35,12 +35,8 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
     quality : "fast" or "meshlab"
         meshlab (by pymeshlab) takes ten times as long, and makes well-shaped triangles where the surface is flat.
 
-    Raises
-    ------
-    InputError
-        The shape is a cloud.
-    OptionError
-        Unknown quality, fewer than 4 faces, or pymeshlab is not there or lacks its filters.
+    `InputError`: the shape is a cloud. `OptionError`: unknown quality, fewer than 4 faces, or pymeshlab is not there
+    or lacks its filters.
     """
     if quality not in ("fast", "meshlab"):
         raise OptionError(f"unknown decimation quality {quality!r}", "choose fast or meshlab")
@@ -93,14 +89,11 @@ def _by_pymeshlab(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints
     try:
         import pymeshlab
     except ModuleNotFoundError as error:
-        raise OptionError(
-            "this choice needs pymeshlab, which is not installed",
-            "pip install pymeshlab (it is under the GPL), or choose fast",
-        ) from error
+        hint = "pip install pymeshlab (it is under the GPL), or choose fast"
+        raise OptionError("this choice needs pymeshlab, which is not installed", hint) from error
     except ImportError as error:
-        raise OptionError(
-            f"pymeshlab cannot start ({str(error)[:100]})", "on Debian: apt-get install libgl1 libopengl0"
-        ) from error
+        hint = "on Debian: apt-get install libgl1 libopengl0"
+        raise OptionError(f"pymeshlab cannot start ({str(error)[:100]})", hint) from error
     if not hasattr(pymeshlab.MeshSet, _COLLAPSE):
         raise OptionError(f"pymeshlab lacks its filter {_COLLAPSE}", "on Debian: apt-get install libopengl0")
     meshes = pymeshlab.MeshSet(verbose=False)

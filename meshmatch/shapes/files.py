@@ -44,10 +44,7 @@ def load_shape(path: str | Path) -> Shape:
     other, each where the scene puts it. An stl has no shared vertices: every corner of every triangle is a
     vertex, 3 F of them.
 
-    Raises
-    ------
-    InputError
-        The file is missing, empty, cut short, of an unknown kind, or holds no usable vertex.
+    `InputError`: the file is missing, empty, cut short, of an unknown kind, or holds no usable vertex.
     """
     path = existing(Path(path), suffixes=SUFFIXES)
     suffix = path.suffix.lower()
@@ -75,12 +72,8 @@ def save_shape(path: str | Path, shape: Shape) -> None:
     shared vertices. Colours go into ply, obj, off and glb. An invalid vertex is written as nan where the
     format allows (all but stl and glb, which take its stand-in).
 
-    Raises
-    ------
-    OptionError
-        The suffix is not one that can be written, or holds no clouds (stl) or no faces (xyz, npy).
-    OutputError
-        The folder is missing or cannot be written.
+    `OptionError`: the suffix is not one that can be written, or holds no clouds (stl) or no faces (xyz, npy).
+    `OutputError`: the folder is missing or cannot be written.
     """
     path = Path(path)
     suffix = check_suffix(path)
@@ -115,10 +108,7 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
     name : str
         For messages, where the source has no name of its own.
 
-    Raises
-    ------
-    InputError
-        The file cannot be read, or the source is none of these.
+    `InputError`: the file cannot be read, or the source is none of these.
     """
     if isinstance(source, Shape):
         return source

@@ -124,10 +124,8 @@ def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Int
         votes.update(tuple(sorted((own, int(near[second]), int(near[third])))) for second, third in stars)
     faces = np.array([key for key, count in votes.items() if count == 3], np.int64).reshape(-1, 3)
     if 3 * len(faces) < len(points):
-        raise InputError(
-            f"{cloud.name or 'the cloud'} is too rough for a template: its points lie on no surface",
-            "give a cleaner or denser cloud, or a mesh, with --template",
-        )
+        rough = f"{cloud.name or 'the cloud'} is too rough for a template: its points lie on no surface"
+        raise InputError(rough, "give a cleaner or denser cloud, or a mesh, with --template")
     a, b, c = (points[faces[:, i]] for i in range(3))
     outwards = (np.cross(b - a, c - a) * normals[faces].sum(1)).sum(1)
     faces[outwards < 0] = faces[outwards < 0][:, ::-1]

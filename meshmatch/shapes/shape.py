@@ -39,10 +39,7 @@ class Shape:
         order (the map answers for it too) but its `verts` row is only a stand-in, and faces that touch it
         have no area.
 
-    Raises
-    ------
-    InputError
-        Wrong array shapes, no vertices, a position that is not finite, or a face that names no vertex.
+    `InputError`: wrong array shapes, no vertices, a position that is not finite, or a face that names no vertex.
     """
 
     verts: Float[Floats, "V 3"]
@@ -89,10 +86,7 @@ class Shape:
         """A shape some of whose positions may be NaN or infinite: these are marked in `invalid`, and moved to the
         centroid of the others.
 
-        Raises
-        ------
-        InputError
-            As for the class; or no position is finite.
+        `InputError`: as for the class; or no position is finite.
         """
         if len(verts) == 0:
             raise InputError(f"{name or 'the shape'} holds no vertices", "is it a mesh or a point cloud at all?")

@@ -35,18 +35,14 @@ def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
     image : str or Path, optional
         A picture that takes the place of those that the file names, or that it fails to name.
 
-    Raises
-    ------
-    InputError
-        An image or material file is missing, damaged, too large, or outside the file's folder; there are no
-        texture coordinates for `image`; or the file has no look at all.
+    `InputError`: an image or material file is missing, damaged, too large, or outside the file's folder; there are no
+    texture coordinates for `image`; or the file has no look at all.
     """
     found = find_appearance(path, shape, image)
     if found is None:
-        raise InputError(
-            f"{Path(path).name} has no texture and no vertex colours: there is nothing to transfer",
-            "name a picture for its texture coordinates with --image, or export it with its materials",
-        )
+        nothing = f"{Path(path).name} has no texture and no vertex colours: there is nothing to transfer"
+        hint = "name a picture for its texture coordinates with --image, or export it with its materials"
+        raise InputError(nothing, hint)
     return found
 
 
@@ -65,7 +61,7 @@ def find_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
         else:
             found = appearance.vertex_colors_alone(shape)
     if len(found.material) != shape.F or (found.colors is not None and len(found.colors) != shape.V):
-        raise _another_file(path, shape)
+        raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
     return None if found.plain else found
 
 
@@ -78,12 +74,8 @@ def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] |
     reader = {".glb": gltf_attributes, ".gltf": gltf_attributes, ".obj": obj_look}.get(path.suffix.lower())
     found = None if reader is None else reader.read_coordinates(path, read_bytes(path))
     if found is not None and len(found) != shape.F:
-        raise _another_file(path, shape)
+        raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
     return found if shape.F else None
-
-
-def _another_file(path: Path, shape: Shape) -> InputError:
-    return InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
 
 
 def files_of(path: Path) -> list[Path]:
@@ -95,10 +87,8 @@ def check_textured(path: Path, colored: tuple[str, ...] = ()) -> None:
     """Refuse a suffix that holds no texture (`OptionError`), nor is one of those `colored` by vertex."""
     if path.suffix.lower() not in (*TEXTURED_SUFFIXES, *colored):
         hint = f", or in {' or '.join(colored)} for vertex colours" if colored else ""
-        raise OptionError(
-            f"{path.name}: cannot write a texture as {path.suffix or '(no suffix)'}",
-            f"end the name in {' or '.join(TEXTURED_SUFFIXES)}{hint}",
-        )
+        unknown = f"{path.name}: cannot write a texture as {path.suffix or '(no suffix)'}"
+        raise OptionError(unknown, f"end the name in {' or '.join(TEXTURED_SUFFIXES)}{hint}")
 
 
 def write_textured(path: Path, places: Sequence[Path], mesh: Textured, image: Pixels) -> None:

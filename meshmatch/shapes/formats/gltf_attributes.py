@@ -87,9 +87,7 @@ class _Look:
 
     def _base(self, number: int) -> tuple[dict[str, Any], dict[str, Any] | None, tuple[float, ...]]:
         """A material, its base colour texture and its factor."""
-        if number < 0:
-            return {}, None, (1.0,) * 4
-        material = self.json["materials"][number]
+        material = self.json["materials"][number] if number >= 0 else {}
         gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
         if gloss is not None and "pbrMetallicRoughness" not in material:
             return material, gloss.get("diffuseTexture"), tuple(gloss.get("diffuseFactor", (1.0,) * 4))

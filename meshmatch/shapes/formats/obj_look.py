@@ -127,10 +127,8 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
             if file is not None:
                 entries |= _parse(file)
             elif shape.colors is None:
-                raise InputError(
-                    f"{path.name} has its materials in {name[:200]}, which is not there",
-                    f"copy it to {path.parent}, or name the picture with --image",
-                )
+                missing = f"{path.name} has its materials in {name[:200]}, which is not there"
+                raise InputError(missing, f"copy it to {path.parent}, or name the picture with --image")
     return entries
 
 
@@ -200,10 +198,8 @@ def _image(path: Path, name: str, entry: _Entry, reader: ImageReader, laid: bool
     def decode(wanted: _Map) -> Pixels:
         file = _beside(entry.folder, wanted.file)
         if file is None:
-            raise InputError(
-                f"{path.name} needs the image {wanted.file[:200]} of its material {name}, which is not there",
-                f"copy it to {entry.folder}, or name another with --image",
-            )
+            what = f"{path.name} needs the image {wanted.file[:200]} of its material {name}, which is not there"
+            raise InputError(what, f"copy it to {entry.folder}, or name another with --image")
         return reader.decode(read_bytes(file), file.name)
 
     if entry.image is None:
@@ -213,9 +209,7 @@ def _image(path: Path, name: str, entry: _Entry, reader: ImageReader, laid: bool
         return image
     other = decode(entry.alpha)
     if other.shape != image.shape:
-        raise InputError(
-            f"{path.name}: the alpha image {entry.alpha.file} differs in size from the colour image",
-            "save both in one size, or the alpha within the colours' png",
-        )
+        what = f"{path.name}: the alpha image {entry.alpha.file} differs in size from the colour image"
+        raise InputError(what, "save both in one size, or the alpha within the colours' png")
     channel = other[..., 0] if (other[..., 3] == 255).all() else other[..., 3]
     return np.concatenate([image[..., :3], channel[..., None]], axis=-1)

@@ -50,26 +50,25 @@ def read(path: Path, data: bytes) -> Raw:
         raise InputError(f"{name}: the header declares no vertices", NO_MESH)
     wanted = [k for k, element in enumerate(elements) if element.name in ("vertex", "face", "tristrips")]
     body = _Body(name, data, start, order)
-    verts, faces, colors = None, NO_FACES, None
+    places, faces, colors = [], NO_FACES, None
     for element in elements[: max(wanted) + 1]:
         if not element.properties:
             continue  # rows of nothing, however many
         _check_kinds(name, element)
         table = body.element(element)
-        if element.name == "vertex" and {"x", "y", "z"} <= set(table):
-            verts = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        if element.name == "vertex":
+            places = [table[axis].astype(np.float64) for axis in "xyz" if axis in table]
             colors = _colors(table, {p.name: p.kind for p in element.properties})
-        elif element.name == "vertex":
-            verts = None
-            break
+            if len(places) < 3:
+                break
         elif element.name == "face":
             lists = next((table[key] for key in _FACE_LISTS if key in table), None)
             faces = faces if lists is None else fan(*lists)
         elif element.name == "tristrips":
             faces = _strips(table[element.properties[0].name][0])
-    if verts is None:
+    if len(places) < 3:
         raise InputError(f"{name}: the vertices have no x, y and z", NO_MESH)
-    return Raw(verts, faces, colors)
+    return Raw(np.stack(places, axis=1), faces, colors)
 
 
 def write(
@@ -176,9 +175,8 @@ def _colors(table: dict[str, Any], kinds: dict[str, str]) -> Floats | None:
     out = np.ones((len(table[names[0]]), 4))
     for k, name in enumerate([*names, *[a for a in ("alpha", "a") if a in table][:1]]):
         values = table[name].astype(np.float64)
-        largest = {"u2": 65535.0}.get(kinds[name], 255.0)
-        if kinds[name][0] == "f" and not (values > 1).any():
-            largest = 1.0
+        small = kinds[name][0] == "f" and not (values > 1).any()
+        largest = 1.0 if small else 65535.0 if kinds[name] == "u2" else 255.0
         out[:, k] = np.clip(np.nan_to_num(values) / largest, 0.0, 1.0)
     return out
 
