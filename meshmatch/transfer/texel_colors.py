@@ -207,10 +207,9 @@ class TexelLocator:
         right = flat[:, 0:1] * first + flat[:, 2:3] * second
         down = flat[:, 1:2] * first + flat[:, 3:4] * second
         self.reach = reach_of(right, down).astype(np.float32)
-        around = np.roll(held, -1, axis=1)
-        length = np.linalg.norm(held - around, axis=2)
-        own = target.verts[target.faces]
-        own_length = np.linalg.norm(own - np.roll(own, -1, axis=1), axis=2)
+        length, own_length = (
+            np.linalg.norm(each - np.roll(each, -1, axis=1), axis=2) for each in (held, target.verts[target.faces])
+        )
         self._size = length.max(axis=1).astype(np.float32)
         scale = float(np.median(length.ravel() / np.maximum(own_length.ravel(), 1e-300)))
         self.discontinuous = np.asarray((length > _STRETCH * scale * own_length + _SLACK).any(axis=1))
@@ -265,12 +264,9 @@ class TexelLocator:
 
     def confidence(self, face: Ints32, weights: Floats32) -> Floats32:
         """(N,) of the map at points (3, N) of triangles (N,)."""
-        total, sure = np.zeros(len(face), np.float32), np.zeros(len(face), np.float32)
-        for k in range(3):
-            held = np.maximum(weights[k], 0)
-            total += held
-            sure += held * self._confidence.take(self._corners[k].take(face))
-        return sure / total
+        held = np.maximum(weights, 0)
+        sure = weighted(held, [self._confidence.take(column.take(face)) for column in self._corners])
+        return sure / (held[0] + held[1] + held[2])
 
     def _continued(self, face: Ints32, weights: Floats32, corner: Ints) -> Floats32:
         """Points (3, N) of discontinuous triangles: the surface around the nearest corner, continued."""

@@ -48,11 +48,13 @@ def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
 
     `InputError` if the file is missing or damaged, holds no weights, or not those of `shape`.
     """
+    from meshmatch.shapes.formats.gltf_attributes import read_skin
+
     readers = {
         ".npz": lambda path: _from_record(read_npz(path, ("format", "names", "joints", "weights"))),
         ".json": lambda path: _from_record(table_files.read_json(path)),
-        ".glb": _read_gltf,
-        ".gltf": _read_gltf,
+        ".glb": lambda path: read_skin(path, path.read_bytes()),
+        ".gltf": lambda path: read_skin(path, path.read_bytes()),
     }
     matrix, names = table_files.read_by_suffix(path, readers, "skin weights", _HINT)
     return SkinWeights(_normalized(Path(path).name, matrix, shape), names)
@@ -65,12 +67,6 @@ def weights_of(matrix: csr_array | ArrayLike, shape: Shape) -> SkinWeights:
     """
     sparse = csr_array(matrix if issparse(matrix) else _table("weights", matrix, np.float64), dtype=np.float64)
     return SkinWeights(_normalized("the array", sparse, shape), tuple(str(joint) for joint in range(sparse.shape[1])))
-
-
-def _read_gltf(path: Path) -> tuple[csr_array, tuple[str, ...]]:
-    from meshmatch.shapes.formats.gltf_attributes import read_skin
-
-    return read_skin(path, path.read_bytes())
 
 
 def _from_record(record: Any) -> tuple[csr_array, tuple[str, ...]]:
