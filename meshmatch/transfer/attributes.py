@@ -102,11 +102,10 @@ def pull_face_labels(
     if not len(ask):
         return found
     votes = csr_array(corners @ _vertex_votes(back, source, labels, on_faces))[ask]
-    continuous = np.flatnonzero(~discontinuous_faces(back, target, source)[ask])
+    continuous = ask[~discontinuous_faces(back, target, source)[ask]]
     if len(continuous):
-        sampled = _sampled_votes(back, source, target, labels, on_faces, ask[continuous], workers)
         # The corners decide only where no point of a face has found a label.
-        votes = 1e-6 * votes + _ones(continuous, np.arange(len(continuous)), (len(ask), len(continuous))) @ sampled
+        votes = 1e-6 * votes + _sampled_votes(back, source, target, labels, on_faces, continuous, workers)[ask]
     found[ask] = most_votes(csr_array(votes))
     return found
 
@@ -114,7 +113,7 @@ def pull_face_labels(
 def _sampled_votes(
     back: VertexMap, source: Shape, target: Shape, labels: Ints, on_faces: bool, faces: Ints, workers: int
 ) -> csr_array:
-    """(N, labels) votes of the points of N faces of the target."""
+    """(F_target, labels) votes of the points of some faces (N,) of the target."""
     spread = lattice(_ROWS)  # P 3
     corners = target.faces[faces]
     normals = back.apply(known_normals(source))
@@ -122,7 +121,7 @@ def _sampled_votes(
         np.einsum("pk,nkd->npd", spread, values[corners]).reshape(-1, 3) for values in (back.points(source), normals)
     )
     found = MappedMesh.of(source).query(points, facing, workers)
-    voter = np.repeat(np.arange(len(faces)), len(spread))
+    voter = np.repeat(faces, len(spread))
     if on_faces and source.F:
         code = np.where(found.face >= 0, labels[found.face], NO_LABEL)
     else:
@@ -131,7 +130,7 @@ def _sampled_votes(
         places = csr_array((found.barycentric.ravel(), (rows, at.ravel())), (len(at), source.V))
         code = most_votes(places @ _one_hot(labels))
     known = code >= 0
-    return _ones(voter[known], code[known], (len(faces), max(int(labels.max(initial=-1)) + 1, 1)))
+    return _ones(voter[known], code[known], (target.F, max(int(labels.max(initial=-1)) + 1, 1)))
 
 
 def lattice(rows: int) -> Float[Floats, "P 3"]:
