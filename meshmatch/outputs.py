@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from meshmatch.errors import OutputError
+from meshmatch.errors import InputError, OutputError
 
 
 def plain_text(text: str) -> str:
@@ -15,6 +15,16 @@ def plain_text(text: str) -> str:
     U+FFFD.
     """
     return text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+
+
+def as_path(path: str | Path) -> Path:
+    """The path that is meant; `InputError` for what is neither text nor a path, such as None."""
+    try:
+        return Path(path)
+    except TypeError as error:
+        raise InputError(
+            f"expected a path, not {type(path).__name__}", "write it as text or as a pathlib.Path"
+        ) from error
 
 
 def make_folder(path: Path) -> None:

@@ -12,7 +12,7 @@ from meshmatch.arrays import Ints
 from meshmatch.errors import InputError
 from meshmatch.maps.evaluate import Evaluation, evaluate_map
 from meshmatch.maps.files import load_map
-from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.threads import thread_limit
 
@@ -52,11 +52,7 @@ def evaluate(
     if isinstance(found, str | Path):
         found = load_map(found, source, target)
     vertex_map = found.map if isinstance(found, MatchResult) else found
-    if not isinstance(vertex_map, VertexMap):
-        raise InputError(
-            f"{type(found).__name__} is not a map",
-            "pass a MatchResult, a VertexMap (VertexMap.between makes one of an index), or the path of a map",
-        )
+    check_map(vertex_map)
     here = there = None
     if isinstance(truth, tuple) and len(truth) == 2:
         here, there = (_vertices(side) for side in truth)

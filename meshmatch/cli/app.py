@@ -1,6 +1,9 @@
 """The tree of verbs."""
 
+from typing import Any
+
 import typer
+from typer.core import TyperGroup
 
 from meshmatch import __version__
 from meshmatch.cli.evaluate import evaluate
@@ -13,8 +16,21 @@ from meshmatch.cli.train import prepare, train
 from meshmatch.cli.transfer import transfer_color, transfer_labels, transfer_landmarks, transfer_weights
 from meshmatch.cli.transfer_texture import transfer_texture
 
+
+class _Verbs(TyperGroup):
+    """Says what is wrong with a word without "Value error", which typer has from pydantic."""
+
+    def invoke(self, *context: Any) -> Any:
+        try:
+            return super().invoke(*context)
+        except typer.BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ")
+            raise
+
+
 app = typer.Typer(
     name="meshmatch",
+    cls=_Verbs,
     help="Dense matching of non-rigid 3D shapes: two meshes in, a vertex map out.",
     no_args_is_help=True,
     add_completion=False,

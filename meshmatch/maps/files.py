@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from meshmatch.errors import InputError
 from meshmatch.maps import table_files
 from meshmatch.maps.mat_file import read_mat
-from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap
+from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap, check_map
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.input_files import read_npy, read_npz
@@ -39,8 +39,10 @@ _FORMAT = "meshmatch map 1"
 def save_map(path: str | Path, vertex_map: VertexMap) -> None:
     """Write a map in the format of the suffix, whole or not at all.
 
-    `OptionError`: unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`. `OutputError`: the file cannot be written.
+    `OptionError`: unsupported suffix; see `meshmatch.maps.MAP_SUFFIXES`. `InputError`: it is no `VertexMap`.
+    `OutputError`: the file cannot be written.
     """
+    check_map(vertex_map)
     write = _FORMATS[check_suffix(path)][0]
     with replace_on_success(path) as temporary:
         write(temporary, vertex_map)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
-from meshmatch.outputs import plain_text
+from meshmatch.outputs import as_path, plain_text
 from meshmatch.shapes.input_files import existing, read_npy
 
 T = TypeVar("T")
@@ -31,10 +31,11 @@ _DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError, RecursionError, 
 
 def check_suffix(path: str | Path, suffixes: Iterable[str], what: str) -> str:
     """The suffix in small letters, if it is one of `suffixes`; `OptionError` otherwise. Ask before long work."""
-    suffix = Path(path).suffix.lower()
+    path = as_path(path)
+    suffix = path.suffix.lower()
     if suffix not in suffixes:
         given = f"'{suffix}'" if suffix else "a name without a suffix"
-        unknown = f"{Path(path).name}: {given} is not a format for {what}"
+        unknown = f"{path.name}: {given} is not a format for {what}"
         raise OptionError(unknown, f"end the name in one of {' '.join(suffixes)}")
     return suffix
 
@@ -46,7 +47,7 @@ def read_by_suffix(path: str | Path, readers: Mapping[str, Callable[[Path], T]],
     The file's name comes first in the message. A reader's own errors keep their kind and words, and get `hint` where
     they have none.
     """
-    path = existing(Path(path), hint)
+    path = existing(as_path(path), hint)
     suffix = path.suffix.lower()
     if suffix not in readers:
         raise InputError(f"{path.name}: {what} are not read from '{suffix}' files", f"choose {', '.join(readers)}")

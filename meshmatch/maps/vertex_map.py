@@ -225,8 +225,10 @@ class VertexMap:
         """This map, then `other`: from this source to the other's target.
 
         The point of a vertex is where `other` puts the vertex ``index[i]``; the confidence is the lower of
-        the two, the verdict the worse. `InputError` if `other` does not start on the shape where this one ends.
+        the two, the verdict the worse. `InputError` if `other` is no map, or does not start on the shape where this one
+        ends.
         """
+        check_map(other)
         counts = {self.target_vertices, other.source_vertices} - {UNKNOWN}
         hashes = {self.target_hash, other.source_hash} - {""}
         if len(counts) > 1 or len(hashes) > 1:
@@ -256,6 +258,15 @@ class VertexMap:
     def __repr__(self) -> str:
         target = "?" if self.target_vertices == UNKNOWN else self.target_vertices
         return f"VertexMap({_way(self)}, {self.source_vertices} -> {target} vertices, {self.verdict})"
+
+
+def check_map(found: object) -> None:
+    """Refuse what is no `VertexMap` (`InputError`)."""
+    if not isinstance(found, VertexMap):
+        raise InputError(
+            f"{type(found).__name__} is not a map",
+            "pass a VertexMap: a MatchResult has one as .map, and VertexMap.between makes one of an index",
+        )
 
 
 def _side(side: str, shape: Shape) -> dict[str, Any]:

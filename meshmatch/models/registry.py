@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from meshmatch.errors import MeshmatchError, ModelError, OutputError
 from meshmatch.models.card import ModelCard, check_name, read_card
 from meshmatch.models.tensor_file import read_header
+from meshmatch.outputs import as_path
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
@@ -291,7 +292,7 @@ def _restore_interrupted() -> None:
 
 def _expanded(path: str | Path) -> Path:
     try:
-        return Path(path).expanduser()
+        return as_path(path).expanduser()
     except RuntimeError as error:
         raise ModelError(f"cannot use {str(path)[:200]}: {error}", "write out the home folder") from error
 

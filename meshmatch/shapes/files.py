@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.errors import InputError, OptionError
-from meshmatch.outputs import plain_text, replace_on_success
+from meshmatch.outputs import as_path, plain_text, replace_on_success
 from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, plain, ply
 from meshmatch.shapes.input_files import existing, read_bytes
 from meshmatch.shapes.shape import Shape
@@ -46,7 +46,7 @@ def load_shape(path: str | Path) -> Shape:
 
     `InputError`: the file is missing, empty, cut short, of an unknown kind, or holds no usable vertex.
     """
-    path = existing(Path(path), suffixes=SUFFIXES)
+    path = existing(as_path(path), suffixes=SUFFIXES)
     suffix = path.suffix.lower()
     if suffix not in _FORMATS:
         unknown = f"{path.name}: unsupported file format {suffix or '(no suffix)'}"
@@ -65,7 +65,7 @@ def check_suffix(path: Path) -> str:
     return suffix
 
 
-def save_shape(path: str | Path, shape: Shape) -> None:
+def save_shape(path: str | Path, shape: ShapeLike) -> None:
     """Write a shape, in the format that the suffix names. The file appears whole or not at all.
 
     ply, obj, off, xyz and npy keep every bit of the positions; stl and glb hold 32-bit floats, and stl no
@@ -73,9 +73,9 @@ def save_shape(path: str | Path, shape: Shape) -> None:
     format allows (all but stl and glb, which take its stand-in).
 
     `OptionError`: the suffix is not one that can be written, or holds no clouds (stl) or no faces (xyz, npy).
-    `OutputError`: the folder is missing or cannot be written.
+    `InputError`: as `as_shape`. `OutputError`: the folder is missing or cannot be written.
     """
-    path = Path(path)
+    path, shape = as_path(path), as_shape(shape)
     suffix = check_suffix(path)
     if suffix == ".stl" and shape.is_cloud:
         raise OptionError("an stl file cannot hold a point cloud", "choose .ply, .xyz or .npy")

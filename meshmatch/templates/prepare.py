@@ -11,7 +11,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
-from meshmatch.outputs import make_folder, replace_on_success
+from meshmatch.outputs import as_path, make_folder, replace_on_success
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
@@ -75,7 +75,7 @@ def prepare(
     template is nothing like the shapes; `OptionError` if there are no landmarks where they should be, or choices do not
     go together; `TemplateError` if the nodes do not reach every vertex; `OutputError` if the folder cannot be written.
     """
-    shapes, output, config = Path(shapes), Path(output), config or PrepareConfig()
+    shapes, output, config = as_path(shapes), as_path(output), config or PrepareConfig()
     if (config.nodes.strategy == "parts") != (config.labels is not None):
         raise OptionError("strategy 'parts' and labels go together", "give both, or choose another strategy")
     if shapes.is_dir():

@@ -131,6 +131,14 @@ def test_configs_and_threads_that_do_not_fit(matcher: Matcher, sphere: Shape) ->
         lambda: Matcher("human", {"up": "y"}),  # type: ignore[arg-type]
         lambda: meshmatch.interpolate("a.ply"),
         lambda: meshmatch.interpolate([np.zeros((3, 3))] * 2, 2.5),  # type: ignore[arg-type]
+        lambda: meshmatch.load_shape(None),  # type: ignore[arg-type]
+        lambda: meshmatch.load_map(3),  # type: ignore[arg-type]
+        lambda: meshmatch.load_model(None),  # type: ignore[arg-type]
+        lambda: meshmatch.prepare(None, "out"),  # type: ignore[arg-type]
+        lambda: meshmatch.save_shape("q.ply", 3),  # type: ignore[arg-type]
+        lambda: meshmatch.save_shape(None, np.eye(3)),  # type: ignore[arg-type]
+        lambda: meshmatch.save_map("q.npy", np.arange(3)),  # type: ignore[arg-type]
+        lambda: meshmatch.VertexMap("a", "b", [0]).compose(np.arange(1)),  # type: ignore[arg-type]
     ],
 )
 def test_arguments_of_other_types(call: Any) -> None:

@@ -40,6 +40,12 @@ def test_a_wrong_command_line_is_2(run: Run, words: list[str]) -> None:
     assert "Error: " in answer.err
 
 
+def test_a_word_that_is_none_of_the_choices(run: Run) -> None:
+    assert (
+        "Error: Invalid value for '--up': 'q' is not one of" in run("view", "a", "b", "-o", "c.html", "--up", "q").err
+    )
+
+
 def test_an_error_is_one_line_a_hint_and_1(run: Run, tmp_path: Path) -> None:
     answer = run("info", tmp_path / "nothing.ply")
     lines = answer.err.splitlines()
