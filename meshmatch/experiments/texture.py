@@ -37,8 +37,8 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.colors import to_srgb
-from meshmatch.shapes.debris import seams
 from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.faces import seams
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.sampling import sample_surface

@@ -49,7 +49,13 @@ def expectation(
     `values` belong to the vertices of the fitted template. Returns the mean of each, and the variance of the first,
     summed over D.
     """
-    matrix, prior = _samples(fit)
+    # vertices and face centers of the template, as a matrix over the vertices, and the area that each stands for
+    F, T = len(fit.faces), len(fit.points)
+    rows = np.repeat(np.arange(F), 3)
+    centers = csr_matrix((np.full(3 * F, 1 / 3), (rows, fit.faces.reshape(-1))), (F, T))
+    matrix = vstack([identity(T), centers]).tocsr()
+    areas = vertex_areas(fit.points, fit.faces), triangle_areas(fit.points, fit.faces)  # half of the whole each
+    prior = np.concatenate([0.5 * area for area in areas])
     tree = cKDTree(matrix @ fit.points)
     sampled = [matrix @ value for value in values]
     means = [np.empty((len(points), value.shape[1])) for value in values]
@@ -83,12 +89,3 @@ def most_likely_points(
     weights[:, 0] = 1.0
     distance = np.linalg.norm(moved - points[vertex], axis=1)
     return Footpoints(vertex, np.full(len(moved), -1, np.int64), weights, distance)
-
-
-def _samples(fit: Fit) -> tuple[csr_matrix, Floats]:
-    """Vertices and face centers as a matrix (S, T) over the vertices, and the area (S,) that each stands for."""
-    F, T = len(fit.faces), len(fit.points)
-    rows = np.repeat(np.arange(F), 3)
-    centers = csr_matrix((np.full(3 * F, 1 / 3), (rows, fit.faces.reshape(-1))), (F, T))
-    areas = (vertex_areas(fit.points, fit.faces), triangle_areas(fit.points, fit.faces))  # half of the whole each
-    return vstack([identity(T), centers]).tocsr(), np.concatenate([0.5 * area for area in areas])

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
-from meshmatch.shapes.orientation import agreeing_flips
+from meshmatch.shapes.faces import agreeing_flips
 
 LARGEST = 20_000
 

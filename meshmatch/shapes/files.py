@@ -116,7 +116,10 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
         return load_shape(os.fspath(source))
     if isinstance(source, HasVertices):
         faces = getattr(source, "faces", getattr(source, "triangles", None))
-        return _from_arrays(source.vertices, faces, name, _trimesh_colors(source))
+        visual: Any = getattr(source, "visual", None)
+        painted = getattr(visual, "kind", None) == "vertex" and len(visual.vertex_colors)  # none: a cloud of trimesh's
+        colors = np.asarray(visual.vertex_colors, np.float64) / 255.0 if painted else None
+        return _from_arrays(source.vertices, faces, name, colors)
     if isinstance(source, tuple | list) and len(source) == 2 and _is_table(source[0]):
         return _from_arrays(source[0], source[1], name)
     if hasattr(source, "__array__") or isinstance(source, tuple | list):
@@ -149,11 +152,3 @@ def _from_arrays(verts: Any, faces: Any, name: str, colors: Any = None) -> Shape
     if verts.ndim != 2 or verts.shape[1] != 3:
         raise InputError(f"{name or 'the shape'}: vertices must be an array of (V, 3), not {verts.shape}", _HINT)
     return Shape.with_invalid(verts, faces, name, colors)
-
-
-def _trimesh_colors(mesh: Any) -> Any:
-    visual: Any = getattr(mesh, "visual", None)
-    if getattr(visual, "kind", None) != "vertex":
-        return None
-    colors = np.asarray(visual.vertex_colors, np.float64)
-    return colors / 255.0 if len(colors) else None  # a trimesh.PointCloud without colours has an empty table

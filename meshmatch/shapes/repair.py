@@ -15,8 +15,7 @@ from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.topology import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
-from meshmatch.shapes.debris import duplicate_faces, find_parts, flat_faces, seams
-from meshmatch.shapes.orientation import turn_faces
+from meshmatch.shapes.faces import duplicate_faces, find_parts, flat_faces, seams, turn_faces
 from meshmatch.shapes.shape import Shape
 
 
@@ -65,7 +64,7 @@ def repair(shape: Shape) -> Repaired:
     position are merged if they lie on an open edge (texture seams of obj and glTF files, every corner of an
     stl; two layers that merely touch stay apart); faces without area; faces that occur twice (both of them,
     where they are a flap of no volume on a closed surface); outlier parts (see
-    `meshmatch.shapes.debris.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the
+    `meshmatch.shapes.faces.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the
     shape is made of small parts, and only those far from the rest are outliers); vertices that no face uses.
     Then faces are turned so that neighbours agree and the shape is not inside out. Open and non-manifold
     edges are counted, not mended. Of a cloud: points without a position, double ones, and outliers far from all

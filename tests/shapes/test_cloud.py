@@ -8,8 +8,8 @@ import pytest
 
 from meshmatch.shapes import cloud
 from meshmatch.shapes.cloud import estimate_normals, local_areas, outlier_points
+from meshmatch.shapes.faces import agreeing_flips
 from meshmatch.shapes.files import load_shape
-from meshmatch.shapes.orientation import agreeing_flips
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 

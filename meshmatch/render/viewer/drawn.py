@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import Rotations, facing, facing_matched
-from meshmatch.shapes.debris import seams
 from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 
 MOST = 150_000

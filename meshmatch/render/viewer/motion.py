@@ -14,7 +14,7 @@ from meshmatch.errors import OptionError
 from meshmatch.render.scales import CLAY
 from meshmatch.render.viewer.assembly import check_page, plain_text, scaled, small_integers, write_html
 from meshmatch.render.viewer.drawn import MOST, draw
-from meshmatch.shapes.debris import seams
+from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
 
 MOST_PLACES = 4_000_000
