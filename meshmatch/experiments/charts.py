@@ -1,4 +1,4 @@
-"""Charts of experiments: horizontal bars in groups, and lines with bands over axes that may be logarithmic.
+"""Charts of experiments: horizontal bars in groups or stacked, and lines with bands over axes that may be logarithmic.
 
 Every ``draw_`` function chooses the format and raises as those of `meshmatch.render.charts` do.
 """
@@ -149,3 +149,31 @@ def _draw_group(axes: Any, bars: Sequence[Bar], end: float) -> None:
             reach = max(reach, min(bar.mark, end))
         offset: dict[str, Any] = {"xytext": (5, 0), "textcoords": "offset points", "va": "center"}
         axes.annotate(short(bar.words, 28), (reach, row), annotation_clip=False, **offset)
+
+
+def draw_stack(parts: Mapping[str, float], path: str | Path, axis: str, form: str = "g") -> None:
+    """Draw one horizontal bar of parts end to end, with a legend of their names and lengths.
+
+    Parameters
+    ----------
+    parts
+        Name: length (0 or more), from left to right.
+    axis
+        What the lengths are, with their unit.
+    form
+        Format of the lengths in the legend.
+    """
+    lengths = np.array([*parts.values()], float)
+    if not (np.isfinite(lengths).all() and (lengths >= 0).all() and lengths.sum() > 0):
+        raise OptionError("a stacked bar needs lengths of 0 or more, and one above 0")
+    with saved(path, 7.2, 1.25 + 0.22 * np.ceil(len(parts) / 3)) as figure:
+        axes = figure.subplots()
+        lefts = np.cumsum(lengths) - lengths
+        for number, (name, length) in enumerate(parts.items()):
+            rounds, color = divmod(number, len(COLORS) - 1)
+            label = f"{short(name, 30)}  {length:{form}}"
+            axes.barh(0, length, left=lefts[number], color="white")  # no grid behind what is paler in later rounds
+            axes.barh(0, length, left=lefts[number], color=COLORS[color], alpha=0.5**rounds, ec="white", label=label)
+        axes.set(xlim=(0, lengths.sum()), xlabel=short(axis, 72), yticks=[])
+        axes.grid(visible=False, axis="y")
+        figure.legend(loc="outside upper left", ncols=3)

@@ -5,6 +5,9 @@ warm but the disk's cache. Shown is the median of several runs after one that do
 seconds of CPU (both cores together), and the largest memory that a run ever held. Bars are for two cores, and all
 processes are kept on two where the system allows that. The shapes are the two samples, split and decimated to the sizes
 that the cases ask for.
+
+``--profile`` shows instead where a match spends its CPU, with one thread; the row ``import`` is a process of its own that
+imports what the command does, and ends. ``--roofline`` shows how near its dearest stages come to what the machine can do.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,9 +27,12 @@ from typing import Annotated, Any
 import numpy as np
 from typer import Option
 
-from meshmatch.errors import MeshmatchError
-from meshmatch.experiments import runner
+from meshmatch.errors import MeshmatchError, OptionError
+from meshmatch.experiments import roofline as roofs
+from meshmatch.experiments import runner, stages
+from meshmatch.experiments.charts import draw_stack
 from meshmatch.geometry.topology import edge_keys
+from meshmatch.render.charts import check_chart
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -41,7 +47,7 @@ class Case:
     ----------
     words : tuple of str
         What follows ``python -m meshmatch``; a word ``NAME@V`` stands for the file of the sample NAME brought to at
-        least V vertices, ``@map`` for a file to write.
+        least V vertices, ``NAME@V+CHANGE`` for one that was also changed (`CHANGES`), ``@map`` for a file to write.
     seconds, gigabytes : float
         The bars; nothing is asked of memory where it is 0.
     """
@@ -52,10 +58,12 @@ class Case:
 
 
 CASES = {
-    "help": Case(("--help",), 0.4),
-    "pair": Case(("match", "climber@10000", "dancer@10000", "-o", "@map"), 8.0, 1.5),
-    "million": Case(("match", "dancer@1000000", "climber@10000", "-o", "@map"), 30.0, 3.0),
-    "onto a million": Case(("match", "climber@10000", "dancer@1000000", "-o", "@map"), 30.0, 3.0),
+    "help": Case(("--help",), 0.1),
+    "pair": Case(("match", "climber@10000", "dancer@10000", "-o", "@map"), 3.0, 0.5),
+    "million": Case(("match", "dancer@1000000", "climber@10000", "-o", "@map"), 8.0, 1.0),
+    "onto a million": Case(("match", "climber@10000", "dancer@1000000", "-o", "@map"), 8.0, 1.0),
+    "noisy": Case(("match", "climber@10000+noise", "dancer@10000+noise", "-o", "@map"), 5.0),
+    "partial": Case(("match", "dancer@10000+upper", "climber@10000", "--partial", "-o", "@map"), 12.0),
 }
 
 
@@ -111,16 +119,35 @@ def sized(shape: Shape, V: int) -> Shape:
     return decimate(shape, 2 * V) if 1.1 * V < shape.V < 200_000 else shape
 
 
-def _write_shape(sample: str, V: int, path: Path) -> None:
-    save_shape(path, sized(load_shape(bundled_folder() / "samples" / f"{sample}.ply"), V))
+def noisy(shape: Shape) -> Shape:
+    """The vertices alone, with Gaussian noise of 1 % of the diagonal."""
+    noise = np.random.default_rng(0).standard_normal(shape.verts.shape)
+    return Shape(shape.verts + 0.01 * shape.diagonal * noise, np.empty((0, 3), np.int64), shape.name)
+
+
+def upper_half(shape: Shape) -> Shape:
+    """What lies above the middle of a shape whose y axis points up."""
+    heights = shape.verts[:, 1]
+    faces = shape.faces[(heights[shape.faces] > 0.5 * (heights.min() + heights.max())).all(1)]
+    used = np.unique(faces)
+    return Shape(shape.verts[used], np.searchsorted(used, faces), shape.name)
+
+
+CHANGES: dict[str, Callable[[Shape], Shape]] = {"": lambda shape: shape, "noise": noisy, "upper": upper_half}
+
+
+def _write_shape(word: str, path: Path) -> None:
+    size, _, change = word.partition("+")
+    sample, V = size.split("@")
+    shape = sized(load_shape(bundled_folder() / "samples" / f"{sample}.ply"), int(V))
+    save_shape(path, CHANGES[change](shape))
 
 
 def shape_file(word: str, folder: Path) -> Path:
     """The file of a ``NAME@V``, made once, by a process of its own: a child's memory is counted from its parent's."""
     path = folder / f"{word.replace('@', '-')}.ply"
     if not path.exists():
-        sample, V = word.split("@")
-        maker = multiprocessing.get_context("spawn").Process(target=_write_shape, args=(sample, int(V), path))
+        maker = multiprocessing.get_context("spawn").Process(target=_write_shape, args=(word, path))
         maker.start()
         maker.join()
         if maker.exitcode:
@@ -164,18 +191,45 @@ COLUMNS = {
 }
 
 
+STAGE_COLUMNS = {"stage": "stage", "CPU s": "cpu:.3f", "share": "share:.1%", "calls": "calls:d"}
+
+
+def profiled(runs: int, folder: Path, picture: Path | None) -> runner.Report:
+    """Stages of the case ``pair``: of the match with the median CPU time."""
+    paths = [shape_file(word, folder) for word in CASES["pair"].words if "@" in word[1:]]
+    imports = [cost_of([sys.executable, "-c", stages.IMPORTS]).cpu for _ in range(runs + 1)][1:]
+    clocks = stages.profile(paths[0], paths[1], folder / "map.npy", runs)
+    rows = stages.rows_of(clocks[(runs - 1) // 2], statistics.median(imports))
+    if picture is not None:
+        draw_stack({row["stage"]: row["cpu"] for row in rows}, picture, "CPU seconds of a match, one thread", ".2f")
+    total = {"stage": "total", "cpu": sum(row["cpu"] for row in rows), "share": 1.0}
+    record = {"stages": rows, "total": total["cpu"], "runs": [clock.total for clock in clocks], "imports": imports}
+    title = f"A match of 10,000 vertices, median of {runs}"
+    return runner.Report(record, [runner.table(title, [*rows, total], STAGE_COLUMNS)])
+
+
 @runner.command
 def main(
     cases: Annotated[str, Option(help=f"of {', '.join(CASES)}")] = ",".join(CASES),
     runs: Annotated[int, Option(min=1, help="counted runs of each case")] = 5,
     cores: Annotated[int, Option(min=1, help="cores that all processes share")] = 2,
+    profile: Annotated[bool, Option("--profile", help="the stages of a match instead")] = False,
+    picture: Annotated[Path | None, Option(help="draw the stages as .png or .svg, with --profile")] = None,
+    roofline: Annotated[bool, Option("--roofline", help="the dearest stages against the machine instead")] = False,
 ) -> runner.Report:
-    names = runner.names_of(cases, CASES, "case")
+    if picture is not None:
+        if not profile:
+            raise OptionError("--picture draws the stages of --profile", "add --profile")
+        check_chart(picture)
     kept = keep_to_cores(cores)
+    if roofline:
+        return roofs.report(runs)
     with tempfile.TemporaryDirectory() as folder:
+        if profile:
+            return profiled(runs, Path(folder), picture)
         rows = [
             record_of(name, CASES[name], measure(CASES[name], runs, Path(folder)))
-            for name in runner.track(names, "running")
+            for name in runner.track(runner.names_of(cases, CASES, "case"), "running")
         ]
     title = f"Whole processes on {kept} cores, median of {runs} runs"
     return runner.Report({"kept_to_cores": kept, "cases": rows}, [runner.table(title, rows, COLUMNS)])

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import OptionError
-from meshmatch.experiments.charts import Bar, Chart, Line, draw_bars, draw_lines
+from meshmatch.experiments.charts import Bar, Chart, Line, draw_bars, draw_lines, draw_stack
 from tests.render.spots import middle, spots
 
 
@@ -80,6 +80,18 @@ def test_a_bar_beyond_the_axis_is_broken_off(tmp_path: Path) -> None:
     assert 0.9 * whole < broken < whole
     with pytest.raises(OptionError, match="axis"):
         draw_bars({"one": bars}, tmp_path / "c.png", "cm", limit=0.0)
+
+
+def test_a_stack_has_its_parts_end_to_end(tmp_path: Path) -> None:
+    draw_stack({"import": 0.5, "load": 0.25, "nothing": 0.0}, tmp_path / "a.png", "seconds", ".2f")
+    pixels = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
+    blue, orange = (np.abs(pixels - color).sum(2) < 6 for color in ((0, 114, 178), (213, 94, 0)))
+    bar = int(blue.sum(1).argmax())  # the row of pixels with most of the first color
+    assert np.flatnonzero(blue[bar]).max() < np.flatnonzero(orange[bar]).min()
+    assert blue[bar].sum() == pytest.approx(2 * orange[bar].sum(), rel=0.05)
+    for wrong in ({}, {"a": -1.0}, {"a": float("nan")}, {"a": 0.0}):
+        with pytest.raises(OptionError, match="stacked"):
+            draw_stack(wrong, tmp_path / "b.png", "seconds")
 
 
 def test_long_and_strange_names_stay_in_the_picture(tmp_path: Path) -> None:
