@@ -26,7 +26,7 @@ from meshmatch.experiments.ablation_views import (
 )
 from meshmatch.experiments.charts import Bar, Chart, Line, draw_bars, draw_lines
 from meshmatch.experiments.runner import table
-from meshmatch.fields.choice import FIELDS, has_nodes
+from meshmatch.fields.shape_functions import FIELDS, has_nodes
 from meshmatch.outputs import make_folder
 
 _AXIS = "mean error, cm (1.9 square meters of skin)"

@@ -20,7 +20,7 @@ from meshmatch.experiments.ablation_views import Run
 from meshmatch.fields.field import Field
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.deformer import Deformer
-from meshmatch.models.encoder import BasisEncoder
+from meshmatch.models.layers import BasisEncoder
 from meshmatch.models.registry import CARD, WEIGHTS, read_card
 from meshmatch.outputs import make_folder
 from meshmatch.threads import set_threads

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from meshmatch.fields.choice import FIELDS, FieldName
+from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.templates.make import STRATEGIES, Strategy
 

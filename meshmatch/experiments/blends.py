@@ -24,7 +24,7 @@ from meshmatch.api.inputs import as_model, validated
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench import OurMethod
 from meshmatch.experiments.sets import BenchSet, load_set
-from meshmatch.fields.energies import arap_energy, volume_energy
+from meshmatch.fields.field import arap_energy, volume_energy
 from meshmatch.fitting.blend import WAYS, Blend, Way
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.evaluate import CM_PER_UNIT

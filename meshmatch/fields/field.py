@@ -15,20 +15,11 @@ import numpy as np
 import torch
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.fields.choice import FieldName, shape_functions
-from meshmatch.fields.pointwise import Motion, PointwiseField
 from meshmatch.fields.shape_functions import ShapeFunctions
-from meshmatch.geometry.kernels import Kernel
 
 
 class PointField(Protocol):
-    """A representation on P fixed points.
-
-    ``linear``: displacements are linear in the rows, so that a fit can be solved for (`Field`).
-    """
-
-    @property
-    def linear(self) -> bool: ...
+    """A representation on P fixed points."""
 
     def displacement(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B P 3"]:
         """Where the points go, relative to where they are."""
@@ -63,15 +54,7 @@ class PointField(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """Shape functions of K nodes on P fixed points, sparse or dense.
-
-    Attributes
-    ----------
-    phi : sparse CSR or dense
-        Shape functions; with moving least squares each row sums to one.
-    gradient : likewise
-        Row 3 p + k holds the derivative of the shape functions at point p along axis k (1 / length).
-    """
+    """`ShapeFunctions` of K nodes on P fixed points as tensors, sparse (CSR) or dense."""
 
     phi: Float[torch.Tensor, "P K"]
     gradient: Float[torch.Tensor, "P3 K"]
@@ -88,10 +71,6 @@ class Field:
     @property
     def K(self) -> int:
         return int(self.phi.shape[1])
-
-    @property
-    def linear(self) -> bool:
-        return True
 
     def displacement(self, rows: Float[torch.Tensor, "B K 3"]) -> Float[torch.Tensor, "B P 3"]:
         """Displacement of the points by node vectors."""
@@ -185,24 +164,21 @@ def _tensor(matrix: Any) -> torch.Tensor:
         return torch.sparse_csr_tensor(start, column, values, matrix.shape, check_invariants=True)
 
 
-def field_at(
-    name: FieldName,
-    points: Float[Floats, "P 3"],
-    nodes: Float[Floats, "K 3"],
-    radius: float,
-    kernel: Kernel,
-    motion: Motion | None = None,
-    D: int = 0,
-) -> PointField:
-    """A representation on fixed points of the template's frame; ``motion``, with codes of ``D`` numbers, if pointwise.
+def determinant(F: Float[torch.Tensor, "*B 3 3"]) -> Float[torch.Tensor, "*B"]:
+    """Determinant written out: several times faster than a batched LU."""
+    a, b, c = F[..., 0], F[..., 1], F[..., 2]
+    return (torch.linalg.cross(a, b) * c).sum(-1)
 
-    Raises
-    ------
-    TemplateError
-        As `shape_functions`.
-    """
-    if name == "pointwise":
-        assert motion is not None
-        at = torch.from_numpy(np.array(points)).float()
-        return PointwiseField(at, at, motion, D)
-    return Field.of(shape_functions(name, points, nodes, radius, kernel))
+
+def volume_energy(F: Float[torch.Tensor, "*B 3 3"]) -> Float[torch.Tensor, "*B"]:
+    """(det F - 1)^2 of every point: volume preservation (the NeurIPS 2022 paper, section 4)."""
+    return (determinant(F) - 1).square()
+
+
+def arap_energy(F: Float[torch.Tensor, "*B 3 3"]) -> Float[torch.Tensor, "*B"]:
+    """|F^T F - I| (Frobenius) of every point: as rigid as possible (ibidem)."""
+    # Six dot products of columns: a batched 3 x 3 matmul is several times slower on a CPU.
+    a, b, c = F[..., 0], F[..., 1], F[..., 2]
+    diagonal = ((a * a).sum(-1) - 1).square() + ((b * b).sum(-1) - 1).square() + ((c * c).sum(-1) - 1).square()
+    mixed = (a * b).sum(-1).square() + (a * c).sum(-1).square() + (b * c).sum(-1).square()
+    return (diagonal + 2 * mixed + 1e-12).sqrt()

@@ -59,10 +59,6 @@ class PointwiseField:
     motion: Motion
     D: int
 
-    @property
-    def linear(self) -> bool:
-        return False
-
     def displacement(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B P 3"]:
         code, turn = unpack(rows, self.D)
         u = self.motion(self.points.expand(len(code), -1, -1), code)

@@ -7,8 +7,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.fields.energies import arap_energy, volume_energy
-from meshmatch.fields.field import Field, PointField
+from meshmatch.fields.field import Field, PointField, arap_energy, volume_energy
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.fit_config import LatentRefineConfig
 from meshmatch.fitting.samples import draw

@@ -66,7 +66,7 @@ class NodeSystem:
     def __init__(self, shape: Shape, field: ShapeFunctions | PointwiseField, strain_points: int = 1500) -> None:
         self.verts = np.asarray(shape.verts)
         self.faces = np.asarray(shape.faces)
-        self.linear = field.linear
+        self.linear = isinstance(field, ShapeFunctions)
         self.strain_points = farthest_points(self.verts, min(strain_points, len(self.verts)))
         self._incidence = _vertex_faces(self.faces, len(self.verts))
         self.field = field

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from meshmatch.errors import ModelError
-from meshmatch.fields.choice import FIELDS, FieldName
+from meshmatch.fields.shape_functions import FIELDS, FieldName
 
 _MAX = {
     "code": 4096, "width": 8192, "depth": 64, "basis": 8192,

@@ -13,15 +13,20 @@ import torch
 from torch import nn
 
 from meshmatch.arrays import Float, Floats, Floats32
-from meshmatch.fields.choice import has_nodes
-from meshmatch.fields.field import PointField, apply_shape_functions, field_at
+from meshmatch.fields.field import Field, PointField, apply_shape_functions
 from meshmatch.fields.pointwise import TURN_ROWS, PointwiseField, code_rows, turned_rows
+from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.config import NetworkConfig
-from meshmatch.models.decoder import FlatDecoder, NodeDecoder, PointDecoder
-from meshmatch.models.encoder import BasisEncoder, PointEncoder
-from meshmatch.models.layers import residual_mlp
-from meshmatch.models.neighbours import two_way_offsets
+from meshmatch.models.layers import (
+    BasisEncoder,
+    FlatDecoder,
+    NodeDecoder,
+    PointDecoder,
+    PointEncoder,
+    residual_mlp,
+    two_way_offsets,
+)
 
 
 def rotation_from_six(six: Float[torch.Tensor, "B 6"]) -> Float[torch.Tensor, "B 3 3"]:
@@ -90,8 +95,9 @@ class Deformer(nn.Module):
 
         ``nodes`` are the template's, in their own precision.
         """
-        motion = self.decoder.displacement if isinstance(self.decoder, PointDecoder) else None
-        return field_at(self.config.field, points, nodes, radius, kernel, motion, self.config.code)
+        if isinstance(self.decoder, PointDecoder):
+            return self.pointwise_field(points)
+        return Field.of(shape_functions(self.config.field, points, nodes, radius, kernel))
 
     def pointwise_field(self, points: Float[Floats, "P 3"]) -> PointwiseField:
         """The field of a pointwise network."""

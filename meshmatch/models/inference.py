@@ -250,7 +250,7 @@ def _offsets(queries: Float[Floats32, "Q 3"], points: Floats32, tree: cKDTree) -
 
 
 def _two_way_offsets(anchors: Float[Floats32, "A 3"], points: Floats32, tree: cKDTree) -> Floats32:
-    """What a registration sees at its anchors (A, 7); see `models.neighbours.two_way_offsets`."""
+    """What a registration sees at its anchors (A, 7); see `models.layers.two_way_offsets`."""
     A = len(anchors)
     forward = _offsets(anchors, points, tree)
     owner = quick_tree(anchors).query(points)[1]

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import ModelError, needs
-from meshmatch.fields.choice import has_nodes, shape_functions
-from meshmatch.fields.shape_functions import ShapeFunctions
+from meshmatch.fields.shape_functions import ShapeFunctions, has_nodes, shape_functions
 from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.card import ModelCard
 from meshmatch.models.checkpoint import load_weights

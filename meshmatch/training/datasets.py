@@ -15,8 +15,8 @@ import torch
 
 from meshmatch.arrays import Float, Floats, Int
 from meshmatch.fields.field import Field
-from meshmatch.fields.mls import build_field
-from meshmatch.models.encoder import BasisEncoder, PointEncoder
+from meshmatch.fields.shape_functions import build_field
+from meshmatch.models.layers import BasisEncoder, PointEncoder
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.training.scans import (
     ScanConfig,

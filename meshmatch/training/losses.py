@@ -13,10 +13,9 @@ from typing import Any
 import torch
 
 from meshmatch.arrays import Float
-from meshmatch.fields.energies import arap_energy, volume_energy
-from meshmatch.fields.field import PointField
+from meshmatch.fields.field import PointField, arap_energy, volume_energy
 from meshmatch.models.deformer import Deformer
-from meshmatch.models.neighbours import nearest_index
+from meshmatch.models.layers import nearest_index
 from meshmatch.training.datasets import Batch, CloudBatch, OnDevice, deformed_normals
 
 Terms = dict[str, torch.Tensor]

@@ -10,8 +10,8 @@ import torch
 
 from meshmatch.arrays import Float, Int, Ints
 from meshmatch.errors import TemplateError
-from meshmatch.fields.choice import has_nodes
-from meshmatch.fields.field import Field, field_at
+from meshmatch.fields.field import Field
+from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.config import NetworkConfig
 from meshmatch.models.deformer import Deformer
@@ -56,8 +56,7 @@ def _build_network(
     anchors = template.shape.verts[anchor_vertices(template, template.K)]
     phi = None
     if has_nodes(network.field):
-        field = field_at(network.field, anchors, template.nodes, template.radius, kernel)
-        assert isinstance(field, Field)
+        field = Field.of(shape_functions(network.field, anchors, template.nodes, template.radius, kernel))
         phi = field.for_training().phi
     nodes = torch.from_numpy(template.nodes).float()
     torch.manual_seed(seed)

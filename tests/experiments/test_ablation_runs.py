@@ -13,7 +13,7 @@ from meshmatch.experiments import ablation_training
 from meshmatch.experiments.ablation_setting import SCANS, Setting, pool_of
 from meshmatch.experiments.ablation_training import built, fewer, is_trained, memory, new_network, timed, train_run
 from meshmatch.experiments.ablation_views import BASE, CODED, CONSTRAINTS, TABLE4, VIEWS, Run, all_runs, methods_of
-from meshmatch.fields.choice import FIELDS, FieldName
+from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.models.registry import load_model
 from meshmatch.training.setup import build_loss_points
 from tests.experiments.egg_runs import make_small, prepare_eggs

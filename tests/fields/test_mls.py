@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from meshmatch.errors import TemplateError
-from meshmatch.fields.energies import arap_energy, determinant, volume_energy
-from meshmatch.fields.field import Field
-from meshmatch.fields.mls import build_field
+from meshmatch.fields.field import Field, arap_energy, determinant, volume_energy
+from meshmatch.fields.shape_functions import build_field
 from meshmatch.geometry.kernels import KERNELS
 
 

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.fields.pointwise import PointwiseField, code_rows, jacobian, pack, turned_rows, unpack
-from meshmatch.models.decoder import PointDecoder
+from meshmatch.models.layers import PointDecoder
 
 D = 7
 

@@ -6,7 +6,7 @@ import torch
 
 from meshmatch.errors import TemplateError
 from meshmatch.fields.field import Field
-from meshmatch.fields.rbf import build_rbf
+from meshmatch.fields.shape_functions import build_rbf
 
 
 @pytest.fixture
@@ -34,7 +34,6 @@ def test_displacement_and_gradient_equal_the_textbook(cloud: tuple[np.ndarray, n
     points, nodes = cloud
     vectors = np.random.default_rng(1).standard_normal((len(nodes), 3))
     field = Field.of(build_rbf(points, nodes))
-    assert field.linear
     given = torch.from_numpy(vectors).float()[None]
     moved, F = field.displacement(given)[0].numpy(), field.deformation_gradient(given)[0].numpy()
     for n, x in enumerate(points):

@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.cli import main
 from meshmatch.errors import ModelError, OptionError
-from meshmatch.fields.choice import FIELDS
-from meshmatch.fields.shape_functions import ShapeFunctions
+from meshmatch.fields.shape_functions import FIELDS, ShapeFunctions
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import Blend
 from meshmatch.fitting.dense import dense_shape

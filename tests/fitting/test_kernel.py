@@ -11,7 +11,7 @@ import torch
 
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.fields.field import Field
-from meshmatch.fields.mls import build_field
+from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.choices import Refine
 from meshmatch.fitting.dense import dense_shape
 from meshmatch.fitting.fit_config import FitConfig

@@ -10,15 +10,21 @@ import torch
 
 from meshmatch.errors import ModelError
 from meshmatch.fields.field import Field
-from meshmatch.fields.mls import build_field
+from meshmatch.fields.shape_functions import build_field
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.config import PAPER, NetworkConfig
-from meshmatch.models.decoder import FlatDecoder, NodeDecoder
 from meshmatch.models.deformer import Deformer, blank_deformer, rotation_from_six, with_weights
-from meshmatch.models.encoder import BasisEncoder, PointEncoder
 from meshmatch.models.inference import NodeNetwork, weight_shapes
-from meshmatch.models.layers import ResidualBlock, residual_mlp
-from meshmatch.models.neighbours import nearest, two_way_offsets
+from meshmatch.models.layers import (
+    BasisEncoder,
+    FlatDecoder,
+    NodeDecoder,
+    PointEncoder,
+    ResidualBlock,
+    nearest,
+    residual_mlp,
+    two_way_offsets,
+)
 from meshmatch.models.registry import built_in_folder, load_model
 from meshmatch.models.trained import TrainedModel, load_network
 from meshmatch.training.setup import build_deformer

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.errors import TemplateError
 from meshmatch.models.deformer import Deformer
-from meshmatch.models.encoder import BasisEncoder
+from meshmatch.models.layers import BasisEncoder
 from meshmatch.templates.template import Template
 from meshmatch.training.bodies import body_source
 from meshmatch.training.datasets import Batch, BatchDataset, registered_source, step_generator

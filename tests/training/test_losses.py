@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from meshmatch.fields.field import Field
-from meshmatch.fields.mls import build_field
+from meshmatch.fields.shape_functions import build_field
 from meshmatch.models.deformer import Deformer
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import Batch

@@ -9,7 +9,7 @@ import pytest
 
 from meshmatch.cli import main
 from meshmatch.fields.field import Field
-from meshmatch.fields.mls import build_field
+from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.models.registry import load_model
