@@ -66,11 +66,9 @@ def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None
         raise InputError(f"{label}: vertex {first} is matched to {int(index.min())}; indices start at 0")
     if target_vertices != UNKNOWN and index.max() >= target_vertices:
         one_based = index.min() >= 1 and index.max() == target_vertices
-        raise InputError(
-            f"{label}: vertex {int(np.argmax(index))} is matched to vertex {int(index.max())}, "
-            f"but the target has only {target_vertices} vertices",
-            "it looks 1-based: subtract 1" if one_based else "is it a map to another shape, or the other way round?",
-        )
+        matched = f"{label}: vertex {int(np.argmax(index))} is matched to vertex {int(index.max())}"
+        hint = "it looks 1-based: subtract 1" if one_based else "is it a map to another shape, or the other way round?"
+        raise InputError(f"{matched}, but the target has only {target_vertices} vertices", hint)
 
 
 def _whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:

@@ -120,10 +120,8 @@ class VertexMap:
             reversed_fits = not self._misfit("source", target) and not self._misfit("target", source)
             if reversed_fits and self.index.max() < source.V:
                 a, b = source.name or "the source", target.name or "the target"
-                raise InputError(
-                    f"{label} runs the wrong way: from {b} to {a}, where one from {a} to {b} is needed",
-                    f"swap the two shapes, or match {a} to {b} ({DIRECTION})",
-                )
+                way = f"{label} runs the wrong way: from {b} to {a}, where one from {a} to {b} is needed"
+                raise InputError(way, f"swap the two shapes, or match {a} to {b} ({DIRECTION})")
         for found in filter(None, misfits):
             raise InputError(f"{label} was made for another {found}", _OTHER_MESH)
         fill: dict[str, Any] = {} if target is None else {"target_faces": target.faces}
@@ -205,12 +203,7 @@ class VertexMap:
 
         ``basis_source @ C`` is the least-squares fit to ``apply(basis_target)``.
 
-        Parameters
-        ----------
-        basis_source : (V_source, K_source)
-            Linearly independent functions on the source's vertices, such as Laplacian eigenvectors, a column each.
-        basis_target : (V_target, K_target)
-            The same on the target.
+        A basis (V, K) has linearly independent functions on the vertices, such as Laplacian eigenvectors, a column each.
 
         `InputError`: as `apply`; the source's functions do not have a row for each vertex; or a value is not finite.
         """

@@ -28,13 +28,8 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
     possible. Non-manifold input is taken as it is. Vertices that no face uses are dropped; colours are those
     of the nearest original vertex.
 
-    Parameters
-    ----------
-    faces : int
-        How many triangles to aim at, at least 4. Borders and closedness can keep it from getting there.
-    quality : "fast" or "meshlab"
-        meshlab (by pymeshlab) takes ten times as long, and makes well-shaped triangles where the surface is flat.
-
+    `faces` is at least 4; borders and closedness can keep it from getting there. Quality "meshlab" (by pymeshlab) takes
+    ten times as long, and makes well-shaped triangles where the surface is flat.
     `InputError`: the shape is a cloud. `OptionError`: unknown quality, fewer than 4 faces, or pymeshlab is not there
     or lacks its filters.
     """

@@ -100,14 +100,8 @@ ShapeLike: TypeAlias = Shape | str | Path | NDArray[np.generic] | tuple[ArrayLik
 def as_shape(source: ShapeLike, name: str = "") -> Shape:
     """The shape that is meant: a `Shape` as it is, a file read, everything else copied.
 
-    Parameters
-    ----------
-    source
-        See `ShapeLike`. Of an object, ``vertices`` are taken and, unless it is a cloud, ``faces`` (trimesh) or
-        ``triangles`` (Open3D); and vertex colours of a `trimesh.Trimesh`.
-    name : str
-        For messages, where the source has no name of its own.
-
+    Of an object, ``vertices`` are taken and, unless it is a cloud, ``faces`` (trimesh) or ``triangles`` (Open3D); and
+    vertex colours of a `trimesh.Trimesh`. `name` is for messages, where the source has none of its own.
     `InputError`: the file cannot be read, or the source is none of these.
     """
     if isinstance(source, Shape):

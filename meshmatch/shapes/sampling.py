@@ -43,11 +43,8 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
         raise InputError(f"{shape.name or 'the shape'} has no surface to sample", "all its faces are degenerate")
     if shape.is_cloud:
         chosen = _draw_points(areas, P, rng)
-        weights, face, normals = (
-            np.tile([1.0, 0.0, 0.0], (P, 1)),
-            np.full(P, -1, np.int64),
-            shape.vertex_normals[chosen],
-        )
+        weights, face = np.tile([1.0, 0.0, 0.0], (P, 1)), np.full(P, -1, np.int64)
+        normals = shape.vertex_normals[chosen]
         return Samples(shape.verts[chosen], normals, signed=False, face=face, barycentric=weights, vertex=chosen)
     # side="right" steps over faces without area
     face = np.searchsorted(total, rng.random(P) * total[-1], side="right").astype(np.int64)

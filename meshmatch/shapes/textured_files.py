@@ -28,13 +28,8 @@ def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
     glb and gltf: materials with base colour image and factor, samplers, texture transforms, vertex colours.
     obj: its mtl with Kd, map_Kd, d and map_d, beside it. Everything else: vertex colours.
 
-    Parameters
-    ----------
-    shape : Shape
-        What `load_shape` made of the same file.
-    image : str or Path, optional
-        A picture that takes the place of those that the file names, or that it fails to name.
-
+    `shape` is what `load_shape` made of the same file; `image` a picture that takes the place of those that the file
+    names, or that it fails to name.
     `InputError`: an image or material file is missing, damaged, too large, or outside the file's folder; there are no
     texture coordinates for `image`; or the file has no look at all.
     """

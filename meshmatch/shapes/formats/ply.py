@@ -107,8 +107,8 @@ def write(
 
 def _rows(table: dict[str, NDArray[Any]], count: int, fields: list[Any], header: list[str]) -> bytes:
     """The rows of a table; its columns that have no field yet get one, and a line in the header."""
+    kinds = {"uint8": ("u1", "uchar"), "int32": ("<i4", "int")}
     for label in list(table)[len(fields) :]:
-        kinds = {"uint8": ("u1", "uchar"), "int32": ("<i4", "int")}
         kind, word = kinds.get(table[label].dtype.name, ("<f8", "double"))
         fields.append((label, kind))
         header.append(f"property {word} {label}")
