@@ -89,8 +89,7 @@ class MappedMesh:
         groups = [np.flatnonzero(size == k) for k in np.unique(size)]
         self._trees = [(cKDTree(self._center[own]), own, float(self._radius[own].max())) for own in groups]
         # A cloud has gaps between its points, which are no reason for low confidence.
-        distinct = len(np.unique(self.points, axis=0)) if source.is_cloud else 1
-        self._gap = self.unit / np.sqrt(distinct) if source.is_cloud else 0.0
+        self._gap = self.unit / np.sqrt(len(np.unique(self.points, axis=0))) if source.is_cloud else 0.0
 
     def query(
         self,
@@ -110,13 +109,11 @@ class MappedMesh:
         about = None if near is None else np.asarray(near, np.float64) / self._source_unit
         item, weights = self._search(points, facing, workers, about)
         corners = self.corners[item]
-        foot = interpolate(self.points, corners, weights)
-        distance = np.sqrt(squared_lengths(foot - points))
+        distance = np.sqrt(squared_lengths(interpolate(self.points, corners, weights) - points))
         beyond = np.maximum(distance - self._gap, 0.0)
         confidence = np.einsum("nk,nk->n", weights, self.confidence[corners])
         confidence = np.clip(confidence, 0, 1) * np.exp(-np.square(beyond / (_DISTANCE_SCALE * self.unit)))
-        opposed = self._opposed(facing, corners)
-        confidence *= np.exp(-np.square(_FACING / _DISTANCE_SCALE * opposed))
+        confidence *= np.exp(-np.square(_FACING / _DISTANCE_SCALE * self._opposed(facing, corners)))
         face = self.face[item]
         vertex = corners[np.arange(len(points)), weights.argmax(axis=1)]
         weights[face < 0] = (1.0, 0.0, 0.0)

@@ -39,9 +39,7 @@ class SurfaceWalker:
         self._opposite = list(np.ascontiguousarray(self.opposite.T))
         self.face_of_vertex = np.full(shape.V, -1, np.int64)  # a face at each vertex; -1 where there is none
         self.face_of_vertex[shape.faces[::-1].ravel()] = np.repeat(np.arange(shape.F - 1, -1, -1), 3)
-        self._broken = np.zeros(shape.F, bool)
-        if shape.invalid is not None:
-            self._broken |= shape.invalid[shape.faces].any(axis=1)
+        self._unfit = self._flat if shape.invalid is None else self._flat | shape.invalid[shape.faces].any(axis=1)
         self._tree: cKDTree | None = None
 
     def places(self, face: NDArray[np.integer], weights: NDArray[np.floating]) -> Floats:
@@ -116,7 +114,7 @@ class SurfaceWalker:
     def _nearest_center(self, points: Floats32) -> Ints32:
         if self._tree is None:
             centers = self.verts[self.faces].mean(axis=1)
-            centers[self._broken | self._flat] = 1e6
+            centers[self._unfit] = 1e6
             self._tree = cKDTree(centers)
         return np.asarray(self._tree.query(points.T)[1], np.int32)
 
