@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from meshmatch.api.interpolation import Interpolation as Interpolation
     from meshmatch.api.interpolation import InterpolationOptions as InterpolationOptions
     from meshmatch.api.interpolation import interpolate as interpolate
-    from meshmatch.api.maps import find_maps as find_maps
     from meshmatch.api.matching import Matcher as Matcher
     from meshmatch.api.matching import match as match
     from meshmatch.api.matching import register as register
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from meshmatch.api.results import ConfidenceRule as ConfidenceRule
     from meshmatch.api.results import MatchResult as MatchResult
     from meshmatch.api.results import Transferred as Transferred
+    from meshmatch.api.results import find_maps as find_maps
     from meshmatch.api.texture import TexturedResult as TexturedResult
     from meshmatch.api.texture import transfer_texture as transfer_texture
     from meshmatch.api.transfer import transfer_colors as transfer_colors
@@ -62,7 +62,7 @@ _HOMES = {
     "Transferred": "meshmatch.api.results",
     "VertexMap": "meshmatch.maps.vertex_map",
     "evaluate": "meshmatch.api.evaluation",
-    "find_maps": "meshmatch.api.maps",
+    "find_maps": "meshmatch.api.results",
     "interpolate": "meshmatch.api.interpolation",
     "load_map": "meshmatch.maps.files",
     "load_model": "meshmatch.models.registry",

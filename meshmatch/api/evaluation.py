@@ -53,23 +53,18 @@ def evaluate(
         found = load_map(found, source, target)
     vertex_map = found.map if isinstance(found, MatchResult) else found
     check_map(vertex_map)
-    here = there = None
-    if isinstance(truth, tuple) and len(truth) == 2:
-        here, there = (_vertices(side) for side in truth)
-    elif truth is not None:
-        there = _vertices(truth)
-        here = np.arange(source.V)
-    if here is not None and there is not None and (here.ndim != 1 or here.shape != there.shape):
-        raise InputError(
-            f"the truth has {here.shape} vertices of the source and {there.shape} of the target",
-            "give one target vertex for every source vertex, or a pair of lists of the same length",
-        )
+    known: list[Ints] = []
+    if truth is not None:
+        pair = truth if isinstance(truth, tuple) and len(truth) == 2 else (np.arange(source.V), truth)
+        for numbers in map(np.asarray, pair):
+            if numbers.dtype.kind not in "iu":
+                hint = "integers, counted from 0"
+                raise InputError(f"the truth must be numbers of vertices, not {numbers.dtype}", hint)
+            known.append(numbers.astype(np.int64))
+        if known[0].ndim != 1 or known[0].shape != known[1].shape:
+            raise InputError(
+                f"the truth has {known[0].shape} vertices of the source and {known[1].shape} of the target",
+                "give one target vertex for every source vertex, or a pair of lists of the same length",
+            )
     with thread_limit(1):
-        return evaluate_map(vertex_map, source, target, here, there, rng=np.random.default_rng(seed))
-
-
-def _vertices(numbers: ArrayLike) -> Ints:
-    found = np.asarray(numbers)
-    if found.dtype.kind not in "iu":
-        raise InputError(f"the truth must be numbers of vertices, not {found.dtype}", "integers, counted from 0")
-    return found.astype(np.int64)
+        return evaluate_map(vertex_map, source, target, *known, rng=np.random.default_rng(seed))

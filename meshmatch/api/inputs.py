@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from meshmatch.errors import InputError, ModelError, OptionError
-from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.shapes.cloud import on_a_line
 from meshmatch.shapes.repair import Repaired, repair
@@ -31,10 +30,7 @@ _loading = threading.Lock()
 def as_model(model: TrainedModel | str | Path) -> TrainedModel:
     """A model, loaded once if it is given by its name or folder (and again if its files have changed since).
 
-    Raises
-    ------
-    ModelError
-        There is none of this name, its files are damaged, or it is something else.
+    `ModelError` where there is none of this name, its files are damaged, or it is something else.
     """
     if not isinstance(model, str | Path):
         from meshmatch.models.trained import TrainedModel
@@ -64,12 +60,8 @@ def _loaded(folder: Path, changed: int) -> TrainedModel:
 
 
 def validated(shape: Shape) -> Repaired:
-    """Repair a shape and refuse what cannot be fitted.
-
-    Raises
-    ------
-    InputError
-        Too few faces or points, no extent, or two large parts far apart.
+    """Repair a shape and refuse what cannot be fitted (`InputError`): too few faces or points, no extent, or large parts
+    far apart.
     """
     clean = repair(shape)
     fixed = clean.shape
@@ -104,13 +96,4 @@ def check_config(config: object) -> None:
     if not isinstance(config, FitConfig):
         raise OptionError(
             f"a config is a FitConfig, not {type(config).__name__}", 'such as meshmatch.FitConfig(up="y")'
-        )
-
-
-def check_fit(fit: object) -> None:
-    """Refuse what is no `Fit` (`OptionError`)."""
-    if not isinstance(fit, Fit):
-        raise OptionError(
-            f"a map is made from fits, not from {type(fit).__name__}",
-            "fit each shape with Matcher.fit; or call match with the shapes themselves",
         )

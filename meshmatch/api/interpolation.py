@@ -30,13 +30,10 @@ from meshmatch.threads import thread_limit
 
 Mesh = Literal["source", "template"]
 Place = Literal["auto", "files", "source"]
-MESHES: tuple[Mesh, ...] = get_args(Mesh)
-PLACES: tuple[Place, ...] = get_args(Place)
 EARLIEST, LATEST = -1.0, 2.0
 """Times between which a sequence may run: the source is at 0, the target at 1."""
 FORMATS = ("ply", "obj", "off", "glb")
 """Of the files in a folder."""
-LIST = "frames.json"
 _HAIR = 1e-9
 _ALIKE = 1.5  # sizes of files in one unit differ by less
 
@@ -74,13 +71,9 @@ class InterpolationOptions:
                 f"a sequence cannot run from {self.start:g} to {self.stop:g}",
                 f"the source is at 0 and the target at 1; times go from {EARLIEST:g} to {LATEST:g}, the earlier first",
             )
-        for name, value, choices in (
-            ("mesh", self.mesh, MESHES),
-            ("way", self.way, WAYS),
-            ("place", self.place, PLACES),
-        ):
-            if value not in choices:
-                raise OptionError(f"invalid {name} {value!r}", f"choose one of {', '.join(choices)}")
+        for name, choices in {"mesh": get_args(Mesh), "way": WAYS, "place": get_args(Place)}.items():
+            if getattr(self, name) not in choices:
+                raise OptionError(f"invalid {name} {getattr(self, name)!r}", f"choose one of {', '.join(choices)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,18 +100,14 @@ class Interpolation:
 
     Attributes
     ----------
-    steps : tuple of Step
-    fits : tuple of Fit
-        Of the source, of the shapes on the way, of the target.
-    times : tuple of float
-        When each of these is met.
-    place : {"files", "source"}
-        Where the shapes lie: from where the source's file has it to where the target's has it, or all in the frame and
-        unit of the source.
-    to_target : float
+    fits, times
+        Of the source, of the shapes on the way, of the target; and when each of these is met.
+    place
+        Where the shapes lie: from where the source's file has it to where the target's has it ("files"), or all in the
+        frame and unit of the source ("source").
+    to_target
         Mean distance of the carried vertices at time 1 to the target's surface, in units of sqrt(area).
-    seconds : float
-    notes : tuple of str
+    notes
         What repair did.
     """
 
@@ -186,7 +175,10 @@ def _steps(
     binding = None
     if options.mesh == "source":
         binding = SurfaceBinding(shape_of(fits[0]), fits[0], blend.turns(fits[0].vectors), matcher.threads)
-    place = options.place if options.place != "auto" else _usual_place(fits)
+    place = options.place
+    if place == "auto":  # files of different units have no place in common
+        sizes = [fit.frame.scale for fit in fits]
+        place = "files" if max(sizes) < _ALIKE * min(sizes) else "source"
 
     def seen(moment: float) -> tuple[np.ndarray, np.ndarray]:
         """Node vectors and carried vertices, core frame."""
@@ -207,23 +199,18 @@ def _steps(
     for met in blend.times:  # which rounding may have missed by a hair
         moments[np.abs(moments - met) < _HAIR] = met
     steps = tuple(step(number, moment) for number, moment in enumerate(moments.tolist()))
-    return steps, place, _distance(seen(1.0)[1], shape_of(fits[-1]).shape, fits[-1])
+    target, last = shape_of(fits[-1]).shape, seen(1.0)[1]
+    own, normals = in_core_frame(target, fits[-1])
+    found = Surface(own, target.faces, np.zeros_like(normals)).query(last, np.zeros_like(last))
+    return steps, place, float(found.distance.mean())
 
 
 def save_folder(path: str | Path, result: Interpolation, kind: str = "ply") -> list[str]:
-    """Write each shape of a sequence into a new folder, and a list of them: ``frame-000.ply`` ..., ``frames.json``.
+    """Write each shape of a sequence into a new folder, and a list of them: ``frame-000.ply`` ..., ``frames.json``; the
+    names of the shapes' files, in order.
 
-    Returns
-    -------
-    list of str
-        The names of the shapes' files, in order.
-
-    Raises
-    ------
-    OptionError
-        The format is none of `FORMATS`.
-    OutputError
-        The folder holds something, or cannot be written.
+    `OptionError` for a format that is none of `FORMATS`; `OutputError` where the folder holds something, or cannot be
+    written.
     """
     if kind not in FORMATS:
         raise OptionError(f"shapes of a sequence are not written as {kind}", f"choose {', '.join(FORMATS)}")
@@ -233,18 +220,5 @@ def save_folder(path: str | Path, result: Interpolation, kind: str = "ply") -> l
             save_shape(folder / name, step.shape)
         frames = [{"file": name} | step.record for name, step in zip(names, result.steps, strict=True)]
         words = {"times_of_the_shapes": list(result.times), "place": result.place, "frames": frames}
-        (folder / LIST).write_text(json.dumps(words, indent=1) + "\n", encoding="utf-8")
+        (folder / "frames.json").write_text(json.dumps(words, indent=1) + "\n", encoding="utf-8")
     return names
-
-
-def _usual_place(fits: Sequence[Fit]) -> Place:
-    """Files of different units have no place in common."""
-    sizes = [fit.frame.scale for fit in fits]
-    return "files" if max(sizes) < _ALIKE * min(sizes) else "source"
-
-
-def _distance(verts: np.ndarray, target: Shape, fit: Fit) -> float:
-    """Mean distance of vertices (N, 3) to a shape, in the core frame of its fit."""
-    own, normals = in_core_frame(target, fit)
-    found = Surface(own, target.faces, np.zeros_like(normals)).query(verts, np.zeros_like(verts))
-    return float(found.distance.mean())

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.api.inputs import as_model, check_config, check_fit, checked_threads, validated
+from meshmatch.api.inputs import as_model, check_config, checked_threads, validated
 from meshmatch.api.results import MatchResult, map_of_fits, shape_of
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
@@ -75,12 +75,7 @@ class Matcher:
         self.progress = progress
 
     def fit(self, shape: ShapeLike, config: FitConfig | None = None) -> Fit:
-        """Fit the model's template to one shape.
-
-        Parameters
-        ----------
-        config : FitConfig, optional
-            For this shape alone, such as its own up axis.
+        """Fit the model's template to one shape, with a config for this shape alone, such as its own up axis.
 
         Raises
         ------
@@ -92,10 +87,7 @@ class Matcher:
     def fit_all(self, shapes: Sequence[ShapeLike], config: FitConfig | Sequence[FitConfig] | None = None) -> list[Fit]:
         """Fit the template to several shapes, some beside each other; where one fails, the others stop.
 
-        Parameters
-        ----------
-        config : FitConfig or sequence of FitConfig, optional
-            One for all shapes, or one for each.
+        There is one config for all shapes, or one for each. Errors as `fit`.
         """
         clean = [validated(shape) for shape in as_shapes(shapes)]
         return self._fit_all(clean, self._configs(config, len(clean)))
@@ -108,16 +100,11 @@ class Matcher:
             return dense_shape(self.model, fit)
 
     def map(self, source: Fit, target: Fit, *, agree: bool = True) -> VertexMap:
-        """The map from the shape of one fit to the shape of another.
+        """The map from the shape of one fit to the shape of another, both of the same model.
 
-        Parameters
-        ----------
-        source, target : Fit
-            From this matcher, or another one of the same model.
-        agree : bool
-            Let both fits agree on how the template stretches first, as `match` does: the more accurate map, and a
-            confidence that knows where they disagreed. Without it fits are only composed: a tenth of a second
-            instead of some seconds.
+        With ``agree`` both fits first agree on how the template stretches, as `match` does: the more accurate map, and
+        a confidence that knows where they disagreed. Without it they are only composed: a tenth of a second instead of
+        some seconds.
 
         Raises
         ------
@@ -126,7 +113,11 @@ class Matcher:
         """
         with thread_limit(1):
             for fit in (source, target):
-                check_fit(fit)
+                if not isinstance(fit, Fit):
+                    raise OptionError(
+                        f"a map is made from fits, not from {type(fit).__name__}",
+                        "fit each shape with Matcher.fit; or call match with the shapes themselves",
+                    )
             fits = self._agreed((source, target)) if agree else (source, target)
             return map_of_fits(fits, (source, target), self.threads)
 
@@ -142,7 +133,11 @@ class Matcher:
         clean = [validated(as_shape(source, "source")), validated(as_shape(target, "target"))]
         configs = self._configs(config, 2)
         if landmarks is not None:
-            _check_landmarks(self.model, configs)
+            for each in configs:
+                if not each.moves_nodes:
+                    hint = "leave out the landmarks, or choose nodes"
+                    raise OptionError(f"landmarks need refine='nodes', not {each.refine!r}", hint)
+            check_landmarks(self.model)
             landmark_places(clean, landmarks)  # before the long work
         with thread_limit(1):
             fits = self._fit_all(clean, configs)
@@ -240,13 +235,11 @@ def match(
     ----------
     source, target : path, Shape, (N, 3) array, (vertices, faces), or an object with .vertices and .faces
         Meshes or point clouds of the model's category, in any unit, orientation and resolution.
-    model : str, path or TrainedModel
-        Name in the registry, model folder, or a model that `load_model` returned.
     config : FitConfig or a pair of them, optional
         How shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes.
     landmarks : (source vertices (N,), target vertices (N,)), optional
         Known pairs, which the map then honours; only with ``refine="nodes"``.
-    threads, progress
+    model, threads, progress
         See `Matcher`.
 
     Returns
@@ -270,26 +263,9 @@ def register(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> Fit:
-    """Fit the model's template to one shape; see `match` for the parameters.
+    """Fit the model's template to one shape; see `match` for the parameters and the errors.
 
-    Returns
-    -------
-    Fit
-        ``fit.points_in_file`` are the template's vertices on the shape, in its own frame and unit; all fits of a
-        model have the same vertices and triangles in the same order.
-
-    Raises
-    ------
-    MeshmatchError
-        As `match`.
+    ``points_in_file`` of the fit are the template's vertices on the shape, in its own frame and unit; all fits of a model
+    have the same vertices and triangles in the same order.
     """
     return Matcher(model, config, threads, progress).fit(shape)
-
-
-def _check_landmarks(model: TrainedModel, configs: Sequence[FitConfig]) -> None:
-    for config in configs:
-        if not config.moves_nodes:
-            raise OptionError(
-                f"landmarks need refine='nodes', not {config.refine!r}", "leave out the landmarks, or choose nodes"
-            )
-    check_landmarks(model)

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch.api.inputs import checked_threads
-from meshmatch.api.maps import MapLike, find_maps
-from meshmatch.api.results import MapPair
+from meshmatch.api.results import MapLike, MapPair, find_maps
 from meshmatch.arrays import Floats, as_numbers
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
-from meshmatch.outputs import replace_on_success
 from meshmatch.render.compose import (
     Composition,
     compose_fit,
@@ -26,8 +24,8 @@ from meshmatch.render.compose import (
     merge_labels,
 )
 from meshmatch.render.facing import facing, facing_alike
-from meshmatch.render.picture import Look
-from meshmatch.render.viewer import Looks, PageReport, share_look, write_page
+from meshmatch.render.picture import Look, check_picture
+from meshmatch.render.viewer import PageReport, share_look, write_page
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
 from meshmatch.shapes.shape import Shape
@@ -49,30 +47,27 @@ def picture(
 ) -> tuple[int, int]:
     """Draw shapes side by side as a PNG, without a GPU, a display or OpenGL.
 
+    Returns width and height in pixels.
+
     Parameters
     ----------
-    shapes : sequence of shapes, or Composition
+    shapes
         Each as in `meshmatch.match`; those given as files have their textures. Or what one of the functions of
         `meshmatch.render.compose` returned, such as the errors of a map.
-    path : path
+    path
         A .png file.
-    match : MatchResult, VertexMap or path, optional
-        Of two shapes: corresponding points have one colour.
-    values : sequence of arrays, optional
+    match
+        A match or map of two shapes: corresponding points have one colour.
+    values
         For each shape a number per vertex (V,), shown as a color map; or colours (V, 3 or 4) in 0..1.
-    labels : sequence of arrays or Labels, optional
+    labels
         For each shape a label per vertex or face.
-    fit : Fit, optional
+    fit
         Of the one shape: the fitted template is drawn over it, with its distance as a color map.
-    look : Look, optional
+    look
         Size, background, axes and side.
-    names : sequence of str, optional
+    names
         What is written below the shapes.
-
-    Returns
-    -------
-    (width, height)
-        In pixels.
 
     Raises
     ------
@@ -80,18 +75,15 @@ def picture(
         More than one of `match`, `values`, `labels` and `fit`; or one that does not belong to the shapes.
     """
     look = look or Look()
-    if Path(path).suffix.lower() != ".png":
-        raise OptionError(f"{Path(path).name}: a picture is a PNG", "end the name in .png")
-    if isinstance(names, str):
-        names = [names]
+    check_picture(path)
     with thread_limit(1):
         shown = _composed(shapes, look, match, values, labels, fit)
         if names is not None:
+            names = [names] if isinstance(names, str) else names
             if len(names) != len(shown.panels):
                 raise OptionError(f"{len(shown.panels)} shapes need as many names, not {len(names)}")
             shown = shown.named(names)
-        with replace_on_success(path) as temporary:
-            return shown.render(temporary, look)
+        return shown.render(path, look)
 
 
 def _composed(
@@ -109,17 +101,25 @@ def _composed(
     if len(chosen) > 1:
         raise OptionError(f"{' and '.join(chosen)} do not go together", "make a picture for each")
     shapes = as_shapes(given)
-    for name, tables in (("values", values), ("labels", labels)):
-        if tables is not None and len(tables) != len(shapes):
-            raise OptionError(f"{len(shapes)} shapes need as many {name}, not {len(tables)}")
+    for name, given_of in (("values", values), ("labels", labels)):
+        if given_of is not None and len(given_of) != len(shapes):
+            raise OptionError(f"{len(shapes)} shapes need as many {name}, not {len(given_of)}")
     if match is not None:
         if len(shapes) != 2:
             raise OptionError(f"a map is of two shapes, not of {len(shapes)}", "give the source, then the target")
         maps = find_maps(shapes[0], shapes[1], match)
-        turns = None if maps.match is None else maps.match.rotations
-        return compose_match(shapes[0], shapes[1], maps.forward, turns or (None, None), look=look)
+        return compose_match(shapes[0], shapes[1], maps.forward, maps.rotations, look)
     if values is not None:
-        return compose_values(shapes, [_table(*each) for each in zip(values, shapes, strict=True)], "")
+        tables = [
+            as_numbers(own, f"values of {shape.name or 'the shape'}") for own, shape in zip(values, shapes, strict=True)
+        ]
+        for table, shape in zip(tables, shapes, strict=True):
+            if table.ndim not in (1, 2) or len(table) != shape.V:
+                raise InputError(
+                    f"values of {shape.name or 'the shape'} must be an array of ({shape.V},), not {table.shape}",
+                    "one number or one colour for each vertex, and one array for each shape",
+                )
+        return compose_values(shapes, tables)
     if labels is not None:
         pairs = zip(labels, shapes, strict=True)
         read = [own if isinstance(own, Labels) else labels_of(own, shape) for own, shape in pairs]
@@ -136,16 +136,6 @@ def _composed(
         return compose_fit(shapes[0], fit.shape, fit.frame.rotation)
     looks = [_read_look(source, shape)[0] for source, shape in zip(given, shapes, strict=True)]
     return compose_shapes(list(zip(shapes, looks, strict=True)))
-
-
-def _table(values: ArrayLike, shape: Shape) -> Floats:
-    table = as_numbers(values, f"values of {shape.name or 'the shape'}")
-    if table.ndim not in (1, 2) or len(table) != shape.V:
-        raise InputError(
-            f"values of {shape.name or 'the shape'} must be an array of ({shape.V},), not {table.shape}",
-            "one number or one colour for each vertex, and one array for each shape",
-        )
-    return table
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,14 +161,14 @@ def view(
     Parameters
     ----------
     source, target, match
-        As in `meshmatch.transfer_values`; textures are read where the shapes are files.
-    path : path
+        See `find_maps`; textures are read where the shapes are files.
+    path
         An .html file.
-    up, front : str, optional
+    up, front
         How the source stands where a map was given, such as "z" and "-y"; guessed by default.
-    names : (str, str), optional
-        To show, instead of the names of the shapes.
-    threads : int
+    names
+        Two, to show instead of the names of the shapes.
+    threads
         For what is searched on the surfaces.
 
     Raises
@@ -192,21 +182,12 @@ def view(
     shapes = as_shape(source, "source"), as_shape(target, "target")
     maps = find_maps(*shapes, match)
     with thread_limit(1):
-        (look, uv, note), (other, other_uv, other_note) = (
-            _read_look_and_uv(given, shape) for given, shape in zip((source, target), shapes, strict=True)
-        )
-        looks: Looks | None = share_look(
-            shapes, (look, other), maps.forward, maps.backward, coordinates=(uv, other_uv), workers=threads
-        )
-        report = write_page(
-            path,
-            *shapes,
-            maps.forward,
-            maps.backward,
-            rotations=_rotations(source, maps, up, front),
-            names=None if names is None else (names[0], names[1]),
-            looks=looks,
-        )
+        (look, uv, note), (other, other_uv, other_note) = map(_read_look, (source, target), shapes)
+        both = maps.forward, maps.backward
+        looks = share_look(shapes, (look, other), *both, coordinates=(uv, other_uv), workers=threads)
+        shown = None if names is None else (names[0], names[1])
+        rotations = _rotations(source, maps, up, front)
+        report = write_page(path, *shapes, *both, rotations=rotations, names=shown, looks=looks)
     notes = tuple(each for each in (note, other_note) if each)
     return Page(report.drawn, (*notes, *report.notes), report.size, maps)
 
@@ -229,12 +210,7 @@ def _rotations(
     return None, None
 
 
-def _read_look(source: ShapeLike, shape: Shape) -> tuple[Appearance | None, str]:
-    look, _, note = _read_look_and_uv(source, shape)
-    return look, note
-
-
-def _read_look_and_uv(source: ShapeLike, shape: Shape) -> tuple[Appearance | None, Floats | None, str]:
+def _read_look(source: ShapeLike, shape: Shape) -> tuple[Appearance | None, Floats | None, str]:
     """Textures and texture coordinates of a file. A look that cannot be read is no reason to show nothing."""
     if not isinstance(source, str | Path):
         return None, None, ""

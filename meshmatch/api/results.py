@@ -1,22 +1,31 @@
-"""What matching and transfers give back, and the maps in both directions that transfers follow."""
+"""What matching and transfers give back, and the maps in both directions that transfers follow: those at hand, or new."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Generic, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.errors import OptionError
+from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
+from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.low_confidence import LowConfidence
+
+if TYPE_CHECKING:
+    from meshmatch.api.matching import Matcher
+
 from meshmatch.transfer.mapped_mesh import invert_map
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +102,48 @@ class MapPair:
             return invert_map(self.forward, self.source, self.target, self.threads)
 
 
-def pair_of_map(found: VertexMap, source: Shape, target: Shape, threads: int = 1, label: str = "the map") -> MapPair:
-    """A map at hand as a pair; `InputError` where it belongs to other shapes or has the opposite direction."""
-    return MapPair(source, target, found.for_shapes(source, target, label), None, threads)
+MapMaker: TypeAlias = Callable[[Shape, Shape], "MatchResult | MapPair"]
+MapLike: TypeAlias = "MatchResult | MapPair | VertexMap | str | Path | Matcher | MapMaker | None"
+"""What a transfer follows: a match or a map from source to target, its file, or who makes it when all else is
+checked: a `Matcher`, or a function of both shapes."""
+
+
+def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> MapPair:
+    """The maps between two shapes, which transfers follow; several transfers can share one pair.
+
+    Parameters
+    ----------
+    source, target
+        As in `meshmatch.match`.
+    match : MatchResult, VertexMap, path, Matcher or None
+        A match or a map from source to target that is there already; or what the shapes are matched with.
+
+    Raises
+    ------
+    MeshmatchError
+        The map belongs to other shapes or has the opposite direction; or as `meshmatch.match`.
+    """
+    source, target = as_shape(source, "source"), as_shape(target, "target")
+    label = Path(match).name if isinstance(match, str | Path) else "the map"
+    found = load_map(match) if isinstance(match, str | Path) else match
+    if callable(found):
+        found = found(source, target)
+    elif not isinstance(found, VertexMap | MatchResult | MapPair):
+        from meshmatch.api.matching import Matcher
+
+        matcher = Matcher() if found is None else found
+        if not isinstance(matcher, Matcher):
+            raise InputError(
+                f"{type(match).__name__} is not a map",
+                "pass a MatchResult, a VertexMap, the path of a map, a Matcher, or nothing to match the shapes",
+            )
+        found = matcher.match(source, target)
+    if isinstance(found, VertexMap):
+        return MapPair(source, target, found.for_shapes(source, target, label))
+    if isinstance(found, MatchResult):
+        return MapPair(source, target, found.map.for_shapes(source, target), found, found.threads)
+    found.forward.for_shapes(source, target)
+    return found
 
 
 def map_of_fits(fits: tuple[Fit, Fit], before_agreement: tuple[Fit, Fit], threads: int = 1) -> VertexMap:
@@ -117,9 +165,6 @@ def shape_of(fit: Fit) -> Repaired:
     if fit.repaired is None:
         raise OptionError("this fit does not know its shape", "make it with meshmatch.register or Matcher.fit")
     return fit.repaired
-
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from meshmatch.api.maps import MapLike, find_maps
-from meshmatch.api.results import MapPair
+from meshmatch.api.results import MapLike, MapPair, find_maps
 from meshmatch.errors import InputError, OptionError
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.appearance import Appearance, vertex_colors_alone
@@ -24,20 +23,9 @@ from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of
 
 @dataclass(frozen=True, eq=False)
 class TexturedResult:
-    """The target with its new texture.
-
-    Attributes
-    ----------
-    mesh : Textured
-        Vertices, faces and texture coordinates.
-    baked : Baked
-        ``baked.image`` (size, size, 4) uint8, and shares of the surface that are not trusted or discontinuous.
-    atlas : Atlas
-        The texture coordinates, and why the target's own were not used.
-    maps : MapPair
-        The maps that were followed.
-    seconds : float
-        Wall time of unwrapping and baking.
+    """The target with its new texture: the ``mesh`` with its texture coordinates, what was ``baked`` (``image`` (size,
+    size, 4) uint8, and shares of the surface that are not trusted or discontinuous), the ``atlas`` (and why the target's
+    own coordinates were not used), the ``maps`` that were followed, and the ``seconds`` of unwrapping and baking.
     """
 
     mesh: Textured
@@ -49,12 +37,7 @@ class TexturedResult:
     def save(self, path: str | Path) -> None:
         """Write a .glb, or an .obj with an .mtl and a .png of the same name.
 
-        Raises
-        ------
-        OptionError
-            The suffix is neither .glb nor .obj.
-        OutputError
-            A file cannot be written.
+        `OptionError` for another suffix, `OutputError` where a file cannot be written.
         """
         save_textured(path, self.mesh, self.baked.image)
 
@@ -70,7 +53,7 @@ def transfer_texture(
     look: Appearance | None = None,
     progress: ProgressCallback | None = None,
 ) -> TexturedResult:
-    """Bake the texture of the source into one of the target.
+    """Bake the texture of the source into one of the target; ``save("target.glb")`` of the result writes it.
 
     Parameters
     ----------
@@ -83,13 +66,8 @@ def transfer_texture(
     options : BakeOptions
     look : Appearance, optional
         Of the source, where it is not a file; else its vertex colours are baked.
-    progress : callable, optional
-        Called with the stage, the name of the shape and the share of the stage that is done (0..1).
-
-    Returns
-    -------
-    TexturedResult
-        ``result.save("target.glb")`` writes it.
+    progress
+        See `Matcher`.
 
     Raises
     ------
@@ -99,12 +77,8 @@ def transfer_texture(
     """
     if uv not in get_args(Keep):
         raise OptionError(f"invalid uv {uv!r}", f"choose one of {', '.join(get_args(Keep))}")
-    own = None
-    if uv != "new" and isinstance(target, str | Path):
-        own_path = Path(target)
-        target = as_shape(target)
-        own = load_coordinates(own_path, target)
     mesh = as_shape(target, "target")
+    own = load_coordinates(target, mesh) if uv != "new" and isinstance(target, str | Path) else None
     shape, look = _look_of(source, image, look)
     began = time.monotonic()
     with thread_limit(1):

@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
-from meshmatch.api.maps import MapLike, find_maps
-from meshmatch.api.results import ConfidenceRule, Transferred
+from meshmatch.api.results import ConfidenceRule, MapLike, MapPair, Transferred, find_maps
 from meshmatch.arrays import Float, Floats, as_numbers
 from meshmatch.errors import InputError, OptionError
-from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import pull_directions, pull_face_labels, pull_labels, pull_values, pull_weights
+from meshmatch.transfer.bake import colors_of_vertices
 from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, named
 from meshmatch.transfer.landmarks import Landmarks, at_points, at_vertices, load_landmarks, push_landmarks
 from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels, replace_low_values, replace_low_weights
 from meshmatch.transfer.value_files import checked_colors, light, light_of, seen
 from meshmatch.transfer.weight_files import SkinWeights, load_weights, weights_of
-
-if TYPE_CHECKING:
-    from meshmatch.shapes.appearance import Appearance
 
 
 def transfer_values(
@@ -37,23 +34,18 @@ def transfer_values(
     directions: bool = False,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Floats]:
-    """Numbers of the source's vertices on the target's vertices, interpolated within the source's faces.
+    """Numbers of the source's vertices on the target's vertices, interpolated within the source's faces: ``data`` is an
+    array (V_target,) or (V_target, D).
 
     Parameters
     ----------
-    source, target, match
-        See `find_maps`.
+    source, target, match, rule
+        See `find_maps` and `ConfidenceRule`.
     values : (V_source,) or (V_source, D)
         Values that are not finite take no part.
     directions : bool
         The values are directions (V_source, 3), such as normals: they are turned as the surface turns from source to
         target, and have unit length.
-    rule : ConfidenceRule
-
-    Returns
-    -------
-    Transferred
-        ``result.data`` is an array (V_target,) or (V_target, D).
 
     Raises
     ------
@@ -76,7 +68,7 @@ def transfer_values(
             found = pull_directions(maps.backward, maps.source, maps.target, numbers)
         else:
             found = pull_values(maps.backward, numbers)
-        confidence = _confidence(maps.backward)
+        confidence = _confidence(maps)
         found, low = replace_low_values(found, confidence < rule.minimum, maps.target, blank, rule.fill)
     return Transferred(found, confidence, low, maps)
 
@@ -89,28 +81,21 @@ def transfer_colors(
     colors: ArrayLike | Appearance | None = None,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Floats]:
-    """Vertex colours of the source on the target's vertices, mixed as light.
+    """Vertex colours of the source on the target's vertices, mixed as light: ``data`` is (V_target, 4), red, green, blue
+    (sRGB) and alpha in 0..1.
 
     Parameters
     ----------
-    source, target, match
-        See `find_maps`.
+    source, target, match, rule
+        See `find_maps` and `ConfidenceRule`.
     colors : (V_source, 3 or 4) in 0..1 (sRGB) or Appearance, optional
         Other colours than those of the source's file; an appearance is sampled with its textures.
-    rule : ConfidenceRule
-
-    Returns
-    -------
-    Transferred
-        ``result.data`` is (V_target, 4): red, green, blue (sRGB) and alpha in 0..1.
 
     Raises
     ------
     MeshmatchError
         The source has no vertex colours; or as `find_maps`.
     """
-    from meshmatch.shapes.appearance import Appearance
-
     source = as_shape(source, "source")
     given = None if isinstance(colors, Appearance) else light_of(source, colors)
     blank = None
@@ -122,11 +107,9 @@ def transfer_colors(
         if given is not None:
             found = pull_values(maps.backward, given)
         else:
-            from meshmatch.transfer.bake import colors_of_vertices
-
             assert isinstance(colors, Appearance)
             found = colors_of_vertices(maps.source, colors, maps.target, maps.backward)
-        confidence = _confidence(maps.backward)
+        confidence = _confidence(maps)
         found, low = replace_low_values(found, confidence < rule.minimum, maps.target, blank, rule.fill)
     return Transferred(seen(found), confidence, low, maps)
 
@@ -140,22 +123,17 @@ def transfer_labels(
     to: On | None = None,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Labels]:
-    """Labels of the source's vertices or faces on the target: voted on, never averaged.
+    """Labels of the source's vertices or faces on the target, voted on, never averaged: ``data.values`` is the label of
+    each vertex or face.
 
     Parameters
     ----------
-    source, target, match
-        See `find_maps`.
+    source, target, match, rule
+        See `find_maps` and `ConfidenceRule`.
     labels : Labels, array (V_source,) or (F_source,) of integers or words, or path
         As `Labels` where their number does not tell what they belong to.
     to : {"vertices", "faces"}, optional
         What gets labels; by default what has them on the source, and the points of a cloud.
-    rule : ConfidenceRule
-
-    Returns
-    -------
-    Transferred
-        ``result.data.values`` is the label of each vertex or face of the target.
 
     Raises
     ------
@@ -178,7 +156,7 @@ def transfer_labels(
     maps = find_maps(source, target, match)
     back, of_face = maps.backward, given.on == "faces"
     with thread_limit(1):
-        confidence = _confidence(back)
+        confidence = _confidence(maps)
         if kind == "faces":
             found = pull_face_labels(back, source, target, given.codes, of_face, maps.threads)
             confidence = confidence[target.faces].mean(axis=1)
@@ -198,22 +176,15 @@ def transfer_weights(
     influences: int = 4,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[SkinWeights]:
-    """Skin weights of the source's vertices on the target's; each row sums to 1.
+    """Skin weights of the source's vertices on the target's: ``data.matrix`` is sparse, (V_target, J), its rows sum to 1.
 
     Parameters
     ----------
-    source, target, match
-        See `find_maps`.
+    source, target, match, rule
+        See `find_maps` and `ConfidenceRule`; weights are filled in or kept, never left blank.
     weights : SkinWeights, (V_source, J) array or sparse array, or path
     influences : int
         How many joints may move a vertex; the heaviest are kept.
-    rule : ConfidenceRule
-        Weights are filled in or kept, never left blank.
-
-    Returns
-    -------
-    Transferred
-        ``result.data.matrix`` is sparse, (V_target, J).
 
     Raises
     ------
@@ -231,7 +202,7 @@ def transfer_weights(
         given = weights if isinstance(weights, SkinWeights) else weights_of(weights, source)
     maps = find_maps(source, target, match)
     with thread_limit(1):
-        confidence = _confidence(maps.backward)
+        confidence = _confidence(maps)
         found = pull_weights(maps.backward, given.matrix, influences)
         found, low = replace_low_weights(found, confidence < rule.minimum, maps.target, rule.fill, influences)
     return Transferred(SkinWeights(found, given.names), confidence, low, maps)
@@ -245,21 +216,15 @@ def transfer_landmarks(
     *,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Landmarks]:
-    """Landmarks of the source at exact points of the target's surface.
+    """Landmarks of the source at exact points of the target's surface: ``data.points`` (N, 3) in the target's frame; also
+    their vertex, or face and barycentric weights.
 
     Parameters
     ----------
-    source, target, match
-        See `find_maps`.
+    source, target, match, rule
+        See `find_maps` and `ConfidenceRule`; landmarks below the minimum are counted, and kept.
     landmarks : Landmarks, vertices (N,), positions (N, 3), or path
         A position stands for the nearest point of the source.
-    rule : ConfidenceRule
-        Its minimum alone: landmarks below it are counted, and kept.
-
-    Returns
-    -------
-    Transferred
-        ``result.data.points`` (N, 3) in the target's frame; also their vertex, or face and barycentric weights.
 
     Raises
     ------
@@ -291,5 +256,5 @@ def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape) -> 
     )
 
 
-def _confidence(back: VertexMap) -> Float[Floats, " V"]:
-    return back.confidence.astype(np.float64)
+def _confidence(maps: MapPair) -> Float[Floats, " V"]:
+    return maps.backward.confidence.astype(np.float64)

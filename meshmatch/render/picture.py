@@ -67,6 +67,12 @@ class Look:
         background_color(self.background)
 
 
+def check_picture(path: str | Path) -> None:
+    """Refuse a file name that is not .png (`OptionError`)."""
+    if Path(path).suffix.lower() != ".png":
+        raise OptionError(f"{Path(path).name}: a picture is a PNG", "end the name in .png")
+
+
 def check_size(size: tuple[int, int]) -> None:
     """Refuse a picture too small to show anything, or too large to hold in memory (`OptionError`)."""
     width, height = size
@@ -115,14 +121,12 @@ def render_shapes(
     OutputError
         The file cannot be written.
     """
-    path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise OptionError(f"{path.name}: a picture is a PNG", "end the name in .png")
+    check_picture(path)
     wanted = [panel if isinstance(panel, Panel) else Panel(*panel) for panel in panels]  # type: ignore[arg-type]
     if not wanted:
         raise OptionError("a picture needs a shape")
-    image = _image(wanted, look or Look())
-    with replace_on_success(path) as temporary:
+    with replace_on_success(path) as temporary:  # what cannot be written is told before the work
+        image = _image(wanted, look or Look())
         image.save(temporary, format="PNG", compress_level=9)
     return image.size
 
