@@ -27,26 +27,19 @@ def evaluate(
 ) -> Evaluation:
     """Measure a map: its coverage, its distortion, and its errors where the truth is known.
 
+    Errors are geodesic distances on the target, over the square root of its area; or in centimetres with the target
+    scaled to 1.9 square metres, the skin of a person.
+
     Parameters
     ----------
-    found : MatchResult, VertexMap or path
-    source, target
-        The shapes that it maps, as in `meshmatch.match`.
+    found, source, target
+        A map, or its file, and the shapes that it maps, as in `meshmatch.match`.
     truth : (V_source,) or ((N,), (N,)), optional
         The true target vertex of every source vertex; or N vertices of the source and those of the target.
     seed : int
         Of the random pairs of points between which distortion is measured.
 
-    Returns
-    -------
-    Evaluation
-        Errors are geodesic distances on the target, over the square root of its area; or in centimetres with the
-        target scaled to 1.9 square metres, the skin of a person.
-
-    Raises
-    ------
-    MeshmatchError
-        The map or the truth belongs to other shapes, or is something else.
+    `MeshmatchError`: the map or the truth belongs to other shapes, or is something else.
     """
     source, target = as_shape(source, "source"), as_shape(target, "target")
     if isinstance(found, str | Path):

@@ -53,10 +53,7 @@ class InterpolationOptions:
     place : {"auto", "files", "source"}
         See `Interpolation`; "auto" is "files" where the sizes of the shapes differ by less than a half.
 
-    Raises
-    ------
-    OptionError
-        An unknown choice, or times out of range.
+    `OptionError` for an unknown choice, or times out of range.
     """
 
     start: float = 0.0
@@ -98,17 +95,10 @@ class Step:
 class Interpolation:
     """A sequence of shapes with the same vertices and faces.
 
-    Attributes
-    ----------
-    fits, times
-        Of the source, of the shapes on the way, of the target; and when each of these is met.
-    place
-        Where the shapes lie: from where the source's file has it to where the target's has it ("files"), or all in the
-        frame and unit of the source ("source").
-    to_target
-        Mean distance of the carried vertices at time 1 to the target's surface, in units of sqrt(area).
-    notes
-        What repair did.
+    ``fits`` are of the source, of the shapes on the way, of the target, and ``times`` are when each of these is met.
+    ``place`` says where the shapes lie: from where the source's file has it to where the target's has it ("files"), or
+    all in the frame and unit of the source ("source"). ``to_target`` is the mean distance of the carried vertices at time
+    1 to the target's surface, in units of sqrt(area). ``notes`` are what repair did.
     """
 
     steps: tuple[Step, ...]
@@ -143,10 +133,7 @@ def interpolate(
     model, config, threads, progress
         See `match`; a sequence of configs has one for each shape.
 
-    Raises
-    ------
-    MeshmatchError
-        A shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
+    `MeshmatchError`: a shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
     """
     began = time.monotonic()
     options = options or InterpolationOptions()

@@ -54,10 +54,7 @@ class Matcher:
     >>> fits = [matcher.fit(path) for path in paths]
     >>> maps = {(a, b): matcher.map(fits[a], fits[b]) for a, b in pairs}
 
-    Raises
-    ------
-    ModelError
-        There is no such model, or it is damaged.
+    `ModelError` where there is no such model, or it is damaged.
     """
 
     def __init__(
@@ -77,10 +74,7 @@ class Matcher:
     def fit(self, shape: ShapeLike, config: FitConfig | None = None) -> Fit:
         """Fit the model's template to one shape, with a config for this shape alone, such as its own up axis.
 
-        Raises
-        ------
-        MeshmatchError
-            The shape cannot be read or fitted, or the choices contradict each other.
+        `MeshmatchError` where the shape cannot be read or fitted, or the choices contradict each other.
         """
         return self.fit_all([shape], config)[0]
 
@@ -104,12 +98,7 @@ class Matcher:
 
         With ``agree`` both fits first agree on how the template stretches, as `match` does: the more accurate map, and
         a confidence that knows where they disagreed. Without it they are only composed: a tenth of a second instead of
-        some seconds.
-
-        Raises
-        ------
-        OptionError
-            A fit of another template, or one that does not know its shape.
+        some seconds. `OptionError` for a fit of another template, or one that does not know its shape.
         """
         with thread_limit(1):
             for fit in (source, target):
@@ -229,7 +218,7 @@ def match(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> MatchResult:
-    """Match two shapes: for every vertex of the source its vertex on the target.
+    """Match two shapes: ``map.index[i]`` of the result is the vertex of the target matched to vertex i of the source.
 
     Parameters
     ----------
@@ -242,15 +231,7 @@ def match(
     model, threads, progress
         See `Matcher`.
 
-    Returns
-    -------
-    MatchResult
-        ``result.map.index[i]`` is the vertex of the target matched to vertex i of the source.
-
-    Raises
-    ------
-    MeshmatchError
-        A shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
+    `MeshmatchError`: a shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
     """
     return Matcher(model, None, threads, progress).match(source, target, config, landmarks)
 

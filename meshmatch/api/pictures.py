@@ -69,10 +69,8 @@ def picture(
     names
         What is written below the shapes.
 
-    Raises
-    ------
-    MeshmatchError
-        More than one of `match`, `values`, `labels` and `fit`; or one that does not belong to the shapes.
+    `MeshmatchError`: more than one of `match`, `values`, `labels` and `fit`; or one that does not belong to the
+    shapes.
     """
     look = look or Look()
     check_picture(path)
@@ -171,10 +169,7 @@ def view(
     threads
         For what is searched on the surfaces.
 
-    Raises
-    ------
-    MeshmatchError
-        As `meshmatch.match`; or the map belongs to other shapes.
+    `MeshmatchError`: as `meshmatch.match`; or the map belongs to other shapes.
     """
     threads = checked_threads(threads)
     if names is not None and (isinstance(names, str) or len(names) != 2):

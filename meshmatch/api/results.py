@@ -44,8 +44,6 @@ class MatchResult:
         What was changed in the shapes before fitting, and which choices were replaced.
     before_agreement : (Fit, Fit)
         The same fits before they agreed; where agreement moved them much, a map is not to be trusted.
-    threads : int
-        Used for `backward` too.
     """
 
     map: VertexMap
@@ -72,14 +70,7 @@ class MatchResult:
 class MapPair:
     """The maps between two shapes in both directions.
 
-    Attributes
-    ----------
-    source, target : Shape
-    forward : VertexMap
-        From source to target.
-    match : MatchResult, optional
-        Where the shapes were matched; without it the backward map is the inverse of the forward map.
-    threads : int
+    ``forward`` is from source to target. Without a ``match`` of the shapes the backward map is the inverse of it.
     """
 
     source: Shape
@@ -118,10 +109,7 @@ def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> Ma
     match : MatchResult, VertexMap, path, Matcher or None
         A match or a map from source to target that is there already; or what the shapes are matched with.
 
-    Raises
-    ------
-    MeshmatchError
-        The map belongs to other shapes or has the opposite direction; or as `meshmatch.match`.
+    `MeshmatchError`: the map belongs to other shapes or has the opposite direction; or as `meshmatch.match`.
     """
     source, target = as_shape(source, "source"), as_shape(target, "target")
     label = Path(match).name if isinstance(match, str | Path) else "the map"
@@ -149,10 +137,7 @@ def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> Ma
 def map_of_fits(fits: tuple[Fit, Fit], before_agreement: tuple[Fit, Fit], threads: int = 1) -> VertexMap:
     """The map from the shape of the first fit to that of the second.
 
-    Raises
-    ------
-    OptionError
-        The fits are of different templates, or do not know their shapes.
+    `OptionError` where the fits are of different templates, or do not know their shapes.
     """
     source, target = fits
     return build_map(
@@ -169,22 +154,10 @@ def shape_of(fit: Fit) -> Repaired:
 
 @dataclass(frozen=True)
 class ConfidenceRule:
-    """What to do where the map is not to be trusted.
+    """What to do where the map is not to be trusted: below a confidence of ``minimum`` (0..1).
 
-    Parameters
-    ----------
-    minimum : float
-        Confidence (0..1) from which a value is trusted.
-    fill : bool
-        Replace values that are not trusted by what their neighbours have.
-    blank : optional
-        Or replace them by this: a number, one number for each column, a colour (sRGB, 0..1), or a label. By default
-        they are kept.
-
-    Raises
-    ------
-    OptionError
-        Both `fill` and `blank`, or a minimum outside 0..1.
+    ``fill`` replaces values by what their neighbours have; ``blank`` by a number, one number for each column, a colour
+    (sRGB, 0..1), or a label. By default they are kept. `OptionError` for both, or a minimum outside 0..1.
     """
 
     minimum: float = 0.3
@@ -200,17 +173,10 @@ class ConfidenceRule:
 
 @dataclass(frozen=True, eq=False)
 class Transferred(Generic[T]):
-    """What arrived on the target.
+    """What arrived on the target: ``data`` is an array, Labels, SkinWeights or Landmarks.
 
-    Attributes
-    ----------
-    data : array, Labels, SkinWeights or Landmarks
-    confidence : (N,) float64
-        Of each vertex, face or landmark, 0 (a guess) to 1 (sure).
-    low : LowConfidence
-        How many were not trusted, and what became of them.
-    maps : MapPair
-        The maps that were followed.
+    ``confidence`` (N,) float64 is that of each vertex, face or landmark, 0 (a guess) to 1 (sure); ``low`` says how many
+    were not trusted, and what became of them; ``maps`` were followed.
     """
 
     data: T

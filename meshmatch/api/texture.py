@@ -69,11 +69,8 @@ def transfer_texture(
     progress
         See `Matcher`.
 
-    Raises
-    ------
-    MeshmatchError
-        The source has neither a texture nor colours, the target is a point cloud, its texture coordinates are to be
-        kept and are not valid; or as `meshmatch.match`.
+    `MeshmatchError`: the source has neither a texture nor colours, the target is a point cloud, its texture
+    coordinates are to be kept and are not valid; or as `meshmatch.match`.
     """
     if uv not in get_args(Keep):
         raise OptionError(f"invalid uv {uv!r}", f"choose one of {', '.join(get_args(Keep))}")

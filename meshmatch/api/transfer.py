@@ -47,10 +47,7 @@ def transfer_values(
         The values are directions (V_source, 3), such as normals: they are turned as the surface turns from source to
         target, and have unit length.
 
-    Raises
-    ------
-    MeshmatchError
-        Not a row for each vertex; or as `find_maps`.
+    `MeshmatchError`: not a row for each vertex; or as `find_maps`.
     """
     source = as_shape(source, "source")
     numbers = as_numbers(values, "values")
@@ -91,10 +88,7 @@ def transfer_colors(
     colors : (V_source, 3 or 4) in 0..1 (sRGB) or Appearance, optional
         Other colours than those of the source's file; an appearance is sampled with its textures.
 
-    Raises
-    ------
-    MeshmatchError
-        The source has no vertex colours; or as `find_maps`.
+    `MeshmatchError`: the source has no vertex colours; or as `find_maps`.
     """
     source = as_shape(source, "source")
     given = None if isinstance(colors, Appearance) else light_of(source, colors)
@@ -135,10 +129,7 @@ def transfer_labels(
     to : {"vertices", "faces"}, optional
         What gets labels; by default what has them on the source, and the points of a cloud.
 
-    Raises
-    ------
-    MeshmatchError
-        Labels that do not belong to the source, faces of a cloud; or as `find_maps`.
+    `MeshmatchError`: labels that do not belong to the source, faces of a cloud; or as `find_maps`.
     """
     source, target = as_shape(source, "source"), as_shape(target, "target")
     if isinstance(labels, str | Path):
@@ -186,10 +177,7 @@ def transfer_weights(
     influences : int
         How many joints may move a vertex; the heaviest are kept.
 
-    Raises
-    ------
-    MeshmatchError
-        Weights that do not belong to the source; or as `find_maps`.
+    `MeshmatchError`: weights that do not belong to the source; or as `find_maps`.
     """
     source = as_shape(source, "source")
     if rule.blank is not None:
@@ -226,10 +214,7 @@ def transfer_landmarks(
     landmarks : Landmarks, vertices (N,), positions (N, 3), or path
         A position stands for the nearest point of the source.
 
-    Raises
-    ------
-    MeshmatchError
-        Landmarks that are not on the source; or as `find_maps`.
+    `MeshmatchError`: landmarks that are not on the source; or as `find_maps`.
     """
     source = as_shape(source, "source")
     given = _landmarks(landmarks, source)

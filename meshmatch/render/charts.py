@@ -113,9 +113,10 @@ def draw_losses(
     ``steps`` (N,) increase; ``terms`` have a name and (N,) values, of which those not positive or not finite are left
     out; ``validation`` is the error on held-out shapes at some steps: dots joined by a line.
     """
-    lines = {name: _positive(steps, values) for name, values in list(terms.items())[:_MOST_TERMS]}
-    lines["validation"] = _positive(sorted(validation), [validation[step] for step in sorted(validation)])
-    lines = {name: line for name, line in lines.items() if len(line[0])}
+    known = {name: list(zip(steps, values, strict=True)) for name, values in list(terms.items())[:_MOST_TERMS]}
+    known["validation"] = sorted(validation.items())
+    positive = {name: [point for point in points if 0 < point[1] < np.inf] for name, points in known.items()}
+    lines = {name: np.array(points, float).T for name, points in positive.items() if points}
     if not lines:
         raise OptionError("the training has no losses to draw", "train for more steps")
     large = [name for name in ("validation", "total") if name in lines]
@@ -137,12 +138,6 @@ def draw_losses(
             column[1].set_ylabel("terms of the loss")
         column[-1].set_xlabel("step")
         column[-1].xaxis.set_major_formatter("{x:,.0f}")
-
-
-def _positive(x: Sequence[float], y: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    at, values = np.asarray(x, float), np.asarray(y, float)
-    kept = np.isfinite(values) & (values > 0)
-    return at[kept], values[kept]
 
 
 def _label_few_decades(axes: Axes) -> None:

@@ -5,7 +5,7 @@ Colors are sRGB in 0..1 unless they are called linear. Maps go from the source, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -46,14 +46,8 @@ PALE = (0.88, 0.88, 0.89)
 
 @dataclass(frozen=True, eq=False)
 class Composition:
-    """Panels side by side and the meaning of their colors, ready to be rendered.
-
-    Parameters
-    ----------
-    caption
-        What is shown, for people.
-    record
-        Numbers about it, as JSON can hold them.
+    """Panels side by side and the meaning of their colors, ready to be rendered; ``caption`` says what is shown, and
+    ``record`` holds numbers about it for JSON.
     """
 
     panels: tuple[Panel, ...]
@@ -98,16 +92,17 @@ def compose_match(
 ) -> Composition:
     """The source colored by position and the target in the colors that the map transfers to it; grey: unmatched.
 
-    Raises
-    ------
-    InputError
-        The map does not belong to these shapes.
+    `InputError` where the map does not belong to these shapes.
     """
     turns = _same_side(source, target, vertex_map, look, rotations)
     here = position_colors(source, turns[0])
     there = matched_colors(here, vertex_map, invert_map(vertex_map, source, target), source)
-    panels = Panel(source, here, source.name), Panel(target, there, target.name)
+    panels = _painted((source, target), (here, there))
     return Composition(panels, caption="matched places in one colour").rotated(turns)
+
+
+def _painted(shapes: Sequence[Shape], colors: Iterable[Float[Floats, "V C"]]) -> tuple[Panel, ...]:
+    return tuple(Panel(shape, own, shape.name) for shape, own in zip(shapes, colors, strict=True))
 
 
 def matched_colors(
@@ -120,12 +115,9 @@ def matched_colors(
 
 def compose_confidence(source: Shape, target: Shape, vertex_map: VertexMap, look: Look | None = None) -> Composition:
     """Source and target colored by the confidence of the map: low is dark."""
-    back = invert_map(vertex_map, source, target)
     scale = Scale(0.0, 1.0, "confidence of the map", reverse=True)
-    panels = (
-        Panel(source, scale.colors(vertex_map.confidence), source.name),
-        Panel(target, scale.colors(back.confidence), target.name),
-    )
+    maps = vertex_map, invert_map(vertex_map, source, target)
+    panels = _painted((source, target), [scale.colors(each.confidence) for each in maps])
     record = {"confidence_mean": float(vertex_map.confidence.mean())}
     shown = Composition(panels, scale, "the confidence of the map", record)
     return shown.rotated(_same_side(source, target, vertex_map, look))
@@ -157,10 +149,8 @@ def _painted_points(shape: Shape, vertices: Int[Ints, " N"], values: Float[Float
 
     In between, a vertex takes the weighted mean of its nearest known ones; one far from all has no value.
     """
-    sums = np.bincount(vertices, values, shape.V)
-    count = np.bincount(vertices, minlength=shape.V)
-    own = np.flatnonzero(count)
-    means = sums[own] / count[own]
+    own, row, count = np.unique(vertices, return_inverse=True, return_counts=True)
+    means = np.bincount(row, values) / count
     unit = float(np.sqrt(shape.area)) or 1.0
     tree = cKDTree(shape.verts[own])
     spacing = float(np.median(tree.query(shape.verts[own], 2)[0][:, 1])) if len(own) > 3 else np.inf
@@ -170,8 +160,7 @@ def _painted_points(shape: Shape, vertices: Int[Ints, " N"], values: Float[Float
     weight = 1.0 / (distance + 1e-3 * unit) ** 2
     painted = (weight * means[place]).sum(axis=1) / weight.sum(axis=1)
     painted[own] = means
-    colors = scale.colors(np.where(distance[:, 0] < 2 * spacing, painted, np.nan))
-    return Panel(shape, colors, shape.name)
+    return Panel(shape, scale.colors(np.where(distance[:, 0] < 2 * spacing, painted, np.nan)), shape.name)
 
 
 def compose_fit(
@@ -203,37 +192,29 @@ def compose_values(
 ) -> Composition:
     """Shapes colored by a number per vertex on one scale, or in given colors: three or four numbers in 0..1 per vertex.
 
-    Raises
-    ------
-    InputError
-        Neither of these.
-    OptionError
-        ``title`` or ``limits`` with colors.
+    `InputError` where they are neither of these, `OptionError` for ``title`` or ``limits`` with colors.
     """
     tables = [table[:, 0] if table.ndim == 2 and table.shape[1] == 1 else table for table in values]
     if all(table.ndim == 1 for table in tables):
         scale = Scale.of(np.concatenate(tables), title, limits)
-        panels = [Panel(shape, scale.colors(table), shape.name) for shape, table in zip(shapes, tables, strict=True)]
         caption = f"numbers from {scale.low:g} to {scale.high:g}"
-        return Composition(tuple(panels), scale, caption, {"range": [scale.low, scale.high]})
+        panels = _painted(shapes, map(scale.colors, tables))
+        return Composition(panels, scale, caption, {"range": [scale.low, scale.high]})
     for shape, table in zip(shapes, tables, strict=True):
-        colors = table.ndim == 2 and table.shape[1] in (3, 4)
-        if not colors or not ((table >= 0) & (table <= 1)).all():
-            columns = 1 if table.ndim == 1 else table.shape[1]
+        columns = 1 if table.ndim == 1 else table.shape[1]
+        if columns not in (3, 4) or not ((table >= 0) & (table <= 1)).all():
             raise InputError(
                 f"{shape.name}: {columns} numbers per vertex are neither a scale nor colors",
                 "give one number per vertex, or red, green and blue in 0..1",
             )
     if title or limits is not None:
         raise OptionError("colors have no scale", "leave out the title and the range")
-    panels = [Panel(shape, table, shape.name) for shape, table in zip(shapes, tables, strict=True)]
-    return Composition(tuple(panels), caption="the colors of a file")
+    return Composition(_painted(shapes, tables), caption="the colors of a file")
 
 
 def compose_light(shapes: Sequence[Shape], light: Sequence[Float[Floats, "V C"]]) -> Composition:
     """Shapes in linear colors of their vertices, three or four columns; alpha is ignored, nan is black."""
-    colors = [to_srgb(np.nan_to_num(table[:, :3])) for table in light]
-    return Composition(tuple(Panel(s, c, s.name) for s, c in zip(shapes, colors, strict=True)))
+    return Composition(_painted(shapes, [to_srgb(np.nan_to_num(table[:, :3])) for table in light]))
 
 
 def compose_labels(
@@ -242,40 +223,32 @@ def compose_labels(
     names: Sequence[str],
     on_faces: Sequence[bool] | None = None,
 ) -> Composition:
-    """Shapes with one color per label.
-
-    Parameters
-    ----------
-    codes
-        For each vertex, or face where ``on_faces``, of each shape its index in ``names``; negative: no label.
+    """Shapes with one color per label: ``codes`` give for each vertex, or face where ``on_faces``, of each shape its index
+    in ``names``; negative: no label.
     """
-    panels = []
-    for shape, own, faces in zip(shapes, codes, on_faces or [False] * len(shapes), strict=True):
-        colors = label_colors(own)
-        painted = Panel(shape, face_colors=colors) if faces else Panel(shape, colors, sharp=True)
-        panels.append(replace(painted, label=shape.name))
+    colors = [label_colors(own) for own in codes]
+    panels = [
+        Panel(shape, None if faces else own, shape.name, sharp=True, face_colors=own if faces else None)
+        for shape, own, faces in zip(shapes, colors, on_faces or [False] * len(shapes), strict=True)
+    ]
     legend = label_swatches(np.concatenate(codes), names)
     return Composition(tuple(panels), legend, f"{len(names)} labels", {"labels": list(names)})
 
 
 def merge_labels(labels: Sequence[Labels]) -> tuple[list[Int[Ints, " N"]], list[str]]:
     """Labels of several shapes by one list of names, sorted, so that a name has one color: codes of each, and names."""
-    names = sorted({str(name) for own in labels for name in own.names}, key=_by_number)
+    found = {str(name) for own in labels for name in own.names}
+    numbers = {name for name in found if name.removeprefix("-").isdecimal()}
+    names = [*sorted(sorted(numbers), key=int), *sorted(found - numbers)]
     number = {name: k for k, name in enumerate(names)}
     return [np.array([*(number[str(name)] for name in own.names), -1])[own.codes] for own in labels], names
 
 
-def _by_number(name: str) -> tuple[int, int, str]:
-    return (0, int(name), "") if name.removeprefix("-").isdecimal() else (1, 0, name)
-
-
 def compose_points(shapes: Sequence[Shape], points: Sequence[Float[Floats, "N 3"]]) -> Composition:
     """Points on each shape as balls, in the frame of its file; those of one index have one color."""
-    panels = [
-        _with_points(shape, own, label_colors(np.arange(len(own))), 0.02 * float(np.sqrt(shape.area)) or None)
-        for shape, own in zip(shapes, points, strict=True)
-    ]
-    return Composition(tuple(panels))
+    colors = [label_colors(np.arange(len(own))) for own in points]
+    radii = [0.02 * float(np.sqrt(shape.area)) or None for shape in shapes]
+    return Composition(tuple(map(_with_points, shapes, points, colors, radii)))
 
 
 def _with_points(
@@ -288,5 +261,5 @@ def _with_points(
 def _same_side(
     source: Shape, target: Shape, vertex_map: VertexMap, look: Look | None, rotations: Rotations = (None, None)
 ) -> Rotations:
-    axes = (None, None) if look is None else (look.up, look.front)
-    return same_side(source, target, vertex_map, rotations, *axes)
+    look = look or Look()
+    return same_side(source, target, vertex_map, rotations, look.up, look.front)

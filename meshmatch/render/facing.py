@@ -30,10 +30,7 @@ _TORSO = 0.2  # half width of the chest without arms
 def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Float[Floats, "3 3"]:
     """Rotation into y up, z front, by named axes of the file; what is not named is guessed.
 
-    Raises
-    ------
-    OptionError
-        An axis other than x, y, z, -x, -y, -z, or the same axis twice.
+    `OptionError` for an axis other than x, y, z, -x, -y, -z, or the same axis twice.
     """
     axes = {name: axis.lstrip("+").lower() for name, axis in (("up", up), ("front", front)) if axis is not None}
     for name, axis in axes.items():

@@ -32,34 +32,17 @@ _SHADOW = 0.42  # how far around its foot a figure throws a shadow
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One shape of a picture.
+    """One shape of a picture: a mesh, or a cloud, whose points are drawn as small discs or balls; its ``label`` is below.
 
-    Parameters
-    ----------
-    shape
-        A mesh, or a cloud: its points are drawn as small discs or balls.
-    colors : (V, 3) or (V, 4) float, optional
-        sRGB in 0..1 per vertex; by default the shape's own colors, or the color of clay. Alpha is ignored.
-    label
-        Name below it.
-    sharp
-        Each point takes the color of its nearest vertex: for labels, which do not mix.
-    face_colors : (F, 3) float, optional
-        sRGB in 0..1 per triangle, instead of ``colors``.
-    appearance
-        Materials and textures of the shape's file, drawn if no other colors are given.
-    points : (K, 3) float, optional
-        Drawn as balls on top, in the shape's own frame: nodes, landmarks.
-    point_colors : (K, 3) float, optional
-        Their colors.
-    point_radius
-        Their radius, in the unit of the shape.
-    rotation : (3, 3) float, optional
-        Into a frame with y up and z to the front, as `Frame.rotation` of a fit; overrides the axes of the picture.
-    glass
-        Whether the shape is transparent around its points.
-    over
-        Another shape in the same frame, drawn over this one as blue glass.
+    ``colors`` (V, 3 or 4) are sRGB in 0..1 per vertex; by default the shape's own, or clay. Alpha is ignored. ``sharp``:
+    each point takes the color of its nearest vertex, for labels, which do not mix. ``face_colors`` (F, 3) are per
+    triangle instead. ``appearance`` is the materials and textures of the shape's file, drawn if no other colors are
+    given. ``glass``: the shape is transparent around its points; ``over`` is another shape in the same frame, drawn over
+    this one as blue glass.
+
+    ``points`` (K, 3) are drawn as balls on top, in the shape's own frame: nodes, landmarks; with ``point_colors`` (K, 3)
+    and ``point_radius`` in the unit of the shape. ``rotation`` (3, 3) leads into a frame with y up and z to the front, as
+    `Frame.rotation` of a fit; it overrides the axes of the picture.
     """
 
     shape: Shape
@@ -113,10 +96,7 @@ def rotation_about_x(degrees: float) -> Float[Floats, "3 3"]:
 def build_figure(panel: Panel, up: str | None, front: str | None, turn: float, tilt: float) -> Figure:
     """The surfaces of a panel as they are seen (`Look` has the parameters).
 
-    Raises
-    ------
-    OptionError
-        An invalid axis, or colors of the wrong shape.
+    `OptionError` for an invalid axis, or colors of the wrong shape.
     """
     shape = panel.shape
     towards = facing(shape, up, front) if panel.rotation is None else np.asarray(panel.rotation, np.float64)

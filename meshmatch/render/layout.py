@@ -62,10 +62,7 @@ def lay_out(
 ) -> Page:
     """Place figures on a page; their boxes (left, bottom; right, top) are as they are seen, the foot at 0.
 
-    Raises
-    ------
-    OptionError
-        The size leaves no room for the shapes above names and legend.
+    `OptionError` where the size leaves no room for the shapes above names and legend.
     """
     seen = np.stack(boxes)
     shorter = min(size[1], 1.6 * size[0]) if size else HEIGHT

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,28 +29,14 @@ BACKGROUNDS: dict[str, Ink | None] = {"white": (255, 255, 255), "dark": (24, 26,
 
 @dataclass(frozen=True)
 class Look:
-    """How shapes are drawn.
+    """How shapes are drawn; `OptionError` for a size that is too small or too large, or an invalid background.
 
-    Parameters
-    ----------
-    size
-        Width and height of the picture in pixels; by default `layout.HEIGHT` high and as wide as the shapes need.
-    background
-        "white", "dark", "transparent", or a color as #rrggbb.
-    up, front
-        The file's axes that point up and to the front of the shape: x, y, z, -x, -y or -z. By default guessed from
-        the extents: tall is up, flat is to the front; the sign cannot be guessed.
-    turn, tilt
-        Degrees by which shapes are rotated to their own left, and tilted towards the viewer; 0, 0 is the front.
-    ground
-        Whether the shapes cast a shadow on the ground.
-    legend
-        What the colors mean.
-
-    Raises
-    ------
-    OptionError
-        The size is too small or too large, or the background is invalid.
+    ``size`` is width and height of the picture in pixels; by default `layout.HEIGHT` high and as wide as the shapes need.
+    ``background`` is "white", "dark", "transparent", or a color as #rrggbb. ``up`` and ``front`` are the file's axes that
+    point up and to the front of the shape: x, y, z, -x, -y or -z; by default guessed from the extents (tall is up, flat
+    is to the front; the sign cannot be guessed). ``turn`` and ``tilt`` are degrees by which shapes are rotated to their
+    own left, and tilted towards the viewer; 0, 0 is the front. ``ground``: the shapes cast a shadow there. ``legend`` is
+    what the colors mean.
     """
 
     size: tuple[int, int] | None = None
@@ -62,9 +49,28 @@ class Look:
     legend: Legend | None = None
 
     def __post_init__(self) -> None:
-        if self.size is not None:
-            check_size(self.size)
         background_color(self.background)
+        if self.size is None:
+            return
+        width, height = self.size
+        if min(self.size) < 16:
+            raise OptionError(f"a picture of {width} x {height} pixels shows nothing", "the minimum is 16 x 16")
+        if max(self.size) > MAX_SIDE or width * height > MAX_PIXELS:
+            raise OptionError(
+                f"a picture of {width} x {height} pixels is too large",
+                f"at most {MAX_SIDE} pixels per side and {MAX_PIXELS // 1_000_000} million in total",
+            )
+
+
+def background_color(background: str) -> Ink | None:
+    """The color of a background in 0..255; None if it is transparent. `OptionError` if it is invalid."""
+    if background in BACKGROUNDS:
+        return BACKGROUNDS[background]
+    if re.fullmatch("#[0-9A-Fa-f]{6}", background) is None:
+        hint = f"choose {', '.join(BACKGROUNDS)}, or a color such as #e8f0f8"
+        raise OptionError(f"invalid background '{background}'", hint)
+    red, green, blue = bytes.fromhex(background[1:])
+    return red, green, blue
 
 
 def check_picture(path: str | Path) -> None:
@@ -73,53 +79,14 @@ def check_picture(path: str | Path) -> None:
         raise OptionError(f"{Path(path).name}: a picture is a PNG", "end the name in .png")
 
 
-def check_size(size: tuple[int, int]) -> None:
-    """Refuse a picture too small to show anything, or too large to hold in memory (`OptionError`)."""
-    width, height = size
-    if min(size) < 16:
-        raise OptionError(f"a picture of {width} x {height} pixels shows nothing", "the minimum is 16 x 16")
-    if max(size) > MAX_SIDE or width * height > MAX_PIXELS:
-        raise OptionError(
-            f"a picture of {width} x {height} pixels is too large",
-            f"at most {MAX_SIDE} pixels per side and {MAX_PIXELS // 1_000_000} million in total",
-        )
-
-
-def background_color(background: str) -> Ink | None:
-    """The color of a background in 0..255; None if it is transparent. `OptionError` if it is invalid."""
-    if background in BACKGROUNDS:
-        return BACKGROUNDS[background]
-    digits = background.removeprefix("#")
-    if background.startswith("#") and len(digits) == 6 and set(digits.lower()) <= set("0123456789abcdef"):
-        return int(digits[:2], 16), int(digits[2:4], 16), int(digits[4:], 16)
-    raise OptionError(
-        f"invalid background '{background}'", f"choose {', '.join(BACKGROUNDS)}, or a color such as #e8f0f8"
-    )
-
-
 def render_shapes(
     panels: Sequence[Panel | tuple[object, ArrayLike | None]], path: str | Path, look: Look | None = None
 ) -> tuple[int, int]:
-    """Draw shapes side by side into a PNG, all on one ground and as large as the picture allows.
+    """Draw shapes side by side into a PNG, all on one ground and as large as the picture allows; its width and height.
 
-    Parameters
-    ----------
-    panels
-        `Panel` objects, or pairs ``(shape, colors or None)``.
-    path
-        Ends in .png.
-
-    Returns
-    -------
-    (int, int)
-        Width and height in pixels.
-
-    Raises
-    ------
-    OptionError
-        Nothing to draw, a suffix other than .png, an invalid axis, or colors of the wrong shape.
-    OutputError
-        The file cannot be written.
+    ``panels`` are `Panel` objects, or pairs ``(shape, colors or None)``. `OptionError` where there is nothing to draw, for
+    a suffix other than .png, an invalid axis, or colors of the wrong shape; `OutputError` for a file that cannot be
+    written.
     """
     check_picture(path)
     wanted = [panel if isinstance(panel, Panel) else Panel(*panel) for panel in panels]  # type: ignore[arg-type]
@@ -149,9 +116,9 @@ def _image(panels: list[Panel], look: Look) -> Image.Image:
 
 
 def _trace(figures: list[Figure], page: Page, look: Look) -> raster.Layer:
-    shifts = [np.array([foot, 0.0, 0.0]) for foot in page.feet]
-    solid = [part.moved(shift) for figure, shift in zip(figures, shifts, strict=True) for part in figure.solid]
-    glass = [part.moved(shift) for figure, shift in zip(figures, shifts, strict=True) for part in figure.glass]
+    placed = list(zip(figures, page.feet, strict=True))
+    solid = [part.moved(foot) for figure, foot in placed for part in figure.solid]
+    glass = [part.moved(foot) for figure, foot in placed for part in figure.glass]
     ground = None
     if look.ground and look.tilt > 0:
         spots = np.stack([figure.spot for figure in figures])

@@ -44,7 +44,10 @@ def draw(scene: Scene, viewport: Viewport) -> Layer:
     """Draw a scene. The same scene gives the same picture, whatever the size of a band."""
     H, W = viewport.height, viewport.width
     whole = Layer(np.zeros((H, W, 3), np.float32), np.zeros((H, W), np.float32), np.full((H, W), -np.inf, np.float32))
-    left, top, right, bottom = _extent(scene, viewport)
+    # Columns and rows in which anything can be, with a margin of one pixel.
+    low, high = (scene.bounds - [viewport.left, viewport.top]) / viewport.pixel
+    left, right = np.clip([np.floor(low[0]) - 1, np.ceil(high[0]) + 1], 0, W).astype(int).tolist()
+    top, bottom = np.clip([np.floor(-high[1]) - 1, np.ceil(-low[1]) + 1], 0, H).astype(int).tolist()
     if left >= right or top >= bottom:
         return whole
     part = replace(
@@ -61,16 +64,6 @@ def draw(scene: Scene, viewport: Viewport) -> Layer:
     for first in range(0, part.height, rows):
         _band(scene, part, edges, first, min(part.height, first + rows), (left, top), drawn)
     return whole
-
-
-def _extent(scene: Scene, viewport: Viewport) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of the pixels in which anything can be, with a margin of one pixel."""
-    low, high = scene.bounds
-    columns = (np.array([low[0], high[0]]) - viewport.left) / viewport.pixel
-    rows = (viewport.top - np.array([high[1], low[1]])) / viewport.pixel
-    left, right = np.clip([np.floor(columns[0]) - 1, np.ceil(columns[1]) + 1], 0, viewport.width).astype(int)
-    top, bottom = np.clip([np.floor(rows[0]) - 1, np.ceil(rows[1]) + 1], 0, viewport.height).astype(int)
-    return int(left), int(top), int(right), int(bottom)
 
 
 def _band(
@@ -114,8 +107,7 @@ def _shaded(
     scene: Scene, hits: Hits, seen: Float[Floats32, "N 2"]
 ) -> tuple[Float[Floats32, "N 3"], Float[Floats32, " N"]]:
     """Light times alpha, and alpha, of all rays."""
-    light = np.zeros((len(hits.face), 3), np.float32)
-    alpha = np.zeros(len(hits.face), np.float32)
+    light, alpha = np.zeros((len(hits.face), 3), np.float32), np.zeros(len(hits.face), np.float32)
     solid = np.flatnonzero(hits.face >= 0)
     light[solid] = shade(hits, solid, seen[solid])
     alpha[solid] = 1.0
@@ -153,12 +145,11 @@ def _smooth(values: Float[Floats32, "H W 2"], hits: Hits, which: Bool[Bools, "H 
     shape = which.shape
     place, flat, normal = (a.reshape(*shape, 3)[part] for a in (hits.place, hits.flat, hits.normal))
     which, found = which[part], values[part]
-    H, W = len(which), which.shape[1]
     half = side // 2
     for axis in (0, 1):
         total, weights = found.copy(), np.ones(which.shape, np.float32)
         for step in (*range(-half, 0), *range(1, half + 1)):
-            here, there = _shifted(step, axis, (H, W))
+            here, there = _shifted(step, axis, (len(which), which.shape[1]))
             gap = np.einsum("hwi,hwi->hw", place[there] - place[here], flat[here])
             turn = np.einsum("hwi,hwi->hw", normal[there], normal[here])
             weight = _same_surface(gap, turn, pixel)
@@ -177,21 +168,17 @@ def _same_surface(gap: Floats32, cosine: Floats32, pixel: float) -> Floats32:
 
 def _shifted(step: int, axis: int, shape: tuple[int, int]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
     """Two views of an array: each pixel, and the one ``step`` further along the axis."""
-    count = max(0, shape[axis] - abs(step))
-    here = slice(max(0, -step), max(0, -step) + count)
-    there = slice(max(0, step), max(0, step) + count)
-    everything = slice(None)
-    if axis == 0:
-        return (here, everything), (there, everything)
-    return (everything, here), (everything, there)
+    count, before = max(0, shape[axis] - abs(step)), (slice(None),) * axis
+    here, there = max(0, -step), max(0, step)
+    return (*before, slice(here, here + count)), (*before, slice(there, there + count))
 
 
 def _differs(values: Float[Floats32, "H W C"], by: float) -> Bool[Bools, "H W"]:
     """Pixels that differ from a neighbor so much that an edge may run through them."""
-    H, W = values.shape[0], values.shape[1]
-    result = np.zeros((H, W), bool)
+    shape = values.shape[0], values.shape[1]
+    result = np.zeros(shape, bool)
     for axis in (0, 1):
-        here, there = _shifted(1, axis, (H, W))
+        here, there = _shifted(1, axis, shape)
         differs = (np.abs(values[there] - values[here]) > by).any(axis=2)
         result[here] |= differs
         result[there] |= differs
@@ -211,22 +198,18 @@ def _fine(
     """Light times alpha, and alpha, of chosen pixels of a band, each the mean over places in it."""
     shape = (len(hits.face) // viewport.width, viewport.width)
     row, column = np.divmod(np.repeat(chosen, len(places)), shape[1])
-    offsets = np.tile(places, (len(chosen), 1))
-    finer = scene.look(
-        *viewport.at(column + 0.5 + offsets[:, 0], row + low + 0.5 + offsets[:, 1]),
-        viewport.pixel / np.sqrt(len(places)),
-    )
+    right, down = np.tile(places, (len(chosen), 1)).T
+    rays = viewport.at(column + 0.5 + right, row + low + 0.5 + down)
+    finer = scene.look(*rays, viewport.pixel / np.sqrt(len(places)))
     met = np.flatnonzero(finer.face != -1)
     light_seen = np.ones((len(row), 2), np.float32)
     light_seen[met], known = _reused(finer, met, row[met], column[met], hits, seen, shape, viewport.pixel)
     missing = met[~known]
     # Each ray of a pixel uses other directions, whichever band it is in.
     number = missing % len(places)
-    block = (
-        (row[missing] + low + corner[1]) * BLOCK + number // BLOCK,
-        (column[missing] + corner[0]) * BLOCK + number % BLOCK,
-    )
-    light_seen[missing] = visibility(scene, finer, missing, block[0], block[1])
+    block_row = (row[missing] + low + corner[1]) * BLOCK + number // BLOCK
+    block_column = (column[missing] + corner[0]) * BLOCK + number % BLOCK
+    light_seen[missing] = visibility(scene, finer, missing, block_row, block_column)
     light, alpha = _shaded(scene, finer, light_seen)
     return light.reshape(len(chosen), -1, 3).mean(axis=1), alpha.reshape(len(chosen), -1).mean(axis=1)
 
@@ -244,15 +227,13 @@ def _reused(
     """Visibility of fine rays from the pixels around them that lie on the same surface, and where there is one."""
     place, flat, normal = finer.place[met], finer.flat[met], finer.normal[met]
     solid = finer.face[met] >= 0
-    total = np.zeros((len(met), 2), np.float32)
-    weights = np.zeros(len(met), np.float32)
+    total, weights = np.zeros((len(met), 2), np.float32), np.zeros(len(met), np.float32)
     for down, right in ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)):
         there = np.clip(row + down, 0, shape[0] - 1) * shape[1] + np.clip(column + right, 0, shape[1] - 1)
         gap = np.einsum("ni,ni->n", hits.place[there] - place, flat)
         turn = np.einsum("ni,ni->n", hits.normal[there], normal)
-        weight = _same_surface(gap, turn, pixel)
         face = hits.face[there]
-        weight *= ((face >= 0) == solid) & (face != -1)
+        weight = _same_surface(gap, turn, pixel) * (((face >= 0) == solid) & (face != -1))
         total += weight[:, None] * seen[there]
         weights += weight
     known = weights > 0.05

@@ -42,18 +42,9 @@ def position_colors(shape: Shape, rotation: Float[Floats, "3 3"] | None = None) 
 class Scale:
     """A scale from numbers to colors.
 
-    Parameters
-    ----------
-    low, high
-        The ends; numbers beyond take the color of the end.
-    title
-        What is measured, with its unit.
-    reverse
-        True where low numbers deserve attention, such as confidence.
-    beyond
-        Whether some numbers lie below ``low``, and above ``high``.
-    unknown
-        Whether some have no value.
+    Numbers beyond ``low`` and ``high`` take the color of the end; ``beyond`` says whether there are some below, and above.
+    ``title`` is what is measured, with its unit. ``reverse``: low numbers deserve attention, such as confidence.
+    ``unknown``: some have no value.
     """
 
     low: float

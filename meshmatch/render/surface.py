@@ -138,9 +138,9 @@ class Surface:
         drawn = self.verts[used]
         return np.stack([drawn.min(axis=0), drawn.max(axis=0)])
 
-    def moved(self, shift: Float[Floats, " 3"]) -> Surface:
-        """The surface translated by ``shift``."""
-        return replace(self, verts=self.verts + shift)
+    def moved(self, right: float) -> Surface:
+        """The surface farther to the right."""
+        return replace(self, verts=self.verts + np.array([right, 0.0, 0.0]))
 
 
 def mesh_surface(

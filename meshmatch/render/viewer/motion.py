@@ -33,25 +33,12 @@ def write_motion(
 ) -> int:
     """Write a page on which a shape goes through frames; how many bytes it has. The same input gives the same bytes.
 
-    Parameters
-    ----------
-    frames
-        At least two shapes with the same vertices and faces, in one frame and unit. The first gives the colours.
-    times
-        (N,) increasing, one for each frame.
-    rotation
-        From the frame of the shapes into y up, z to the front.
-    met
-        Names to show at some of the times.
-    most
-        Vertices up to which the shape is drawn whole; less where there are many frames.
+    The ``frames`` are at least two shapes with the same vertices and faces, in one frame and unit, each with its time,
+    which increase; the first gives the colours. ``rotation`` leads from there into y up, z to the front. ``met`` are names
+    to show at some of the times. Up to ``most`` vertices are drawn, and fewer where there are many frames.
 
-    Raises
-    ------
-    OptionError
-        The suffix is no page's; fewer than two frames; frames of different shapes; times that do not increase.
-    OutputError
-        The file cannot be written.
+    `OptionError` for a suffix that is no page's, and for other frames or times; `OutputError` where the file cannot be
+    written.
     """
     check_page(path)
     first = frames[0] if frames else None

@@ -35,7 +35,7 @@ def write_page(
     path: str | Path,
     source: Shape,
     target: Shape,
-    there: VertexMap,
+    there: VertexMap,  # from source to target
     back: VertexMap,
     *,
     rotations: Rotations = (None, None),
@@ -45,27 +45,12 @@ def write_page(
     """Write a page that shows two shapes side by side, and for each point of one its match on the other.
 
     The source is coloured by position, the target by its colours carried along the map. The same input gives
-    the same bytes.
+    the same bytes. ``rotations`` are as `Frame.rotation` of a fit; the source's is guessed if not given, and the target's
+    then follows from the map. ``names`` are shown instead of the shapes' own. ``looks`` are what they wear, for the button
+    that shows it.
 
-    Parameters
-    ----------
-    there, back : VertexMap
-        From source to target, and from target to source.
-    rotations
-        As `Frame.rotation` of a fit. The source's is guessed if not given, and the target's then follows from the map.
-    names
-        To show; the shapes' own if not given.
-    looks
-        What they wear, for the button that shows it.
-
-    Raises
-    ------
-    OptionError
-        The suffix is no page's.
-    InputError
-        A map is not of these shapes.
-    OutputError
-        The file cannot be written.
+    `OptionError` for a suffix that is no page's, `InputError` for a map that is not of these shapes, `OutputError` where
+    the file cannot be written.
     """
     check_page(path)
     there, back = there.for_shapes(source, target), back.for_shapes(target, source, "the map back")
