@@ -20,7 +20,6 @@ from meshmatch.outputs import replace_on_success
 from meshmatch.render.legend import readable
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Okabe and Ito's colors, which color-blind readers can tell apart.
@@ -123,6 +122,8 @@ def draw_losses(
     groups = [group for group in (large, [name for name in lines if name not in large]) if group]
     pens = {name: pen(k) for k, name in enumerate(name for group in groups for name in group)}
     with saved(path, 6.4, 3.4 + 1.6 * (len(groups) - 1)) as figure:
+        from matplotlib.ticker import LogLocator
+
         column = figure.subplots(len(groups), sharex=True, squeeze=False, height_ratios=(2, 1)[: len(groups)])[:, 0]
         for axes, group in zip(column, groups, strict=True):
             for name in group:
@@ -131,24 +132,18 @@ def draw_losses(
                 dot = "o" if above or len(lines[name][0]) == 1 else ""
                 axes.plot(*lines[name], marker=dot, label=short(name, 24), **pens[name], **weight)
             axes.set_yscale("log")
-            _label_few_decades(axes)
+            # Plain numbers, also between the powers of ten where these are few.
+            low, high = np.log10(axes.get_ylim())
+            between = (1.0, 2.0, 5.0) if high - low < 2 else (1.0, 3.0) if high - low < 4 else (1.0,)
+            axes.yaxis.set_major_locator(LogLocator(subs=between, numticks=12))
+            axes.minorticks_off()
+            axes.yaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
             axes.legend(loc="upper left", bbox_to_anchor=(1, 1), fontsize=9.5 if len(group) < 6 else 6.5)
         column[0].set_ylabel("loss")
         if len(groups) == 2:
             column[1].set_ylabel("terms of the loss")
         column[-1].set_xlabel("step")
         column[-1].xaxis.set_major_formatter("{x:,.0f}")
-
-
-def _label_few_decades(axes: Axes) -> None:
-    """Plain numbers on a logarithmic axis, also between its powers of ten where they are few."""
-    from matplotlib.ticker import LogLocator
-
-    low, high = np.log10(axes.get_ylim())
-    between = (1.0, 2.0, 5.0) if high - low < 2 else (1.0, 3.0) if high - low < 4 else (1.0,)
-    axes.yaxis.set_major_locator(LogLocator(subs=between, numticks=12))
-    axes.minorticks_off()
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
 
 
 @contextmanager

@@ -13,7 +13,10 @@ from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
-Rotations = tuple[Float[Floats, "3 3"] | None, Float[Floats, "3 3"] | None]
+Rotation = Float[Floats, "3 3"]
+Direction = Float[Floats, " 3"]
+Points = Float[Floats, "N 3"]
+Rotations = tuple[Rotation | None, Rotation | None]
 """Of source and target into y up, z to the viewer; None where unknown."""
 
 _AXES = {sign + name: (-1.0 if sign else 1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in ("", "-")}
@@ -27,7 +30,7 @@ _NEAR_AXIS = np.cos(np.radians(35.0))
 _TORSO = 0.2  # half width of the chest without arms
 
 
-def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Float[Floats, "3 3"]:
+def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Rotation:
     """Rotation into y up, z front, by named axes of the file; what is not named is guessed.
 
     `OptionError` for an axis other than x, y, z, -x, -y, -z, or the same axis twice.
@@ -50,7 +53,7 @@ def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Flo
     return np.stack([np.cross(upward, ahead), upward, ahead])
 
 
-def upright(rotation: Float[Floats, "3 3"]) -> Float[Floats, "3 3"]:
+def upright(rotation: Rotation) -> Rotation:
     """The rotation with its up direction snapped to an axis of the file, if it lies near one.
 
     The frame of a fit follows the torso, which may lean; files nearly always have an axis that points up.
@@ -69,7 +72,7 @@ def same_side(
     rotations: Rotations = (None, None),
     up: str | None = None,
     front: str | None = None,
-) -> tuple[Float[Floats, "3 3"], Float[Floats, "3 3"]]:
+) -> tuple[Rotation, Rotation]:
     """Rotations of source and target into y up, z to the viewer that show both from the same side.
 
     ``rotations`` are those of fits (`Frame.rotation`), if known; otherwise the named axes count, and without these the
@@ -84,9 +87,7 @@ def same_side(
     return first, second
 
 
-def facing_matched(
-    source: Shape, target: Shape, vertex_map: VertexMap, rotation: Float[Floats, "3 3"]
-) -> Float[Floats, "3 3"]:
+def facing_matched(source: Shape, target: Shape, vertex_map: VertexMap, rotation: Rotation) -> Rotation:
     """Rotation that shows the target from the side from which ``rotation`` shows the source; that if nothing tells."""
     known = np.ones(source.V, bool) if source.invalid is None else ~source.invalid
     if not known.any():
@@ -94,7 +95,7 @@ def facing_matched(
     return facing_alike(target, vertex_map.points(target)[known], source.verts[known] @ rotation.T)
 
 
-def facing_alike(shape: Shape, points: Float[Floats, "N 3"], seen: Float[Floats, "N 3"]) -> Float[Floats, "3 3"]:
+def facing_alike(shape: Shape, points: Points, seen: Points) -> Rotation:
     """Rotation that shows a shape from the side from which another one is seen; if it stands by itself, upright.
 
     ``points`` are of this shape, in its file's frame; ``seen`` the same of the other one, y up and z to the viewer.
@@ -108,14 +109,14 @@ def facing_alike(shape: Shape, points: Float[Floats, "N 3"], seen: Float[Floats,
     return _standing(upward, turn[2]) if stands and upward @ turn[1] >= 0.5 else np.asarray(turn)
 
 
-def _standing(upward: Float[Floats, " 3"], ahead: Float[Floats, " 3"]) -> Float[Floats, "3 3"]:
+def _standing(upward: Direction, ahead: Direction) -> Rotation:
     """The rotation whose y is ``upward`` and whose z is the nearest to ``ahead``."""
     ahead = ahead - (ahead @ upward) * upward
     ahead = ahead / np.linalg.norm(ahead)
     return np.stack([np.cross(upward, ahead), upward, ahead])
 
 
-def _samples(shape: Shape) -> tuple[Float[Floats, "N 3"], Float[Floats, " N"]]:
+def _samples(shape: Shape) -> tuple[Points, Float[Floats, " N"]]:
     """Points all over the surface, centered, in units of sqrt(area), and the share of the area around each."""
     if shape.is_cloud:
         points = shape.verts if shape.invalid is None else shape.verts[~shape.invalid]
@@ -131,7 +132,7 @@ def _samples(shape: Shape) -> tuple[Float[Floats, "N 3"], Float[Floats, " N"]]:
     return (points - np.average(points, axis=0, weights=weights)) / unit, weights / weights.sum()
 
 
-def _upward(points: Float[Floats, "N 3"], ahead: Float[Floats, " 3"] | None) -> tuple[Float[Floats, " 3"], bool]:
+def _upward(points: Points, ahead: Direction | None) -> tuple[Direction, bool]:
     """The axis that points up, and whether the shape stands on it by itself."""
     extents = np.ptp(points, axis=0)
     free = [k for k in range(3) if ahead is None or ahead[k] == 0]
@@ -145,7 +146,7 @@ def _upward(points: Float[Floats, "N 3"], ahead: Float[Floats, " 3"] | None) -> 
     return np.eye(3)[max(free, key=lambda k: score[k])], False
 
 
-def _support(points: Float[Floats, "N 3"], upward: Float[Floats, " 3"]) -> float:
+def _support(points: Points, upward: Direction) -> float:
     """How far inside the footprint the center of mass lies; negative: outside."""
     from scipy.spatial import ConvexHull, QhullError
 
@@ -158,9 +159,7 @@ def _support(points: Float[Floats, "N 3"], upward: Float[Floats, " 3"]) -> float
     return float(-hull.equations[:, 2].max())
 
 
-def _chest(
-    points: Float[Floats, "N 3"], weights: Float[Floats, " N"], upward: Float[Floats, " 3"]
-) -> Float[Floats, " 3"] | None:
+def _chest(points: Points, weights: Float[Floats, " N"], upward: Direction) -> Direction | None:
     """Unit vector to the front of a standing body; None if its chest is round."""
     level = np.flatnonzero(upward == 0)
     height = points @ upward

@@ -13,11 +13,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.render.facing import facing
 from meshmatch.render.scales import CLAY, Color
-from meshmatch.render.surface import Paint, Surface, TexturePaint, VertexPaint, balls, discs, face_paint, mesh_surface
+from meshmatch.render.surface import (
+    Paint,
+    Rows,
+    Surface,
+    TexturePaint,
+    VertexPaint,
+    balls,
+    corners_of,
+    discs,
+    face_paint,
+    mesh_surface,
+)
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.shape import Shape
@@ -103,8 +114,8 @@ def build_figure(panel: Panel, up: str | None, front: str | None, turn: float, t
     points = np.empty((0, 3)) if panel.points is None else np.asarray(panel.points, dtype=np.float64)
     a = np.radians(turn)
     rotation = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]) @ towards
-    drawn = [_drawn_points(shape), points, *([] if panel.over is None else [_drawn_points(panel.over)])]
-    rotated = np.concatenate(drawn) @ rotation.T
+    drawn = [each.verts[_seen_vertices(each)] for each in (shape, panel.over) if each is not None]
+    rotated = np.concatenate([*drawn, points]) @ rotation.T
     low, high = rotated.min(axis=0), rotated.max(axis=0)
     longest = float((high - low).max())
     scale = float(np.sqrt(shape.area))
@@ -127,16 +138,15 @@ def build_figure(panel: Panel, up: str | None, front: str | None, turn: float, t
     return Figure(solid, glass, np.stack([used.min(axis=0), used.max(axis=0)]), spot, panel.glass)
 
 
-def _drawn_points(shape: Shape) -> Float[Floats, "N 3"]:
-    """The vertices that will be seen: neither those without a position nor those that no face uses."""
+def _seen_vertices(shape: Shape) -> Rows:
+    """Neither those without a position nor those that no face uses; at least one."""
     if shape.is_cloud:
-        return shape.verts if shape.invalid is None else shape.verts[~shape.invalid]
-    used = np.zeros(shape.V, bool)
-    used[shape.faces[_valid_faces(shape)]] = True
-    return shape.verts[used] if used.any() else shape.verts[:1]
+        return np.arange(shape.V) if shape.invalid is None else np.flatnonzero(~shape.invalid)
+    used = corners_of(shape.faces[_valid_faces(shape)], shape.V)
+    return used if len(used) else np.zeros(1, np.int64)
 
 
-def _valid_faces(shape: Shape) -> Int[Ints, " N"]:
+def _valid_faces(shape: Shape) -> Rows:
     """Indices of the faces whose corners all have a position."""
     if shape.invalid is None:
         return np.arange(shape.F)
@@ -164,7 +174,7 @@ def _skin(shape: Shape, paint: Paint, pose: _Pose) -> Surface:
             return mesh_surface(verts[:1], np.zeros((1, 3), np.int64), face_paint(np.ones((1, 3))))
         return mesh_surface(verts, shape.faces, paint, None if len(valid) == shape.F else valid)
     colors = paint.colors if isinstance(paint, VertexPaint) else np.tile(to_linear(np.array(CLAY)), (shape.V, 1))
-    drawn = np.arange(shape.V) if shape.invalid is None else np.flatnonzero(~shape.invalid)
+    drawn = _seen_vertices(shape)
     drawn = drawn[:: max(1, -(-len(drawn) // MOST_POINTS))]
     # The distance of each point to its fifth neighbor: discs as large nearly close the surface.
     near = cKDTree(verts[drawn]).query(verts[drawn], k=min(6, len(drawn)))[0].reshape(len(drawn), -1)

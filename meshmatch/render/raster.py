@@ -10,11 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
 from meshmatch.render.layout import Viewport
-from meshmatch.render.scene import Hits, Scene
-from meshmatch.render.shading import BLOCK, GROUND_BLOCK, shade, shadow, visibility
+from meshmatch.render.scene import Hits, Scene, Vectors
+from meshmatch.render.shading import BLOCK, GROUND_BLOCK, Shares, shade, shadow, visibility
+from meshmatch.render.surface import Rows
 
+Seen = Float[Floats32, "P 2"]
+"""Shares of lamp and sky that reach what the pixels of a band show."""
 BAND = 100_000
 """Pixels worked on at once."""
 MOST_POINTS = 6_000_000
@@ -103,9 +106,7 @@ def _band(
     whole.depth[first:last] = depth[own]
 
 
-def _shaded(
-    scene: Scene, hits: Hits, seen: Float[Floats32, "N 2"]
-) -> tuple[Float[Floats32, "N 3"], Float[Floats32, " N"]]:
+def _shaded(scene: Scene, hits: Hits, seen: Shares) -> tuple[Vectors, Float[Floats32, " N"]]:
     """Light times alpha, and alpha, of all rays."""
     light, alpha = np.zeros((len(hits.face), 3), np.float32), np.zeros(len(hits.face), np.float32)
     solid = np.flatnonzero(hits.face >= 0)
@@ -189,12 +190,12 @@ def _fine(
     scene: Scene,
     viewport: Viewport,
     hits: Hits,
-    seen: Float[Floats32, "P 2"],
+    seen: Seen,
     low: int,
     corner: tuple[int, int],
-    chosen: Int[Ints, " N"],
+    chosen: Rows,
     places: Float[Floats, "R 2"],
-) -> tuple[Float[Floats32, "N 3"], Float[Floats32, " N"]]:
+) -> tuple[Vectors, Float[Floats32, " N"]]:
     """Light times alpha, and alpha, of chosen pixels of a band, each the mean over places in it."""
     shape = (len(hits.face) // viewport.width, viewport.width)
     row, column = np.divmod(np.repeat(chosen, len(places)), shape[1])
@@ -215,15 +216,8 @@ def _fine(
 
 
 def _reused(
-    finer: Hits,
-    met: Int[Ints, " N"],
-    row: Int[Ints, " N"],
-    column: Int[Ints, " N"],
-    hits: Hits,
-    seen: Float[Floats32, "P 2"],
-    shape: tuple[int, int],
-    pixel: float,
-) -> tuple[Float[Floats32, "N 2"], Bool[Bools, " N"]]:
+    finer: Hits, met: Rows, row: Rows, column: Rows, hits: Hits, seen: Seen, shape: tuple[int, int], pixel: float
+) -> tuple[Shares, Bool[Bools, " N"]]:
     """Visibility of fine rays from the pixels around them that lie on the same surface, and where there is one."""
     place, flat, normal = finer.place[met], finer.flat[met], finer.normal[met]
     solid = finer.face[met] >= 0

@@ -12,14 +12,16 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
-from meshmatch.render.surface import Surface
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
+from meshmatch.render.surface import Rows, Surface
 
 # Cosines of the angle between a facet and the smooth normal of a corner: up to here smooth, from there on a crease.
 _SMOOTH, _CREASE = np.cos(np.radians(28.0)), np.cos(np.radians(42.0))
 
 _LIFT = 3e-3
 _LAYERS = 12  # of surfaces with holes behind each other
+Vectors = Float[Floats32, "N 3"]
+Numbers = Float[Floats, " N"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +35,12 @@ class Ground:
     height: float
     spots: Float[Floats, "K 4"]
 
-    def depth(self, x: Float[Floats, " N"], y: Float[Floats, " N"]) -> Float[Floats, " N"]:
+    def depth(self, x: Numbers, y: Numbers) -> Numbers:
         """z of the plane at points of the picture."""
         a, b, c = self.normal
         return np.asarray((self.height - a * x - b * y) / c)
 
-    def strength(self, x: Float[Floats, " N"], y: Float[Floats, " N"]) -> Float[Floats32, " N"]:
+    def strength(self, x: Numbers, y: Numbers) -> Float[Floats32, " N"]:
         """How strongly shadows are drawn at points of the picture, 0 to 1: they fade out towards the rims."""
         strength = np.zeros(len(x), np.float32)
         for left, top, width, height in self.spots:
@@ -57,11 +59,11 @@ class Hits:
     itself.
     """
 
-    face: Int[Ints, " N"]
-    place: Float[Floats32, "N 3"]
-    flat: Float[Floats32, "N 3"]
-    normal: Float[Floats32, "N 3"]
-    color: Float[Floats32, "N 3"]
+    face: Rows
+    place: Vectors
+    flat: Vectors
+    normal: Vectors
+    color: Vectors
     lift: Float[Floats32, " N"]
 
 
@@ -92,9 +94,7 @@ class Scene:
             ends += [np.stack([spot[:2] - spot[2:], spot[:2] + spot[2:]]) for spot in self.ground.spots]
         return np.stack([np.min(ends, axis=(0, 1)), np.max(ends, axis=(0, 1))])
 
-    def blocked(
-        self, places: Float[Floats32, "N 3"], directions: Float[Floats32, "N 3"], reach: float
-    ) -> Bool[Bools, " N"]:
+    def blocked(self, places: Vectors, directions: Vectors, reach: float) -> Bool[Bools, " N"]:
         """Whether anything lies within reach of each place along a unit direction."""
         found = self._embree.run(
             np.ascontiguousarray(places, np.float32),
@@ -104,7 +104,7 @@ class Scene:
         )
         return np.asarray(found >= 0)
 
-    def look(self, x: Float[Floats, " N"], y: Float[Floats, " N"], pixel: float) -> Hits:
+    def look(self, x: Numbers, y: Numbers, pixel: float) -> Hits:
         """What is seen at points of the picture plane; ``pixel`` is the size of a pixel, for textures."""
         count = len(x)
         face = np.full(count, -1, np.int64)
@@ -135,9 +135,7 @@ class Scene:
             hits.color[there] = strength[:, None]
         return hits
 
-    def _describe(
-        self, hits: Hits, rows: Int[Ints, " N"], weights: Float[Floats32, "N 3"], pixel: float
-    ) -> Bool[Bools, " N"]:
+    def _describe(self, hits: Hits, rows: Rows, weights: Vectors, pixel: float) -> Bool[Bools, " N"]:
         """Fill in rows of the hits; whether each is a hole in its texture."""
         face = hits.face[rows]
         holes = np.zeros(len(rows), bool)

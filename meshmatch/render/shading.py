@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
-from meshmatch.render.scene import Hits, Scene
+from meshmatch.arrays import Float, Floats, Floats32
+from meshmatch.render.scene import Hits, Scene, Vectors
+from meshmatch.render.surface import Rows
 
 BLOCK, GROUND_BLOCK = 4, 8
 """Sides of a block of pixels on a surface and on the ground: each pixel of a block uses other directions."""
@@ -18,7 +19,10 @@ _KEY_RAYS = 4  # a pixel
 _SKY_RAYS = 8
 _REACH = 0.75  # how far away something may be and still occlude the sky
 _SHADOW_REACH = 1.6
-Vectors = Float[Floats32, "N 3"]
+Directions = tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]
+"""Unit vectors, and how far each ray looks, in S subsets of R rays."""
+Shares = Float[Floats32, "N 2"]
+"""Of lamp and sky, that reach a place."""
 _AT_ONCE = 20_000  # rows: what belongs to them then stays in the processor's cache
 
 
@@ -38,8 +42,8 @@ def _spread(count: int) -> Float[Floats, "count 3"]:
     return (0.5 + np.arange(1, count + 1)[:, None] * np.array([1 / root, root**-2, root**-3])) % 1.0
 
 
-def _key_directions() -> tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]:
-    """Unit directions towards points of the lamp, and how far each ray looks, in S subsets of R rays."""
+def _key_directions() -> Directions:
+    """Towards points of the lamp."""
     numbers = _spread(_SUBSETS * _KEY_RAYS)
     side = np.cross(_KEY, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
@@ -49,17 +53,15 @@ def _key_directions() -> tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]
     return _in_subsets(aim, _SHADOW_REACH * (0.15 + 0.85 * numbers[:, 2]))
 
 
-def _sky_directions() -> tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]:
-    """Unit directions around +z, distributed by their cosine, and how far each ray looks."""
+def _sky_directions() -> Directions:
+    """Around +z, distributed by their cosine."""
     numbers = _spread(_SUBSETS * _SKY_RAYS)
     angle, radius = 2 * np.pi * numbers[:, 0], np.sqrt(numbers[:, 1])
     local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)
     return _in_subsets(local, _REACH * (0.06 + 0.94 * numbers[:, 2] ** 1.5))
 
 
-def _in_subsets(
-    aims: Float[Floats, "N 3"], reaches: Float[Floats, " N"]
-) -> tuple[Float[Floats32, "S R 3"], Float[Floats32, "S R"]]:
+def _in_subsets(aims: Float[Floats, "N 3"], reaches: Float[Floats, " N"]) -> Directions:
     return (aims.reshape(_SUBSETS, -1, 3).astype(np.float32), reaches.reshape(_SUBSETS, -1).astype(np.float32))
 
 
@@ -67,9 +69,7 @@ _KEY_SET, _KEY_FAR = _key_directions()
 _SKY_SET, _SKY_FAR = _sky_directions()
 
 
-def visibility(
-    scene: Scene, hits: Hits, rows: Int[Ints, " N"], row: Int[Ints, " N"], column: Int[Ints, " N"]
-) -> Float[Floats32, "N 2"]:
+def visibility(scene: Scene, hits: Hits, rows: Rows, row: Rows, column: Rows) -> Shares:
     """Shares of the key lamp and of the sky that reach ``rows`` of the hits.
 
     ``row`` and ``column`` of their pixels select the subset of the directions that each uses.
@@ -92,9 +92,7 @@ def visibility(
     return result
 
 
-def _seen(
-    scene: Scene, places: Vectors, flat: Vectors, normal: Vectors, subset: int, few: slice
-) -> Float[Floats32, "N 2"]:
+def _seen(scene: Scene, places: Vectors, flat: Vectors, normal: Vectors, subset: int, few: slice) -> Shares:
     """Shares of lamp and sky at places on a surface, by ``few`` of the rays of a subset."""
     # At a grazing angle a facet shades its neighbors although the smooth surface is lit: shadows fade there.
     grazing = np.clip((flat @ _KEY) / np.float32(0.3), 0.0, 1.0)
@@ -125,7 +123,7 @@ def _tangents(normal: Vectors) -> tuple[Vectors, Vectors]:
     )
 
 
-def shade(hits: Hits, rows: Int[Ints, " N"], seen: Float[Floats32, "N 2"]) -> Vectors:
+def shade(hits: Hits, rows: Rows, seen: Shares) -> Vectors:
     """Linear light that rows of the hits send to the viewer; ``seen`` as from `visibility`."""
     normal, color = hits.normal[rows], hits.color[rows]
     lamp, sky = seen[:, 0], seen[:, 1]
@@ -144,7 +142,7 @@ def shade(hits: Hits, rows: Int[Ints, " N"], seen: Float[Floats32, "N 2"]) -> Ve
     return np.asarray(color * light + (gloss + 0.06 * edge)[:, None], np.float32)
 
 
-def shadow(seen: Float[Floats32, "N 2"]) -> Float[Floats32, " N"]:
+def shadow(seen: Shares) -> Float[Floats32, " N"]:
     """How dark the ground is, 0 to 1, where shares ``seen`` of lamp and sky reach it."""
     dark = 0.30 * (1.0 - seen[:, 0]) + 0.52 * (1.0 - seen[:, 1])
     return np.asarray(np.clip(dark, 0.0, 0.85), np.float32)

@@ -21,12 +21,22 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.texels import Pyramid
 
 AnyFloats = NDArray[np.floating[Any]]
-Paint = Callable[[Int[Ints, " N"], Float[AnyFloats, "N 3"], float], Float[AnyFloats, "N C"]]
+Rows = Int[Ints, " N"]
+Weights = Float[AnyFloats, "N 3"]
+Places = Float[AnyFloats, "K 3"]
+Paint = Callable[[Rows, Weights, float], Float[AnyFloats, "N C"]]
 """What gives triangles their color: at points of these faces, given by barycentric weights, three or four columns, of
 which a fourth below a half is a hole. The last argument is the size of a pixel in view coordinates: finer detail is
 averaged.
 """
 _INVISIBLE = 0.05  # an alpha below this is meant to be invisible
+
+
+def corners_of(faces: Int[Ints, "F 3"], V: int) -> Rows:
+    """The vertices of some face, in order; of V there are."""
+    seen = np.zeros(V, bool)
+    seen[faces] = True
+    return np.flatnonzero(seen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +53,7 @@ class VertexPaint:
     def __post_init__(self) -> None:
         object.__setattr__(self, "colors", np.asarray(self.colors, np.float32))
 
-    def __call__(
-        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
-    ) -> Float[AnyFloats, "N C"]:
+    def __call__(self, faces: Rows, weights: Weights, footprint: float) -> Float[AnyFloats, "N C"]:
         corners = self.faces[faces]
         if self.sharp:
             return self.colors[np.take_along_axis(corners, weights.argmax(axis=1)[:, None], axis=1)[:, 0]]
@@ -83,9 +91,7 @@ class TexturePaint:
         solid = 2.0 * shape.face_areas / scale**2
         self._density = np.sqrt(flat * texels[look.material] / np.maximum(solid, 1e-20)).astype(np.float32)
 
-    def __call__(
-        self, faces: Int[Ints, " N"], weights: Float[AnyFloats, "N 3"], footprint: float
-    ) -> Float[Floats32, "N 4"]:
+    def __call__(self, faces: Rows, weights: Weights, footprint: float) -> Float[Floats32, "N 4"]:
         weights = np.asarray(weights, np.float32)
         out, tint = np.ones((2, len(faces), 4), np.float32)
         materials = self._look.material[faces]
@@ -133,9 +139,7 @@ class Surface:
     @cached_property
     def extent(self) -> Float[AnyFloats, "2 3"]:
         """Lowest and highest corner of all triangles."""
-        used = np.zeros(len(self.verts), bool)
-        used[self.faces] = True
-        drawn = self.verts[used]
+        drawn = self.verts[corners_of(self.faces, len(self.verts))]
         return np.stack([drawn.min(axis=0), drawn.max(axis=0)])
 
     def moved(self, right: float) -> Surface:
@@ -144,7 +148,7 @@ class Surface:
 
 
 def mesh_surface(
-    verts: Float[AnyFloats, "V 3"], faces: Int[Ints, "F 3"], paint: Paint, chosen: Int[Ints, " N"] | None = None
+    verts: Float[AnyFloats, "V 3"], faces: Int[Ints, "F 3"], paint: Paint, chosen: Rows | None = None
 ) -> Surface:
     """A mesh, or the ``chosen`` of its triangles; normals are smooth, also across the duplicate vertices of texture
     seams and stl files.
@@ -156,7 +160,7 @@ def mesh_surface(
     return Surface(verts, faces[chosen], normals, lambda some, *where: paint(chosen[some], *where))
 
 
-def balls(centers: Float[AnyFloats, "K 3"], radius: float, colors: Float[AnyFloats, "K 3"]) -> Surface:
+def balls(centers: Places, radius: float, colors: Places) -> Surface:
     """A ball around every center in its color; the fewer, the finer."""
     verts, faces = _ball(4 if len(centers) <= 60 else 3 if len(centers) <= 1_000 else 2 if len(centers) <= 5_000 else 1)
     count = len(centers)
@@ -168,12 +172,7 @@ def balls(centers: Float[AnyFloats, "K 3"], radius: float, colors: Float[AnyFloa
     )
 
 
-def discs(
-    centers: Float[AnyFloats, "K 3"],
-    normals: Float[AnyFloats, "K 3"],
-    radius: Float[AnyFloats, " K"],
-    colors: Float[AnyFloats, "K 3"],
-) -> Surface:
+def discs(centers: Places, normals: Places, radius: Float[AnyFloats, " K"], colors: Places) -> Surface:
     """A flat octagon for every center, perpendicular to its normal, with its radius."""
     turn = 2 * np.pi * np.arange(8) / 8
     side = np.where(np.abs(normals[:, :1]) < 0.8, [[1.0, 0, 0]], [[0, 1.0, 0]])

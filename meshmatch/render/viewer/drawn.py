@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import Rotations, facing, facing_matched
+from meshmatch.render.surface import corners_of
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.faces import seams
 from meshmatch.shapes.shape import Shape
@@ -52,7 +53,7 @@ class Drawn:
     @cached_property
     def used(self) -> Int[Ints, " U"]:
         """Rows that can be seen: those of a face, or every point."""
-        return _corners(self.faces, len(self.verts)) if len(self.faces) else np.arange(len(self.verts))
+        return corners_of(self.faces, len(self.verts)) if len(self.faces) else np.arange(len(self.verts))
 
 
 def draw(shape: Shape, most: int = MOST) -> Drawn:
@@ -68,11 +69,11 @@ def draw(shape: Shape, most: int = MOST) -> Drawn:
     smooth = Shape(shape.verts, joined[faces]).vertex_normals[joined]
     if shape.V <= most:
         return Drawn(shape.verts, faces, smooth, np.arange(shape.V), sound)
-    kept = _corners(joined[faces], shape.V)
+    kept = corners_of(joined[faces], shape.V)
     number = np.empty(shape.V, np.int64)
     number[kept] = np.arange(len(kept))
     coarse = decimate(Shape(shape.verts[kept], number[joined[faces]]), 2 * int(_LEAN * most))
-    used = _corners(faces, shape.V)
+    used = corners_of(faces, shape.V)
     if coarse.V > most:  # nothing that holds together: a heap of single triangles
         return _some_points(shape, used, most)
     # Each vertex of the coarse mesh stands for the nearest one of the file that faces the same way.
@@ -93,13 +94,6 @@ def _some_points(shape: Shape, rows: Int[Ints, " N"], most: int) -> Drawn:
     verts = shape.verts[rows]
     normals = Shape(verts, none).vertex_normals if shape.is_cloud else shape.vertex_normals[rows]
     return Drawn(verts, none, normals, rows, _NONE, note)
-
-
-def _corners(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " U"]:
-    """The vertices of some face, in order."""
-    seen = np.zeros(V, bool)
-    seen[faces] = True
-    return np.flatnonzero(seen)
 
 
 @dataclass(frozen=True, eq=False)
