@@ -126,7 +126,7 @@ def _draw_strip(path: Path, result: "Interpolation", met: Met) -> None:
 
 def _write_page(path: Path, result: "Interpolation", met: Met) -> None:
     """In one frame, that of the first shape: what moves in the files moves on the page."""
-    from meshmatch.render.viewer.motion import write_motion
+    from meshmatch.render.viewer.page import write_motion
 
     shapes = [step.shape for step in result.steps]
     times = [step.time for step in result.steps]

@@ -113,8 +113,7 @@ class LookOptions:
 
     def look(self) -> "Look":
         """The same for the library."""
-        from meshmatch.render.layout import VIEWS
-        from meshmatch.render.picture import Look
+        from meshmatch.render.picture import VIEWS, Look
 
         options.check_axes(self.up, self.front)
         return Look(_size(self.size), self.background, self.up, self.front, *VIEWS[self.view], self.ground)

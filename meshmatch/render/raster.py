@@ -7,11 +7,12 @@ pixel. Work proceeds in bands of rows, so that memory does not grow with the pic
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
-from meshmatch.render.layout import Viewport
 from meshmatch.render.scene import Hits, Scene, Vectors
 from meshmatch.render.shading import BLOCK, GROUND_BLOCK, Shares, shade, shadow, visibility
 from meshmatch.render.surface import Rows
@@ -32,6 +33,21 @@ def _lattice(count: int, step: int) -> Float[Floats, "count 2"]:
 
 
 _RIM, _INNER = _lattice(16, 7), _lattice(8, 3)  # where an outline runs through a pixel; where colours meet
+
+
+@dataclass(frozen=True)
+class Viewport:
+    """The part of the picture plane that the pixels show: the first one's upper left corner, and the size of one."""
+
+    width: int
+    height: int
+    left: float
+    top: float
+    pixel: float
+
+    def at(self, column: NDArray[Any], row: NDArray[Any]) -> tuple[Float[Floats, " ..."], Float[Floats, " ..."]]:
+        """x and y of places in the picture, counted in pixels from its upper left corner."""
+        return self.left + self.pixel * column, self.top - self.pixel * row
 
 
 @dataclass(frozen=True, eq=False)

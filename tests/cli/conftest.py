@@ -21,7 +21,7 @@ from meshmatch.shapes.shape import Shape
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures whose size is not given are small: rays cost seconds."""
-    monkeypatch.setattr("meshmatch.render.layout.HEIGHT", 240)
+    monkeypatch.setattr("meshmatch.render.picture.HEIGHT", 240)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import OptionError, OutputError
-from meshmatch.render import Look, Panel, layout, position_colors, render_shapes
+from meshmatch.render import Look, Panel, position_colors, render_shapes
 from meshmatch.render import picture as module
 from meshmatch.render.scales import Scale, label_swatches
 from meshmatch.shapes.appearance import vertex_colors_alone
@@ -76,8 +76,8 @@ def test_without_a_size_the_picture_takes_the_room_that_the_shapes_need(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     height = 200  # four times smaller: the same shares
-    monkeypatch.setattr(layout, "HEIGHT", height)
-    monkeypatch.setattr(layout, "_WIDEST", 500)
+    monkeypatch.setattr(module, "HEIGHT", height)
+    monkeypatch.setattr(module, "_WIDEST", 500)
     bare = replace(SMALL, size=None)
     narrow = draw(tmp_path, (box((0.1, 1, 0.1)), None), look=bare).shape
     wide = draw(tmp_path, (box((1.5, 1, 0.1)), None), look=bare).shape

@@ -5,8 +5,7 @@ import pytest
 
 from meshmatch.render import raster, shading
 from meshmatch.render.figures import rotation_about_x
-from meshmatch.render.layout import Viewport
-from meshmatch.render.raster import Layer, composite, draw
+from meshmatch.render.raster import Layer, Viewport, composite, draw
 from meshmatch.render.scene import Ground, Scene
 from meshmatch.render.surface import Surface, VertexPaint, balls, discs, face_paint, mesh_surface
 

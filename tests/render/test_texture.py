@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from meshmatch.render.layout import Viewport
-from meshmatch.render.raster import draw
+from meshmatch.render.raster import Viewport, draw
 from meshmatch.render.scene import Scene
 from meshmatch.render.surface import TexturePaint, mesh_surface
 from meshmatch.shapes.appearance import Appearance, Material

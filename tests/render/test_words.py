@@ -5,8 +5,8 @@ import pytest
 from PIL import Image
 
 from meshmatch.render import legend as module
-from meshmatch.render.layout import lay_out
 from meshmatch.render.legend import draw_legend, fitting, legend_height, readable, width_of, write
+from meshmatch.render.picture import lay_out
 from meshmatch.render.scales import Scale, Swatches
 from meshmatch.shapes.colors import label_colors
 
