@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from meshmatch.api.results import ConfidenceRule as ConfidenceRule
     from meshmatch.api.results import MatchResult as MatchResult
     from meshmatch.api.results import Transferred as Transferred
-    from meshmatch.api.results import find_maps as find_maps
     from meshmatch.api.texture import TexturedResult as TexturedResult
     from meshmatch.api.texture import transfer_texture as transfer_texture
+    from meshmatch.api.transfer import find_maps as find_maps
     from meshmatch.api.transfer import transfer_colors as transfer_colors
     from meshmatch.api.transfer import transfer_labels as transfer_labels
     from meshmatch.api.transfer import transfer_landmarks as transfer_landmarks
@@ -62,7 +62,7 @@ _HOMES = {
     "Transferred": "meshmatch.api.results",
     "VertexMap": "meshmatch.maps.vertex_map",
     "evaluate": "meshmatch.api.evaluation",
-    "find_maps": "meshmatch.api.results",
+    "find_maps": "meshmatch.api.transfer",
     "interpolate": "meshmatch.api.interpolation",
     "load_map": "meshmatch.maps.files",
     "load_model": "meshmatch.models.registry",

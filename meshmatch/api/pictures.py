@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch.api.inputs import checked_threads
-from meshmatch.api.results import MapLike, MapPair, find_maps
+from meshmatch.api.results import MapPair
+from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.arrays import Floats, as_numbers
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit

@@ -1,28 +1,21 @@
-"""What matching and transfers give back, and the maps in both directions that transfers follow: those at hand, or new."""
+"""What matching and transfers give back, and the maps in both directions that transfers follow."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
+from typing import Generic, TypeVar
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
-from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.low_confidence import LowConfidence
-
-if TYPE_CHECKING:
-    from meshmatch.api.matching import Matcher
-
 from meshmatch.transfer.mapped_mesh import invert_map
 
 T = TypeVar("T")
@@ -91,47 +84,6 @@ class MapPair:
             return self.match.backward()
         with thread_limit(1):
             return invert_map(self.forward, self.source, self.target, self.threads)
-
-
-MapMaker: TypeAlias = Callable[[Shape, Shape], "MatchResult | MapPair"]
-MapLike: TypeAlias = "MatchResult | MapPair | VertexMap | str | Path | Matcher | MapMaker | None"
-"""What a transfer follows: a match or a map from source to target, its file, or who makes it when all else is
-checked: a `Matcher`, or a function of both shapes."""
-
-
-def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> MapPair:
-    """The maps between two shapes, which transfers follow; several transfers can share one pair.
-
-    Parameters
-    ----------
-    source, target
-        As in `meshmatch.match`.
-    match : MatchResult, VertexMap, path, Matcher or None
-        A match or a map from source to target that is there already; or what the shapes are matched with.
-
-    `MeshmatchError`: the map belongs to other shapes or has the opposite direction; or as `meshmatch.match`.
-    """
-    source, target = as_shape(source, "source"), as_shape(target, "target")
-    label = Path(match).name if isinstance(match, str | Path) else "the map"
-    found = load_map(match) if isinstance(match, str | Path) else match
-    if callable(found):
-        found = found(source, target)
-    elif not isinstance(found, VertexMap | MatchResult | MapPair):
-        from meshmatch.api.matching import Matcher
-
-        matcher = Matcher() if found is None else found
-        if not isinstance(matcher, Matcher):
-            raise InputError(
-                f"{type(match).__name__} is not a map",
-                "pass a MatchResult, a VertexMap, the path of a map, a Matcher, or nothing to match the shapes",
-            )
-        found = matcher.match(source, target)
-    if isinstance(found, VertexMap):
-        return MapPair(source, target, found.for_shapes(source, target, label))
-    if isinstance(found, MatchResult):
-        return MapPair(source, target, found.map.for_shapes(source, target), found, found.threads)
-    found.forward.for_shapes(source, target)
-    return found
 
 
 def map_of_fits(fits: tuple[Fit, Fit], before_agreement: tuple[Fit, Fit], threads: int = 1) -> VertexMap:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from meshmatch.api.results import MapLike, MapPair, find_maps
+from meshmatch.api.results import MapPair
+from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.errors import InputError, OptionError
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.appearance import Appearance, vertex_colors_alone

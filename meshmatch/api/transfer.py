@@ -1,17 +1,20 @@
-"""Attributes from one shape to another: values, colours, labels, skin weights and landmarks."""
+"""Attributes from one shape to another: values, colours, labels, skin weights and landmarks; the maps they follow."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
-from meshmatch.api.results import ConfidenceRule, MapLike, MapPair, Transferred, find_maps
+from meshmatch.api.results import ConfidenceRule, MapPair, MatchResult, Transferred
 from meshmatch.arrays import Float, Floats, as_numbers
 from meshmatch.errors import InputError, OptionError
+from meshmatch.maps.files import load_map
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.shape import Shape
@@ -23,6 +26,49 @@ from meshmatch.transfer.landmarks import Landmarks, at_points, at_vertices, load
 from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels, replace_low_values, replace_low_weights
 from meshmatch.transfer.value_files import checked_colors, light, light_of, seen
 from meshmatch.transfer.weight_files import SkinWeights, load_weights, weights_of
+
+if TYPE_CHECKING:
+    from meshmatch.api.matching import Matcher
+
+MapMaker: TypeAlias = Callable[[Shape, Shape], "MatchResult | MapPair"]
+MapLike: TypeAlias = "MatchResult | MapPair | VertexMap | str | Path | Matcher | MapMaker | None"
+"""What a transfer follows: a match or a map from source to target, its file, or who makes it when all else is
+checked: a `Matcher`, or a function of both shapes."""
+
+
+def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> MapPair:
+    """The maps between two shapes, which transfers follow; several transfers can share one pair.
+
+    Parameters
+    ----------
+    source, target
+        As in `meshmatch.match`.
+    match : MatchResult, VertexMap, path, Matcher or None
+        A match or a map from source to target that is there already; or what the shapes are matched with.
+
+    `MeshmatchError`: the map belongs to other shapes or has the opposite direction; or as `meshmatch.match`.
+    """
+    source, target = as_shape(source, "source"), as_shape(target, "target")
+    label = Path(match).name if isinstance(match, str | Path) else "the map"
+    found = load_map(match) if isinstance(match, str | Path) else match
+    if callable(found):
+        found = found(source, target)
+    elif not isinstance(found, VertexMap | MatchResult | MapPair):
+        from meshmatch.api.matching import Matcher
+
+        matcher = Matcher() if found is None else found
+        if not isinstance(matcher, Matcher):
+            raise InputError(
+                f"{type(match).__name__} is not a map",
+                "pass a MatchResult, a VertexMap, the path of a map, a Matcher, or nothing to match the shapes",
+            )
+        found = matcher.match(source, target)
+    if isinstance(found, VertexMap):
+        return MapPair(source, target, found.for_shapes(source, target, label))
+    if isinstance(found, MatchResult):
+        return MapPair(source, target, found.map.for_shapes(source, target), found, found.threads)
+    found.forward.for_shapes(source, target)
+    return found
 
 
 def transfer_values(

@@ -91,7 +91,7 @@ class Transfer:
 
     def __call__(self, source: Shape, target: Shape) -> MapPair:
         """The maps, from the file or by matching; judged if --strict was given."""
-        from meshmatch.api.results import find_maps
+        from meshmatch.api.transfer import find_maps
 
         def matched(a: Shape, b: Shape) -> MatchResult:
             return self.options.match(a, b, self.run, self.console)
