@@ -27,7 +27,7 @@ GROUND = ("errors", "threads", "outputs", "progress")
 ROOMS = (
     *GROUND,
     *("arrays", "geometry", "shapes", "templates", "fields", "models", "training", "fitting"),
-    *("maps", "transfer", "render", "api", "experiments", "cli", "__main__"),
+    *("maps", "transfer", "render", "api", "cli", "__main__", "experiments"),
 )
 
 # Which rooms know which third-party library.

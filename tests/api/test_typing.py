@@ -35,7 +35,7 @@ def test_public_names_are_there_and_nothing_else_is() -> None:
 
 
 def test_the_reference_names_everything_public() -> None:
-    from meshmatch.cli import reference
+    from meshmatch.experiments import reference
 
     described = {name for names in reference.API.values() for name in names}
     assert described == set(meshmatch.__all__) - {"__version__"}

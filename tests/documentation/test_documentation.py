@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from meshmatch.cli import reference
+from meshmatch.experiments import reference
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -1,6 +1,6 @@
 """Write ``docs/cli.md`` and ``docs/api.md`` from the program's own help and docstrings.
 
-``python -m meshmatch.cli.reference [--check] [FOLDER]``
+``python -m meshmatch.experiments.reference [--check] [FOLDER]``
 """
 
 import argparse
@@ -20,11 +20,11 @@ from meshmatch.cli.app import app
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 CLI_HEAD = """# The command line
 
-Made by `python -m meshmatch.cli.reference` from the program's own `--help`; a test keeps it fresh.
+Made by `python -m meshmatch.experiments.reference` from the program's own `--help`; a test keeps it fresh.
 """
 API_HEAD = """# The Python library
 
-Made by `python -m meshmatch.cli.reference` from signatures and docstrings; a test keeps it fresh. All names are
+Made by `python -m meshmatch.experiments.reference` from signatures and docstrings; a test keeps it fresh. All names are
 attributes of `meshmatch`, which loads them when they are first used. Whatever a user can get wrong is a
 `MeshmatchError` with a `message` and a `hint`.
 """
@@ -124,7 +124,7 @@ def _written(annotation: object) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Write the pages, or with --check say whether the files are what would be written."""
-    parser = argparse.ArgumentParser(prog="python -m meshmatch.cli.reference", description="Write the references.")
+    parser = argparse.ArgumentParser(prog="python -m meshmatch.experiments.reference", description="Write the references.")
     parser.add_argument("folder", nargs="?", type=Path, default=DOCS, help="where cli.md and api.md are")
     parser.add_argument("--check", action="store_true", help="write nothing; status 1 if a page is stale")
     words = parser.parse_args(arguments)
@@ -134,7 +134,7 @@ def main(arguments: Sequence[str]) -> int:
         if not words.check:
             file.write_text(page, encoding="utf-8")
         elif not file.is_file() or file.read_text(encoding="utf-8") != page:
-            print(f"{os.path.relpath(file)} is stale: run python -m meshmatch.cli.reference", file=sys.stderr)
+            print(f"{os.path.relpath(file)} is stale: run python -m meshmatch.experiments.reference", file=sys.stderr)
             stale = 1
     return stale
 
