@@ -124,7 +124,9 @@ def _written(annotation: object) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Write the pages, or with --check say whether the files are what would be written."""
-    parser = argparse.ArgumentParser(prog="python -m meshmatch.experiments.reference", description="Write the references.")
+    parser = argparse.ArgumentParser(
+        prog="python -m meshmatch.experiments.reference", description="Write the references."
+    )
     parser.add_argument("folder", nargs="?", type=Path, default=DOCS, help="where cli.md and api.md are")
     parser.add_argument("--check", action="store_true", help="write nothing; status 1 if a page is stale")
     words = parser.parse_args(arguments)
