@@ -44,8 +44,11 @@ STAGES = (
     ("map", "meshmatch.maps.build", "build_map"),
     ("write", "meshmatch.maps.files", "save_map"),
 )
-# What a command has to import before it can match.
-IMPORTS = "import meshmatch.cli.app, meshmatch.cli.match, meshmatch.api.matching, meshmatch.maps.files"
+# What a command has imported when it has matched.
+IMPORTS = (
+    "import meshmatch.cli.app, meshmatch.cli.match, meshmatch.api.matching, meshmatch.maps.files\n"
+    "import platformdirs, pydantic.types, rich.console, threadpoolctl\n"
+)
 
 
 class Clock:

@@ -220,11 +220,20 @@ def test_a_picture_is_of_stages(capsys: pytest.CaptureFixture[str]) -> None:
     assert "stages.doc: unsupported chart format" in told
 
 
-def test_the_command_imports_nothing_else() -> None:
-    """What a match loads of this package is loaded when the row ``import`` ends."""
-    loaded = f"{stages.IMPORTS}\nimport sys\nprint(*(name for name in sys.modules if name.startswith('meshmatch')))"
-    before = set(subprocess.run(python(loaded), capture_output=True, text=True, check=True).stdout.split())
-    assert {module for _, module, _ in STAGES} <= before
+def test_a_match_imports_nothing_else(tmp_path: Path) -> None:
+    """No library is loaded later than in the row ``import``."""
+
+    def packages(code: str) -> set[str]:
+        told = subprocess.run(
+            python(f"{code}\nimport sys; print(*sys.modules)"), capture_output=True, text=True, check=True
+        )
+        names = {name.split(".")[0] for name in told.stdout.splitlines()[-1].split()}
+        return names - set(sys.stdlib_module_names)
+
+    paths = [str(shape_file(word, tmp_path)) for word in ("climber@900", "dancer@900")]
+    words = ["match", *paths, "-o", str(tmp_path / "map.npy"), "--quiet"]
+    run = f"from meshmatch.cli import main\nassert main({words!r}) == 0"
+    assert packages(run) <= packages(stages.IMPORTS)
 
 
 def test_the_machine_and_its_bounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
