@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from dataclasses import field as entry
 from datetime import datetime
@@ -38,69 +40,47 @@ _KINDS: dict[str, tuple[type, str]] = {  # by annotation
     "dict[str, Any]": (dict, "an object"),
 }
 _FIELD_KEYS = {"kernel": "str", "radius": "float", "nodes": "int"}
+_RULES: dict[str, tuple[Callable[[Any], object], str]] = {  # what entries must be besides their kind
+    "template_hash": (re.compile("[0-9a-f]{16}").fullmatch, "16 hex digits"),
+    "weights_sha256": (re.compile("[0-9a-f]{64}").fullmatch, "64 hex digits"),
+    "steps": (lambda count: count >= 0, "0 or more"),
+    "training_minutes": (lambda minutes: minutes >= 0, "0 or more"),
+    "stiffness": (lambda number: number > 0, "above 0"),
+    "created": (datetime.fromisoformat, "an ISO date such as 2026-01-31"),
+    "field.radius": (lambda radius: radius > 0, "above 0"),
+    "field.nodes": (lambda count: count >= 4, "4 or more"),
+    "frame.orientation": (ORIENTATIONS.__contains__, f"one of {', '.join(ORIENTATIONS)}"),
+    "frame.scale": (SCALES.__contains__, f"one of {', '.join(SCALES)}"),
+}
 
 
 @dataclass(frozen=True)
 class ModelCard:
     """Everything about a model but its weights. Valid once built; its dictionaries are plain JSON values.
 
-    Parameters
-    ----------
-    name : str
-        Small letters, digits and ``. _ -``, at most 64; the folder of an installed model has this name.
-    category : str
-        What it was trained on, such as "human".
-    template, template_hash : str
-        Name and hash of the template that the weights belong to.
-    network : dict
-        Sizes and choices of the network.
-    field : dict
-        Of the deformation field: ``kernel`` (str), ``radius`` (sqrt-area units), ``nodes`` (K).
-    data, licence : str
-        What it was trained on, and under which terms the weights may be used.
-    recipe : dict
-        All settings of the training.
-    seed, steps : int
-    training_minutes : float
-    metrics : dict
-        For each evaluation set a dict of numbers, or of dicts of numbers by refinement ("none", "nodes").
-    weights_sha256 : str
-        Of the weights file, 64 hex digits.
-    created : str
-        ISO date.
-    description : str
-        A sentence for people; may be empty.
-    schema : int
-        Version of this list.
-    frame : dict
-        How a shape is brought to the template: ``orientation`` (one of `ORIENTATIONS`), ``scale`` (of `SCALES`).
-    stiffness : float
-        How firmly fits that agree hold a common stretch of the template; 1 suits bodies, less suits what varies more.
-
-    Raises
-    ------
-    ModelError
-        A value of the wrong kind, or out of its range.
+    `ModelError` if a value is of the wrong kind, or out of its range.
     """
 
-    name: str
-    category: str
+    name: str  # small letters, digits and . _ -, at most 64; the folder of an installed model has this name
+    category: str  # what it was trained on, such as "human"
     template: str
-    template_hash: str
-    network: dict[str, Any]
-    field: dict[str, Any]
-    data: str
-    licence: str
-    recipe: dict[str, Any]
+    template_hash: str  # of the template that the weights belong to
+    network: dict[str, Any]  # its sizes and choices
+    field: dict[str, Any]  # of the deformation: kernel (str), radius (sqrt-area units), nodes (K)
+    data: str  # what it was trained on
+    licence: str  # under which terms the weights may be used
+    recipe: dict[str, Any]  # all settings of the training
     seed: int
     steps: int
     training_minutes: float
-    metrics: dict[str, Any]
-    weights_sha256: str
-    created: str
-    description: str = ""
-    schema: int = SCHEMA
+    metrics: dict[str, Any]  # of each evaluation set: numbers, or dicts of numbers by refinement ("none", "nodes")
+    weights_sha256: str  # of the weights file
+    created: str  # ISO date
+    description: str = ""  # a sentence for people
+    schema: int = SCHEMA  # version of this list
+    # How a shape is brought to the template: orientation (one of `ORIENTATIONS`), scale (of `SCALES`).
     frame: dict[str, Any] = entry(default_factory=lambda: dict(_OLD_FRAME))
+    # How firmly fits that agree hold a common stretch of the template: 1 suits bodies, less suits what varies more.
     stiffness: float = 1.0
 
     def __post_init__(self) -> None:
@@ -109,27 +89,18 @@ class ModelCard:
             object.__setattr__(self, item.name, value)
         _check_schema(self.schema)
         check_name(self.name)
-        for name, digits in (("template_hash", 16), ("weights_sha256", 64)):
-            if not re.fullmatch(f"[0-9a-f]{{{digits}}}", getattr(self, name)):
-                _refuse(f"{name} must be {digits} hex digits, not {_shown(getattr(self, name))}")
-        if self.steps < 0 or self.training_minutes < 0:
-            _refuse("steps and training_minutes must be 0 or more")
-        if not self.stiffness > 0:
-            _refuse(f"stiffness must be above 0, not {self.stiffness:g}")
-        try:
-            datetime.fromisoformat(self.created)
-        except ValueError:
-            _refuse(f"created must be an ISO date such as 2026-01-31, not {_shown(self.created)}")
         for name, keys in (("field", _FIELD_KEYS), ("frame", _OLD_FRAME)):
             if (found := getattr(self, name)).keys() != keys.keys():
                 _refuse(f"{name} must have {', '.join(keys)}, not {', '.join(found) or 'nothing'}")
         for key, kind in _FIELD_KEYS.items():
             self.field[key] = _checked(self.field[key], f"field.{key}", kind)
-        if not self.field["radius"] > 0 or self.field["nodes"] < 4:
-            _refuse("field needs a positive radius and at least 4 nodes")
-        for key, values in (("orientation", ORIENTATIONS), ("scale", SCALES)):
-            if self.frame[key] not in values:
-                _refuse(f"frame.{key} must be one of {', '.join(values)}, not {_shown(self.frame[key])}")
+        for where, (holds, words) in _RULES.items():
+            name, _, key = where.partition(".")
+            value = getattr(self, name)[key] if key else getattr(self, name)
+            with suppress(ValueError):
+                if holds(value):
+                    continue
+            _refuse(f"{where} must be {words}, not {_shown(value)}")
         for name, results in self.metrics.items():
             for key, value in _checked(results, f"metrics.{name}", "dict[str, Any]").items():
                 numbers = value.values() if isinstance(value, dict) else (value,)
@@ -140,21 +111,16 @@ class ModelCard:
 def check_name(name: str) -> str:
     """The name, if it can be one; `ModelError` otherwise. It can then be used as the name of a folder."""
     if not _NAME.fullmatch(name):
-        raise ModelError(
-            f"{name[:80]!r} cannot be the name of a model",
-            "use small letters, digits, '.', '_' and '-', beginning with a letter or digit, at most 64",
-        )
+        hint = "use small letters, digits, '.', '_' and '-', beginning with a letter or digit, at most 64"
+        raise ModelError(f"{name[:80]!r} cannot be the name of a model", hint)
     return name
 
 
 def read_card(path: str | Path) -> ModelCard:
     """Read a card.
 
-    Raises
-    ------
-    ModelError
-        The file is missing, too large, not a JSON object, of another schema, or has missing, unknown, repeated
-        or wrong entries.
+    `ModelError` if the file is missing, too large, not a JSON object, of another schema, or has missing, unknown, repeated
+    or wrong entries.
     """
     path = Path(path)
     try:
@@ -163,10 +129,8 @@ def read_card(path: str | Path) -> ModelCard:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise ModelError(
-            f"{path.parent} holds no model: cannot read {path.name}",
-            "a model is a folder with card.json, weights.safetensors and template.safetensors",
-        ) from error
+        hint = "a model is a folder with card.json, weights.safetensors and template.safetensors"
+        raise ModelError(f"{path.parent} holds no model: cannot read {path.name}", hint) from error
     if len(data) > MAX_BYTES:
         raise ModelError(f"{path} is not a model card: it is larger than {MAX_BYTES // 1000} kB")
     try:
@@ -180,7 +144,7 @@ def read_card(path: str | Path) -> ModelCard:
 def card_from_json(text: str) -> ModelCard:
     """The card that a text holds; `ModelError` if it holds none."""
     try:
-        found = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_not_json)
+        found = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=float)
     except (ValueError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
         raise ModelError(f"this is not JSON: {reason}", "is the file damaged?") from error
@@ -209,23 +173,15 @@ def card_to_json(card: ModelCard) -> str:
 
 
 def write_card(card: ModelCard, path: str | Path) -> None:
-    """Write a card completely or not at all. Write it last: a folder without one is not a model.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Write a card, or raise `OutputError`. Write it last: a folder without one is not a model."""
     with replace_on_success(path) as temporary:
         temporary.write_text(card_to_json(card), encoding="utf-8")
 
 
 def _check_schema(schema: int) -> None:
     if schema != SCHEMA:
-        raise ModelError(
-            f"the model card has schema {schema}, not {SCHEMA}",
-            "it needs a newer meshmatch: update it" if schema > SCHEMA else "train or fetch the model again",
-        )
+        hint = "it needs a newer meshmatch: update it" if schema > SCHEMA else "train or fetch the model again"
+        raise ModelError(f"the model card has schema {schema}, not {SCHEMA}", hint)
 
 
 def _checked(value: Any, where: str, annotation: str) -> Any:
@@ -241,19 +197,17 @@ def _json_value(value: Any, where: str, depth: int = 0) -> Any:
     """The value as JSON has it: tuples become lists; what JSON does not have is refused."""
     if depth > 20:
         _refuse(f"{where} is nested too deeply")
-    if value is None or isinstance(value, str | bool | int):
+    if isinstance(value, float) and not math.isfinite(value):
+        _refuse(f"{where} must be finite, not {value}")
+    if value is None or isinstance(value, str | bool | int | float):
         return value
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            _refuse(f"{where} must be finite, not {value}")
-        return value
-    if isinstance(value, dict):
-        if not all(isinstance(key, str) for key in value):
-            _refuse(f"{where} has a key that is not text")
-        return {key: _json_value(inner, f"{where}.{key}", depth + 1) for key, inner in value.items()}
     if isinstance(value, list | tuple):
         return [_json_value(inner, where, depth + 1) for inner in value]
-    _refuse(f"{where} cannot hold {_shown(value)}")
+    if not isinstance(value, dict):
+        _refuse(f"{where} cannot hold {_shown(value)}")
+    if not all(isinstance(key, str) for key in value):
+        _refuse(f"{where} has a key that is not text")
+    return {key: _json_value(inner, f"{where}.{key}", depth + 1) for key, inner in value.items()}
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -261,10 +215,6 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) != len(pairs):
         raise ValueError("a key occurs twice")
     return found
-
-
-def _not_json(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not a JSON number")
 
 
 def _shown(value: Any) -> str:

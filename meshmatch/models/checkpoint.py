@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -23,32 +23,18 @@ from meshmatch.models.tensor_file import TensorInfo, read_header
 from meshmatch.outputs import replace_on_success
 
 Storage = Literal["float32", "float16", "int8"]
-STORAGES: tuple[Storage, ...] = ("float32", "float16", "int8")
-
+STORAGES: tuple[Storage, ...] = get_args(Storage)
 SCALE = ".scale"
-_KEY = "meshmatch"
-_FORMAT = "weights 1"
+_KEY, _FORMAT = "meshmatch", "weights 1"
 _SHORT_ROW = 64  # of a matrix with fewer columns the scales would weigh as much as they save
 
 
 def save_weights(state: Mapping[str, Any], path: str | Path, *, storage: str = "float16") -> str:
     """Write a state dict and return the sha256 of the file (64 hex digits). Same state, same file.
 
-    Parameters
-    ----------
-    state
-        Arrays, or torch tensors on any device, by name.
-    storage : {"float32", "float16", "int8"}
-        "int8" quantises the matrices of linear layers with at least 64 columns; other weights become float16.
-
-    Raises
-    ------
-    ModelError
-        A tensor is not finite.
-    OptionError
-        An unknown storage.
-    OutputError
-        The file cannot be written.
+    The state has arrays, or torch tensors on any device. "int8" quantises the matrices of linear layers with at least 64
+    columns; other weights become float16. `ModelError` if a tensor is not finite, `OptionError` if the storage is unknown,
+    `OutputError` if the file cannot be written.
     """
     if storage not in STORAGES:
         raise OptionError(f"unknown storage {storage!r}", f"choose one of {', '.join(STORAGES)}")
@@ -56,11 +42,10 @@ def save_weights(state: Mapping[str, Any], path: str | Path, *, storage: str = "
     for name in sorted(state):
         array = state[name]
         array = np.array(array.numpy(force=True) if hasattr(array, "numpy") else array, order="C")
-        floating = array.dtype.kind == "f"
-        if floating:
+        if floating := array.dtype.kind == "f":
+            array = array.astype(np.float32)
             if not np.isfinite(array).all():
                 raise ModelError(f"weight {name} is not finite", "the training diverged: use an earlier checkpoint")
-            array = array.astype(np.float32)
         if name.endswith(SCALE) and name.removesuffix(SCALE) in state:
             raise ModelError(f"{name} is reserved for the scale of {name.removesuffix(SCALE)}")
         if storage == "float32" or not (name.endswith("weight") and floating and array.ndim > 1):
@@ -78,17 +63,9 @@ def save_weights(state: Mapping[str, Any], path: str | Path, *, storage: str = "
 
 
 def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """Read what `save_weights` wrote: float32 where it was floating.
+    """Read what `save_weights` wrote: float32 where it was floating. Each tensor must have the shape that is ``expected``.
 
-    Parameters
-    ----------
-    expected
-        Shape of every tensor that must be there; no other may be.
-
-    Raises
-    ------
-    ModelError
-        The file is missing or damaged, or its tensors are not those expected.
+    `ModelError` if the file is missing or damaged, or its tensors are not those expected.
     """
     path = Path(path)
     held = read_header(path)
@@ -118,11 +95,10 @@ def _check(path: Path, held: Mapping[str, TensorInfo], expected: Mapping[str, tu
     """Refuse a file whose names, shapes or scales are not those of the expected tensors."""
     scales = {name for name in held if name.endswith(SCALE) and name.removesuffix(SCALE) in held}
     names = held.keys() - scales
-    missing, unexpected = sorted(expected.keys() - names), sorted(names - expected.keys())
-    if missing:
-        raise _mismatch(path, f"missing {_some(missing)}")
-    if unexpected:
-        raise _mismatch(path, f"unexpected {_some(unexpected)}")
+    for word, wrong in (("missing", sorted(expected.keys() - names)), ("unexpected", sorted(names - expected.keys()))):
+        if wrong:
+            more = f" and {len(wrong) - 4} more" if len(wrong) > 4 else ""
+            raise _mismatch(path, f"{word} {', '.join(wrong[:4])}{more}")
     for name, shape in expected.items():
         if held[name].shape != tuple(shape):
             raise _mismatch(path, f"{name} has shape {held[name].shape}, not {tuple(shape)}")
@@ -139,12 +115,6 @@ def _quantised(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.clip(np.round(matrix / scale[:, None]), -127, 127).astype(np.int8), scale
 
 
-def _some(names: list[str]) -> str:
-    rest = f" and {len(names) - 4} more" if len(names) > 4 else ""
-    return ", ".join(names[:4]) + rest
-
-
 def _mismatch(path: Path, reason: str) -> ModelError:
-    return ModelError(
-        f"{path} does not fit its model card: {reason}", "the card and the weights are of different models"
-    )
+    hint = "the card and the weights are of different models"
+    return ModelError(f"{path} does not fit its model card: {reason}", hint)

@@ -30,24 +30,13 @@ _REPLACED = ".replaced"  # the end of the hidden name of a model that is being r
 
 @dataclass(frozen=True)
 class Entry:
-    """One model of the registry.
-
-    Parameters
-    ----------
-    name : str
-    folder : Path
-    built_in : bool
-        It came with the package and cannot be removed.
-    card : ModelCard or None
-        None if it cannot be read; then `problem` says why.
-    problem : str
-    """
+    """One model of the registry. A built-in one came with the package and cannot be removed."""
 
     name: str
     folder: Path
     built_in: bool
-    card: ModelCard | None
-    problem: str = ""
+    card: ModelCard | None  # None if it cannot be read
+    problem: str = ""  # then why
 
 
 def built_in_folder() -> Path:
@@ -72,49 +61,27 @@ def list_models() -> tuple[Entry, ...]:
     _restore_interrupted()
     found: dict[str, Entry] = {}
     for parent, built_in in ((built_in_folder(), True), (user_folder(), False)):
-        try:
-            folders = sorted(folder for folder in parent.iterdir() if folder.is_dir())
-        except OSError:
-            continue
-        for folder in folders:
-            # a hidden folder is a copy in the making
-            if not folder.name.startswith(".") and folder.name not in found:
+        for folder in sorted(parent.glob("[!.]*/")):  # a hidden folder is a copy in the making
+            if folder.name not in found:
                 found[folder.name] = _entry(folder, built_in)
     return tuple(found.values())
 
 
-def get_entry(name: str) -> Entry:
-    """The registered model of this name.
-
-    Raises
-    ------
-    ModelError
-        There is none; the hint names those that are spelled alike.
-    """
-    folder = _registered(name)
-    return _entry(folder, folder.parent == built_in_folder())
-
-
 def locate_model(name: str | Path) -> Path:
-    """The folder of a model, given by its name or by its folder. A name wins over a folder of the same name
-    here; write ``./name`` for the folder.
+    """The folder of a model, given by its name or by its folder; `ModelError` if it is neither.
 
-    Raises
-    ------
-    ModelError
-        Neither a registered name nor a model folder.
+    A name wins over a folder of the same name here; write ``./name`` for the folder.
     """
     text, folder = str(name), _expanded(name)
     if isinstance(name, Path) or os.sep in text or "/" in text or text in (".", ".."):
-        if not _is_folder(folder):
-            raise ModelError(
-                f"there is no model folder {text[:200]}", "give the name of a model, or a folder with a card.json"
-            )
+        if not os.path.isdir(folder):
+            hint = "give the name of a model, or a folder with a card.json"
+            raise ModelError(f"there is no model folder {text[:200]}", hint)
         return folder
     try:
         return _registered(text)
     except ModelError:
-        if _is_folder(folder) and (folder / CARD).is_file():
+        if os.path.isdir(folder) and (folder / CARD).is_file():
             return folder
         raise
 
@@ -122,15 +89,12 @@ def locate_model(name: str | Path) -> Path:
 def find_model(name: str | Path) -> tuple[Path, ModelCard]:
     """Folder and card of a model that is safe to load: headers are bounded, the weights have the card's hash.
 
-    Raises
-    ------
-    ModelError
-        No such model, or it is damaged.
+    `ModelError` if there is no such model, or it is damaged.
     """
     folder = locate_model(name)
     card = read_card(folder / CARD)
-    read_header(folder / TEMPLATE)
-    read_header(folder / WEIGHTS)
+    for part in (TEMPLATE, WEIGHTS):
+        read_header(folder / part)
     with (folder / WEIGHTS).open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if digest != card.weights_sha256:
@@ -160,13 +124,7 @@ def load_model(name: str | Path = "human") -> TrainedModel:
 
 
 def verify_model(name: str | Path) -> ModelCard:
-    """Load a model to be sure that it can be loaded. Returns the card.
-
-    Raises
-    ------
-    ModelError
-        No such model, or anything about it is wrong.
-    """
+    """The card of a model that was loaded to be sure that it can be; `ModelError` if anything about it is wrong."""
     folder = locate_model(name)
     try:
         card = load_model(folder).card
@@ -176,31 +134,19 @@ def verify_model(name: str | Path) -> ModelCard:
         raise ModelError(f"model {folder.name}: {error.message}", "fetch or add the model again") from error
     registered = folder.parent in (built_in_folder(), user_folder()) and not folder.name.startswith(".")
     if registered and folder.name != card.name:
-        raise ModelError(
-            f"the folder {folder.name} holds a model called {card.name}", "remove it, and add it again from its source"
-        )
+        hint = "remove it, and add it again from its source"
+        raise ModelError(f"the folder {folder.name} holds a model called {card.name}", hint)
     return card
 
 
 def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
-    """Copy a model folder into the registry, under the name on its card.
+    """Copy a model folder into the registry, under the name on its card, in place of the user's own one with ``replace``.
 
-    The copy is verified before it gets its name: what is registered is what was checked.
-
-    Parameters
-    ----------
-    replace
-        Overwrite the user's own model of the same name.
-
-    Raises
-    ------
-    ModelError
-        It is not a model, damaged, or its name is taken.
-    OutputError
-        The registry's folder cannot be written.
+    The copy is verified before it gets its name: what is registered is what was checked. `ModelError` if it is not a model,
+    damaged, or its name is taken; `OutputError` if the registry's folder cannot be written.
     """
     source = _expanded(folder)
-    if not _is_folder(source):
+    if not os.path.isdir(source):
         raise ModelError(f"there is no folder {str(source)[:200]}", "a model is a folder with a card.json")
     card = read_card(source / CARD)
     for file in (TEMPLATE, WEIGHTS):
@@ -209,9 +155,8 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
         raise ModelError(f"a built-in model is called {card.name}", "change the name on its card")
     _restore_interrupted()
     target = user_folder() / card.name
-    taken = ModelError(
-        f"there is a model called {card.name} already", f"`meshmatch models remove {card.name}`, or --replace"
-    )
+    hint = f"`meshmatch models remove {card.name}`, or --replace"
+    taken = ModelError(f"there is a model called {card.name} already", hint)
     if target.exists() and not replace:
         raise taken
     temporary = user_folder() / f".{card.name}.{secrets.token_hex(4)}"
@@ -241,15 +186,7 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
 
 
 def remove_model(name: str) -> None:
-    """Remove one of the user's own models.
-
-    Raises
-    ------
-    ModelError
-        There is no such model, or it is built in.
-    OutputError
-        Its folder cannot be removed.
-    """
+    """Remove one of the user's own models: `ModelError` if there is no such model, `OutputError` if it cannot be done."""
     folder = _registered(name)
     if folder.parent == built_in_folder():
         raise ModelError(f"{name} is a built-in model and cannot be removed")
@@ -295,13 +232,6 @@ def _expanded(path: str | Path) -> Path:
         return as_path(path).expanduser()
     except RuntimeError as error:
         raise ModelError(f"cannot use {str(path)[:200]}: {error}", "write out the home folder") from error
-
-
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except OSError:  # such as a name that is too long
-        return False
 
 
 def _entry(folder: Path, built_in: bool) -> Entry:

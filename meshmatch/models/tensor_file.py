@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from meshmatch.errors import ModelError
 
@@ -11,9 +11,8 @@ MAX_BYTES = 1_000_000_000
 """A larger file is refused."""
 
 
-@dataclass(frozen=True)
-class TensorInfo:
-    """Kind and shape of one tensor in a file."""
+class TensorInfo(NamedTuple):
+    """Of one tensor in a file."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -22,10 +21,7 @@ class TensorInfo:
 def read_header(path: str | Path) -> dict[str, TensorInfo]:
     """The tensors of a safetensors file; nothing else of it is read.
 
-    Raises
-    ------
-    ModelError
-        The file is missing, not a regular file, larger than `MAX_BYTES`, or its header and its bytes do not match.
+    `ModelError` if it is missing, not a regular file, larger than `MAX_BYTES`, or its header and its bytes do not match.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -33,10 +29,8 @@ def read_header(path: str | Path) -> dict[str, TensorInfo]:
     try:
         if not path.is_file():
             raise ModelError(f"cannot read {path}: there is no such file", "is the model complete?")
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            reason = f"it has {size:,} bytes; at most {MAX_BYTES:,} are allowed"
-            raise ModelError(f"{path} is damaged: {reason}", "fetch or make it again")
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise OSError(f"it has {size:,} bytes; at most {MAX_BYTES:,} are allowed")
         with safe_open(str(path), "numpy") as file:
             slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
             return {name: TensorInfo(s.get_dtype(), tuple(s.get_shape())) for name, s in slices.items()}
