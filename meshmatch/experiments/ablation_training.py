@@ -25,7 +25,7 @@ from meshmatch.models.registry import CARD, WEIGHTS, read_card
 from meshmatch.outputs import make_folder
 from meshmatch.threads import set_threads
 from meshmatch.training.loop import Trainer
-from meshmatch.training.losses import LossPoints, validation_error
+from meshmatch.training.losses import LossPoints, held_out_error
 from meshmatch.training.setup import build_dataset, build_deformer, build_loss_points
 from meshmatch.training.train import CardFacts, export
 
@@ -60,12 +60,12 @@ def train_run(run: Run, setting: Setting, folder: Path, *, minutes: float = 0.0,
         trainer.config = replace(recipe.train, steps=whole)
         batch = pool.batch(trainer.step, recipe.train.shapes, run.shapes, run.seed, model.encoder)
         trainer.iterate(replace(batch, targets=batch.targets[:, : run.supervised]))
-        trainer.wait()
+        _wait(trainer)
         spent = clock() - began
     trainer.seconds = spent
     trainer.config = recipe.train
     model.load_state_dict(trainer.averaged_state())
-    held_out = validation_error(model, pool.held_out, points.to(trainer.device))
+    held_out = held_out_error(model, pool.held_out, points.to(trainer.device))
     make_folder(folder)
     category = "human" if setting.folder is None else Path(setting.folder).name
     facts = CardFacts("run", category, f"{run.shapes} shapes, scanned beforehand", licence="")
@@ -80,6 +80,12 @@ def train_run(run: Run, setting: Setting, folder: Path, *, minutes: float = 0.0,
         "rule": setting.rule(run),
         "model": read_card(folder / CARD).weights_sha256,
     }
+
+
+def _wait(trainer: Trainer) -> None:
+    """Until a GPU has done what it was asked: it works on while Python does, and clocks must not."""
+    if trainer.device.type == "cuda":
+        torch.cuda.synchronize(trainer.device)
 
 
 def new_network(run: Run, setting: Setting, pool: Pool) -> Deformer:
@@ -136,10 +142,10 @@ def timed(setting: Setting, runs: Sequence[Run], rounds: int) -> dict[str, dict[
     for turn in range(-1, rounds):
         first = max(turn, 0) % len(ready)
         for run, trainer, batches in ready[first:] + ready[:first]:
-            trainer.wait()
+            _wait(trainer)
             began, worked = time.perf_counter(), time.process_time()
             trainer.iterate(batches[turn % _BATCHES])
-            trainer.wait()
+            _wait(trainer)
             if turn >= 0:
                 wall[run.name].append(1e3 * (time.perf_counter() - began))
                 cpu[run.name].append(1e3 * (time.process_time() - worked))
@@ -175,8 +181,10 @@ def _grown(setting: Setting, run: Run, iterations: int) -> tuple[float, str]:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     for number in range(iterations):
         trainer.iterate(batches[number % _BATCHES])
-    trainer.wait()
-    peak = trainer.device_peak()
+    _wait(trainer)
+    peak = (
+        torch.cuda.max_memory_allocated(trainer.device) if trainer.device.type == "cuda" else None
+    )  # bytes of tensors
     if peak is not None:
         return float(peak), "allocated on the GPU, at most"
     return float(max(_memory("VmHWM") - before, 0)), "growth of the resident set, at most"

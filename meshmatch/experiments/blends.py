@@ -91,7 +91,7 @@ def decoded(model: str, bodies: int, seed: int) -> dict[str, float]:
     between = [network.decoder((1 - time) * codes + time * others) for time in TIMES]
     energies = {}
     for name, answers in (("ends", [ends]), ("between", between)):
-        F = torch.cat([points.deformation_gradient(each) for each in answers])
+        F = torch.cat([points.field.deformation_gradient(each) for each in answers])
         energies[f"{name}_volume"] = float(volume_energy(F).mean())
         energies[f"{name}_arap"] = float(arap_energy(F).mean())
     return energies | {

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import platformdirs
 import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
 
 from meshmatch.arrays import Float
 from meshmatch.errors import OptionError
@@ -39,32 +42,25 @@ class Bodies:
 
 def draw_identities(
     rig: Rig, B: int, generator: torch.Generator
-) -> tuple[Float[torch.Tensor, "B V 3"], Float[torch.Tensor, "B J 3"]]:
+) -> tuple[Float[Tensor, "B V 3"], Float[Tensor, "B J 3"]]:
     """Blend pairs of stored identities: rest vertices and joints, metres.
 
     The body model is linear in its coefficients, so a blend of two bodies (and a little beyond) is a body.
     """
-    pick = torch.randint(rig.identities, (2, B), generator=generator)
+    a, b = torch.randint(len(rig.rest), (2, B), generator=generator)
     blend = torch.rand(B, 1, 1, generator=generator) * 1.2 - 0.1
-    rest = torch.lerp(rig.rest[pick[0]].float(), rig.rest[pick[1]].float(), blend)
-    heads = torch.lerp(rig.heads[pick[0]], rig.heads[pick[1]], blend)
-    return rest, heads
+    return torch.lerp(rig.rest[a].float(), rig.rest[b].float(), blend), torch.lerp(rig.heads[a], rig.heads[b], blend)
 
 
 def sample_bodies(
     rig: Rig, B: int, generator: torch.Generator, poses: GivenPoses | None = None
-) -> Float[torch.Tensor, "B V 3"]:
+) -> Float[Tensor, "B V 3"]:
     """Posed bodies in metres, pelvis roughly upright, y up, facing +z; some in given poses."""
     rest, heads = draw_identities(rig, B, generator)
     world, offset = sample_free_pose(rig, heads, generator)
     if poses is not None:
         world, offset = poses.mixed(rig, heads, world, offset, generator)
     return skin(rig, rest, world, offset)
-
-
-def body_source(rig: Rig, poses: GivenPoses | None = None) -> Source:
-    """Generated human bodies without end; some of them in given poses."""
-    return lambda count, generator: sample_bodies(rig, count, generator, poses)
 
 
 def human_source(
@@ -76,35 +72,25 @@ def human_source(
 ) -> Source:
     """Generated bodies on a human template's vertices, some in given poses; the rig is built once and cached.
 
-    Raises
-    ------
-    OptionError
-        The template is not made from the body model, or the extra ``train`` is not installed.
-    InputError
-        The body has no joint of a name in ``poses``.
+    `OptionError` if the template is not made from the body model, or the extra ``train`` is not installed; `InputError` if
+    the body has no joint of a name in ``poses``.
     """
     rig = cached_rig(identities, seed, progress)
     if poses is not None:
         poses.columns(rig)  # checks the names
     # Template vertices are a subset of the body model's: the dense mesh says which.
-    from scipy.spatial import cKDTree
-
     apart, keep = cKDTree(template.dense.verts).query(template.shape.verts)
     if template.dense.verts.shape[0] != rig.rest.shape[1] or apart.max() > 1e-4:
-        raise OptionError(
-            f"template {template.name} is not made from the body model",
-            "train on a prepared folder (--shapes), or use a human template",
-        )
-    return body_source(rig.restricted(keep, np.array(template.shape.faces)), poses)
+        hint = "train on a prepared folder (--shapes), or use a human template"
+        raise OptionError(f"template {template.name} is not made from the body model", hint)
+    return partial(sample_bodies, rig.restricted(keep, np.array(template.shape.faces)), poses=poses)
 
 
 def cached_rig(identities: int, seed: int, progress: Progress | None = None) -> Rig:
     """The body rig from the cache, or built into it (a minute or two, once)."""
     cache = Path(platformdirs.user_cache_dir("meshmatch"))
     path = cache / f"rig-v{RIG_VERSION}-{identities}-{seed}.safetensors"
-    if path.is_file():
-        return load_rig(path)
-    make_folder(path.parent)
-    rig = build_rig(identities, seed, progress=progress)
-    save_rig(rig, path)
-    return rig
+    if not path.is_file():
+        make_folder(path.parent)
+        save_rig(build_rig(identities, seed, progress=progress), path)
+    return load_rig(path)

@@ -12,6 +12,7 @@ from typing import Self
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from meshmatch.arrays import Float, Floats, Int
 from meshmatch.fields.field import Field
@@ -34,10 +35,10 @@ _REACH = 1.9  # of a lattice node, in spacings
 _MAX_POINTS = 400_000  # for which a lattice is kept ready; with more shapes there is no need to deform them
 
 # Draws shapes with the template's connectivity: (count, generator) -> vertices (count, V, 3), any unit.
-Source = Callable[[int, torch.Generator], Float[torch.Tensor, "N V 3"]]
+Source = Callable[[int, torch.Generator], Float[Tensor, "N V 3"]]
 
 
-def registered_source(shapes: Float[torch.Tensor, "N V 3"]) -> Source:
+def registered_source(shapes: Float[Tensor, "N V 3"]) -> Source:
     """A fixed set of registered shapes, drawn with replacement."""
     shapes = shapes - shapes.mean(1, keepdim=True)
     return lambda count, generator: shapes[torch.randint(len(shapes), (count,), generator=generator)]
@@ -57,42 +58,30 @@ class OnDevice:
 
 @dataclass(frozen=True, eq=False)
 class Batch(OnDevice):
-    """One training batch; lengths in units of sqrt(surface area).
+    """Scans in a roughly right core frame, lengths in units of sqrt(surface area); where the template's loss points belong
+    in it; what the encoder reads of ``points``; and the aligner's input (any turn) and answer."""
 
-    points : scan in a roughly right core frame
-    targets : where the template's loss points belong, same frame
-    encode_features : what the encoder reads of ``points``
-    align_features, align_rotation, align_center : the aligner's input (any turn) and answer
-    """
-
-    points: Float[torch.Tensor, "B P 3"]
-    targets: Float[torch.Tensor, "B M 3"]
-    encode_features: torch.Tensor
-    align_features: torch.Tensor | None = None
-    align_rotation: Float[torch.Tensor, "B 3 3"] | None = None
-    align_center: Float[torch.Tensor, "B 3"] | None = None
-
-
-def _features(encoder: BasisEncoder | PointEncoder | None, points: torch.Tensor) -> torch.Tensor:
-    return torch.zeros(len(points), 0) if encoder is None else encoder.features(points)
+    points: Float[Tensor, "B P 3"]
+    targets: Float[Tensor, "B M 3"]
+    encode_features: Tensor
+    align_features: Tensor | None = None
+    align_rotation: Float[Tensor, "B 3 3"] | None = None
+    align_center: Float[Tensor, "B 3"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class BatchDataset(torch.utils.data.Dataset):
     """Item s is the batch of training step s.
 
-    Attributes
-    ----------
-    template_core : template vertices of the core, template frame; core : their indices
-    loss_points : vertex indices that are supervised
-    scans_per_shape : each drawn shape is scanned this many times
+    ``template_core`` are the template's vertices of the core, ``core`` their indices; ``loss_points`` the indices of
+    supervised vertices. Each drawn shape is scanned ``scans_per_shape`` times.
     """
 
     source: Source
-    faces: Int[torch.Tensor, "F 3"]
-    template_core: Float[torch.Tensor, "C 3"]
-    core: Int[torch.Tensor, " C"]
-    loss_points: Int[torch.Tensor, " M"]
+    faces: Int[Tensor, "F 3"]
+    template_core: Float[Tensor, "C 3"]
+    core: Int[Tensor, " C"]
+    loss_points: Int[Tensor, " M"]
     encoder: BasisEncoder | PointEncoder | None
     aligner: BasisEncoder | None
     scan: ScanConfig
@@ -111,15 +100,11 @@ class BatchDataset(torch.utils.data.Dataset):
         scale = verts.flatten(1).std(1)[:, None, None]
         verts = bump(verts / scale * 0.3, self.scan.bumps, generator)
         verts, areas = normalise(verts, self.faces)
-        if self.scans_per_shape > 1:
-            verts = verts.repeat_interleave(self.scans_per_shape, 0)
-            areas = areas.repeat_interleave(self.scans_per_shape, 0)
+        verts, areas = (table.repeat_interleave(self.scans_per_shape, 0) for table in (verts, areas))
         B = len(verts)
-        size = 1 + self.scan.scale * torch.randn(B, 1, 1, generator=generator).clamp(-2, 2)
-        verts = verts * size
+        verts = verts * (1 + self.scan.scale * torch.randn(B, 1, 1, generator=generator).clamp(-2, 2))
         points = sample_scan(verts, areas, self.faces, self.scan, generator)
         R, t = rigid_fit(self.template_core, verts[:, self.core])
-
         # The roughly right frame in which the encoder works: x_core = S R^T (x - t) + shift.
         if self.scan.upright:
             t = points.mean(1)
@@ -129,7 +114,7 @@ class BatchDataset(torch.utils.data.Dataset):
             shift = 0.03 * torch.randn(B, 1, 3, generator=generator)
         in_core = (points - t[:, None]) @ turn.transpose(1, 2) + shift
         targets = (verts[:, self.loss_points] - t[:, None]) @ turn.transpose(1, 2) + shift
-        features = _features(self.encoder, in_core)
+        features = torch.zeros(B, 0) if self.encoder is None else self.encoder.features(in_core)
         if self.aligner is None:
             return Batch(in_core, targets, features)
         # The aligner sees the scan centred on its own points and turned anywhere.
@@ -151,7 +136,7 @@ class Augmentation:
     deform: float = 0.08
     plain: float = 0.25
 
-    def vectors(self, B: int, L: int, generator: torch.Generator) -> Float[torch.Tensor, "B L 3"]:
+    def vectors(self, B: int, L: int, generator: torch.Generator) -> Float[Tensor, "B L 3"]:
         """Vectors of the lattice's nodes for a batch of shapes."""
         size = self.deform * torch.rand(B, 1, 1, generator=generator)
         size = size * (torch.rand(B, 1, 1, generator=generator) >= self.plain)
@@ -162,22 +147,19 @@ class Augmentation:
 class Lattice:
     """A coarse field on every sample of N shapes, its gradient there, and the field on their landmarks."""
 
-    phi: Float[torch.Tensor, "N P L"]
-    gradient: Float[torch.Tensor, "N P 3 L"]
-    landmark_phi: Float[torch.Tensor, "N M L"]
+    phi: Float[Tensor, "N P L"]
+    gradient: Float[Tensor, "N P 3 L"]
+    landmark_phi: Float[Tensor, "N M L"]
 
 
 @dataclass(frozen=True, eq=False)
 class CloudBatch(OnDevice):
-    """One batch; lengths in units of sqrt(surface area), roughly the template's frame.
+    """As `Batch`, roughly in the template's frame; landmarks that a shape lacks are NaN."""
 
-    Landmarks that a shape lacks are NaN; ``encode_features`` are what the encoder reads of ``points``.
-    """
-
-    points: Float[torch.Tensor, "B P 3"]
-    normals: Float[torch.Tensor, "B P 3"]
-    landmarks: Float[torch.Tensor, "B L 3"]
-    encode_features: torch.Tensor
+    points: Float[Tensor, "B P 3"]
+    normals: Float[Tensor, "B P 3"]
+    landmarks: Float[Tensor, "B L 3"]
+    encode_features: Tensor
 
 
 def build_lattice(samples: ShapeSamples) -> Lattice | None:
@@ -186,13 +168,10 @@ def build_lattice(samples: ShapeSamples) -> Lattice | None:
     if N * P > _MAX_POINTS:
         return None
     known = np.nan_to_num(samples.landmarks)
-    everything = np.concatenate([samples.points.reshape(-1, 3), known.reshape(-1, 3)]).astype(np.float64)
-    field = _lattice_field(everything)
-    phi = field.phi.to_dense()
-    gradient = field.gradient.to_dense()[: 3 * N * P].reshape(N, P, 3, -1)
-    return Lattice(
-        phi[: N * P].reshape(N, P, -1), gradient, phi[N * P :].reshape(N, samples.landmarks.shape[1], field.K)
-    )
+    field = _lattice_field(np.concatenate([samples.points.reshape(-1, 3), known.reshape(-1, 3)]).astype(np.float64))
+    phi, gradient = field.phi.to_dense(), field.gradient.to_dense()[: 3 * N * P]
+    on_landmarks = phi[N * P :].reshape(N, known.shape[1], field.K)
+    return Lattice(phi[: N * P].reshape(N, P, -1), gradient.reshape(N, P, 3, -1), on_landmarks)
 
 
 def _lattice_field(points: Float[Floats, "N 3"]) -> Field:
@@ -204,7 +183,7 @@ def _lattice_field(points: Float[Floats, "N 3"]) -> Field:
     return Field.of(build_field(points, lattice, _REACH * float(ticks[1] - ticks[0]), "smooth"))
 
 
-def deformed_source(shapes: Float[torch.Tensor, "N V 3"], augmentation: Augmentation | None = None) -> Source:
+def deformed_source(shapes: Float[Tensor, "N V 3"], augmentation: Augmentation | None = None) -> Source:
     """Registered shapes, drawn with replacement and smoothly deformed; all stand alike, in any unit.
 
     So many that no change is needed (see `build_lattice`) are drawn as they are.
@@ -217,7 +196,7 @@ def deformed_source(shapes: Float[torch.Tensor, "N V 3"], augmentation: Augmenta
     shapes = 0.3 * shapes / shapes.flatten(1).std(1)[:, None, None]  # about area 1
     phi = _lattice_field(shapes.reshape(-1, 3).double().numpy()).phi.to_dense().reshape(N, V, -1)
 
-    def draw(count: int, generator: torch.Generator) -> torch.Tensor:
+    def draw(count: int, generator: torch.Generator) -> Tensor:
         which = torch.randint(N, (count,), generator=generator)
         return shapes[which] + phi[which] @ augmentation.vectors(count, phi.shape[2], generator)
 
@@ -228,9 +207,9 @@ def deformed_source(shapes: Float[torch.Tensor, "N V 3"], augmentation: Augmenta
 class CloudDataset(torch.utils.data.Dataset):
     """Item s is the batch of training step s, a function of the seed and s alone."""
 
-    points: Float[torch.Tensor, "N P 3"]
-    normals: Float[torch.Tensor, "N P 3"]
-    landmarks: Float[torch.Tensor, "N L 3"]
+    points: Float[Tensor, "N P 3"]
+    normals: Float[Tensor, "N P 3"]
+    landmarks: Float[Tensor, "N L 3"]
     lattice: Lattice | None
     encoder: BasisEncoder | PointEncoder | None
     scan: ScanConfig
@@ -268,12 +247,11 @@ class CloudDataset(torch.utils.data.Dataset):
         normals = normals @ turn.transpose(1, 2)
         sigma = self.scan.noise * torch.rand(B, 1, 1, generator=generator) ** 3
         points = points + sigma * torch.randn(B, P, 3, generator=generator)
-        return CloudBatch(points, normals, known, _features(self.encoder, points))
+        features = torch.zeros(B, 0) if self.encoder is None else self.encoder.features(points)
+        return CloudBatch(points, normals, known, features)
 
 
-def deformed_normals(
-    F: Float[torch.Tensor, "*B 3 3"], normals: Float[torch.Tensor, "*#B 3"]
-) -> Float[torch.Tensor, "*B 3"]:
+def deformed_normals(F: Float[Tensor, "*B 3 3"], normals: Float[Tensor, "*#B 3"]) -> Float[Tensor, "*B 3"]:
     """Unit normals after a deformation with gradient F: its cofactors on the normals."""
     a, b, c = F.unbind(-1)  # columns
     cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -1)

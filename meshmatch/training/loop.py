@@ -13,6 +13,7 @@ import torch
 import torch.distributed as dist
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.models.deformer import Deformer
@@ -25,12 +26,7 @@ class TrainConfig:
     """How long and how fast to learn.
 
     ``steps`` fixes the schedule: warm-up, a constant rate, then a cosine to zero over the last ``decay`` share.
-    ``minutes`` only stops the run (with a checkpoint to go on from).
-
-    Raises
-    ------
-    OptionError
-        A count, a rate or a share that cannot be.
+    ``minutes`` only stops the run (with a checkpoint to go on from). `OptionError` if a number cannot be.
     """
 
     steps: int = 20_000
@@ -81,9 +77,8 @@ class StepReport:
 def learning_rate(step: int, config: TrainConfig) -> float:
     """Rate of a step: linear warm-up, constant, cosine to zero."""
     start = (1 - config.decay) * config.steps
-    fade = 1.0
-    if step > start:
-        fade = 0.5 * (1 + math.cos(math.pi * min(1.0, (step - start) / max(config.steps - start, 1))))
+    faded = min(1.0, max(0.0, step - start) / max(config.steps - start, 1))
+    fade = 0.5 * (1 + math.cos(math.pi * faded))
     return config.rate * min(1.0, (step + 1) / max(config.warm_up, 1)) * fade
 
 
@@ -94,20 +89,17 @@ class Trainer:
         self.config = config
         self.rank = int(os.environ.get("RANK", 0))
         self.world = int(os.environ.get("WORLD_SIZE", 1))
-        if torch.cuda.is_available():
-            self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
-        else:
-            self.device = torch.device("cpu")
+        cuda = torch.cuda.is_available()
+        self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))) if cuda else torch.device("cpu")
         if self.world > 1 and not dist.is_initialized():
-            dist.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
+            dist.init_process_group("nccl" if cuda else "gloo")
         self.model = model.to(self.device)
         self.points = points.to(self.device)
         self.average = {n: p.detach().clone() for n, p in model.named_parameters()}
         self.optimiser = torch.optim.AdamW(
             model.parameters(), lr=config.rate, betas=(0.9, 0.99), weight_decay=config.weight_decay, fused=True
         )
-        self.step = 0
-        self.seconds = 0.0
+        self.step, self.seconds = 0, 0.0
 
     def save(self, path: Path) -> None:
         """Write everything that the next step depends on (rank 0 only)."""
@@ -123,37 +115,33 @@ class Trainer:
             save_file(arrays, temporary, words)
 
     def load(self, path: Path) -> None:
-        """Continue exactly where :meth:`save` was called.
-
-        Raises
-        ------
-        ModelError
-            The file is not a checkpoint, or of another seed, network or template.
-        """
+        """Continue exactly where `save` was called; `ModelError` if it was for another seed, network or template."""
         hint = "train into another folder, or start afresh"
+        parts: dict[str, dict[str, Tensor]] = {"model": {}, "average": {}, "optimiser": {}}
         try:
             with safe_open(str(path), framework="pt") as file:
                 words = file.metadata() or {}
                 step, seconds = int(words["step"]), float(words.get("seconds", 0.0))
                 seed = int(words.get("seed", self.config.seed))
-                arrays = {n: file.get_tensor(n) for n in file.keys()}  # noqa: SIM118 (it is no dictionary)
+                for name in file.keys():  # noqa: SIM118 (it is no dictionary)
+                    part, _, key = name.partition(".")
+                    parts[part][key] = file.get_tensor(name)
         except (SafetensorError, OSError, KeyError, ValueError) as error:
             raise ModelError(f"{path} is not a checkpoint of a training", hint) from error
         if seed != self.config.seed:
             raise ModelError(f"{path} is a checkpoint of a training with seed {seed}", hint)
-        weights = _part(arrays, "model.")
-        here = self.model.state_dict()
+        weights, here = parts["model"], self.model.state_dict()
         if {n: t.shape for n, t in weights.items()} != {n: t.shape for n, t in here.items()}:
             raise ModelError(f"{path} is a checkpoint of another network", hint)
         if not all(torch.equal(weights[n], here[n].cpu()) for n in ("nodes", "anchors")):
             raise ModelError(f"{path} is a checkpoint for another template", hint)
         self.step, self.seconds = step, seconds
         self.model.load_state_dict(weights)
-        for n, tensor in _part(arrays, "average.").items():
-            self.average[n].copy_(tensor)
-        state: dict[int, dict[str, torch.Tensor]] = {}
-        for n, tensor in _part(arrays, "optimiser.").items():
-            index, key = n.split(".")
+        for name, tensor in parts["average"].items():
+            self.average[name].copy_(tensor)
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, tensor in parts["optimiser"].items():
+            index, key = name.split(".")
             state.setdefault(int(index), {})[key] = tensor
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
@@ -171,16 +159,12 @@ class Trainer:
         torch.set_num_threads(config.threads)
         ours = range(self.rank, config.steps * self.world, self.world)[self.step : config.steps]
         loader = torch.utils.data.DataLoader(
-            data,
-            batch_size=None,
-            sampler=ours,
-            num_workers=config.workers,
-            prefetch_factor=4 if config.workers else None,
-            worker_init_fn=_one_thread,
-        )
+            data, batch_size=None, sampler=ours, num_workers=config.workers,
+            prefetch_factor=4 if config.workers else None, worker_init_fn=_one_thread,
+        )  # fmt: skip
         began = saved = time.monotonic()
         before = self.seconds
-        sums: dict[str, torch.Tensor] = {}
+        sums: dict[str, Tensor] = {}
         summed = 0
         self.model.train()
         for batch in loader:
@@ -205,7 +189,7 @@ class Trainer:
             self.save(checkpoint)
         self.model.eval()
 
-    def iterate(self, batch) -> dict[str, torch.Tensor]:
+    def iterate(self, batch) -> dict[str, Tensor]:
         """One step of training on a batch; returns its losses. The model must be in training mode."""
         config = self.config
         seed = config.seed * 7919 + self.step * self.world + self.rank
@@ -218,57 +202,40 @@ class Trainer:
             terms = config.loss(self.model, batch.to(self.device), self.points, generator)
         self.optimiser.zero_grad(set_to_none=True)
         terms["total"].backward()
-        self._share_gradients()
+        if self.world > 1:
+            for parameter in self.model.parameters():
+                if parameter.grad is not None:
+                    dist.all_reduce(parameter.grad)
+                    parameter.grad /= self.world
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
         self.optimiser.step()
         self.step += 1
         self._update_average()
         return terms
 
-    def wait(self) -> None:
-        """Until a GPU has done what it was asked: it works on while Python does, and clocks must not."""
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-
-    def device_peak(self) -> int | None:
-        """Most bytes that tensors ever took on the GPU; None without one."""
-        return torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None
-
-    def _share_gradients(self) -> None:
-        if self.world > 1:
-            for parameter in self.model.parameters():
-                if parameter.grad is not None:
-                    dist.all_reduce(parameter.grad)
-                    parameter.grad /= self.world
-
-    def _any(self, stop: bool) -> bool:
-        """Whether any process says so: one that stopped alone would leave the others waiting for its gradients."""
-        if self.world > 1:
-            said = torch.tensor(float(stop), device=self.device)
-            dist.all_reduce(said, dist.ReduceOp.MAX)
-            return bool(said)
-        return stop
-
-    @torch.no_grad()
     def _update_average(self) -> None:
         # A young average follows quickly, an old one slowly.
         keep = min(self.config.average, (1 + self.step) / (10 + self.step))
         names, values = zip(*self.model.named_parameters(), strict=True)
         torch._foreach_lerp_([self.average[n] for n in names], [v.detach() for v in values], 1 - keep)
 
+    def _any(self, stop: bool) -> bool:
+        """Whether any process says so: one that stopped alone would leave the others waiting for its gradients."""
+        if self.world == 1:
+            return stop
+        said = torch.tensor(float(stop), device=self.device)
+        dist.all_reduce(said, dist.ReduceOp.MAX)
+        return bool(said)
+
     def close(self) -> None:
         """Part from the other processes, if there are any; nothing more can be trained."""
         if self.world > 1 and dist.is_initialized():
             dist.destroy_process_group()
 
-    def averaged_state(self) -> dict[str, torch.Tensor]:
+    def averaged_state(self) -> dict[str, Tensor]:
         """State dict of the model with the averaged weights, on the CPU."""
         state = {n: t.detach().cpu().clone() for n, t in self.model.state_dict().items()}
         return state | {n: t.cpu().clone() for n, t in self.average.items()}
-
-
-def _part(arrays: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
-    return {n[len(prefix) :]: t for n, t in arrays.items() if n.startswith(prefix)}
 
 
 def _one_thread(_: int) -> None:

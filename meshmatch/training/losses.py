@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from meshmatch.arrays import Float
 from meshmatch.fields.field import PointField, arap_energy, volume_energy
@@ -18,7 +19,7 @@ from meshmatch.models.deformer import Deformer
 from meshmatch.models.layers import nearest_index
 from meshmatch.training.datasets import Batch, CloudBatch, OnDevice, deformed_normals
 
-Terms = dict[str, torch.Tensor]
+Terms = dict[str, Tensor]
 NORMAL_WEIGHT = 0.15
 """How far a normal that points the other way (2 units) pushes a neighbour away, units of sqrt(area); set by hand."""
 _ROBUST = 0.25  # distances far beyond it no longer pull harder, units of sqrt(area); set by hand
@@ -28,15 +29,12 @@ _ROBUST = 0.25  # distances far beyond it no longer pull harder, units of sqrt(a
 class LossPoints(OnDevice):
     """The supervised template points (M, 3) and the field there, with its gradient on the first G of them."""
 
-    positions: Float[torch.Tensor, "M 3"]
+    positions: Float[Tensor, "M 3"]
     field: PointField
 
-    def moved(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B M 3"]:
+    def moved(self, rows: Float[Tensor, "B R 3"]) -> Float[Tensor, "B M 3"]:
         """Where what the decoder answers moves the points."""
         return self.positions + self.field.displacement(rows)
-
-    def deformation_gradient(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B G 3 3"]:
-        return self.field.deformation_gradient(rows)
 
 
 @dataclass(frozen=True)
@@ -58,23 +56,18 @@ class Objective(ABC):
     def __call__(self, model: Deformer, batch: Any, points: Any, generator: torch.Generator) -> Terms:
         """Weighted terms by name; their sum under ``total``. Errors without weight start with ``error``."""
 
-    def rigidity(self, F: Float[torch.Tensor, "B G 3 3"]) -> Terms:
+    def rigidity(self, F: Float[Tensor, "B G 3 3"]) -> Terms:
         """Weighted volume and as-rigid-as-possible energies of deformation gradients."""
         return {"volume": self.volume * volume_energy(F).mean(), "arap": self.arap * arap_energy(F).mean()}
 
     def between(
-        self,
-        model: Deformer,
-        code: Float[torch.Tensor, "B D"],
-        shift: int,
-        points: LossPoints,
-        generator: torch.Generator,
+        self, model: Deformer, code: Float[Tensor, "B D"], shift: int, points: LossPoints, generator: torch.Generator
     ) -> Terms:
         """The weighted energies of random blends of every code with the one ``shift`` places before it."""
         if not self.blend:
             return {}
         share = torch.rand(len(code), 1, generator=generator).to(code.device)
-        F = points.deformation_gradient(model.decoder(share * code + (1 - share) * code.roll(shift, 0)))
+        F = points.field.deformation_gradient(model.decoder(share * code + (1 - share) * code.roll(shift, 0)))
         return {"blend": self.blend * (volume_energy(F).mean() + arap_energy(F).mean())}
 
 
@@ -121,34 +114,23 @@ class CorrespondenceLoss(Objective):
             errors["error_align"] = turn.detach()
         return {"total": torch.stack(list(terms.values())).sum(), **terms, **errors}
 
-    def _rigidity(self, points: LossPoints, rows: torch.Tensor) -> Terms:
+    def _rigidity(self, points: LossPoints, rows: Tensor) -> Terms:
         if not self.volume and not self.arap:
             return {}  # the gradient is not computed for nothing
-        return self.rigidity(points.deformation_gradient(rows))
+        return self.rigidity(points.field.deformation_gradient(rows))
 
 
-def distance(a: Float[torch.Tensor, "*N 3"], b: Float[torch.Tensor, "*N 3"]) -> Float[torch.Tensor, ""]:
+def distance(a: Float[Tensor, "*N 3"], b: Float[Tensor, "*N 3"]) -> Float[Tensor, ""]:
     """Mean Euclidean distance of corresponding points."""
     return ((a - b).square().sum(-1) + 1e-8).sqrt().mean()
-
-
-@torch.no_grad()
-def validation_error(model: Deformer, batch: Batch, points: LossPoints) -> float:
-    """Mean distance (units of sqrt(area)) on held-out scans, learned corrections included."""
-    was = model.training
-    model.eval()
-    device = points.positions.device
-    error = float(distance(points.moved(model(batch.points.to(device))), batch.targets.to(device)))
-    model.train(was)
-    return error
 
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints(LossPoints):
     """Template points with unit normals (M, 3), and the template's known points (L, 3) with the field there."""
 
-    normals: Float[torch.Tensor, "M 3"]
-    landmarks: Float[torch.Tensor, "L 3"]
+    normals: Float[Tensor, "M 3"]
+    landmarks: Float[Tensor, "L 3"]
     landmark_field: PointField
 
 
@@ -166,22 +148,22 @@ class ChamferLoss(Objective):
         terms |= self.between(model, code, 1, points, generator)
         if model.corrector is not None:
             current = rows.detach()
-            correct: torch.Tensor | float = 0.0
+            correct: Tensor | float = 0.0
             for _ in range(model.config.corrections):
                 current = model.correct(current, batch.points[:, : self.correct_points])
                 again, fit = self._energies(current, batch, points)
                 correct = correct + self.correct * torch.stack(list(again.values())).sum()
                 current = current.detach()
-            assert isinstance(correct, torch.Tensor)
+            assert isinstance(correct, Tensor)
             terms["correct"] = correct
         return {"total": torch.stack(list(terms.values())).sum(), **terms, "error": fit}
 
     def _energies(
-        self, rows: Float[torch.Tensor, "B R 3"], batch: CloudBatch, points: SurfacePoints
-    ) -> tuple[Terms, Float[torch.Tensor, ""]]:
+        self, rows: Float[Tensor, "B R 3"], batch: CloudBatch, points: SurfacePoints
+    ) -> tuple[Terms, Float[Tensor, ""]]:
         """Weighted terms of node vectors, and the mean distance both ways."""
         moved = points.moved(rows)
-        F = points.deformation_gradient(rows)
+        F = points.field.deformation_gradient(rows)
         normals = deformed_normals(F.detach(), points.normals)
         there, back = chamfer(moved, normals, batch.points, batch.normals)
         terms = {"reconstruction": self.reconstruction * (robust(there).mean() + robust(back).mean())}
@@ -197,11 +179,11 @@ class ChamferLoss(Objective):
 
 
 def chamfer(
-    moved: Float[torch.Tensor, "B M 3"],
-    normals: Float[torch.Tensor, "B M 3"],
-    points: Float[torch.Tensor, "B P 3"],
-    point_normals: Float[torch.Tensor, "B P 3"],
-) -> tuple[Float[torch.Tensor, "B M"], Float[torch.Tensor, "B P"]]:
+    moved: Float[Tensor, "B M 3"],
+    normals: Float[Tensor, "B M 3"],
+    points: Float[Tensor, "B P 3"],
+    point_normals: Float[Tensor, "B P 3"],
+) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B P"]]:
     """Squared distances of the moved points to the nearest of the others, and back.
 
     Neighbours are nearest in position and a share of the normal; the distance is of positions alone, and gradients
@@ -216,17 +198,24 @@ def chamfer(
     return (moved - nearest).square().sum(-1), (partner - points).square().sum(-1)
 
 
-def robust(squared: Float[torch.Tensor, "*N"]) -> Float[torch.Tensor, "*N"]:
+def robust(squared: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
     """Geman and McClure's function of squared distances: d^2 / (1 + d^2 / s^2), near d^2 for small ones."""
     return squared / (1 + squared / _ROBUST**2)
 
 
 @torch.no_grad()
-def surface_error(model: Deformer, batch: CloudBatch, points: SurfacePoints) -> float:
-    """Mean distance both ways between the fitted template and held-out draws of the shapes, units of sqrt(area)."""
+def held_out_error(model: Deformer, batch: Batch | CloudBatch, points: LossPoints) -> float:
+    """Mean distance (units of sqrt(area)) on held-out shapes, learned corrections included.
+
+    Of the template's points from their places; without correspondence both ways, between fitted template and shape.
+    """
     was = model.training
     model.eval()
     batch = batch.to(points.positions.device)
-    terms = ChamferLoss(blend=0.0)(model, batch, points, torch.Generator())
+    if isinstance(batch, Batch):
+        error = distance(points.moved(model(batch.points)), batch.targets)
+    else:
+        assert isinstance(points, SurfacePoints)
+        error = ChamferLoss(blend=0.0)(model, batch, points, torch.Generator())["error"]
     model.train(was)
-    return float(terms["error"])
+    return float(error)

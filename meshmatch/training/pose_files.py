@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from meshmatch.arrays import Float, Floats32
 from meshmatch.errors import InputError, OptionError
@@ -38,23 +39,10 @@ _HINT = "see docs/formats.md for what a file of poses holds"
 class GivenPoses:
     """Poses to learn from besides the generated ones. Valid once built, but for the names of its joints.
 
-    Parameters
-    ----------
-    joints : tuple of str
-        J names of joints of the body rig, each once.
-    vectors
-        Rotation vectors in radians, none longer than a full turn.
-    share : float
-        Of the bodies, 0..1, how many stand in a pose of these.
-    name : str
-        Of the file.
+    J joints of the body rig, each once, and rotation vectors in radians, none longer than a full turn. A ``share`` of the
+    bodies, 0..1, stands in a pose of these; ``name`` is the file's.
 
-    Raises
-    ------
-    InputError
-        There is no pose, or names and vectors are not as above.
-    OptionError
-        The share is not in 0..1.
+    `InputError` if there is no pose, or names and vectors are not as above; `OptionError` if the share is not in 0..1.
     """
 
     joints: tuple[str, ...]
@@ -65,11 +53,8 @@ class GivenPoses:
     def __post_init__(self) -> None:
         vectors = np.asarray(self.vectors)
         if vectors.dtype.kind not in "fiu" or vectors.ndim != 3 or vectors.shape[1:] != (len(self.joints), 3):
-            raise InputError(
-                f"rotations are {vectors.dtype} of {_shown(vectors.shape)}, not numbers of "
-                f"(poses, {len(self.joints)} joints, 3)",
-                _HINT,
-            )
+            wanted = f"numbers of (poses, {len(self.joints)} joints, 3)"
+            raise InputError(f"rotations are {vectors.dtype} of {_shown(vectors.shape)}, not {wanted}", _HINT)
         if vectors.size == 0:
             raise InputError("there are no poses in it", _HINT)
         if len(set(self.joints)) < len(self.joints):
@@ -95,30 +80,22 @@ class GivenPoses:
         return len(self.vectors)
 
     def columns(self, rig: Rig) -> list[int]:
-        """Where each joint stands in a rig.
-
-        Raises
-        ------
-        InputError
-            The rig has no joint of a name.
-        """
+        """Where each joint stands in a rig; `InputError` if it has no joint of a name."""
         strangers = [name for name in self.joints if name not in rig.names]
         if strangers:
-            near = get_close_matches(strangers[0], rig.names, n=3)
-            raise InputError(
-                f"the body has no joint {strangers[0][:80]!r}",
-                f"did you mean {' or '.join(near)}?" if near else "docs/formats.md names all joints",
-            )
+            near = " or ".join(get_close_matches(strangers[0], rig.names, n=3))
+            hint = f"did you mean {near}?" if near else "docs/formats.md names all joints"
+            raise InputError(f"the body has no joint {strangers[0][:80]!r}", hint)
         return [rig.joint(name) for name in self.joints]
 
     def mixed(
         self,
         rig: Rig,
-        heads: Float[torch.Tensor, "B J 3"],
-        world: Float[torch.Tensor, "B J 3 3"],
-        offset: Float[torch.Tensor, "B J 3"],
+        heads: Float[Tensor, "B J 3"],
+        world: Float[Tensor, "B J 3 3"],
+        offset: Float[Tensor, "B J 3"],
         generator: torch.Generator,
-    ) -> tuple[Float[torch.Tensor, "B J 3 3"], Float[torch.Tensor, "B J 3"]]:
+    ) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
         """World rotations and offsets of `forward_kinematics`, where a share of the bodies has a pose of these instead."""
         B, J = heads.shape[:2]
         taken = torch.rand(B, generator=generator) < self.share
@@ -126,21 +103,14 @@ class GivenPoses:
         vectors = torch.zeros(B, J, 3)
         vectors[:, self.columns(rig)] = torch.from_numpy(self.vectors)[pick]
         own_world, own_offset = forward_kinematics(rig, heads, rotation_from_vector(vectors))
-        return (
-            torch.where(taken[:, None, None, None], own_world, world),
-            torch.where(taken[:, None, None], own_offset, offset),
-        )
+        taken = taken[:, None, None]
+        return torch.where(taken[..., None], own_world, world), torch.where(taken, own_offset, offset)
 
 
 def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
     """Read a file of poses; the suffix says which kind it is.
 
-    Raises
-    ------
-    InputError
-        It is missing, too large or damaged, of another kind, or holds no poses.
-    OptionError
-        The share is not in 0..1.
+    `InputError` if it is missing, too large or damaged, of another kind, or holds no poses; else as `GivenPoses`.
     """
     path = Path(path)
     read = _READERS.get(path.suffix.lower())
@@ -152,15 +122,12 @@ def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path.name}: it is larger than {MAX_BYTES // 10**6} MB", "split it, or keep fewer poses")
         joints, vectors = read(path)
-    except _DAMAGE as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error, RecursionError) as error:
         raise InputError(f"{path.name} is not a file of poses: {error}", _HINT) from error
     try:
         return GivenPoses(tuple(joints), vectors, share, path.name)
     except InputError as error:
         raise InputError(f"{path.name}: {error.message}", error.hint) from error
-
-
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error, RecursionError)
 
 
 def _read_npz(path: Path) -> tuple[list[Any], Any]:
@@ -179,10 +146,9 @@ def _read_json(path: Path) -> tuple[list[Any], Any]:
     found: Any = json.loads(path.read_text(encoding="utf-8-sig"))
     if not isinstance(found, dict):
         raise ValueError("it is not an object with joints and rotations")
-    joints = _entry(found, "joints")
+    joints, rotations = _entry(found, "joints"), _entry(found, "rotations")
     if not isinstance(joints, list) or not all(isinstance(word, str) for word in joints):
         raise ValueError("joints are not a list of names")
-    rotations = _entry(found, "rotations")
     try:
         return joints, np.array(rotations, np.float64)
     except (ValueError, TypeError, OverflowError):

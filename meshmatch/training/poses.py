@@ -7,6 +7,7 @@ are expressed in the axes of the rest pose (y up, facing +z, left at +x) about t
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from meshmatch.arrays import Float
 from meshmatch.training.limbs import FOLDED, Draw, Limbs, draw_arms, draw_limbs, mirrored, with_legs
@@ -15,8 +16,8 @@ from meshmatch.training.rotations import DEGREE, rotation_between, rotation_from
 
 
 def sample_free_pose(
-    rig: Rig, heads: Float[torch.Tensor, "B J 3"], generator: torch.Generator, tries: int = 8, tolerance: float = 0.02
-) -> tuple[Float[torch.Tensor, "B J 3 3"], Float[torch.Tensor, "B J 3"]]:
+    rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Generator, tries: int = 8, tolerance: float = 0.02
+) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
     """Of several drawn poses keep the first that is free of self-intersection, else the best.
 
     Returns the world rotations and offsets of :func:`forward_kinematics`. ``tolerance`` is in units of the torso length.
@@ -30,9 +31,7 @@ def sample_free_pose(
     return world[pick], offset[pick]
 
 
-def sample_pose(
-    rig: Rig, heads: Float[torch.Tensor, "B J 3"], generator: torch.Generator
-) -> Float[torch.Tensor, "B J 3 3"]:
+def sample_pose(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Generator) -> Float[Tensor, "B J 3 3"]:
     """Draw one pose per body: the rotation of every joint, in rest axes, relative to its parent.
 
     ``heads`` are the rest joints of the bodies, metres. Shares and angles are set by hand.
@@ -60,15 +59,10 @@ def sample_pose(
 
 
 def pose_limbs(
-    vectors: Float[torch.Tensor, "B J 3"],
-    rig: Rig,
-    heads: Float[torch.Tensor, "B J 3"],
-    left: Limbs,
-    right: Limbs,
-    draw: Draw,
-) -> dict[int, Float[torch.Tensor, "B 3 3"]]:
+    vectors: Float[Tensor, "B J 3"], rig: Rig, heads: Float[Tensor, "B J 3"], left: Limbs, right: Limbs, draw: Draw
+) -> dict[int, Float[Tensor, "B 3 3"]]:
     """Write both sides into ``vectors``; returns the rotations of joints that are no single turn, for `joint_rotations`."""
-    matrices: dict[int, torch.Tensor] = {}
+    matrices: dict[int, Tensor] = {}
     for side, suffix, limbs in ((1.0, ".L", left), (-1.0, ".R", right)):
         _pose_arm(vectors, matrices, rig, heads, side, suffix, limbs, draw)
         _pose_leg(vectors, matrices, rig, heads, side, suffix, limbs, draw)
@@ -77,8 +71,8 @@ def pose_limbs(
 
 
 def joint_rotations(
-    vectors: Float[torch.Tensor, "B J 3"], matrices: dict[int, Float[torch.Tensor, "B 3 3"]]
-) -> Float[torch.Tensor, "B J 3 3"]:
+    vectors: Float[Tensor, "B J 3"], matrices: dict[int, Float[Tensor, "B 3 3"]]
+) -> Float[Tensor, "B J 3 3"]:
     """Rotation vectors as matrices; some joints have theirs already."""
     rotations = rotation_from_vector(vectors)
     for index, rotation in matrices.items():

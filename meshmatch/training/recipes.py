@@ -33,24 +33,14 @@ class Recipe:
     deform: bool = False
     storage: Storage = "int8"
 
-    @property
-    def needs_correspondence(self) -> bool:
-        return isinstance(self.train.loss, CorrespondenceLoss)
-
     def changed(self, **settings: Any) -> Recipe:
         """Another recipe: fields of `TrainConfig`, ``field`` of the network or ``blend`` of the loss; None changes nothing.
 
-        Raises
-        ------
-        OptionError
-            A setting that is unknown or out of range.
+        `OptionError` if a setting is unknown or out of range.
         """
         wanted = {name: value for name, value in settings.items() if value is not None}
-        network, loss = self.network, self.train.loss
-        if "field" in wanted:
-            network = replace(network, field=wanted.pop("field"))
-        if "blend" in wanted:
-            loss = replace(loss, blend=wanted.pop("blend"))
+        network = replace(self.network, field=wanted.pop("field", self.network.field))
+        loss = replace(self.train.loss, blend=wanted.pop("blend", self.train.loss.blend))
         known = {each.name for each in fields(TrainConfig)}
         if unknown := sorted(wanted.keys() - known):
             raise OptionError(f"unknown training setting {unknown[0]!r}", f"choose from {', '.join(sorted(known))}")
@@ -68,10 +58,11 @@ def paper() -> Recipe:
 
     Scans are 3,000 clean points turned about the vertical axis; 75,000 steps are its 1,200 epochs of 1,000 shapes.
     """
-    train = TrainConfig(
-        steps=75_000, shapes=16, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=CorrespondenceLoss()
+    train = TrainConfig(steps=75_000, shapes=16, scans_per_shape=1, decay=0.0, weight_decay=0.0)
+    scan = ScanConfig(
+        3000, noise=0.0, holes=0.0, outliers=0.0, partial=0.0, density=0.0, bumps=0.0, scale=0.0, upright=True
     )
-    return Recipe(PAPER, train, ScanConfig.clean(3000, upright=True), "cubic")
+    return Recipe(PAPER, train, scan, "cubic")
 
 
 def small_data() -> Recipe:
@@ -105,11 +96,7 @@ def recipe_for(shapes: str | Path | None = None, preset: Preset = "default", uns
 
     With correspondence where all shapes are registered, unless ``unsupervised``; by the recipe for small data where
     they are few and stand at equal areas. The paper's preset knows no small data.
-
-    Raises
-    ------
-    OptionError
-        An unknown preset, or ``unsupervised`` without a folder.
+    `OptionError` if the preset is unknown, or ``unsupervised`` is without a folder.
     """
     if preset not in ("default", "paper"):
         raise OptionError(f"unknown preset {preset!r}", "choose default or paper")

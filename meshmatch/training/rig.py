@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.numpy import save_file
+from torch import Tensor
 
 from meshmatch.arrays import Float, Int, Ints
 from meshmatch.errors import OptionError
@@ -39,16 +40,12 @@ class Rig:
     rows sum to one; the parent of every joint, -1 for the root, and parents come first.
     """
 
-    rest: Float[torch.Tensor, "N V 3"]
-    heads: Float[torch.Tensor, "N J 3"]
-    weights: Float[torch.Tensor, "V J"]
+    rest: Float[Tensor, "N V 3"]
+    heads: Float[Tensor, "N J 3"]
+    weights: Float[Tensor, "V J"]
     parents: tuple[int, ...]
     names: tuple[str, ...]
-    faces: Int[torch.Tensor, "F 3"]
-
-    @property
-    def identities(self) -> int:
-        return int(self.rest.shape[0])
+    faces: Int[Tensor, "F 3"]
 
     def joint(self, name: str) -> int:
         return self.names.index(name)
@@ -59,7 +56,7 @@ class Rig:
         return replace(self, rest=self.rest[:, chosen], weights=self.weights[chosen], faces=torch.from_numpy(faces))
 
 
-def _sample_phenotypes(B: int, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+def _sample_phenotypes(B: int, rng: np.random.Generator) -> dict[str, Tensor]:
     """Adults mostly, about one child in ten; genders mostly clear, builds wide."""
     child = rng.random(B) < 0.1
     values = {
@@ -74,9 +71,9 @@ def _sample_phenotypes(B: int, rng: np.random.Generator) -> dict[str, torch.Tens
     return {name: torch.as_tensor(value) for name, value in values.items()}
 
 
-def _sample_local_changes(labels: list[str], B: int, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+def _sample_local_changes(labels: list[str], B: int, rng: np.random.Generator) -> dict[str, Tensor]:
     """Local measures around the phenotype, the same on both sides up to a little asymmetry."""
-    changes: dict[str, torch.Tensor] = {}
+    changes: dict[str, Tensor] = {}
     shared: dict[str, np.ndarray] = {}
     for label in labels:
         if not any(group in label for group in _LOCAL_GROUPS):
@@ -114,14 +111,9 @@ def build_rig(identities: int = 4096, seed: int = 0, progress: Progress | None =
         if progress is not None:
             progress((start + B) / identities)
     weights = model.dense_vertex_bone_weights.float()
-    return Rig(
-        rest=torch.cat(rest),
-        heads=torch.cat(heads),
-        weights=weights / weights.sum(1, keepdim=True),
-        parents=tuple(int(parent) for parent in model.bone_parents),
-        names=tuple(model.bone_labels),
-        faces=model.get_triangular_faces(),
-    )
+    weights = weights / weights.sum(1, keepdim=True)
+    parents, names = tuple(int(parent) for parent in model.bone_parents), tuple(model.bone_labels)
+    return Rig(torch.cat(rest), torch.cat(heads), weights, parents, names, model.get_triangular_faces())
 
 
 def save_rig(rig: Rig, path: str | Path) -> None:
@@ -143,11 +135,11 @@ def load_rig(path: str | Path) -> Rig:
 
 
 def forward_kinematics(
-    rig: Rig, heads: Float[torch.Tensor, "B J 3"], rotations: Float[torch.Tensor, "B J 3 3"]
-) -> tuple[Float[torch.Tensor, "B J 3 3"], Float[torch.Tensor, "B J 3"]]:
+    rig: Rig, heads: Float[Tensor, "B J 3"], rotations: Float[Tensor, "B J 3 3"]
+) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
     """World rotation R and offset t of every joint: x -> R x + t for a rest point x."""
-    world: list[torch.Tensor] = []
-    offset: list[torch.Tensor] = []
+    world: list[Tensor] = []
+    offset: list[Tensor] = []
     for index, parent in enumerate(rig.parents):
         R, head = rotations[:, index], heads[:, index]
         shift = head - (R @ head[..., None])[..., 0]
@@ -160,11 +152,8 @@ def forward_kinematics(
 
 
 def skin(
-    rig: Rig,
-    rest: Float[torch.Tensor, "B V 3"],
-    world: Float[torch.Tensor, "B J 3 3"],
-    offset: Float[torch.Tensor, "B J 3"],
-) -> Float[torch.Tensor, "B V 3"]:
+    rig: Rig, rest: Float[Tensor, "B V 3"], world: Float[Tensor, "B J 3 3"], offset: Float[Tensor, "B J 3"]
+) -> Float[Tensor, "B V 3"]:
     """Linear blend skinning: posed vertices."""
     transforms = torch.cat([world.flatten(2), offset], -1)  # B J 12
     blended = torch.einsum("vj,bjk->bvk", rig.weights, transforms)
@@ -193,20 +182,17 @@ def _capsule_pairs() -> list[tuple[int, int]]:
 
 
 def penetration(
-    rig: Rig,
-    heads: Float[torch.Tensor, "B J 3"],
-    world: Float[torch.Tensor, "B J 3 3"],
-    offset: Float[torch.Tensor, "B J 3"],
-) -> Float[torch.Tensor, " B"]:
+    rig: Rig, heads: Float[Tensor, "B J 3"], world: Float[Tensor, "B J 3 3"], offset: Float[Tensor, "B J 3"]
+) -> Float[Tensor, " B"]:
     """Summed overlap of non-adjacent body capsules, in units of the torso length."""
     joints = (world @ heads[..., None])[..., 0] + offset
     torso = (heads[:, rig.joint("neck01")] - heads[:, rig.joint("root")]).norm(dim=-1)
     steps = torch.linspace(0, 1, 5)
-    start = torch.stack([joints[:, rig.joint(capsule[0])] for capsule in _CAPSULES], 1)
-    end = torch.stack([joints[:, rig.joint(capsule[1])] for capsule in _CAPSULES], 1)
+    starts, ends, sizes = zip(*_CAPSULES, strict=True)
+    start, end = (torch.stack([joints[:, rig.joint(name)] for name in names], 1) for names in (starts, ends))
     points = start[:, :, None] + (end - start)[:, :, None] * steps[:, None]  # B C 5 3
     pairs = torch.tensor(_capsule_pairs())
-    radii = torch.tensor([capsule[2] for capsule in _CAPSULES])
+    radii = torch.tensor(sizes)
     gap = (points[:, pairs[:, 0], :, None] - points[:, pairs[:, 1], None]).norm(dim=-1).amin((-1, -2))
     touch = 0.85 * (radii[pairs[:, 0]] + radii[pairs[:, 1]])
     return (touch - gap / torso[:, None]).clamp_min(0).sum(-1)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import Tensor
 
 from meshmatch.arrays import Float
 
 DEGREE = math.pi / 180.0
 
 
-def rotation_from_vector(vector: Float[torch.Tensor, "*B 3"]) -> Float[torch.Tensor, "*B 3 3"]:
+def rotation_from_vector(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
     """Rodrigues' formula: rotation vectors, in radians, to matrices."""
     angle = vector.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     x, y, z = (vector / angle).unbind(-1)
@@ -21,7 +22,7 @@ def rotation_from_vector(vector: Float[torch.Tensor, "*B 3"]) -> Float[torch.Ten
     return torch.eye(3).to(vector) + sine * cross + (1 - cosine) * (cross @ cross)
 
 
-def rotation_between(a: Float[torch.Tensor, "*B 3"], b: Float[torch.Tensor, "*B 3"]) -> Float[torch.Tensor, "*B 3"]:
+def rotation_between(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
     """Smallest rotation that takes unit vectors a to b, as rotation vectors."""
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)
@@ -33,6 +34,6 @@ def rotation_between(a: Float[torch.Tensor, "*B 3"], b: Float[torch.Tensor, "*B 
     return torch.where(half, across * math.pi, axis / sine.clamp_min(1e-9) * torch.atan2(sine, cosine))
 
 
-def unit(vector: Float[torch.Tensor, "*B 3"]) -> Float[torch.Tensor, "*B 3"]:
+def unit(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
     """The same vectors with length 1."""
     return torch.nn.functional.normalize(vector, dim=-1)

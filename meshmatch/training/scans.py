@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from meshmatch.arrays import Float, Int
 from meshmatch.training.rotations import DEGREE, rotation_from_vector
@@ -29,15 +30,10 @@ class ScanConfig:
     scale: float = 0.04
     upright: bool = False
 
-    @staticmethod
-    def clean(points: int, upright: bool = False) -> ScanConfig:
-        """Points exactly on the surface and all over it."""
-        return ScanConfig(points, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, upright)
-
 
 def surface_area(
-    verts: Float[torch.Tensor, "B V 3"], faces: Int[torch.Tensor, "F 3"]
-) -> tuple[Float[torch.Tensor, "B F"], Float[torch.Tensor, "B 3"]]:
+    verts: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]
+) -> tuple[Float[Tensor, "B F"], Float[Tensor, "B 3"]]:
     """Face areas and their area-weighted centroid."""
     a, b, c = (verts[:, faces[:, k]] for k in range(3))
     area = 0.5 * torch.linalg.cross(b - a, c - a).square().sum(-1).sqrt()
@@ -46,15 +42,15 @@ def surface_area(
 
 
 def normalise(
-    verts: Float[torch.Tensor, "B V 3"], faces: Int[torch.Tensor, "F 3"]
-) -> tuple[Float[torch.Tensor, "B V 3"], Float[torch.Tensor, "B F"]]:
+    verts: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]
+) -> tuple[Float[Tensor, "B V 3"], Float[Tensor, "B F"]]:
     """Scale every shape to area 1 with its centroid at 0; returns vertices and normalised face areas."""
     area, centroid = surface_area(verts, faces)
     total = area.sum(1)
     return (verts - centroid[:, None]) / total.sqrt()[:, None, None], area / total[:, None]
 
 
-def random_rotations(B: int, generator: torch.Generator) -> Float[torch.Tensor, "B 3 3"]:
+def random_rotations(B: int, generator: torch.Generator) -> Float[Tensor, "B 3 3"]:
     """Uniform rotations from random unit quaternions."""
     q = torch.nn.functional.normalize(torch.randn(B, 4, generator=generator), dim=1)
     w, x, y, z = q.unbind(1)
@@ -67,8 +63,8 @@ def random_rotations(B: int, generator: torch.Generator) -> Float[torch.Tensor, 
 
 
 def rigid_fit(
-    source: Float[torch.Tensor, "N 3"], target: Float[torch.Tensor, "B N 3"]
-) -> tuple[Float[torch.Tensor, "B 3 3"], Float[torch.Tensor, "B 3"]]:
+    source: Float[Tensor, "N 3"], target: Float[Tensor, "B N 3"]
+) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"]]:
     """Best rigid motions: target ~ R source + t (Kabsch), batched."""
     center = target.mean(1)
     covariance = (target - center[:, None]).transpose(1, 2) @ (source - source.mean(0))
@@ -79,21 +75,19 @@ def rigid_fit(
     return R, center - (R @ source.mean(0)[:, None])[..., 0]
 
 
-def small_rotations(B: int, generator: torch.Generator) -> Float[torch.Tensor, "B 3 3"]:
+def small_rotations(B: int, generator: torch.Generator) -> Float[Tensor, "B 3 3"]:
     """Mostly a few degrees, sometimes tens: what an aligner gets wrong."""
     size = torch.where(torch.rand(B, 1, generator=generator) < 0.75, 6.0, 18.0) * DEGREE
     return rotation_from_vector(size * torch.randn(B, 3, generator=generator))
 
 
-def yaw_rotations(B: int, generator: torch.Generator) -> Float[torch.Tensor, "B 3 3"]:
+def yaw_rotations(B: int, generator: torch.Generator) -> Float[Tensor, "B 3 3"]:
     """Rotations about the vertical axis y."""
     angle = 2 * torch.pi * torch.rand(B, 1, generator=generator)
     return rotation_from_vector(angle * torch.tensor([0.0, 1.0, 0.0]))
 
 
-def bump(
-    verts: Float[torch.Tensor, "B V 3"], amplitude: float, generator: torch.Generator
-) -> Float[torch.Tensor, "B V 3"]:
+def bump(verts: Float[Tensor, "B V 3"], amplitude: float, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
     """Smooth random displacement (clothes, soft tissue, another modeller's hand), unit: sqrt(area)."""
     B = len(verts)
     size = amplitude * torch.rand(B, 1, 1, generator=generator)
@@ -105,11 +99,8 @@ def bump(
 
 
 def seen_share(
-    normals: Float[torch.Tensor, "B F 3"],
-    centers: Float[torch.Tensor, "B F 3"],
-    share: float,
-    generator: torch.Generator,
-) -> Float[torch.Tensor, "B F"]:
+    normals: Float[Tensor, "B F 3"], centers: Float[Tensor, "B F 3"], share: float, generator: torch.Generator
+) -> Float[Tensor, "B F"]:
     """Factors for the chance of each face: nearly 0 where a partial scan does not see it, else 1.
 
     A ``share`` of the scans is partial. Half of those see what faces one direction, the others lose what lies
@@ -127,12 +118,12 @@ def seen_share(
 
 
 def sample_scan(
-    verts: Float[torch.Tensor, "B V 3"],
-    areas: Float[torch.Tensor, "B F"],
-    faces: Int[torch.Tensor, "F 3"],
+    verts: Float[Tensor, "B V 3"],
+    areas: Float[Tensor, "B F"],
+    faces: Int[Tensor, "F 3"],
     config: ScanConfig,
     generator: torch.Generator,
-) -> Float[torch.Tensor, "B P 3"]:
+) -> Float[Tensor, "B P 3"]:
     """Points on the surface, with uneven density, holes, noise and outliers."""
     B, P = len(verts), config.points
     a, b, c = (verts[:, faces[:, k]] for k in range(3))

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from meshmatch.arrays import Float, Int, Ints
 from meshmatch.errors import TemplateError
@@ -24,35 +25,45 @@ from meshmatch.training.losses import LossPoints, SurfacePoints
 from meshmatch.training.scans import ScanConfig
 
 
-def fill_basis(points: Float[torch.Tensor, "B P 3"], M: int, generator: torch.Generator) -> Float[torch.Tensor, "M 3"]:
+def fill_basis(points: Float[Tensor, "B P 3"], M: int, generator: torch.Generator) -> Float[Tensor, "M 3"]:
     """Basis points spread where shapes of the category are: farthest points of jittered samples."""
     flat = points.flatten(0, 1)
     flat = flat[torch.randperm(len(flat), generator=generator)[:20_000]]
     jittered = flat + 0.06 * torch.randn(len(flat), 3, generator=generator)
     # Farthest points run to the outliers of a set: leave out the outermost ones first.
-    keep = jittered.norm(dim=1) < torch.quantile(jittered.norm(dim=1), 0.995)
-    jittered = jittered[keep]
+    jittered = jittered[jittered.norm(dim=1) < torch.quantile(jittered.norm(dim=1), 0.995)]
     return jittered[torch.from_numpy(farthest_points(jittered.double().numpy(), M))]
 
 
 def anchor_vertices(template: Template, A: int) -> Int[Ints, " A"]:
     """Template vertices where corrections look at the scan; `TemplateError` if there are fewer than that."""
     if template.shape.V < A:
-        raise TemplateError(
-            f"template {template.name} has {A} nodes but only {template.shape.V} vertices",
-            "prepare it with fewer nodes",
-        )
+        problem = f"template {template.name} has {A} nodes but only {template.shape.V} vertices"
+        raise TemplateError(problem, "prepare it with fewer nodes")
     return farthest_points(template.shape.verts, A)
 
 
-def _build_network(
+def build_deformer(
     template: Template,
+    source: Source | CloudDataset,
     network: NetworkConfig,
+    scan: ScanConfig,
     kernel: Kernel,
     seed: int,
-    basis: torch.Tensor,
-    align_basis: torch.Tensor,
 ) -> Deformer:
+    """An untrained network for a template, its basis points laid where the source's shapes are."""
+    basis = align_basis = torch.zeros(1, 3)
+    if network.encoder == "basis" or network.align_basis:
+        if isinstance(source, CloudDataset):
+            points = replace(source, shapes=64, seed=seed + 1)[0].points
+        else:
+            points = build_dataset(template, source, None, scan, shapes=48, scans_per_shape=2, seed=seed)[0].points
+        generator = torch.Generator().manual_seed(seed)
+        basis = fill_basis(points, network.basis, generator)
+        if network.align_basis:
+            turned = points - points.mean(1, keepdim=True)
+            direction = torch.nn.functional.normalize(torch.randn(turned.shape, generator=generator), dim=-1)
+            align_basis = fill_basis(turned.norm(dim=-1, keepdim=True) * direction, network.align_basis, generator)
     anchors = template.shape.verts[anchor_vertices(template, template.K)]
     phi = None
     if has_nodes(network.field):
@@ -61,34 +72,6 @@ def _build_network(
     nodes = torch.from_numpy(template.nodes).float()
     torch.manual_seed(seed)
     return Deformer(network, nodes, torch.from_numpy(anchors).float(), phi, basis, align_basis)
-
-
-def build_deformer(
-    template: Template, source: Source, network: NetworkConfig, scan: ScanConfig, kernel: Kernel, seed: int
-) -> Deformer:
-    """An untrained network for a template, its basis points laid where the source's shapes are."""
-    basis = align_basis = torch.zeros(1, 3)
-    if network.encoder == "basis" or network.align_basis:
-        batch = build_dataset(template, source, None, scan, shapes=48, scans_per_shape=2, seed=seed)[0]
-        generator = torch.Generator().manual_seed(seed)
-        basis = fill_basis(batch.points, network.basis, generator)
-        if network.align_basis:
-            turned = batch.points - batch.points.mean(1, keepdim=True)
-            direction = torch.nn.functional.normalize(torch.randn(turned.shape, generator=generator), dim=-1)
-            ball = turned.norm(dim=-1, keepdim=True) * direction
-            align_basis = fill_basis(ball, network.align_basis, generator)
-    return _build_network(template, network, kernel, seed, basis, align_basis)
-
-
-def build_cloud_deformer(
-    template: Template, data: CloudDataset, network: NetworkConfig, kernel: Kernel, seed: int
-) -> Deformer:
-    """An untrained network, its basis points laid where the folder's shapes are."""
-    basis = empty = torch.zeros(1, 3)
-    if network.encoder == "basis":
-        drawn = replace(data, shapes=64, seed=seed + 1)[0]
-        basis = fill_basis(drawn.points, network.basis, torch.Generator().manual_seed(seed))
-    return _build_network(template, network, kernel, seed, basis, empty)
 
 
 def loss_vertices(template: Template, M: int = 1000) -> Int[Ints, " M"]:
@@ -112,20 +95,11 @@ def build_dataset(
     """
     verts = torch.from_numpy(np.array(template.shape.verts)).float()
     core = torch.from_numpy(template.core)
-    return BatchDataset(
-        source=source,
-        faces=torch.from_numpy(np.array(template.shape.faces)),
-        template_core=verts[core],
-        core=core,
-        loss_points=torch.from_numpy(loss_vertices(template)),
-        encoder=None if model is None else deepcopy(model.encoder).cpu(),
-        aligner=None if model is None or model.aligner is None else deepcopy(model.aligner).cpu(),
-        scan=scan,
-        shapes=shapes,
-        scans_per_shape=scans_per_shape,
-        seed=seed,
-        length=length,
-    )
+    faces, supervised = torch.from_numpy(np.array(template.shape.faces)), torch.from_numpy(loss_vertices(template))
+    encoder = None if model is None else deepcopy(model.encoder).cpu()
+    aligner = None if model is None or model.aligner is None else deepcopy(model.aligner).cpu()
+    settings = scan, shapes, scans_per_shape, seed, length
+    return BatchDataset(source, faces, verts[core], core, supervised, encoder, aligner, *settings)
 
 
 def build_loss_points(template: Template, kernel: Kernel, model: Deformer, strained: int = 400) -> LossPoints:
@@ -139,18 +113,9 @@ def build_cloud_dataset(
     samples: ShapeSamples, config: TrainConfig, scan: ScanConfig, augmentation: Augmentation | None = None
 ) -> CloudDataset:
     """Batches of a folder's samples, as yet without an encoder."""
-    return CloudDataset(
-        points=torch.from_numpy(samples.points),
-        normals=torch.from_numpy(samples.normals),
-        landmarks=torch.from_numpy(samples.landmarks),
-        lattice=build_lattice(samples),
-        encoder=None,
-        scan=scan,
-        augmentation=augmentation or Augmentation(),
-        shapes=config.shapes,
-        seed=config.seed,
-        length=config.steps,
-    )
+    points, normals, known = map(torch.from_numpy, (samples.points, samples.normals, samples.landmarks))
+    settings = scan, augmentation or Augmentation(), config.shapes, config.seed, config.steps
+    return CloudDataset(points, normals, known, build_lattice(samples), None, *settings)
 
 
 def build_surface_points(
@@ -158,14 +123,8 @@ def build_surface_points(
 ) -> SurfacePoints:
     """Evenly spread template vertices, and the landmark vertices, with what a Chamfer distance needs of them."""
     chosen = loss_vertices(template, count)
-    at = np.concatenate([chosen, landmarks]).astype(np.int64)
-    verts = template.shape.verts[at]
-    field = model.field(verts, template.nodes, template.radius, kernel).for_training()
-    M = len(chosen)
-    return SurfacePoints(
-        torch.from_numpy(verts[:M]).float(),
-        field.part(0, M),
-        torch.from_numpy(template.shape.vertex_normals[chosen]).float(),
-        torch.from_numpy(verts[M:]).float(),
-        field.part(M, len(at)),
-    )
+    at, M = np.concatenate([chosen, landmarks]).astype(np.int64), len(chosen)
+    field = model.field(template.shape.verts[at], template.nodes, template.radius, kernel).for_training()
+    verts = torch.from_numpy(template.shape.verts[at]).float()
+    normals = torch.from_numpy(template.shape.vertex_normals[chosen]).float()
+    return SurfacePoints(verts[:M], field.part(0, M), normals, verts[M:], field.part(M, len(at)))

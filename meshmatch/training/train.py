@@ -24,19 +24,12 @@ from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.templates.prepared_folder import ShapeSamples, frame_of, read_registered, read_samples
 from meshmatch.templates.template import Template, read_template, save_template
+from meshmatch.training import setup
 from meshmatch.training.bodies import Bodies, human_source
 from meshmatch.training.datasets import Source, deformed_source, registered_source
 from meshmatch.training.loop import StepReport, Trainer
-from meshmatch.training.losses import surface_error, validation_error
+from meshmatch.training.losses import CorrespondenceLoss, held_out_error
 from meshmatch.training.recipes import Recipe, recipe_for
-from meshmatch.training.setup import (
-    build_cloud_dataset,
-    build_cloud_deformer,
-    build_dataset,
-    build_deformer,
-    build_loss_points,
-    build_surface_points,
-)
 
 VALIDATION_SEED = 999_983
 """Of the batch that no training sees and every training is measured on."""
@@ -150,7 +143,7 @@ def train(
 def _source(shapes: Path, template: Template, recipe: Recipe) -> tuple[Source | ShapeSamples, str]:
     """The shapes of a prepared folder as a recipe needs them, and a few words about them."""
     name = shapes.resolve().name
-    if recipe.needs_correspondence:
+    if isinstance(recipe.train.loss, CorrespondenceLoss):
         verts = torch.from_numpy(read_registered(shapes, template))
         source = (deformed_source if recipe.deform else registered_source)(verts)
         return source, f"{len(verts)} registered shapes of {name}"
@@ -171,53 +164,45 @@ def train_model(
 ) -> Path:
     """`train` on shapes with the template's vertices, or on samples without correspondence; returns the folder.
 
-    Raises
-    ------
-    InputError
-        There is only one shape.
-    OptionError
-        The model to start from has another template, network or kernel.
+    `InputError` if there is only one shape; `OptionError` if the model to start from has another template, network or
+    kernel.
     """
     output = Path(output)
     checkpoint = checkpoint_in(output)
     make_folder(checkpoint.parent)
     config, kernel = recipe.train, recipe.kernel
-    measure: Any
     points: Any
     data: Any
-    held_out: Any
     if isinstance(source, ShapeSamples):
         if len(source.points) < 2:
-            raise InputError(
-                "one shape is too few to learn from", "prepare a folder of several; ten or more are better"
-            )
-        data = build_cloud_dataset(source, config, recipe.scan)
-        model = build_cloud_deformer(template, data, recipe.network, kernel, config.seed)
+            hint = "prepare a folder of several; ten or more are better"
+            raise InputError("one shape is too few to learn from", hint)
+        data = setup.build_cloud_dataset(source, config, recipe.scan)
+        model = setup.build_deformer(template, data, recipe.network, recipe.scan, kernel, config.seed)
         _begin(model, template, recipe, facts)
         data = replace(data, encoder=deepcopy(model.encoder).cpu())
-        points = build_surface_points(template, kernel, model, source.template_landmarks)
-        held_out = replace(data, seed=VALIDATION_SEED, shapes=min(32, 2 * len(source.points)))[0]
+        points = setup.build_surface_points(template, kernel, model, source.template_landmarks)
         facts = replace(facts, frame=facts.frame or {"orientation": source.align, "scale": source.scale})
-        measure = surface_error
+        few = {"shapes": min(32, 2 * len(source.points))}
     else:
-        model = build_deformer(template, source, recipe.network, recipe.scan, kernel, config.seed)
+        model = setup.build_deformer(template, source, recipe.network, recipe.scan, kernel, config.seed)
         _begin(model, template, recipe, facts)
-        points = build_loss_points(template, kernel, model)
+        points = setup.build_loss_points(template, kernel, model)
         size = config.shapes, config.scans_per_shape
-        data = build_dataset(template, source, model, recipe.scan, *size, config.seed, config.steps)
-        held_out = replace(data, seed=VALIDATION_SEED, shapes=32, scans_per_shape=1)[0]
-        measure = validation_error
+        data = setup.build_dataset(template, source, model, recipe.scan, *size, config.seed, config.steps)
+        few = {"shapes": 32, "scans_per_shape": 1}
+    held_out = replace(data, seed=VALIDATION_SEED, **few)[0]
     trainer = Trainer(model, points, config)
     if resume and checkpoint.is_file():
         trainer.load(checkpoint)
         for name in ("encoder", "aligner"):  # what reads the batches are copies (see `build_dataset`)
             if (reader := getattr(data, name, None)) is not None:
                 reader.load_state_dict(getattr(trainer.model, name).state_dict())
-    trainer.run(data, checkpoint, report, lambda model: measure(model, held_out, trainer.points))
+    trainer.run(data, checkpoint, report, lambda model: held_out_error(model, held_out, trainer.points))
     trainer.close()
     if trainer.rank == 0:
         trainer.model.load_state_dict(trainer.averaged_state())
-        export(trainer, template, output, recipe, facts, measure(trainer.model, held_out, trainer.points))
+        export(trainer, template, output, recipe, facts, held_out_error(trainer.model, held_out, trainer.points))
     return output
 
 
@@ -231,12 +216,10 @@ def _begin(model: Deformer, template: Template, recipe: Recipe, facts: CardFacts
     start = facts.start
     if not isinstance(start, TrainedModel):
         return
-    same = start.template.hash == template.hash and start.network.config == recipe.network
-    if not (same and start.card.field["kernel"] == recipe.kernel):
-        raise OptionError(
-            f"model {start.card.name} has another template, network or kernel",
-            "start from a model of the same template and preset, or from nothing",
-        )
+    theirs = start.template.hash, start.network.config, start.card.field["kernel"]
+    if theirs != (template.hash, recipe.network, recipe.kernel):
+        hint = "start from a model of the same template and preset, or from nothing"
+        raise OptionError(f"model {start.card.name} has another template, network or kernel", hint)
     model.load_state_dict(start.network.state_dict())
 
 
@@ -251,22 +234,11 @@ def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, f
         settings["start"] = {"model": begun.name, "weights_sha256": begun.weights_sha256, "steps": begun.steps}
     frame: dict[str, Any] = {} if facts.frame is None else {"frame": facts.frame}
     card = ModelCard(
-        name=facts.name,
-        category=facts.category,
-        template=template.name,
-        template_hash=template.hash,
+        name=facts.name, category=facts.category, template=template.name, template_hash=template.hash,
         network=recipe.network.to_dict(),
         field={"kernel": recipe.kernel, "radius": template.radius, "nodes": template.K},
-        data=facts.data,
-        licence=facts.licence,
-        recipe=settings,
-        seed=recipe.train.seed,
-        steps=trainer.step,
-        training_minutes=round(trainer.seconds / 60, 1),
-        metrics={"validation": {"distance": round(score, 5)}},
-        weights_sha256=digest,
-        created=datetime.date.today().isoformat(),
-        stiffness=facts.stiffness,
-        **frame,
-    )
+        data=facts.data, licence=facts.licence, recipe=settings, seed=recipe.train.seed, steps=trainer.step,
+        training_minutes=round(trainer.seconds / 60, 1), metrics={"validation": {"distance": round(score, 5)}},
+        weights_sha256=digest, created=datetime.date.today().isoformat(), stiffness=facts.stiffness, **frame,
+    )  # fmt: skip
     write_card(card, output / CARD)

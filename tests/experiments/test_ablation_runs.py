@@ -183,7 +183,7 @@ def test_fewer_supervised_points_are_regularised_everywhere(setting: Setting) ->
     few = fewer(points, 50)
     vectors = torch.randn(2, 300, 3, generator=torch.Generator().manual_seed(0)) * 0.1
     assert torch.allclose(few.moved(vectors), points.moved(vectors)[:, :50], atol=1e-6)
-    assert torch.equal(few.deformation_gradient(vectors), points.deformation_gradient(vectors))
+    assert torch.equal(few.field.deformation_gradient(vectors), points.field.deformation_gradient(vectors))
     assert fewer(points, 1000) is points
 
 

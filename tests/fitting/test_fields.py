@@ -28,7 +28,7 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.training import recipes
 from meshmatch.training.loop import TrainConfig, Trainer
-from meshmatch.training.losses import CorrespondenceLoss, validation_error
+from meshmatch.training.losses import CorrespondenceLoss, held_out_error
 from tests.fitting.eggs import bent_egg, egg_model, gentle_vectors, scan_of
 from tests.training.small import NETWORK, SCAN, egg_template, small_data, small_network, small_points
 
@@ -66,9 +66,9 @@ def test_it_learns(field: str) -> None:
     )
     data = small_data(egg, model, length=40)
     held_out = small_data(egg, model, seed=7)[0]
-    before = validation_error(model, held_out, points)
+    before = held_out_error(model, held_out, points)
     Trainer(model, points, config).run(data)
-    assert validation_error(model, held_out, points) < 0.97 * before
+    assert held_out_error(model, held_out, points) < 0.97 * before
 
 
 @pytest.mark.parametrize("field", FIELDS)

@@ -13,10 +13,10 @@ from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import Augmentation, CloudDataset, build_lattice, deformed_normals, deformed_source
 from meshmatch.training.loop import TrainConfig, Trainer
-from meshmatch.training.losses import ChamferLoss, chamfer, robust, surface_error
+from meshmatch.training.losses import ChamferLoss, chamfer, held_out_error, robust
 from meshmatch.training.recipes import Recipe
 from meshmatch.training.scans import ScanConfig
-from meshmatch.training.setup import build_cloud_dataset, build_cloud_deformer, build_surface_points
+from meshmatch.training.setup import build_cloud_dataset, build_deformer, build_surface_points
 from tests.training.small import egg_template
 
 SMALL = Recipe(
@@ -58,7 +58,7 @@ def eggs(template: Template) -> ShapeSamples:
 @pytest.fixture(scope="module")
 def data(eggs: ShapeSamples, template: Template) -> CloudDataset:
     data = build_cloud_dataset(eggs, SMALL.train, SMALL.scan)
-    return replace(data, encoder=build_cloud_deformer(template, data, SMALL.network, SMALL.kernel, 0).encoder)
+    return replace(data, encoder=build_deformer(template, data, SMALL.network, SMALL.scan, SMALL.kernel, 0).encoder)
 
 
 def test_a_lattice_reproduces_affine_maps_and_their_normals(eggs: ShapeSamples) -> None:
@@ -154,7 +154,7 @@ def test_the_robust_function() -> None:
 
 
 def test_known_points_are_pulled_to_their_places(eggs: ShapeSamples, template: Template, data: CloudDataset) -> None:
-    model = build_cloud_deformer(template, data, SMALL.network, SMALL.kernel, 0).eval()
+    model = build_deformer(template, data, SMALL.network, SMALL.scan, SMALL.kernel, 0).eval()
     points = build_surface_points(template, "smooth", model, eggs.template_landmarks, 60)
     batch = data[0]
     loss = ChamferLoss(blend=0.0, landmarks=2.0)
@@ -176,14 +176,14 @@ def test_known_points_are_pulled_to_their_places(eggs: ShapeSamples, template: T
 
 
 def test_it_learns(eggs: ShapeSamples, template: Template, data: CloudDataset) -> None:
-    model = build_cloud_deformer(template, data, SMALL.network, SMALL.kernel, 0)
+    model = build_deformer(template, data, SMALL.network, SMALL.scan, SMALL.kernel, 0)
     points = build_surface_points(template, "smooth", model, eggs.template_landmarks, 150)
     stretched = replace(data, encoder=model.encoder, length=150)
     held_out = replace(stretched, seed=99, shapes=6)[0]
-    before = surface_error(model, held_out, points)
+    before = held_out_error(model, held_out, points)
     trainer = Trainer(model, points, replace(SMALL.train, steps=150, rate=3e-3))
     trainer.run(stretched)
-    assert surface_error(model, held_out, points) < 0.9 * before
+    assert held_out_error(model, held_out, points) < 0.9 * before
 
 
 def test_few_registered_shapes_are_deformed_at_every_drawing(template: Template) -> None:

@@ -11,7 +11,7 @@ from meshmatch.errors import TemplateError
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.layers import BasisEncoder
 from meshmatch.templates.template import Template
-from meshmatch.training.bodies import body_source
+from meshmatch.training.bodies import sample_bodies
 from meshmatch.training.datasets import Batch, BatchDataset, registered_source, step_generator
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.setup import anchor_vertices, build_dataset, fill_basis, loss_vertices
@@ -147,7 +147,7 @@ def test_registered_shapes_are_drawn_wherever_they_lie() -> None:
 
 def test_bodies_come_from_the_rig() -> None:
     rig = stick_figure()
-    drawn = body_source(rig)(3, torch.Generator().manual_seed(0))
+    drawn = sample_bodies(rig, 3, torch.Generator().manual_seed(0))
     assert drawn.shape == (3, rig.rest.shape[1], 3)
 
 

@@ -198,7 +198,7 @@ def test_bodies_need_a_template_of_the_body_model(monkeypatch: pytest.MonkeyPatc
     half = Template("half", small, dense, np.eye(3), 1.0, np.zeros(len(keep), int), ("all",), np.arange(9))
     drawn = bodies.human_source(half)(3, torch.Generator().manual_seed(0))
     assert drawn.shape == (3, len(keep), 3)
-    wanted = bodies.body_source(rig)(3, torch.Generator().manual_seed(0))[:, keep]
+    wanted = bodies.sample_bodies(rig, 3, torch.Generator().manual_seed(0))[:, keep]
     assert torch.equal(drawn, wanted)
 
 
