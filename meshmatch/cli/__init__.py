@@ -1,8 +1,3 @@
-"""The command line: thin verbs, and one boundary where errors become words and an exit status.
+"""The command line: thin verbs that import nothing heavy before they need it, so that ``--help`` answers at once."""
 
-Nothing heavy is imported before a verb needs it, so that ``meshmatch --help`` answers at once.
-"""
-
-from meshmatch.cli.boundary import main
-
-__all__ = ["main"]
+from meshmatch.cli.boundary import main as main

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from meshmatch.cli.console import Console
+from meshmatch.cli.words import Console
 from meshmatch.errors import MeshmatchError
 
 DEBUG_VARIABLE = "MESHMATCH_DEBUG"

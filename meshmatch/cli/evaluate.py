@@ -7,8 +7,8 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import options
-from meshmatch.cli.console import Console, print_json, print_rows
 from meshmatch.cli.output_paths import check_outputs
+from meshmatch.cli.words import Console, print_json, print_rows
 from meshmatch.errors import OptionError
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.console import Json, print_json, print_rows
+from meshmatch.cli.words import Json, print_json, print_rows
 from meshmatch.errors import InputError
 
 

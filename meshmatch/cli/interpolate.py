@@ -2,19 +2,18 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from typer import Argument, Option
 
+import meshmatch
 from meshmatch.cli import words
-from meshmatch.cli.console import Console, Json, print_json
 from meshmatch.cli.options import FitOptions, RunOptions, grouped, output_option
 from meshmatch.cli.output_paths import check_outputs
+from meshmatch.cli.words import Console, Json, print_json
 from meshmatch.errors import OptionError
+from meshmatch.models.registry import locate_model
 from meshmatch.outputs import folder_on_success, replace_on_success
-
-if TYPE_CHECKING:
-    from meshmatch.api.interpolation import Interpolation
 
 Met = dict[float, str]
 """Names of the shapes that are passed, by their times."""
@@ -64,19 +63,12 @@ def interpolate(
     its file, and at time 1 A's mesh lies on B. Shapes given with --through are passed at even times in between.
     """
     from meshmatch.api import interpolation
-    from meshmatch.models.registry import locate_model
-    from meshmatch.shapes.files import load_shape
 
     how.check()
-    folder = output.suffix == "" or output.is_dir()
-    write = (
-        None if folder else {".png": _draw_strip, ".html": _write_page, ".htm": _write_page}.get(output.suffix.lower())
-    )
-    if not folder and write is None:
-        raise OptionError(
-            f"{output.name}: unsupported format for a sequence: {output.suffix}",
-            "give a name without a suffix for a folder (see --format), or one that ends in .png or .html",
-        )
+    suffix = "" if output.is_dir() else output.suffix.lower()
+    if suffix not in ("", *_WRITERS):
+        hint = "give a name without a suffix for a folder (see --format), or one that ends in .png or .html"
+        raise OptionError(f"{output.name}: unsupported format for a sequence: {output.suffix}", hint)
     files = [source, *(sequence.through or []), target]
     check_outputs(files, output, chart=sequence.plot)
     options = interpolation.InterpolationOptions(
@@ -84,9 +76,9 @@ def interpolate(
     )
     console = Console(run.quiet)
     # What cannot be written, a mistyped model and broken files are told before the long work.
-    with (replace_on_success if write else folder_on_success)(output) as temporary:
+    with (replace_on_success if suffix else folder_on_success)(output) as temporary:
         locate_model(how.model)
-        shapes = [load_shape(file) for file in files]
+        shapes = [meshmatch.load_shape(file) for file in files]
         with console.progress() as report:
             result = interpolation.interpolate(
                 shapes, sequence.frames, options=options, model=how.model, config=how.configs()[0],
@@ -97,10 +89,10 @@ def interpolate(
         met = dict(zip(result.times, [file.name for file in files], strict=True))
         if sequence.plot is not None:
             _plot(sequence.plot, result, met)
-        if write is None:
-            interpolation.save_folder(temporary, result, sequence.format)
+        if suffix:
+            _WRITERS[suffix](temporary, result, met)
         else:
-            write(temporary, result, met)
+            interpolation.save_folder(temporary, result, sequence.format)
     _tell(console, result, files, sequence.place)
     console.say(
         f"wrote {output}: {sequence.frames} shapes of {result.steps[0].shape.V} vertices, from time "
@@ -113,18 +105,17 @@ def interpolate(
         print_json({"output": output, "plot": sequence.plot} | _record(result, files) | chosen | how.record)
 
 
-def _draw_strip(path: Path, result: "Interpolation", met: Met) -> None:
+def _draw_strip(path: Path, result: "meshmatch.Interpolation", met: Met) -> None:
     """All shapes in a row, each with its time, or the name of the shape that is passed then."""
     from meshmatch.render.figures import Panel
     from meshmatch.render.picture import render_shapes
 
-    panels = [
-        Panel(step.shape, label=met.get(step.time, f"{step.time:.3g}"), rotation=step.rotation) for step in result.steps
-    ]
-    render_shapes(panels, path)
+    labels = [met.get(step.time, f"{step.time:.3g}") for step in result.steps]
+    pairs = zip(result.steps, labels, strict=True)
+    render_shapes([Panel(step.shape, label=label, rotation=step.rotation) for step, label in pairs], path)
 
 
-def _write_page(path: Path, result: "Interpolation", met: Met) -> None:
+def _write_page(path: Path, result: "meshmatch.Interpolation", met: Met) -> None:
     """In one frame, that of the first shape: what moves in the files moves on the page."""
     from meshmatch.render.viewer.page import write_motion
 
@@ -134,7 +125,10 @@ def _write_page(path: Path, result: "Interpolation", met: Met) -> None:
     write_motion(path, shapes, times, rotation=result.steps[0].rotation, met=met, title=title)
 
 
-def _plot(path: Path, result: "Interpolation", met: Met) -> None:
+_WRITERS = {".png": _draw_strip, ".html": _write_page, ".htm": _write_page}
+
+
+def _plot(path: Path, result: "meshmatch.Interpolation", met: Met) -> None:
     from meshmatch.render.charts import draw_lines
 
     times = [step.time for step in result.steps]
@@ -147,7 +141,7 @@ def _plot(path: Path, result: "Interpolation", met: Met) -> None:
     draw_lines(lines, path, xlabel, "mean deviation over the surface", marks)
 
 
-def _tell(console: Console, result: "Interpolation", files: list[Path], asked: str) -> None:
+def _tell(console: Console, result: "meshmatch.Interpolation", files: list[Path], asked: str) -> None:
     for note in result.notes:
         console.say(note)
     for file, fit in zip(files, result.fits, strict=True):
@@ -162,7 +156,7 @@ def _tell(console: Console, result: "Interpolation", files: list[Path], asked: s
     )
 
 
-def _record(result: "Interpolation", files: list[Path]) -> Json:
+def _record(result: "meshmatch.Interpolation", files: list[Path]) -> Json:
     shapes = []
     for file, time, fit in zip(files, result.times, result.fits, strict=True):
         about = words.fit_record(str(file), fit)

@@ -6,9 +6,10 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import options, words
-from meshmatch.cli.console import Console, print_json
 from meshmatch.cli.options import FitOptions, PairOptions, RunOptions, grouped, output_option
 from meshmatch.cli.output_paths import check_outputs
+from meshmatch.cli.words import Console, print_json
+from meshmatch.models.registry import locate_model
 from meshmatch.outputs import replace_on_success
 
 
@@ -28,7 +29,6 @@ def match(
     target matched to vertex i of the source; vertices are counted from 0, in the order of the files.
     """
     from meshmatch.maps.files import check_suffix
-    from meshmatch.models.registry import locate_model
 
     how.check()
     check_suffix(output)
@@ -75,7 +75,6 @@ def register(
     Results for all shapes have the same vertices and triangles in the same order. More than one of --threads may change
     the last bits.
     """
-    from meshmatch.models.registry import locate_model
     from meshmatch.shapes.files import check_suffix
 
     how.check()

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from meshmatch.cli import options
-from meshmatch.cli.console import Console, print_json, print_rows, print_text
+from meshmatch.cli.words import Console, print_json, print_rows, print_text
 from meshmatch.errors import ModelError
 from meshmatch.models import card as cards
 from meshmatch.models import registry
@@ -14,7 +14,6 @@ from meshmatch.models import registry
 models = typer.Typer(
     help="List, show, add, remove and verify trained models.", no_args_is_help=True, rich_markup_mode=None
 )
-
 Name = Annotated[str, typer.Argument(metavar="NAME", help="The model's name.")]
 
 
@@ -35,10 +34,9 @@ def list_all(json: options.Json = False) -> None:
     rows = [("NAME", "CATEGORY", "CREATED", "FROM", "LICENCE")]
     for entry in entries:
         where = "package" if entry.built_in else "own"
-        category, created, licence = ("", "", "damaged")
-        if entry.card is not None:
-            category, created, licence = entry.card.category, entry.card.created, entry.card.licence
-        rows.append((entry.name, category, created, where, licence))
+        card = entry.card
+        about = ("", "", where, "damaged") if card is None else (card.category, card.created, where, card.licence)
+        rows.append((entry.name, *about))
     print_rows(rows)
     for entry in entries:
         if entry.problem:

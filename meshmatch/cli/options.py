@@ -14,15 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 from typer import Argument, Option
 
+import meshmatch
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.choices import Refine
 
 if TYPE_CHECKING:
-    from meshmatch.api.results import ConfidenceRule, MatchResult
     from meshmatch.arrays import Ints
-    from meshmatch.cli.console import Console
-    from meshmatch.fitting.fit_config import FitConfig
-    from meshmatch.shapes.shape import Shape
+    from meshmatch.cli.words import Console
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
@@ -69,7 +67,9 @@ def check_truth(truth: Path | None, points: tuple[Path, Path] | None) -> bool:
     return truth is not None or points is not None
 
 
-def load_truth(truth: Path | None, points: tuple[Path, Path] | None, source: Shape) -> tuple[Ints, Ints] | None:
+def load_truth(
+    truth: Path | None, points: tuple[Path, Path] | None, source: meshmatch.Shape
+) -> tuple[Ints, Ints] | None:
     """True points on source and target, where they are known."""
     import numpy as np
 
@@ -84,10 +84,8 @@ def load_truth(truth: Path | None, points: tuple[Path, Path] | None, source: Sha
     except InputError:
         column = load_points(truth)  # its error is the one to tell: a column is the simpler form
     if len(column) != source.V:
-        raise InputError(
-            f"{truth.name} has {len(column)} entries, but {source.name} has {source.V} vertices",
-            "a truth of one column has an entry for every vertex of the source",
-        )
+        hint = "a truth of one column has an entry for every vertex of the source"
+        raise InputError(f"{truth.name} has {len(column)} entries, but {source.name} has {source.V} vertices", hint)
     return np.arange(source.V), column
 
 
@@ -126,7 +124,7 @@ class FitOptions:
         for up, front in self.axes:
             check_axes(up, front)
 
-    def configs(self) -> tuple[FitConfig, ...]:
+    def configs(self) -> tuple[meshmatch.FitConfig, ...]:
         """The same for the library, one for each of `axes`."""
         from meshmatch.fitting.fit_config import FitConfig
 
@@ -157,7 +155,9 @@ class PairOptions(FitOptions):
         source = self.source_up or self.up, self.source_front or self.front
         return source, (self.target_up or self.up, self.target_front or self.front)
 
-    def match(self, source: Shape, target: Shape, run: RunOptions, console: Console) -> MatchResult:
+    def match(
+        self, source: meshmatch.Shape, target: meshmatch.Shape, run: RunOptions, console: Console
+    ) -> meshmatch.MatchResult:
         """Match two shapes, with bars."""
         from meshmatch.maps.table_files import load_pairs
 
@@ -196,13 +196,11 @@ class RuleOptions:
     blank: str | None = Option(None, metavar="VALUE", help="Or write VALUE there. Default: keep them as they are.")
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for a value to be trusted.")
 
-    def rule(self, blank: float | str | Sequence[float] | None = None) -> ConfidenceRule:
+    def rule(self, blank: float | str | Sequence[float] | None = None) -> meshmatch.ConfidenceRule:
         """The same for the library; `blank` is what the text means."""
-        from meshmatch.api.results import ConfidenceRule
-
         if self.fill and self.blank is not None:
             raise OptionError("--fill and --blank contradict each other", "choose one of them")
-        return ConfidenceRule(self.min_confidence, self.fill, blank)
+        return meshmatch.ConfidenceRule(self.min_confidence, self.fill, blank)
 
 
 def grouped(verb: Callable[..., None]) -> Callable[..., None]:

@@ -14,13 +14,8 @@ def check_outputs(
 ) -> None:
     """Refuse, before the work, what could not be written after it. What is None is not wanted.
 
-    Raises
-    ------
-    OptionError
-        A picture that is not a PNG, a chart of an unknown kind; or an output, be it a picture or a chart, that would
-        replace an input or another output.
-    OutputError
-        The picture or the chart cannot be written. (Other outputs are claimed while the work is done.)
+    `OptionError` if the picture is no PNG, the chart of an unknown kind, or anything would replace an input or another
+    output; `OutputError` if picture or chart cannot be written. (Other outputs are claimed while the work is done.)
     """
     check_chart(chart)
     if picture is not None and picture.suffix.lower() != ".png":

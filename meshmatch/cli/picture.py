@@ -3,24 +3,26 @@
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import options, words
-from meshmatch.cli.console import Console, print_json
 from meshmatch.cli.output_paths import check_outputs
 from meshmatch.cli.transfer_options import Transfer, ViewMapOptions
+from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import ModelError, OptionError
+from meshmatch.models.registry import TEMPLATE, locate_model
 
 if TYPE_CHECKING:
     from meshmatch.render.compose import Composition
     from meshmatch.render.picture import Look
     from meshmatch.shapes.appearance import Appearance
-    from meshmatch.shapes.shape import Shape
     from meshmatch.templates.template import Template
 
+Subject: TypeAlias = "tuple[meshmatch.Shape | Template, Appearance | None]"
+"""What was named, with its textures or colors if it has any."""
 View = Literal["quarter", "front", "left", "right", "back", "above"]
 
 
@@ -155,16 +157,15 @@ def picture(
     """
     shown.check(len(shapes))
     if name and len(name) != len(shapes):
-        raise OptionError(
-            f"{len(shapes)} shapes need {len(shapes)} names, not {len(name)}", "give --name once for each shape"
-        )
+        problem = f"{len(shapes)} shapes need {len(shapes)} names, not {len(name)}"
+        raise OptionError(problem, "give --name once for each shape")
     look = how.look()
     check_outputs([*shapes, *shown.files], picture=output)
     console = Console(quiet)
     subjects = [_load_subject(path, shown) for path in shapes]
     made = _compose(shown, subjects, look, console)
     labels = [panel.label for panel in made.panels]
-    own = [subject.name for subject in subjects]
+    own = [subject.name for subject, _ in subjects]
     for k, (before, given) in enumerate(zip(own, name or words.names_of(shapes, own), strict=True)):
         if name or given != before:
             labels[k] = labels[k].replace(before, given) if len(labels) > len(shapes) else given
@@ -175,30 +176,18 @@ def picture(
         print_json(record | {"width": width, "height": height} | made.record)
 
 
-@dataclass(frozen=True)
-class Subject:
-    """A shape that was named, with its textures or colors if it has any, and its template if it is one."""
-
-    name: str
-    shape: "Shape"
-    appearance: "Appearance | None" = None
-    template: "Template | None" = None
-
-
 def _load_subject(path: Path, shown: PictureOptions) -> Subject:
     """Read a shape, or a template by its file or name, or that of a model."""
     from meshmatch.shapes.textured_files import find_appearance
 
-    template = _template(path)
-    if template is not None:
-        return Subject(template.name, template.shape, None, template)
+    if (template := _template(path)) is not None:
+        return template, None
     shape = meshmatch.load_shape(path)
     textured = not (shown.plain or shown.map or shown.values or shown.labels or shown.fit)
-    return Subject(path.name, shape, find_appearance(path, shape, shown.image) if textured else None)
+    return shape, find_appearance(path, shape, shown.image) if textured else None
 
 
 def _template(path: Path) -> "Template | None":
-    from meshmatch.models.registry import TEMPLATE, locate_model
     from meshmatch.templates.location import bundled_folder
     from meshmatch.templates.template import load_template
 
@@ -219,7 +208,7 @@ def _compose(shown: PictureOptions, subjects: list[Subject], look: "Look", conso
     """Read what the options name, and compose the picture of it."""
     from meshmatch.render.compose import compose_labels, compose_shapes, compose_values, merge_labels
 
-    shapes = [subject.shape for subject in subjects]
+    shapes: list[Any] = [getattr(each, "shape", each) for each, _ in subjects]  # of a template its own
     if shown.map is not None:
         return _compose_map(shown, shown.map, shapes, look)
     if shown.fit is not None:
@@ -236,10 +225,10 @@ def _compose(shown: PictureOptions, subjects: list[Subject], look: "Look", conso
 
         labels = [load_labels(*pair, shown.on) for pair in zip(shown.labels, shapes, strict=True)]
         return compose_labels(shapes, *merge_labels(labels), [own.on == "faces" for own in labels])
-    return compose_shapes([(each.template or each.shape, each.appearance) for each in subjects], plain=shown.plain)
+    return compose_shapes(subjects, plain=shown.plain)
 
 
-def _compose_map(shown: PictureOptions, file: Path, shapes: "list[Shape]", look: "Look") -> "Composition":
+def _compose_map(shown: PictureOptions, file: Path, shapes: "list[meshmatch.Shape]", look: "Look") -> "Composition":
     from meshmatch.render.compose import compose_confidence, compose_errors, compose_match
 
     source, target = shapes
@@ -256,7 +245,9 @@ def _compose_map(shown: PictureOptions, file: Path, shapes: "list[Shape]", look:
     return compose_errors(source, target, found, known, errors, shown.unit, shown.range, look)
 
 
-def _compose_fit(shown: PictureOptions, fit: str, shape: "Shape", look: "Look", console: Console) -> "Composition":
+def _compose_fit(
+    shown: PictureOptions, fit: str, shape: "meshmatch.Shape", look: "Look", console: Console
+) -> "Composition":
     """The template over a shape, from the file of a fit or by a model, which is fitted now."""
     from meshmatch.render.compose import compose_fit
     from meshmatch.shapes.files import SUFFIXES
@@ -264,8 +255,6 @@ def _compose_fit(shown: PictureOptions, fit: str, shape: "Shape", look: "Look", 
     file = Path(fit)
     if file.is_file() or file.suffix.lower() in SUFFIXES:
         return compose_fit(shape, meshmatch.load_shape(file), limits=shown.range)
-    from meshmatch.models.registry import locate_model
-
     locate_model(fit)
     config = meshmatch.FitConfig(seed=shown.seed, up=look.up, front=look.front)
     with console.progress() as report:

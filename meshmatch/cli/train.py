@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Literal
 from typer import Argument, Option
 
 from meshmatch.cli import options
-from meshmatch.cli.console import Console, print_json
 from meshmatch.cli.output_paths import check_chart, check_writable
+from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import needs
+from meshmatch.models.card import read_card
+from meshmatch.models.registry import CARD
 from meshmatch.outputs import make_folder
 from meshmatch.threads import set_threads
 
@@ -236,8 +238,6 @@ def _picture(console: Console, picture: Path | None, reports: "list[StepReport]"
 
 
 def _summary(console: Console, output: Path, steps: int, picture: Path | None, json: bool) -> None:
-    from meshmatch.models.registry import CARD, read_card
-
     card = read_card(output / CARD)
     console.say(
         f"wrote model {card.name}, learned from {card.data}, to {output} after step {card.steps}; use it with "

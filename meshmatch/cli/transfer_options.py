@@ -10,16 +10,18 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
+import meshmatch
 from meshmatch.cli import words
-from meshmatch.cli.console import Console, Json, print_json
 from meshmatch.cli.options import PAIRS_HELP, PairOptions, RunOptions
 from meshmatch.cli.output_paths import check_outputs
+from meshmatch.cli.words import Console, Json, print_json
 from meshmatch.errors import OptionError
+from meshmatch.models.registry import locate_model
+from meshmatch.outputs import replace_on_success
 
 if TYPE_CHECKING:
-    from meshmatch.api.results import MapPair, MatchResult
+    from meshmatch.api.results import MapPair
     from meshmatch.render.compose import Composition
-    from meshmatch.shapes.shape import Shape
     from meshmatch.transfer.low_confidence import LowConfidence
 
 Source = Annotated[Path, Argument(metavar="SRC", help="Shape to transfer from.")]
@@ -73,9 +75,6 @@ class Transfer:
 
         What cannot be written, and options that do not go together, are told before the work; ``read`` is another input.
         """
-        from meshmatch.models.registry import locate_model
-        from meshmatch.outputs import replace_on_success
-
         files = files or [self.output]
         self.options.check()
         if self.options.map is not None and self.options.given:
@@ -89,14 +88,13 @@ class Transfer:
                 locate_model(self.options.model)  # a mistyped name is told before the long work
             yield temporary
 
-    def __call__(self, source: Shape, target: Shape) -> MapPair:
+    def __call__(self, source: meshmatch.Shape, target: meshmatch.Shape) -> MapPair:
         """The maps, from the file or by matching; judged if --strict was given."""
-        from meshmatch.api.transfer import find_maps
 
-        def matched(a: Shape, b: Shape) -> MatchResult:
+        def matched(a: meshmatch.Shape, b: meshmatch.Shape) -> meshmatch.MatchResult:
             return self.options.match(a, b, self.run, self.console)
 
-        maps = find_maps(source, target, self.options.map or matched)
+        maps = meshmatch.find_maps(source, target, self.options.map or matched)
         found = maps.forward
         words.refuse_poor(self.run.strict, found.verdict, found.reasons)
         a, b = self.names

@@ -2,19 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from typer import Option
 
 import meshmatch
-from meshmatch.cli.console import Console, Json
 from meshmatch.cli.options import RuleOptions, RunOptions, grouped, output_option
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
+from meshmatch.cli.words import Console, Json
 from meshmatch.errors import OptionError
-
-if TYPE_CHECKING:
-    from meshmatch.api.results import ConfidenceRule
-    from meshmatch.api.texture import TexturedResult
 
 _COLORS = (".ply", ".off")
 _WORTH_SAYING = 0.002  # of the surface
@@ -76,10 +72,8 @@ def transfer_texture(
     a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
     painted = b.is_cloud or output.suffix.lower() in _COLORS
     if painted and uv == "keep":
-        raise OptionError(
-            f"{b.name} gets vertex colours, which need no texture coordinates",
-            "leave out --uv keep" if b.is_cloud else "end the output in .glb or .obj for a texture",
-        )
+        hint = "leave out --uv keep" if b.is_cloud else "end the output in .glb or .obj for a texture"
+        raise OptionError(f"{b.name} gets vertex colours, which need no texture coordinates", hint)
     files = [output] if painted else textured_files.files_of(output)
     with transfer.outputs(image, files) as temporary:
         look = textured_files.load_appearance(source, a, image)
@@ -105,7 +99,9 @@ def transfer_texture(
     transfer.print_record(record, pair, float(pair.backward.confidence.mean()))
 
 
-def _tell_baked(console: Console, made: "TexturedResult", rule: "ConfidenceRule", size: int) -> Json:
+def _tell_baked(
+    console: Console, made: "meshmatch.TexturedResult", rule: "meshmatch.ConfidenceRule", size: int
+) -> Json:
     """What came out, in words and for --json."""
     baked, atlas = made.baked, made.atlas
     if atlas.note:
