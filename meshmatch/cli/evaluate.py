@@ -70,9 +70,8 @@ def evaluate(
 
 def _rows(result: "Evaluation", threshold: float) -> list[tuple[str, str, str]]:
     rows = []
-    if result.errors is not None:
-        errors = result.errors
-        rows += [
+    if (errors := result.errors) is not None:
+        rows = [
             ("mean error", f"{errors.mean_cm:.2f} cm", f"{100 * errors.mean:.2f} x 0.01 sqrt(area)"),
             ("median error", f"{errors.median_cm:.2f} cm", f"{100 * errors.median:.2f} x 0.01 sqrt(area)"),
             (f"over {threshold:g} cm", f"{100 * errors.share_over(threshold):.2f} %", ""),
