@@ -115,7 +115,7 @@ class Trainer:
             save_file(arrays, temporary, words)
 
     def load(self, path: Path) -> None:
-        """Continue exactly where `save` was called; `ModelError` if the file is none, or of another seed, network or template."""
+        """Go on where `save` was called; `ModelError` if the file is none, or of another seed, network or template."""
         hint = "train into another folder, or start afresh"
         parts: dict[str, dict[str, Tensor]] = {"model": {}, "average": {}, "optimiser": {}}
         try:
