@@ -28,16 +28,9 @@ def evaluate(
     """Measure a map: its coverage, its distortion, and its errors where the truth is known.
 
     Errors are geodesic distances on the target, over the square root of its area; or in centimetres with the target
-    scaled to 1.9 square metres, the skin of a person.
-
-    Parameters
-    ----------
-    found, source, target
-        A map, or its file, and the shapes that it maps, as in `meshmatch.match`.
-    truth : (V_source,) or ((N,), (N,)), optional
-        The true target vertex of every source vertex; or N vertices of the source and those of the target.
-    seed : int
-        Of the random pairs of points between which distortion is measured.
+    scaled to 1.9 square metres, the skin of a person. ``found`` is a map, or its file; the shapes are as in `match`.
+    ``truth`` is the true target vertex of every source vertex (V_source,); or N vertices of the source and those of the
+    target, ((N,), (N,)). ``seed`` is of the random pairs of points between which distortion is measured.
 
     `MeshmatchError`: the map or the truth belongs to other shapes, or is something else.
     """

@@ -42,16 +42,10 @@ _ALIKE = 1.5  # sizes of files in one unit differ by less
 class InterpolationOptions:
     """What a sequence of shapes shows.
 
-    Parameters
-    ----------
-    start, stop : float
-        Times of the first and the last shape, from -1 to 2; beyond 0 and 1 the motion goes on.
-    mesh : {"source", "template"}
-        Move the source's own mesh, or the template's.
-    way : {"field", "codes"}
-        Blend the rotation and stretch of the field everywhere, or the network's codes.
-    place : {"auto", "files", "source"}
-        See `Interpolation`; "auto" is "files" where the sizes of the shapes differ by less than a half.
+    ``start`` and ``stop`` are the times of the first and the last shape, from -1 to 2; beyond 0 and 1 the motion goes on.
+    ``mesh``: the source's own moves, or the template's. ``way``: blend the rotation and stretch of the "field" everywhere,
+    or the network's "codes". ``place``: see `Interpolation`; "auto" is "files" where the sizes of the shapes differ by
+    less than a half.
 
     `OptionError` for an unknown choice, or times out of range.
     """
@@ -122,16 +116,8 @@ def interpolate(
 ) -> Interpolation:
     """The shapes between two shapes: from the first at time 0 to the last at time 1.
 
-    Parameters
-    ----------
-    shapes : sequence of shapes
-        At least two, each as in `match`; those in between are passed at even times.
-    frames : int
-        How many shapes to make, at least 2, at even times.
-    options : InterpolationOptions, optional
-        Times, what moves, how it is blended and where it lies.
-    model, config, threads, progress
-        See `match`; a sequence of configs has one for each shape.
+    There are at least two ``shapes``, each as in `match`; those in between are passed at even times. ``frames`` says how
+    many shapes to make, at least 2, at even times. For the rest see `match`; a sequence of configs has one for each shape.
 
     `MeshmatchError`: a shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
     """

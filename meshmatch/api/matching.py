@@ -35,21 +35,12 @@ LandmarkPairs = tuple[ArrayLike, ArrayLike]
 class Matcher:
     """One model, for many shapes: fit each of them once, then map between any two of the fits.
 
-    Parameters
-    ----------
-    model : str, path or TrainedModel
-        Name in the registry, model folder, or a model that `load_model` returned.
-    config : FitConfig
-        How shapes are fitted, for all of them.
-    threads : int, optional
-        How many shapes are fitted beside each other, each on one thread of the numerical libraries; 2 by default. One
-        shape alone is fitted on one thread by default, and on more if they are asked for, which may change the last
-        bits. Afterwards the libraries have their threads back.
-    progress : callable, optional
-        Called with the stage, the name of the shape and the share of the stage that is done (0..1).
+    ``model`` is a name in the registry, a model folder, or what `load_model` returned; ``config`` says how all shapes
+    are fitted. ``threads`` is how many shapes are fitted beside each other, each on one thread of the numerical
+    libraries; 2 by default. One shape alone is fitted on one thread by default, and on more if they are asked for, which
+    may change the last bits. Afterwards the libraries have their threads back. ``progress`` is called with the stage, the
+    name of the shape and the share of the stage that is done (0..1).
 
-    Examples
-    --------
     >>> matcher = meshmatch.Matcher("human")
     >>> fits = [matcher.fit(path) for path in paths]
     >>> maps = {(a, b): matcher.map(fits[a], fits[b]) for a, b in pairs}
@@ -220,16 +211,11 @@ def match(
 ) -> MatchResult:
     """Match two shapes: ``map.index[i]`` of the result is the vertex of the target matched to vertex i of the source.
 
-    Parameters
-    ----------
-    source, target : path, Shape, (N, 3) array, (vertices, faces), or an object with .vertices and .faces
-        Meshes or point clouds of the model's category, in any unit, orientation and resolution.
-    config : FitConfig or a pair of them, optional
-        How shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes.
-    landmarks : (source vertices (N,), target vertices (N,)), optional
-        Known pairs, which the map then honours; only with ``refine="nodes"``.
-    model, threads, progress
-        See `Matcher`.
+    ``source`` and ``target`` are meshes or point clouds of the model's category, in any unit, orientation and resolution:
+    a path, a Shape, an (N, 3) array, (vertices, faces), or an object with .vertices and .faces. ``config`` says how
+    shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes.
+    ``landmarks`` are known pairs, (source vertices (N,), target vertices (N,)), which the map then honours; only with
+    ``refine="nodes"``. See `Matcher` for the rest.
 
     `MeshmatchError`: a shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
     """

@@ -46,29 +46,14 @@ def picture(
     look: Look | None = None,
     names: Sequence[str] | None = None,
 ) -> tuple[int, int]:
-    """Draw shapes side by side as a PNG, without a GPU, a display or OpenGL.
+    """Draw shapes side by side as a PNG, without a GPU, a display or OpenGL; its width and height in pixels.
 
-    Returns width and height in pixels.
-
-    Parameters
-    ----------
-    shapes
-        Each as in `meshmatch.match`; those given as files have their textures. Or what one of the functions of
-        `meshmatch.render.compose` returned, such as the errors of a map.
-    path
-        A .png file.
-    match
-        A match or map of two shapes: corresponding points have one colour.
-    values
-        For each shape a number per vertex (V,), shown as a color map; or colours (V, 3 or 4) in 0..1.
-    labels
-        For each shape a label per vertex or face.
-    fit
-        Of the one shape: the fitted template is drawn over it, with its distance as a color map.
-    look
-        Size, background, axes and side.
-    names
-        What is written below the shapes.
+    ``shapes`` are each as in `match`, those given as files with their textures; or what one of the functions of
+    `meshmatch.render.compose` returned, such as the errors of a map. With the ``match`` or map of two shapes
+    corresponding points have one colour. ``values`` are for each shape a number per vertex (V,), shown as a color map, or
+    colours (V, 3 or 4) in 0..1; ``labels`` for each shape one per vertex or face. With the ``fit`` of the one shape its
+    template is drawn over it, with its distance as a color map. ``look`` is size, background, axes and side; ``names``
+    are written below the shapes.
 
     `MeshmatchError`: more than one of `match`, `values`, `labels` and `fit`; or one that does not belong to the
     shapes.
@@ -157,18 +142,9 @@ def view(
 ) -> Page:
     """Write a page that shows two shapes and the map between them: one .html file for any recent browser.
 
-    Parameters
-    ----------
-    source, target, match
-        See `find_maps`; textures are read where the shapes are files.
-    path
-        An .html file.
-    up, front
-        How the source stands where a map was given, such as "z" and "-y"; guessed by default.
-    names
-        Two, to show instead of the names of the shapes.
-    threads
-        For what is searched on the surfaces.
+    See `find_maps` for the shapes and the match; textures are read where the shapes are files. ``up`` and ``front`` say
+    how the source stands where a map was given, such as "z" and "-y"; guessed by default. Two ``names`` are shown instead
+    of the shapes' own; ``threads`` search on the surfaces.
 
     `MeshmatchError`: as `meshmatch.match`; or the map belongs to other shapes.
     """

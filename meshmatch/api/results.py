@@ -25,18 +25,10 @@ T = TypeVar("T")
 class MatchResult:
     """What `match` found.
 
-    Attributes
-    ----------
-    map : VertexMap
-        From source to target: ``map.index[i]`` is the vertex of the target matched to vertex i of the source.
-    source_fit, target_fit : Fit
-        The template fitted to each shape, after both fits agreed on how it stretches.
-    seconds : float
-        Wall time.
-    notes : tuple of str
-        What was changed in the shapes before fitting, and which choices were replaced.
-    before_agreement : (Fit, Fit)
-        The same fits before they agreed; where agreement moved them much, a map is not to be trusted.
+    ``map`` is from source to target: ``map.index[i]`` is the vertex of the target matched to vertex i of the source.
+    ``source_fit`` and ``target_fit`` are the template fitted to each shape, after both fits agreed on how it stretches;
+    ``before_agreement`` the same before: where agreement moved them much, a map is not to be trusted. ``seconds`` is wall
+    time. ``notes`` say what was changed in the shapes before fitting, and which choices were replaced.
     """
 
     map: VertexMap

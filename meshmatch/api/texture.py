@@ -56,19 +56,11 @@ def transfer_texture(
 ) -> TexturedResult:
     """Bake the texture of the source into one of the target; ``save("target.glb")`` of the result writes it.
 
-    Parameters
-    ----------
-    source, target, match
-        See `meshmatch.find_maps`; textures and texture coordinates are read where these are files.
-    image : path, optional
-        A picture for the source's texture coordinates, instead of those that its file names.
-    uv : {"auto", "keep", "new"}
-        Reuse the target's texture coordinates if they are valid; reuse them or fail; or unwrap the target anew.
-    options : BakeOptions
-    look : Appearance, optional
-        Of the source, where it is not a file; else its vertex colours are baked.
-    progress
-        See `Matcher`.
+    See `find_maps` for the shapes and the match; textures and texture coordinates are read where the shapes are files.
+    ``image`` is a picture for the source's texture coordinates, instead of those that its file names. ``uv``: reuse the
+    target's texture coordinates if they are valid ("auto"); reuse them or fail ("keep"); or unwrap the target anew
+    ("new"). ``look`` is of the source, where it is not a file; else its vertex colours are baked. See `Matcher` for
+    ``progress``.
 
     `MeshmatchError`: the source has neither a texture nor colours, the target is a point cloud, its texture
     coordinates are to be kept and are not valid; or as `meshmatch.match`.

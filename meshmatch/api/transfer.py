@@ -1,4 +1,7 @@
-"""Attributes from one shape to another: values, colours, labels, skin weights and landmarks; the maps they follow."""
+"""Attributes from one shape to another: values, colours, labels, skin weights and landmarks; the maps they follow.
+
+Shapes and ``match`` are as in `find_maps`. `ConfidenceRule` says what is done where the map is not to be trusted.
+"""
 
 from __future__ import annotations
 
@@ -37,14 +40,10 @@ checked: a `Matcher`, or a function of both shapes."""
 
 
 def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> MapPair:
-    """The maps between two shapes, which transfers follow; several transfers can share one pair.
+    """The maps between two shapes, given as in `match`, which transfers follow; several transfers can share one pair.
 
-    Parameters
-    ----------
-    source, target
-        As in `meshmatch.match`.
-    match : MatchResult, VertexMap, path, Matcher or None
-        A match or a map from source to target that is there already; or what the shapes are matched with.
+    ``match`` is a match or a map from source to target that is there already, or its path; or a `Matcher`, with which the
+    shapes are matched, by default a new one.
 
     `MeshmatchError`: the map belongs to other shapes or has the opposite direction; or as `meshmatch.match`.
     """
@@ -83,15 +82,8 @@ def transfer_values(
     """Numbers of the source's vertices on the target's vertices, interpolated within the source's faces: ``data`` is an
     array (V_target,) or (V_target, D).
 
-    Parameters
-    ----------
-    source, target, match, rule
-        See `find_maps` and `ConfidenceRule`.
-    values : (V_source,) or (V_source, D)
-        Values that are not finite take no part.
-    directions : bool
-        The values are directions (V_source, 3), such as normals: they are turned as the surface turns from source to
-        target, and have unit length.
+    ``values`` are (V_source,) or (V_source, D); those that are not finite take no part. ``directions``: they are
+    directions (V_source, 3), such as normals, and are turned as the surface turns from source to target, to unit length.
 
     `MeshmatchError`: not a row for each vertex; or as `find_maps`.
     """
@@ -127,12 +119,8 @@ def transfer_colors(
     """Vertex colours of the source on the target's vertices, mixed as light: ``data`` is (V_target, 4), red, green, blue
     (sRGB) and alpha in 0..1.
 
-    Parameters
-    ----------
-    source, target, match, rule
-        See `find_maps` and `ConfidenceRule`.
-    colors : (V_source, 3 or 4) in 0..1 (sRGB) or Appearance, optional
-        Other colours than those of the source's file; an appearance is sampled with its textures.
+    ``colors`` (V_source, 3 or 4) in 0..1 (sRGB) are other ones than those of the source's file; an `Appearance` is
+    sampled with its textures.
 
     `MeshmatchError`: the source has no vertex colours; or as `find_maps`.
     """
@@ -166,14 +154,8 @@ def transfer_labels(
     """Labels of the source's vertices or faces on the target, voted on, never averaged: ``data.values`` is the label of
     each vertex or face.
 
-    Parameters
-    ----------
-    source, target, match, rule
-        See `find_maps` and `ConfidenceRule`.
-    labels : Labels, array (V_source,) or (F_source,) of integers or words, or path
-        As `Labels` where their number does not tell what they belong to.
-    to : {"vertices", "faces"}, optional
-        What gets labels; by default what has them on the source, and the points of a cloud.
+    ``labels`` are (V_source,) or (F_source,) integers or words, or a path; `Labels` where their number does not tell what
+    they belong to. ``to`` is what gets labels; by default what has them on the source, and the points of a cloud.
 
     `MeshmatchError`: labels that do not belong to the source, faces of a cloud; or as `find_maps`.
     """
@@ -215,13 +197,8 @@ def transfer_weights(
 ) -> Transferred[SkinWeights]:
     """Skin weights of the source's vertices on the target's: ``data.matrix`` is sparse, (V_target, J), its rows sum to 1.
 
-    Parameters
-    ----------
-    source, target, match, rule
-        See `find_maps` and `ConfidenceRule`; weights are filled in or kept, never left blank.
-    weights : SkinWeights, (V_source, J) array or sparse array, or path
-    influences : int
-        How many joints may move a vertex; the heaviest are kept.
+    ``weights`` are (V_source, J), dense, sparse or in a file. ``influences`` is how many joints may move a vertex; the
+    heaviest are kept. By the ``rule`` weights are filled in or kept, never left blank.
 
     `MeshmatchError`: weights that do not belong to the source; or as `find_maps`.
     """
@@ -253,12 +230,8 @@ def transfer_landmarks(
     """Landmarks of the source at exact points of the target's surface: ``data.points`` (N, 3) in the target's frame; also
     their vertex, or face and barycentric weights.
 
-    Parameters
-    ----------
-    source, target, match, rule
-        See `find_maps` and `ConfidenceRule`; landmarks below the minimum are counted, and kept.
-    landmarks : Landmarks, vertices (N,), positions (N, 3), or path
-        A position stands for the nearest point of the source.
+    ``landmarks`` are vertices (N,), positions (N, 3), which stand for the nearest point of the source, or a path. Those
+    below the minimum of the ``rule`` are counted, and kept.
 
     `MeshmatchError`: landmarks that are not on the source; or as `find_maps`.
     """
