@@ -1,4 +1,4 @@
-"""Baselines that need no network of their own, each behind the benchmark's `Method`; the libraries do the work.
+"""The methods of the comparison (`METHODS`), each behind the benchmark's `Method`; the libraries do the work.
 
 Those that bend one shape onto the other begin with the same rigid alignment: both shapes scaled to area 1 and centered,
 all orientations tried (`shapes.align`). A library that gives up on a pair fails that pair (`InputError`); a bug of ours
@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -20,6 +22,7 @@ from scipy.spatial import cKDTree
 from meshmatch.api.matching import Matcher
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
+from meshmatch.experiments.bench import Method, OurMethod
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.latent import LatentRefineConfig
@@ -28,6 +31,7 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.surface import Surface
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.registry import find_model
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.normalise import align, sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
@@ -162,19 +166,11 @@ def viscoelastic(floating: Mesh, target: Mesh) -> Float[Floats, "V 3"]:
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """A thinned mesh of pyFM (V_thin vertices, area 1) with its eigenfunctions.
-
-    Parameters
-    ----------
-    at
-        The eigenfunctions at the original's vertices.
-    original
-        The original vertex nearest to each of the thinned mesh.
-    """
+    """A thinned mesh of pyFM (V_thin vertices, area 1) with its eigenfunctions."""
 
     mesh: Any
-    at: Float[Floats, "V k"]
-    original: Int[Ints, " V_thin"]
+    at: Float[Floats, "V k"]  # the eigenfunctions at the original's vertices
+    original: Int[Ints, " V_thin"]  # the original vertex nearest to each of the thinned mesh
 
 
 @dataclass(frozen=True)
@@ -250,3 +246,74 @@ class Coded:
     def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:
         """Through the template."""
         return Matcher(self.model).map(source_fit, target_fit, agree=False)
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """One row of the comparison."""
+
+    name: str  # of its files
+    label: str  # for people
+    method: Method | None  # None where it cannot run
+    missing: str = ""  # why it cannot run
+    minutes: float | None = None  # how long it was trained; None for a method that learns nothing
+    model: str = ""  # tells its weights from others
+
+
+@dataclass(frozen=True)
+class Choices:
+    """The words of the command that methods ask for."""
+
+    model: str = "human"
+    coded: str | None = None
+    coded_steps: int = 2000
+    transmatch: Path | None = None
+    seed: int = 0
+    threads: int = 1
+
+
+def _plain(name: str, label: str, method: Method, package: str = "") -> list[Baseline]:
+    """The row of a method that learns nothing; where its package is not installed it cannot run."""
+    if not package or find_spec(package) is not None:
+        return [Baseline(name, label, method)]
+    return [Baseline(name, label, None, f"{package} is not installed: pip install 'meshmatch[bench]'")]
+
+
+def _coded(choices: Choices) -> list[Baseline]:
+    if choices.coded is None:
+        return [Baseline("coded", "3D-CODED", None, _NOT_GIVEN.format("coded"))]
+    card, method = find_model(choices.coded)[1], Coded(choices.coded, choices.coded_steps, choices.seed)
+    return [Baseline("coded", "3D-CODED", method, "", card.training_minutes, card.weights_sha256)]
+
+
+def _transmatch(choices: Choices) -> list[Baseline]:
+    if choices.transmatch is None:
+        return [Baseline("transmatch", "TransMatch", None, _NOT_GIVEN.format("transmatch"))]
+    from meshmatch.experiments.learned_baselines import TransMatch, load_transmatch
+
+    words = load_transmatch(choices.transmatch).words
+    method, minutes = TransMatch(str(choices.transmatch), seed=choices.seed), float(words.get("minutes", 0.0))
+    return [Baseline("transmatch", "TransMatch", method, "", minutes, f"{words.get('date')} step {words.get('steps')}")]
+
+
+def _ours(choices: Choices) -> list[Baseline]:
+    card = find_model(choices.model)[1]
+    nodes = OurMethod(choices.model, "nodes", choices.seed, threads=choices.threads)
+    none = replace(nodes, refine="none")
+    rows = ("ours-none", "ours, unrefined", none), ("ours", "ours, refined", nodes)
+    return [Baseline(*row, "", card.training_minutes, card.weights_sha256) for row in rows]
+
+
+_NOT_GIVEN = "give --{0} MODEL, made by python -m meshmatch.experiments.learned_baselines {0}"
+METHODS: dict[str, Callable[[Choices], list[Baseline]]] = {
+    "rigid": lambda choices: _plain("rigid", "rigid, nearest", Registration("rigid", None, choices.seed)),
+    "zoomout": lambda choices: _plain("zoomout", "ZoomOut (pyfmaps)", ZoomOut(), "pyFM"),
+    "nricp": lambda choices: _plain("nricp", "nricp (trimesh)", Registration("nricp", 5000, choices.seed), "trimesh"),
+    "meshmonk": lambda choices: _plain(
+        "meshmonk", "meshmonk", Registration("meshmonk", 20_000, choices.seed), "meshmonk"
+    ),
+    "coded": _coded,
+    "transmatch": _transmatch,
+    "ours": _ours,
+}
+"""The rows of each method that can be asked for. `ModelError` or `TemplateError` for a model that cannot be read."""

@@ -23,119 +23,25 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
 from typer import Option
 
 from meshmatch.experiments import runner
-from meshmatch.experiments.baseline_methods import Coded, Registration, ZoomOut
-from meshmatch.experiments.bench import INCOMPLETE, Method, OurMethod, run_set
+from meshmatch.experiments.baseline_methods import METHODS, Baseline, Choices
+from meshmatch.experiments.bench import INCOMPLETE, run_set
 from meshmatch.experiments.charts import Bar, draw_bars
 from meshmatch.experiments.sets import ALL_SETS, SET_NAMES, BenchSet, load_set
-from meshmatch.fitting.fit_config import Refine
 from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.geodesics import GEODESIC
-from meshmatch.models.registry import find_model
 from meshmatch.outputs import make_folder
 
-NAMES = ("rigid", "zoomout", "nricp", "meshmonk", "coded", "transmatch", "ours")
 COLUMNS = {
     **{"set": "set", "method": "label", "pairs": "measured:>", "failed": "failures", "mean": "mean_cm:.2f"},
     **{"median": "median_cm:.2f", f"over {LOST_CM:g}": "share_over_15cm:.1%", "flips": "flips:.0%"},
     **{"fit s": "fit_seconds_mean:.2f", "pair s": "map_seconds_mean:.2f", "trained, min": "minutes:g"},
 }
-
-
-@dataclass(frozen=True)
-class Baseline:
-    """One row of the comparison.
-
-    Parameters
-    ----------
-    name : str
-        Of its files.
-    label : str
-        For people.
-    method : Method, optional
-        None where it cannot run.
-    missing : str
-        Why it cannot run.
-    minutes : float, optional
-        How long it was trained; None for a method that learns nothing.
-    model : str
-        What tells its weights from others.
-    """
-
-    name: str
-    label: str
-    method: Method | None
-    missing: str = ""
-    minutes: float | None = None
-    model: str = ""
-
-
-def plain_baselines(seed: int) -> list[Baseline]:
-    """The methods that learn nothing; those whose package is not installed cannot run."""
-    packages = {"zoomout": "pyFM", "nricp": "trimesh", "meshmonk": "meshmonk"}
-    found: list[tuple[str, str, Method]] = [
-        ("rigid", "rigid, nearest", Registration("rigid", None, seed)),
-        ("zoomout", "ZoomOut (pyfmaps)", ZoomOut()),
-        ("nricp", "nricp (trimesh)", Registration("nricp", 5000, seed)),
-        ("meshmonk", "meshmonk", Registration("meshmonk", 20_000, seed)),
-    ]
-    rows = []
-    for name, label, method in found:
-        package = packages.get(name)
-        if package is None or find_spec(package) is not None:
-            rows.append(Baseline(name, label, method))
-        else:
-            missing = f"{package} is not installed: pip install 'meshmatch[bench]'"
-            rows.append(Baseline(name, label, None, missing))
-    return rows
-
-
-def learned_baselines(coded: str | None, coded_steps: int, transmatch: Path | None, seed: int) -> list[Baseline]:
-    """The methods that were trained; those whose model is not given cannot run.
-
-    Raises
-    ------
-    ModelError, TemplateError
-        A model that was given cannot be read.
-    """
-    from meshmatch.experiments.learned_baselines import TransMatch, load_transmatch
-
-    how = "give --{0} MODEL, made by python -m meshmatch.experiments.learned_baselines {0}"
-    rows = [
-        Baseline("coded", "3D-CODED", None, how.format("coded")),
-        Baseline("transmatch", "TransMatch", None, how.format("transmatch")),
-    ]
-    if coded is not None:
-        card = find_model(coded)[1]
-        method = Coded(coded, coded_steps, seed)
-        rows[0] = Baseline("coded", "3D-CODED", method, "", card.training_minutes, card.weights_sha256)
-    if transmatch is not None:
-        words = load_transmatch(transmatch).words
-        model = f"{words.get('date')} step {words.get('steps')}"
-        minutes = float(words.get("minutes", 0.0))
-        rows[1] = Baseline("transmatch", "TransMatch", TransMatch(str(transmatch), seed=seed), "", minutes, model)
-    return rows
-
-
-def our_baselines(model: str, seed: int, threads: int) -> list[Baseline]:
-    """This project's rows."""
-    card = find_model(model)[1]
-    rows: tuple[tuple[str, str, Refine], ...] = (
-        ("ours-none", "ours, unrefined", "none"),
-        ("ours", "ours, refined", "nodes"),
-    )
-    minutes, digest = card.training_minutes, card.weights_sha256
-    return [
-        Baseline(name, label, OurMethod(model, refine, seed, threads=threads), "", minutes, digest)
-        for name, label, refine in rows
-    ]
 
 
 def measured(
@@ -189,7 +95,7 @@ def draw_results(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 def main(
     data: runner.Data = runner.DATA,
     sets: Annotated[str, Option(help=f"of {', '.join(ALL_SETS)}")] = ",".join(SET_NAMES),
-    methods: Annotated[str, Option(help=f"of {', '.join(NAMES)}")] = ",".join(NAMES),
+    methods: Annotated[str, Option(help=f"of {', '.join(METHODS)}")] = ",".join(METHODS),
     limit_pairs: runner.LimitPairs = None,
     minutes: Annotated[float, Option(help="start nothing new after so long")] = 1e6,
     output: Annotated[Path, Option(help="folder of the results")] = Path("out/baselines"),
@@ -205,15 +111,12 @@ def main(
 ) -> runner.Report:
     until = time.monotonic() + 60 * minutes
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
-    asked = runner.names_of(methods, NAMES, "method")
-    known = plain_baselines(seed)
-    if {"coded", "transmatch"} & set(asked):
-        known += learned_baselines(coded, coded_steps, transmatch, seed)
-    known += our_baselines(model, seed, threads) if "ours" in asked else []
+    choices = Choices(model, coded, coded_steps, transmatch, seed, threads)
+    known = [row for name in runner.names_of(methods, METHODS, "method") for row in METHODS[name](choices)]
     make_folder(output)
     rows, skipped = [], {}
     for bench in benches:
-        for row in (row for name in asked for row in known if row.name.removesuffix("-none") == name):
+        for row in known:
             found = None
             if row.method is not None:
                 runner.tell(f"{row.label} on {bench.name}")

@@ -11,9 +11,19 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import InputError, ModelError
-from meshmatch.experiments import baselines, learned_baselines
-from meshmatch.experiments.baseline_methods import Coded, Registration, ZoomOut, carried, library, placed
-from meshmatch.experiments.baselines import NAMES, Baseline, main
+from meshmatch.experiments import baseline_methods, learned_baselines
+from meshmatch.experiments.baseline_methods import (
+    METHODS,
+    Baseline,
+    Choices,
+    Coded,
+    Registration,
+    ZoomOut,
+    carried,
+    library,
+    placed,
+)
+from meshmatch.experiments.baselines import main
 from meshmatch.experiments.bench import Method
 from meshmatch.experiments.learned_baselines import (
     TransConfig,
@@ -107,10 +117,12 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def words(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The command's words, with oracles for two of the methods; one of them refuses a shape."""
-    plain = [Baseline("rigid", "turned round", Oracle(turned=True)), Baseline("nricp", "n", None, "gone")]
-    monkeypatch.setattr(baselines, "plain_baselines", lambda seed: plain)
-    ours = [Baseline("ours", "ours", Oracle(refuses="2"), "", 12.5, "abc")]
-    monkeypatch.setattr(baselines, "our_baselines", lambda *_: ours)
+    for row in (
+        Baseline("rigid", "turned round", Oracle(turned=True)),
+        Baseline("nricp", "n", None, "gone"),
+        Baseline("ours", "ours", Oracle(refuses="2"), "", 12.5, "abc"),
+    ):
+        monkeypatch.setitem(METHODS, row.name, lambda _, row=row: [row])
     words = ["--data", str(small), "--cache", str(tmp_path / "cache"), "--output", str(tmp_path / "kept")]
     return [*words, "--methods", "rigid,ours"]
 
@@ -173,19 +185,21 @@ def test_what_is_not_there_is_skipped_with_a_reason(
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(baselines, "find_spec", lambda name: None)
-    rigid, *others = baselines.plain_baselines(0)
+    monkeypatch.setattr(baseline_methods, "find_spec", lambda name: None)
+    (rigid,) = METHODS["rigid"](Choices())
     assert rigid.method is not None
-    assert all(row.method is None and "pip install 'meshmatch[bench]'" in row.missing for row in others)
+    for name in ("zoomout", "nricp", "meshmonk"):
+        (row,) = METHODS[name](Choices())
+        assert row.method is None and "pip install 'meshmatch[bench]'" in row.missing
 
 
 def test_our_own_rows() -> None:
-    plain, refined = baselines.our_baselines("human", 5, 1)
+    choices = Choices(seed=5, coded="human", coded_steps=7)
+    plain, refined = METHODS["ours"](choices)
     assert (plain.method.refine, refined.method.refine, refined.method.seed) == ("none", "nodes", 5)  # type: ignore[union-attr]
     assert refined.minutes and refined.minutes > 0
-    coded, transmatch = baselines.learned_baselines("human", 7, None, 0)
-    assert coded.method == Coded("human", 7, 0) and transmatch.method is None
-    assert {plain.name.removesuffix("-none"), coded.name, transmatch.name} < set(NAMES)
+    assert [row.method for row in METHODS["coded"](choices)] == [Coded("human", 7, 5)]
+    assert [row.method for row in METHODS["transmatch"](choices)] == [None]
 
 
 @pytest.mark.parametrize(
