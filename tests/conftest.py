@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: many small products, in several processes
 
@@ -34,8 +35,11 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def remembering(folder: Path) -> Iterator[None]:
-    """Fit no shape with the same model and choices twice: `folder` keeps the fits, for other tests and processes."""
+def remembering(folder: Path) -> Iterator[Callable[..., Any]]:
+    """Fit no shape with the same model and choices twice: `folder` keeps the fits, for other tests and processes.
+
+    Gives the method that fits without remembering.
+    """
     from meshmatch.fitting.fitter import Fitter
 
     fit = Fitter.fit
@@ -51,14 +55,14 @@ def remembering(folder: Path) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Fitter, "fit", remembered)
-        yield
+        yield fit
 
 
-@pytest.fixture
-def remembered_fits(run_folder: Path) -> Iterator[None]:
-    """For tests of what comes after a fit."""
-    with remembering(run_folder):
-        yield
+@pytest.fixture(scope="module")
+def remembered_fits(run_folder: Path) -> Iterator[Callable[..., Any]]:
+    """For modules whose tests ask what comes after a fit, or about fits that others ask about too."""
+    with remembering(run_folder) as fit:
+        yield fit
 
 
 @pytest.fixture(scope="session")

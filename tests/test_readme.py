@@ -125,7 +125,7 @@ def test_python_on_a_page_compiles_and_names_what_exists(page: Path) -> None:
                 assert {alias.name for alias in node.names} <= set(dir(module))
 
 
-def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, remembered_fits: None) -> None:
+def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, remembered_fits: Any) -> None:
     (tmp_path / "templates").symlink_to(ROOT / "templates")
     monkeypatch.chdir(tmp_path)
     found: dict[str, Any] = {}

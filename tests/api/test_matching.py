@@ -17,6 +17,7 @@ from meshmatch.fitting.fitter import Fitter
 from meshmatch.shapes.shape import Shape
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
+pytestmark = pytest.mark.usefixtures("remembered_fits")
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def matcher() -> Matcher:
 
 
 @pytest.fixture(scope="module")
-def result(matcher: Matcher) -> MatchResult:
+def result(matcher: Matcher, remembered_fits: Any) -> MatchResult:
     return matcher.match(SAMPLES / "climber.ply", SAMPLES / "dancer.ply")
 
 

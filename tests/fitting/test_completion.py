@@ -1,6 +1,6 @@
 """Parts completed by the template: what counts as visible, what stands in, and a body that was cut."""
 
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -8,7 +8,6 @@ from scipy.spatial import cKDTree
 
 from meshmatch.api.inputs import as_model
 from meshmatch.experiments.partial import part_of
-from meshmatch.experiments.sets import load_set
 from meshmatch.fitting.completion import area_share, completed, visible_vertices
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import Candidate
@@ -16,7 +15,9 @@ from meshmatch.fitting.part import PartCandidate
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
 from tests.fitting.eggs import egg_model, scan_of
 
 
@@ -148,9 +149,8 @@ def test_a_candidate_knows_its_size_and_what_it_costs() -> None:
     assert PartCandidate(0.25, fit).cost > PartCandidate(0.5, fit).cost > fit.residual
 
 
-def test_half_of_a_body_is_read_as_what_it_is(bench: Path) -> None:
-    known = load_set("scape", bench)
-    body = known.shape(known.shapes[0])
+def test_half_of_a_body_is_read_as_what_it_is(remembered_fits: Callable) -> None:
+    body = load_shape(bundled_folder() / "samples" / "dancer.ply")
     half, used = part_of(body, "cut", 0)
     model = as_model("human")
     whole, part = Fitter(model).fit(body), Fitter(model).fit(half)

@@ -1,5 +1,7 @@
 """Strays among the points of a cloud, normals whose side nobody knows, and clouds that are none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -134,15 +136,13 @@ def test_a_cloud_is_tried_as_a_part_only_where_it_leaves_the_template_bare(
 def test_a_tenth_of_strays_changes_little_and_nine_tenths_are_told() -> None:
     points = body(1000)
     with_strays = np.concatenate([points[:900], around(points, 100)])
-    clean = register(Shape(points, NO_FACES))
-    rough = register(Shape(with_strays, NO_FACES))
+    clean, rough = (register(Shape(cloud, NO_FACES), config=FEW) for cloud in (points, with_strays))
     assert rough.verdict != "poor" and not rough.partial
     apart = np.linalg.norm(rough.points_in_file - clean.points_in_file, axis=1)
     assert apart.mean() < 4  # centimetres
     assert len(rough.vertex_distance) == validated(Shape(with_strays, NO_FACES)).shape.V > 950
-    lost = register(
-        Shape(np.concatenate([points[:100], around(points, 900)]), NO_FACES), config=FitConfig(partial="no")
-    )
+    nowhere = Shape(np.concatenate([points[:100], around(points, 900)]), NO_FACES)
+    lost = register(nowhere, config=replace(FEW, partial="no"))
     assert lost.verdict == "poor" and lost.reasons
 
 
@@ -166,6 +166,6 @@ def test_what_is_no_cloud_is_refused_in_one_line(points: np.ndarray, message: st
 def test_a_point_at_the_end_of_the_world_is_a_stray() -> None:
     points = body(600)
     far = np.concatenate([points, [[1e30, 0.0, 0.0], [0.0, -1e15, 0.0]]])
-    here, there = (register(Shape(cloud, NO_FACES), config=FitConfig(refine="none")) for cloud in (points, far))
+    here, there = (register(Shape(cloud, NO_FACES), config=replace(FEW, refine="none")) for cloud in (points, far))
     assert there.verdict == here.verdict != "poor"
     assert np.linalg.norm(here.points_in_file - there.points_in_file, axis=1).mean() < 4  # centimetres

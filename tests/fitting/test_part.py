@@ -1,5 +1,6 @@
 """Parts of shapes: when one is tried, what it costs, and one side of a real body."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -30,7 +31,9 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from tests.fitting.eggs import egg_model
 
+pytestmark = pytest.mark.usefixtures("remembered_fits")
 MATCHER = Matcher("human")
+FEW = FitConfig(copies=16, variants=2, finalists=1, careful=1)
 SQUARE = Shape(np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
@@ -79,7 +82,7 @@ def dancer() -> Shape:
 
 
 @pytest.fixture(scope="module")
-def whole(dancer: Shape) -> Fit:
+def whole(dancer: Shape, remembered_fits: Callable) -> Fit:
     """The fit of all of the dancer."""
     return MATCHER.fit(dancer)
 
@@ -87,14 +90,14 @@ def whole(dancer: Shape) -> Fit:
 @pytest.mark.slow
 def test_one_side_of_a_body_is_found_to_be_a_part_and_matches_the_whole(dancer: Shape, whole: Fit) -> None:
     side, used = side_of(dancer, np.array([0.3, 0.1, 1.0]))
-    found_part = MATCHER.fit(side)
+    found_part = MATCHER.fit(side, FEW)
     assert (whole.partial, found_part.partial) == (False, True)
     assert found_part.verdict != "good"
     assert "part" in {reason.code for reason in found_part.reasons}
     found = MATCHER.map(found_part, whole).index
     apart = np.linalg.norm(dancer.verts[found] - dancer.verts[used], axis=1)  # centimetres
     assert apart.mean() < 5
-    never = MATCHER.fit(side, FitConfig(partial="no"))
+    never = MATCHER.fit(side, replace(FEW, partial="no"))
     assert not never.partial
     alone = MATCHER.map(never, whole, agree=False).index
     assert apart.mean() < np.linalg.norm(dancer.verts[alone] - dancer.verts[used], axis=1).mean()
@@ -103,7 +106,7 @@ def test_one_side_of_a_body_is_found_to_be_a_part_and_matches_the_whole(dancer: 
 @pytest.mark.slow
 def test_a_whole_stays_a_whole_where_parts_are_tried() -> None:
     climber = load_shape(bundled_folder() / "samples" / "climber.ply")
-    assert not MATCHER.fit(climber, FitConfig(partial="yes")).partial
+    assert not MATCHER.fit(climber, replace(FEW, partial="yes")).partial
 
 
 @pytest.mark.parametrize("wide_is_better", [True, False])
