@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from meshmatch.errors import needs
+from meshmatch.shapes.files import save_shape
+from tests.fitting.eggs import egg_model, write_model
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "templates" / "samples" / "climber.ply"
@@ -30,7 +32,8 @@ def run(code: str) -> subprocess.CompletedProcess[str]:
 def test_a_shape_is_matched_without_torch() -> None:
     done = run(
         "import meshmatch\n"
-        f"found = meshmatch.match({str(SAMPLE)!r}, {str(SAMPLE)!r})\n"
+        "few = meshmatch.FitConfig(variants=4, finalists=2)\n"
+        f"found = meshmatch.match({str(SAMPLE)!r}, {str(SAMPLE)!r}, config=few)\n"
         "print(found.map.verdict, found.map.confidence.mean() > 0.8)"
     )
     assert (done.stdout.strip(), done.stderr) == ("good True", "")
@@ -40,11 +43,14 @@ def test_a_shape_is_matched_without_torch() -> None:
     "words",
     [
         ["train", "-o", "model", "--shapes", "nowhere"],
-        ["register", str(SAMPLE), "-o", "fitted.ply", "--refine", "latent"],
+        ["register", "egg.ply", "-o", "fitted.ply", "--refine", "latent", "--model", "./model"],
     ],
     ids=lambda words: words[0],
 )
 def test_what_needs_torch_says_so_in_a_line(words: list[str], tmp_path: Path) -> None:
+    egg = egg_model()
+    write_model(egg, tmp_path / "model")
+    save_shape(tmp_path / "egg.ply", egg.template.shape)
     done = run(f"import os\nos.chdir({str(tmp_path)!r})\nfrom meshmatch.cli import main\nsys.exit(main({words!r}))")
     assert done.returncode == 1
     assert done.stderr.splitlines()[-2:] == [

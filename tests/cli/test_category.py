@@ -145,7 +145,10 @@ def test_known_points_and_preset_reach_the_training(
         (["prepare", "eggs/egg0.ply", "-o", "out", "--landmarks", ".x"], "landmarks goes with a folder"),
         (["prepare", "eggs", "-o", "out", "--landmarks", ".nothing"], "has landmarks"),
         (["prepare", "eggs", "-o", "out", "--template", "egg9"], "egg9"),
-        (["prepare", "eggs", "-o", "out", "--template", "needle.ply", *FEW], "nothing like the template"),
+        (
+            ["prepare", "eggs", "-o", "out", "--template", "needle.ply", "--align", "none", *FEW],
+            "nothing like the template",
+        ),
         (["prepare", "eggs", "-o", "out", "--template", "bad/three.npy"], "three.npy cannot be a template"),
         (["prepare", "eggs", "-o", "out", "--template", "bad/same.npy"], "it has points in only 1 place"),
         (["prepare", "eggs", "-o", "out", "--template", "bad/line.npy"], "on no surface"),

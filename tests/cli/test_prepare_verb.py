@@ -78,6 +78,7 @@ def test_one_shape_becomes_a_template(
 
 def test_the_nodes_are_drawn(run: Run, two: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
+    monkeypatch.setattr("meshmatch.render.layout.HEIGHT", 240)
     made(run("prepare", two[0], "-o", tmp_path / "out", *FEW, "--json"))
     with Image.open(tmp_path / "out" / "nodes.png") as drawn:
         assert min(drawn.size) > 100
@@ -121,7 +122,7 @@ def test_shapes_that_are_not_registered_are_prepared_all_the_same(
 ) -> None:
     save_shape(folder / "other.ply", torus)
     (folder / "broken.ply").write_bytes(b"ply\n")
-    answer = run("prepare", folder, "-o", tmp_path / "out", *FEW, "--json")
+    answer = run("prepare", folder, "-o", tmp_path / "out", *FEW, "--align", "none", "--json")
     record = made(answer)
     assert record["registered"] == 0
     assert any("broken.ply" in note for note in record["notes"])  # type: ignore[attr-defined]
@@ -153,7 +154,7 @@ def test_options_of_the_nodes_reach_them(run: Run, two: tuple[Path, Path], tmp_p
     ("words", "told"),
     [
         (["nothing.ply"], "nothing.ply"),
-        (["a.ply", "--radius", "0.01"], "vert"),
+        (["a.ply", "--radius", "0.01", "--nodes", "60", "--strategy", "uniform"], "vert"),
         (["a.ply", "--template", "b.ply"], "folder"),
         (["empty"], "no shapes"),
     ],

@@ -23,7 +23,7 @@ PAIR = {
     "transfer-labels": ("out.txt", "--labels", "labels.txt"),
     "transfer-weights": ("out.npz", "--weights", "weights.json"),
     "transfer-landmarks": ("out.csv", "--landmarks", "points.txt"),
-    "transfer-texture": ("out.glb", "--size", "64"),
+    "transfer-texture": ("out.glb", "--size", "32", "--samples", "1"),
 }
 """Verbs of two shapes: the output, and what else each needs."""
 SHARED: list[tuple[tuple[str, ...], dict[str, Any], dict[str, Any]]] = [

@@ -206,7 +206,7 @@ def test_few_points_one_point_and_strays_are_left_out_or_told(pears: Path, tmp_p
     np.save(pears / "same.npy", np.ones((500, 3)))
     fog = np.concatenate([pear(3).verts[:64], rng.uniform(-9, 9, (576, 3))])  # 90 % of it are strays
     np.save(pears / "fog.npy", fog)
-    made = prepared(pears, tmp_path / "out", FEW)
+    made = prepared(pears, tmp_path / "out", FEW, template="pear2", align="near")
     notes = "\n".join(made.notes)
     assert "three.npy left out: it has points in only 3 places" in notes
     assert "same.npy left out" in notes
