@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from meshmatch.cli import main as meshmatch
 from meshmatch.experiments import ablation_setting
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
+from meshmatch.templates.prepare import PrepareConfig, prepare
 from tests.conftest import icosphere
 from tests.training.small import NETWORK, bent_eggs
 
@@ -31,8 +31,7 @@ def prepare_eggs(root: Path) -> Path:
     for seed in range(6):
         verts = drawn(1, torch.Generator().manual_seed(seed))[0].double().numpy()
         save_shape(root / "eggs" / f"egg{seed}.ply", Shape(verts, ball.faces, "egg"))
-    nodes = ["--nodes", "36", "--radius", "0.5", "--strategy", "uniform", "-q"]
-    assert meshmatch(["prepare", str(root / "eggs"), "-o", str(root / "prepared"), *nodes]) == 0
+    prepare(root / "eggs", root / "prepared", PrepareConfig(NodeConfig("uniform", 36, 0.5)))
     return root / "prepared"
 
 

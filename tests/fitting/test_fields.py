@@ -26,6 +26,8 @@ from meshmatch.models.config import NetworkConfig
 from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.templates.make import NodeConfig
+from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.training import recipes
 from meshmatch.training.loop import TrainConfig, Trainer
 from meshmatch.training.losses import CorrespondenceLoss, held_out_error
@@ -185,17 +187,28 @@ def test_a_field_that_does_not_exist_is_refused() -> None:
     assert NetworkConfig.from_dict({}).field == "mls"  # cards of before
 
 
+@pytest.fixture(scope="module")
+def eggs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of three registered eggs, prepared in "prepared" beside it."""
+    egg, folder = egg_model(), tmp_path_factory.mktemp("fields") / "eggs"
+    folder.mkdir()
+    for seed in range(3):
+        save_shape(folder / f"egg{seed}.ply", bent_egg(egg, seed))
+    prepare(folder, folder.with_name("prepared"), PrepareConfig(NodeConfig("uniform", 36, 0.5)))
+    return folder
+
+
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("way", ["registered", "clouds"])
 def test_train_save_load_and_register(
-    field: str, way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    field: str,
+    way: str,
+    eggs: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    egg, eggs, prepared = egg_model(), tmp_path / "eggs", tmp_path / "prepared"
-    eggs.mkdir()
-    for seed in range(3):
-        save_shape(eggs / f"egg{seed}.ply", bent_egg(egg, seed))
-    nodes = ["--nodes", "36", "--radius", "0.5", "--strategy", "uniform"]
-    assert main(["prepare", str(eggs), "-o", str(prepared), *nodes, "-q"]) == 0
+    prepared = eggs.with_name("prepared")
 
     def small(plain: recipes.Recipe) -> recipes.Recipe:
         train = replace(plain.train, shapes=2, scans_per_shape=1, warm_up=1, workers=0)

@@ -16,6 +16,8 @@ from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import NodeConfig
+from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.training import recipes
 from tests.training.small import POINTS, egg_template
 
@@ -42,8 +44,7 @@ def eggs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def model(eggs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The preset as it is, but for a narrow network, few points, small batches and a rate that suits 60 steps."""
     root = tmp_path_factory.mktemp("paper")
-    nodes = ["--nodes", "36", "--radius", "0.45", "--strategy", "uniform"]
-    assert main(["prepare", str(eggs), "-o", str(root / "prepared"), *nodes, "-q"]) == 0
+    prepare(eggs, root / "prepared", PrepareConfig(NodeConfig("uniform", 36, 0.45)))
     plain = recipes.paper
 
     def narrow() -> recipes.Recipe:
