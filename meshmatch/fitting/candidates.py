@@ -136,7 +136,7 @@ class CandidateScorer:
         home = self._system.verts[surface.tree.query(local.features)[1]]
         start, end = self._from, self._to
         length = np.linalg.norm(local.points[start] - local.points[end], axis=1)
-        apart = is_discontinuous(home[start], home[end], length)
+        apart = is_discontinuous(np.linalg.norm(home[start] - home[end], axis=1), length)
         weights = None if local.weights is None else local.weights[start] * local.weights[end]
         return float(weighted_mean(apart, weights))
 

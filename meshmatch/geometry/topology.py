@@ -12,6 +12,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 # Neighbours are discontinuous if their images are further apart than this (sqrt(area)) plus so many times their own
 # distance. Set by hand.
 _GAP, _STRETCH = 0.06, 3.0
+_CHUNK = 65_536  # edges at a time
 _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 
 
@@ -140,12 +141,19 @@ def _hash(rows: Floats | Ints) -> NDArray[np.uint64]:
     return total
 
 
-def is_discontinuous(
-    here: Float[Floats, "N 3"], there: Float[Floats, "N 3"], length: Float[Floats, " N"]
-) -> Bool[Bools, " N"]:
-    """Whether images of neighbours lie much further apart than the neighbours do, as at a tear of the map.
+def edge_lengths(points: Float[Floats, "V 3"], edges: Int[Ints, "E 2"]) -> Float[Floats, " E"]:
+    """Distance of the two ends of each edge, by parts: millions of edges cost no more memory than their lengths."""
+    length = np.empty(len(edges))
+    for low in range(0, len(edges), _CHUNK):
+        part = slice(low, low + _CHUNK)
+        apart = points[edges[part, 0]] - points[edges[part, 1]]
+        length[part] = np.sqrt(np.einsum("ni,ni->n", apart, apart))
+    return length
 
-    ``length`` is the distance of the neighbours; all are in units of sqrt(area).
+
+def is_discontinuous(apart: Float[Floats, " N"], length: Float[Floats, " N"]) -> Bool[Bools, " N"]:
+    """Whether images of neighbours lie much further ``apart`` than the neighbours do, as at a tear of the map.
+
+    ``length`` is the distance of the neighbours; both are in units of sqrt(area).
     """
-    apart = here - there
-    return np.asarray(np.einsum("ni,ni->n", apart, apart) >= np.square(_GAP + _STRETCH * length))
+    return np.asarray(apart >= _GAP + _STRETCH * length)

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.fitting.fit import Fit
-from meshmatch.geometry.topology import is_discontinuous
+from meshmatch.geometry.topology import edge_lengths, is_discontinuous
 from meshmatch.geometry.triangles import interpolate, vertex_normals
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.shapes.repair import Repaired
@@ -102,7 +102,7 @@ def reassign_islands(
     `found`; `images` are the points themselves, in units of their own surface's sqrt(area), and `search` gives
     footpoints of some vertices near such points. Returns the footpoints and their images.
     """
-    length = np.linalg.norm(verts[edges[:, 0]] - verts[edges[:, 1]], axis=1)
+    length = edge_lengths(verts, edges)
     image = images(found)
     for _ in range(rounds):
         island = small_islands(edges, length, image, areas)
@@ -125,7 +125,7 @@ def small_islands(
     Lengths are in units of sqrt(area); ``areas`` are those around the vertices.
     """
     V = len(image)
-    continuous = ~is_discontinuous(image[edges[:, 0]], image[edges[:, 1]], length)
+    continuous = ~is_discontinuous(edge_lengths(image, edges), length)
     if continuous.all():
         return np.zeros(V, bool)
     kept = edges[continuous]
@@ -138,10 +138,10 @@ def surrounding_values(
     edges: Int[Ints, "E 2"], values: Float[Floats, "V D"], unknown: Bool[Bools, " V"]
 ) -> Float[Floats, "V D"]:
     """Values with the unknown rows replaced by the average of their surroundings; NaN out of reach."""
-    V = len(values)
+    V, rows = len(values), np.flatnonzero(unknown)
+    edges = edges[unknown[edges].any(axis=1)]
     graph = csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (V, V))
     graph = (graph + graph.T).tocsr()
-    rows = np.flatnonzero(unknown)
     part = graph[rows]
     filled = np.where(unknown[:, None], 0.0, values)
     known = (~unknown).astype(float)

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import NORMAL_WEIGHT, OrientedPoints, with_normals
-from meshmatch.geometry.topology import is_discontinuous
+from meshmatch.geometry.topology import edge_lengths, is_discontinuous
 
 
 def ball(signed: bool = True) -> OrientedPoints:
@@ -51,5 +51,7 @@ def test_unsigned_normals_face_as_their_surroundings_do() -> None:
 
 
 def test_images_far_apart_of_near_neighbours_are_discontinuous() -> None:
-    here, there = np.zeros((3, 3)), np.array([[0.08, 0, 0], [0.1, 0, 0], [0.1, 0, 0]])
-    assert is_discontinuous(here, there, np.array([0.01, 0.01, 0.02])).tolist() == [False, True, False]
+    images = np.array([[0, 0, 0], [0.08, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    apart = edge_lengths(images, np.array([[0, 1], [0, 2], [3, 0]]))
+    assert np.allclose(apart, [0.08, 0.1, 0.1])
+    assert is_discontinuous(apart, np.array([0.01, 0.01, 0.02])).tolist() == [False, True, False]

@@ -100,7 +100,7 @@ def test_a_label_has_one_colour_whoever_else_is_there() -> None:
 def test_the_legend_of_labels_names_those_that_occur() -> None:
     swatches = label_swatches([4, 1, 1, -1], ["a", "arm", "c", "d"])
     assert swatches.names == ("arm", "4", "none")
-    assert swatches.colors[0] == tuple(label_colors([1])[0])
+    assert swatches.colors[0] == pytest.approx(label_colors([1])[0])
     assert swatches.colors[2] == UNKNOWN
     many = label_swatches(np.arange(100), most=10)
     assert len(many.names) == 10
