@@ -9,26 +9,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool as Bool
+from jaxtyping import Float as Float
+from jaxtyping import Int as Int
+from jaxtyping import UInt8 as UInt8
 from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.errors import InputError
-
-__all__ = [
-    "Bool",
-    "Bools",
-    "Float",
-    "Floats",
-    "Floats32",
-    "Int",
-    "Ints",
-    "Ints32",
-    "UInt8",
-    "UInts8",
-    "as_numbers",
-    "frozen",
-    "read_only",
-]
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -41,15 +28,11 @@ Bools = NDArray[np.bool_]
 def read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
     """The values as a contiguous, read-only array of their own; an array that is all of this already is shared.
 
-    Raises
-    ------
-    InputError
-        The values are not numbers, or rows differ in length; ``label`` says whose they are.
+    `InputError` if the values are not numbers, or rows differ in length; ``label`` says whose they are.
     """
-    if isinstance(values, np.ndarray) and values.dtype == dtype and values.base is None:
-        shareable = values.flags.c_contiguous and not values.flags.writeable
-        if shareable:
-            return values
+    own = isinstance(values, np.ndarray) and values.dtype == dtype and values.base is None
+    if own and values.flags.c_contiguous and not values.flags.writeable:
+        return values
     try:
         array: NDArray[Any] = np.array(values, dtype=dtype, order="C")
     except (TypeError, ValueError) as error:

@@ -9,19 +9,10 @@ from contextlib import contextmanager
 
 
 class MeshmatchError(Exception):
-    """Something that the user can put right.
-
-    Parameters
-    ----------
-    message : str
-        What is wrong, in one line.
-    hint : str
-        What to do about it, in one line; may be empty.
-    """
+    """Something that the user can put right: what is wrong, and a hint what to do (may be empty), in one line each."""
 
     def __init__(self, message: str, hint: str = "") -> None:
-        self.message = _one_line(message)
-        self.hint = _one_line(hint)
+        self.message, self.hint = (" ".join(str(text).split()) for text in (message, hint))
         super().__init__(self.message)
 
     def __reduce__(self) -> tuple[type["MeshmatchError"], tuple[str, str]]:
@@ -50,10 +41,6 @@ class OutputError(MeshmatchError):
 
 class PoorFit(MeshmatchError):
     """A fit was judged poor, and the caller asked for this to be an error."""
-
-
-def _one_line(text: str) -> str:
-    return " ".join(str(text).split())
 
 
 @contextmanager

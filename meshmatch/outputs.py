@@ -30,10 +30,7 @@ def as_path(path: str | Path) -> Path:
 def make_folder(path: Path) -> None:
     """Make a folder if it is not there; before long work, so that one that cannot be made is told at once.
 
-    Raises
-    ------
-    OutputError
-        It cannot be made, or is a file.
+    `OutputError` if it cannot be made, or is a file.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -49,11 +46,7 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
     included (and SIGTERM, which the command line turns into it), the temporary file is removed and whatever was at
     `path` before is untouched. Where `path` is a link, what it leads to is replaced, and the link stays.
 
-    Raises
-    ------
-    OutputError
-        The folder is missing or cannot be written, `path` is a folder or write-protected, or the disk refuses the
-        write.
+    `OutputError` if the folder is missing or cannot be written, `path` is a folder or write-protected, or the disk refuses.
     """
     path = Path(path)
     final = Path(os.path.realpath(path)) if path.is_symlink() else path
@@ -90,10 +83,7 @@ def folder_on_success(path: str | Path) -> Iterator[Path]:
     On any exception the temporary folder is removed with all that is in it. Nothing of the user's is ever replaced:
     `path` must be new, or an empty folder.
 
-    Raises
-    ------
-    OutputError
-        `path` is a file or holds something, its folder is missing or cannot be written, or the disk refuses.
+    `OutputError` if `path` is a file or holds something, its folder is missing or cannot be written, or the disk refuses.
     """
     path = Path(path)
     path = Path(os.path.realpath(path)) if path.is_symlink() else path

@@ -11,24 +11,12 @@ ProgressCallback = Callable[[str, str, float], None]
 
 @dataclass(frozen=True)
 class Progress:
-    """A range of one progress bar; calling it with a share (0..1) of that range reports it.
+    """A range of one progress bar; calling it with a share (0..1) of that range reports it."""
 
-    Parameters
-    ----------
-    callback : callable, optional
-        What is called; without one nothing happens.
-    name : str
-        The shape that is worked on.
-    stage_name : str
-        What is going on.
-    start, end : float
-        Where on the bar of the stage this range lies.
-    """
-
-    callback: ProgressCallback | None = None
-    name: str = ""
-    stage_name: str = ""
-    start: float = 0.0
+    callback: ProgressCallback | None = None  # without one nothing happens
+    name: str = ""  # the shape that is worked on
+    stage_name: str = ""  # what is going on
+    start: float = 0.0  # where on the bar of the stage this range lies
     end: float = 1.0
 
     def __call__(self, share: float) -> None:

@@ -22,11 +22,7 @@ def thread_limit(count: int) -> Iterator[None]:
 
     Two fits beside each other, each on one thread, are faster than each on all of them, above all where other work
     runs too. Blocks may be nested. Where they overlap in several threads, the BLAS libraries obey the first one.
-
-    Raises
-    ------
-    ValueError
-        `count` is below 1.
+    `ValueError` if `count` is below 1.
     """
     global _open_blocks, _torch_before
     _check(count)
@@ -55,11 +51,7 @@ def set_threads(count: int) -> None:
     """Use `count` threads in everything that this process computes.
 
     Libraries that are not loaded yet read the environment when they are; torch is told directly if it is loaded.
-
-    Raises
-    ------
-    ValueError
-        `count` is below 1.
+    `ValueError` if `count` is below 1.
     """
     _check(count)
     for name in _THREAD_VARIABLES:

@@ -17,9 +17,8 @@ from meshmatch.api.results import MatchResult, map_of_fits, shape_of
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_config import FitConfig, check_landmarks
-from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.landmarks import fits_with_landmarks, landmark_places
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fitter import Fitter, check_landmarks, fits_with_landmarks, landmark_places
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
@@ -79,7 +78,7 @@ class Matcher:
 
     def dense(self, fit: Fit) -> Shape:
         """The template in its full resolution on the shape of a fit, in the frame and unit of its file."""
-        from meshmatch.fitting.dense import dense_shape
+        from meshmatch.fitting.fit import dense_shape
 
         with thread_limit(1):
             return dense_shape(self.model, fit)

@@ -16,7 +16,7 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.errors import InputError, OptionError
-from meshmatch.fitting.choices import Refine
+from meshmatch.fitting.fit_config import Refine
 
 if TYPE_CHECKING:
     from meshmatch.arrays import Ints

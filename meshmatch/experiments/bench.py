@@ -26,9 +26,8 @@ from meshmatch.errors import MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.experiments.scores import SetScores, evaluate_set
 from meshmatch.experiments.sets import ALL_SETS, SET_NAMES, BenchSet, Pair, load_set
-from meshmatch.fitting.choices import ON_NODES
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_config import FitConfig, Partial, Refine
+from meshmatch.fitting.fit_config import ON_NODES, FitConfig, Partial, Refine
 from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.geodesics import GEODESIC

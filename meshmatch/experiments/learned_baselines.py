@@ -30,7 +30,7 @@ from typer import Argument, Option
 from meshmatch.arrays import Float, Floats, Int
 from meshmatch.errors import ModelError
 from meshmatch.experiments import runner
-from meshmatch.fitting.orientation import standing_grid
+from meshmatch.fitting.initial_frames import standing_grid
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.surface import Surface
 from meshmatch.maps.vertex_map import VertexMap

@@ -31,7 +31,7 @@ from meshmatch.api.matching import match, register
 from meshmatch.arrays import Float, Floats
 from meshmatch.experiments import runner
 from meshmatch.experiments.speed import cost_of, keep_to_cores, sized
-from meshmatch.fitting.dense import dense_shape
+from meshmatch.fitting.fit import dense_shape
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import make_folder

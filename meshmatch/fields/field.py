@@ -9,47 +9,14 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float
+from meshmatch.fields.pointwise import PointwiseField
 from meshmatch.fields.shape_functions import ShapeFunctions
-
-
-class PointField(Protocol):
-    """A representation on P fixed points."""
-
-    def displacement(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B P 3"]:
-        """Where the points go, relative to where they are."""
-        ...
-
-    def deformation_gradient(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B G 3 3"]:
-        """F[..., a, k] = dx'_a / dx_k on the first G points: all of them, except after `for_training`."""
-        ...
-
-    def displaced(self, rows: Float[Floats, "R 3"]) -> Float[Floats, "P 3"]:
-        """The displacement of one answer, in float64."""
-        ...
-
-    def strain(self, rows: Float[Floats, "R 3"], at: Int[Ints, " N"]) -> Float[Floats, "N 3 3"]:
-        """F of one answer at some of the points."""
-        ...
-
-    def for_training(self, strained: int | None = None) -> PointField:
-        """The same arranged for large batches; the gradient on the first ``strained`` points alone."""
-        ...
-
-    def for_descent(self) -> PointField:
-        """The same arranged for many steps with gradients of a single answer."""
-        ...
-
-    def part(self, start: int, stop: int) -> PointField:
-        """The same on the points from ``start`` to ``stop``; after `for_training`."""
-        ...
-
-    def to(self, *args, **kwargs) -> PointField: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,43 +32,35 @@ class Field:
         return cls(_tensor(functions.phi), _tensor(functions.gradient))
 
     @property
-    def P(self) -> int:
-        return int(self.phi.shape[0])
-
-    @property
     def K(self) -> int:
         return int(self.phi.shape[1])
 
     def displacement(self, rows: Float[torch.Tensor, "B K 3"]) -> Float[torch.Tensor, "B P 3"]:
-        """Displacement of the points by node vectors."""
+        """Where the points go, relative to where they are."""
         return self._apply(self.phi, rows)
 
     def deformation_gradient(self, rows: Float[torch.Tensor, "B K 3"]) -> Float[torch.Tensor, "B P 3 3"]:
-        """F = I + sum_i u_i (grad Phi_i)^T of node vectors, F[..., a, k] = dx'_a / dx_k."""
+        """F = I + sum_i u_i (grad Phi_i)^T, F[..., a, k] = dx'_a / dx_k: on all points, except after `for_training`."""
         columns = self._apply(self.gradient, rows).unflatten(1, (-1, 3))  # B P k a
         # At least float32: in bfloat16 the small difference from the identity would be lost.
         kind = torch.promote_types(rows.dtype, torch.float32)
         return columns.transpose(-1, -2) + torch.eye(3, dtype=kind, device=rows.device)
 
-    def displaced(self, rows: Float[Floats, "K 3"]) -> Float[Floats, "P 3"]:
-        return (self.phi.double() @ torch.from_numpy(np.array(rows))).numpy()
-
-    def strain(self, rows: Float[Floats, "K 3"], at: Int[Ints, " N"]) -> Float[Floats, "N 3 3"]:
-        slopes = (self.gradient.double() @ torch.from_numpy(np.array(rows))).unflatten(0, (-1, 3))
-        return slopes.transpose(1, 2).numpy()[at] + np.eye(3)
-
     def for_training(self, strained: int | None = None) -> Field:
+        """The same arranged for large batches; the gradient on the first ``strained`` points alone."""
         # Dense, for a large batch is one product: a sparse one would be slower.
         rows = None if strained is None else 3 * strained
-        return Field(_dense(self.phi), _dense(self.gradient)[:rows])
+        return Field(self.phi.to_dense(), self.gradient.to_dense()[:rows])
 
     def for_descent(self) -> Field:
+        """The same arranged for many steps with gradients of a single answer."""
         if self.phi.layout == torch.strided:
             return self
         transposes = (self.phi.t().to_sparse_csr(), self.gradient.t().to_sparse_csr())
         return _DescentField(self.phi, self.gradient, *transposes)
 
     def part(self, start: int, stop: int) -> Field:
+        """The same on the points from ``start`` to ``stop``; after `for_training`."""
         return Field(self.phi[start:stop], self.gradient[3 * start : 3 * stop])
 
     def to(self, *args, **kwargs) -> Field:
@@ -109,6 +68,10 @@ class Field:
 
     def _apply(self, matrix: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
         return apply_shape_functions(matrix, rows)
+
+
+# A representation on P fixed points; both answer the same questions, and take rows (B, R, 3).
+PointField = Field | PointwiseField
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,10 +109,6 @@ def apply_shape_functions(
     B, K, _ = vectors.shape
     flat = vectors.transpose(0, 1).reshape(K, B * 3)
     return (matrix @ flat).unflatten(1, (B, 3)).transpose(0, 1)
-
-
-def _dense(matrix: torch.Tensor) -> torch.Tensor:
-    return matrix if matrix.layout == torch.strided else matrix.to_dense()
 
 
 def _tensor(matrix: Any) -> torch.Tensor:

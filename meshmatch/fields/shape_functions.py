@@ -55,10 +55,6 @@ class ShapeFunctions:
     gradient: Any
 
     @property
-    def P(self) -> int:
-        return int(self.phi.shape[0])
-
-    @property
     def K(self) -> int:
         return int(self.phi.shape[1])
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.fitting.fit import Fit, vertex_distance
-from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.nodes import NodeRefineConfig, add_landmarks, geometric_between, nearest_rotations, pair_terms
-from meshmatch.fitting.samples import Landmarks, take_samples
+from meshmatch.fitting.fit_config import FitConfig, NodeRefineConfig, geometric_between
+from meshmatch.fitting.nodes import add_landmarks, nearest_rotations, pair_terms
 from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.task import Landmarks, take_samples
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
@@ -29,22 +29,11 @@ _MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
 
 @dataclass(frozen=True)
 class AgreeConfig:
-    """How fits are refined together. Set by hand.
-
-    Attributes
-    ----------
-    steps : int
-    strain : float
-        Weight of the common stretch.
-    scale : float
-        Of the robust weight (units of sqrt(area)).
-    point_share, back_points, shared
-        As in `NodeRefineConfig`.
-    """
+    """How fits are refined together. Set by hand; the last three as in `NodeRefineConfig`."""
 
     steps: int = 8
-    strain: float = 0.0004
-    scale: float = 0.05
+    strain: float = 0.0004  # weight of the common stretch
+    scale: float = 0.05  # of the robust weight (units of sqrt(area))
     point_share: float = 0.1
     back_points: int = 8000
     shared: float = 0.0
@@ -59,10 +48,6 @@ class AgreeConfig:
             shared=max(self.shared, roughness),
         )
 
-    def pairing(self, nodes: NodeRefineConfig) -> NodeRefineConfig:
-        """How pairs are found: as in the refinement of nodes, with this pull along the surface."""
-        return replace(nodes, point_share=self.point_share, back_points=self.back_points, shared=self.shared)
-
 
 def agreed_fits(
     model: TrainedModel,
@@ -72,19 +57,12 @@ def agreed_fits(
     landmarks: Sequence[Landmarks] | None = None,
     how: AgreeConfig | None = None,
 ) -> list[Fit]:
-    """Let the fits of several repaired shapes agree on how the template stretches.
+    """Let the fits of several repaired shapes agree on how the template stretches; by default as the card says how much.
 
-    Parameters
-    ----------
-    landmarks : optional, for each shape template vertices (N,) and positions (N, 3) in the shape's file frame
-    how : by default as stiff as the model's card says
-
-    Returns
-    -------
-    list of Fit
-        Node vectors, points and vertex distances are new; residual and verdict stay those that each fit had alone.
-        As given if one of them is poor, for it has nothing to say about the others, or if nodes are not refined
-        (a pointwise model has none).
+    ``landmarks`` are template vertices (N,) and positions (N, 3) in the shape's file frame, for each shape. Node vectors,
+    points and vertex distances of the result are new; residual and verdict stay those that each fit had alone. The fits
+    are as given if one of them is poor, for it has nothing to say about the others, or if nodes are not refined (a
+    pointwise model has none).
     """
     config = (config or FitConfig()).for_model(model)
     if any(fit.verdict == "poor" for fit in fits) or not config.moves_nodes:
@@ -118,34 +96,19 @@ def _samples(shape: Shape, fit: Fit, config: FitConfig) -> OrientedPoints:
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """One of several fits that agree.
+    """One of several fits that agree."""
 
-    Attributes
-    ----------
-    samples : OrientedPoints
-        Of the shape, in the fit's core frame.
-    vectors : (K, 3)
-        Node vectors of the fit.
-    config : AgreeConfig
-        All members take as many steps as the first.
-    landmarks : (template vertices (N,), positions (N, 3) in the core frame), optional
-    partial : bool
-        The shape shows a part only.
-    """
-
-    samples: OrientedPoints
-    vectors: Float[Floats, "K 3"]
-    config: AgreeConfig
-    landmarks: Landmarks | None = None
-    partial: bool = False
+    samples: OrientedPoints  # of the shape, in the fit's core frame
+    vectors: Float[Floats, "K 3"]  # node vectors of the fit
+    config: AgreeConfig  # all members take as many steps as the first
+    landmarks: Landmarks | None = None  # template vertices (N,), positions (N, 3) in the core frame
+    partial: bool = False  # the shape shows a part only
 
 
 def agree(system: NodeSystem, members: Sequence[Member], nodes: NodeRefineConfig) -> list[Float[Floats, "K 3"]]:
     """Refine the fits of several shapes together: better node vectors for each.
 
-    Parameters
-    ----------
-    nodes : how pairs of points are found and weighed, where a member's own configuration does not say
+    ``nodes`` says how pairs of points are found and weighed, where a member's own configuration does not.
     """
     refined = [member.vectors for member in members]
     for _ in range(members[0].config.steps):
@@ -153,7 +116,8 @@ def agree(system: NodeSystem, members: Sequence[Member], nodes: NodeRefineConfig
         common = mean_stretch(gradients)
         for number, (member, F) in enumerate(zip(members, gradients, strict=True)):
             config, vectors = member.config, refined[number]
-            pairing = config.pairing(nodes)
+            share, points = config.point_share, config.back_points
+            pairing = replace(nodes, point_share=share, back_points=points, shared=config.shared)
             terms = pair_terms(system, member.samples, vectors, config.scale, pairing, member.partial)
             if member.landmarks is not None:
                 add_landmarks(terms, member.landmarks, nodes.landmark_weight)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -13,10 +13,9 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.fields.shape_functions import ShapeFunctions
-from meshmatch.fitting.choices import WAYS, Way
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.samples import take_samples
 from meshmatch.fitting.system import node_system
+from meshmatch.fitting.task import take_samples
 from meshmatch.fitting.turning import FieldPath, Path, RotationBlend, StretchBlend, polar
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
@@ -25,6 +24,9 @@ from meshmatch.shapes.shape import Shape
 if TYPE_CHECKING:
     from meshmatch.fields.pointwise import PointwiseField
 
+Way = Literal["field", "codes"]
+"""What is blended between fits, see `Blend`."""
+WAYS: tuple[Way, ...] = get_args(Way)
 _SAMPLES = 2048  # of which a shape's code is read
 
 
@@ -53,21 +55,13 @@ class Blend:
 
     Parameters
     ----------
-    model : TrainedModel
-    fits : sequence of Fit
-        At least two, of the model's template.
-    times : (n,) increasing, optional
-        When each fit is met; evenly from 0 to 1 by default.
-    shapes : sequence of Shape, optional
-        The repaired shapes, for the way "codes" alone.
-    way : {"field", "codes"}
-        Blend what the field does (`turning`), or the codes that the network has for the shapes.
+    fits : at least two, of the model's template
+    times : (n,) increasing: when each fit is met; evenly from 0 to 1 by default
+    shapes : the repaired shapes, for the way "codes" alone
+    way : blend what the "field" does (`turning`), or the "codes" that the network has for the shapes
 
-    Raises
-    ------
-    OptionError
-        Fewer than two fits, fits of another template, times that do not increase, an unknown way, or the way
-        "field" for a model without nodes.
+    `OptionError` for fewer than two fits, fits of another template, times that do not increase, an unknown way, or the
+    way "field" for a model without nodes.
     """
 
     def __init__(
@@ -106,7 +100,9 @@ class Blend:
         self._correction = self._keys - np.stack(met)
         self._node_field: ShapeFunctions | PointwiseField | None = None
         if way == "codes" and model.has_nodes:
-            self._node_field = model.field(_beside_nodes(model))
+            # At the template vertex beside each node the field is sure to have nodes enough around it.
+            verts = model.template.shape.verts
+            self._node_field = model.field(verts[cKDTree(verts).query(model.template.nodes)[1]])
             turns = np.stack([_turns(self._node_field, vectors) for vectors in met])
             self._correction = np.einsum("nkij,nki->nkj", turns, self._correction)
         self._turns = RotationBlend([fit.frame.rotation[None] for fit in fits])
@@ -156,12 +152,6 @@ class Blend:
 def _turns(field: ShapeFunctions | PointwiseField, vectors: Float[Floats, "K 3"]) -> Float[Floats, "P 3 3"]:
     """Rotations by which a pose turns the points of a field."""
     return polar(field.strain(vectors))[0]
-
-
-def _beside_nodes(model: TrainedModel) -> Float[Floats, "K 3"]:
-    """The template vertex beside each node: there the field is sure to have nodes enough around it."""
-    verts = model.template.shape.verts
-    return verts[cKDTree(verts).query(model.template.nodes)[1]]
 
 
 def _energies(F: Float[Floats, "G 3 3"], S: Float[Floats, "... 3 3"]) -> tuple[float, float]:

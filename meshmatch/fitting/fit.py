@@ -17,6 +17,8 @@ from meshmatch.shapes.shape import Shape
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
+    from meshmatch.models.trained import TrainedModel
+
 Verdict = Literal["good", "fair", "poor"]
 ReasonCode = Literal["residual", "unreached", "part", "empty"]
 """Template and shape stay apart; some of the shape is not reached; it was taken for a part; template lies where the
@@ -43,35 +45,20 @@ class Fit:
 
     Attributes
     ----------
-    template_hash : str
-        Which template: fits of two templates cannot be joined.
-    frame : Frame
-        From the shape's file to the core frame (template's orientation, area about 1).
-    points : (V, 3)
-        Template vertices (low resolution) on the shape, core frame.
-    vectors : (K, 3)
-        Node vectors, core frame.
-    resting : (V, 3)
-        The same vertices on the resting template, template frame.
-    faces : (F, 3)
-        The template's triangles.
-    residual : float
-        Mean distance, normals included, between template and shape, both ways, in units of sqrt(area).
-    vertex_distance : (N,)
-        Distance of every vertex of the shape to the nearest template vertex, same unit.
-    verdict : {"good", "fair", "poor"}
-    reasons : tuple of Reason
-        Why the verdict is not good.
-    up, front : str
-        The axes of the file that the fit took for up and front, such as "+y" and "-z".
-    seconds : float
-    seed : int
-    partial : bool
-        The shape was taken for a part: the residual is from the shape to the template only.
-    repaired : Repaired, optional
-        The shape itself, with the way back to the vertices of its file.
-    notes : tuple of str
-        What was changed in the shape before fitting, and which choices were replaced.
+    template_hash : which template; fits of two templates cannot be joined
+    frame : from the shape's file to the core frame (template's orientation, area about 1)
+    points : (V, 3) template vertices (low resolution) on the shape, core frame
+    vectors : (K, 3) node vectors, core frame
+    resting : (V, 3) the same vertices on the resting template, template frame
+    faces : (F, 3) the template's triangles
+    residual : mean distance, normals included, between template and shape, both ways, in units of sqrt(area)
+    vertex_distance : (N,) distance of every vertex of the shape to the nearest template vertex, same unit
+    verdict, reasons : "good", "fair" or "poor", and why it is not good
+    up, front : the axes of the file that the fit took for up and front, such as "+y" and "-z"
+    seconds, seed : how long the fit took, and with which random numbers
+    partial : the shape was taken for a part; the residual is from the shape to the template only
+    repaired : the shape itself, with the way back to the vertices of its file
+    notes : what was changed in the shape before fitting, and which choices were replaced
     """
 
     template_hash: str
@@ -124,3 +111,15 @@ def axis_name(direction: Float[Floats, " 3"]) -> str:
     """The signed axis nearest to a direction, such as "+y"."""
     axis = int(np.abs(direction).argmax())
     return ("+" if direction[axis] > 0 else "-") + "xyz"[axis]
+
+
+def dense_shape(model: TrainedModel, fit: Fit) -> Shape:
+    """The dense mesh of a model's template under a fit's node vectors, in the frame and unit of the shape's file.
+
+    `OptionError` if the fit is of another template, `TemplateError` if a vertex has too few nodes in reach.
+    """
+    template = model.template
+    fit.check_template(template.hash)
+    verts = np.asarray(template.dense.verts)
+    moved = verts + model.field(verts).displaced(fit.vectors)
+    return Shape(fit.frame.undo(moved), template.dense.faces, template.name)

@@ -1,19 +1,71 @@
-"""How hard a fit looks for the right pose, and how it is refined."""
+"""How hard a fit looks for the right pose, and how it is refined: the user's choices, apart from what carries them out.
+
+Standard library alone, so that a command line can list them without loading more.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from numbers import Integral
+from typing import TYPE_CHECKING, Literal, get_args
 
 from meshmatch.errors import OptionError
-from meshmatch.fitting.choices import ON_NODES, PARTIALS, REFINE_NAMES, Partial, Refine
-from meshmatch.fitting.nodes import NodeRefineConfig
-from meshmatch.fitting.orientation import axis_vector
-from meshmatch.models.trained import TrainedModel
+
+if TYPE_CHECKING:
+    from meshmatch.models.trained import TrainedModel
+
+Refine = Literal["none", "latent", "nodes"]
+"""How a fit is refined, see `meshmatch.fitting.refinement.REFINEMENTS`."""
+Partial = Literal["auto", "yes", "no"]
+"""Whether a shape may be a part of a whole, such as a scan from one side."""
+ON_NODES: tuple[Refine, ...] = ("nodes",)
+"""Refinements that move node vectors themselves: the model's field must have nodes; landmarks hold and fits agree."""
+REFINE_NAMES: tuple[Refine, ...] = get_args(Refine)
+PARTIALS: tuple[Partial, ...] = get_args(Partial)
 
 _LEAST = {"seed": 0, "variants": 0, "screening": 0} | dict.fromkeys(
     ("samples", "coarse_samples", "copies", "hypotheses", "careful", "finalists"), 1
 )
+
+
+@dataclass(frozen=True)
+class NodeRefineConfig:
+    """Schedule and weights of the node refinement; lengths in units of sqrt(area). Set by hand."""
+
+    steps: int = 10
+    strain_first: float = 0.003  # weight of the prior in the first step
+    strain_last: float = 0.0001  # and in the last; it falls geometrically between them
+    scale_first: float = 0.1  # the same of the scale of the robust weight
+    scale_last: float = 0.03
+    point_share: float = 0.3  # how much a pair pulls along the surface, against 1 across it
+    normal_cosine: float = 0.2  # pairs whose normals differ more do not count
+    back_points: int = 4000  # about how many samples look for their template vertex
+    damping: float = 1e-4  # weight of the present node vectors, for those that nothing else holds
+    landmark_weight: float = 0.05  # of each landmark; all other pairs together have about 1
+    # How much (0..1) samples pull at all of the template within about ``spread`` instead of at the nearest of it.
+    shared: float = 0.0
+    spread: float = 0.016
+
+    def for_noise(self, roughness: float) -> NodeRefineConfig:
+        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`).
+
+        Noise does not tell across from along, and asks for the mean of many points rather than for the nearest: a wider
+        robust scale, a stiffer template, more points, shared pairs. Tuned on 14 hard pairs of SCAPE with noise of 1 % of
+        the diagonal.
+        """
+        return replace(
+            self,
+            strain_last=geometric_between(self.strain_last, 10 * self.strain_last, roughness),
+            scale_last=geometric_between(self.scale_last, 2 * self.scale_last, roughness),
+            point_share=geometric_between(self.point_share, max(self.point_share, 1.0), roughness),
+            back_points=round(geometric_between(self.back_points, 5 * self.back_points, roughness)),
+            shared=max(self.shared, roughness),
+        )
+
+
+def geometric_between(low: float, high: float, share: float) -> float:
+    """The number at a ``share`` (0..1) of the way from one to another, by ratio."""
+    return low if low <= 0 else low * (high / low) ** share
 
 
 @dataclass(frozen=True)
@@ -34,33 +86,22 @@ class FitConfig:
 
     Attributes
     ----------
-    refine : {"none", "latent", "nodes"}
-        The network alone, the paper's search over codes, or Gauss-Newton on the nodes.
-    seed : int
-    up, front : str, optional
-        Axes of the file, such as "y" or "-z"; searched where not given.
-    partial : {"auto", "yes", "no"}
-        Whether the shape may be a part: tried where a fit of the whole leaves template without surface, always, never.
-    samples, coarse_samples : int
-        Points drawn on the surface, and how many of them are used to screen orientations.
-    copies : int
-        Turned copies of the samples that vote on the orientation.
-    hypotheses : int
-        Voted orientations that are tried, each with its flips.
-    careful : int
-        The best so many of these are fitted again with all samples.
-    variants, tilt : int, float
-        Further interpretations of the best of these: predictions from frames tilted at random, by about so many degrees.
-    finalists, screening : int
-        So many interpretations get so many node steps before the best one gets them all.
-    nodes : NodeRefineConfig
-    latent : LatentRefineConfig
+    refine : "none" the network alone, "latent" the paper's search over codes, or "nodes" Gauss-Newton on the nodes
+    seed : of all random numbers
+    up, front : axes of the file, such as "y" or "-z"; searched where not given
+    partial : whether the shape may be a part: "auto" tries it where a fit of the whole leaves template without surface,
+        "yes" always, "no" never
+    samples, coarse_samples : points drawn on the surface, and how many of them are used to screen orientations
+    copies : turned copies of the samples that vote on the orientation
+    hypotheses : voted orientations that are tried, each with its flips
+    careful : the best so many of these are fitted again with all samples
+    variants, tilt : further interpretations of the best of these: predictions from frames tilted at random, by about so
+        many degrees
+    finalists, screening : so many interpretations get so many node steps before the best one gets them all
+    nodes, latent : how node vectors, or codes, are refined
 
-    Raises
-    ------
-    OptionError
-        An unknown refinement, axis or word for ``partial``; up and front along the same axis; or a count that is too
-        small or not an integer.
+    `OptionError` for an unknown refinement, axis or word for ``partial``; up and front along the same axis; or a count
+    that is too small or not an integer.
     """
 
     refine: Refine = "nodes"
@@ -89,8 +130,8 @@ class FitConfig:
             value = getattr(self, name)
             if not isinstance(value, Integral) or value < least:
                 raise OptionError(f"{name} cannot be {value!r}", f"give an integer of {least} or more, or leave it out")
-        axes = [axis_vector(axis) for axis in (self.up, self.front) if axis is not None]
-        if len(axes) == 2 and axes[0] @ axes[1] != 0:
+        axes = {axis_of(axis)[0] for axis in (self.up, self.front) if axis is not None}
+        if len(axes) == 1 and None not in (self.up, self.front):
             raise OptionError("up and front lie along the same axis", "choose two different axes")
 
     @property
@@ -109,10 +150,10 @@ class FitConfig:
         return replace(self, samples=round(self.samples * (1 + roughness)), nodes=self.nodes.for_noise(roughness))
 
 
-def check_landmarks(model: TrainedModel) -> None:
-    """Refuse landmarks for a model without nodes, which could not hold them (`OptionError`)."""
-    if not model.has_nodes:
-        raise OptionError(
-            f"model {model.card.name} is pointwise: it has no nodes that landmarks could hold",
-            "leave out the landmarks, or use a model of another field",
-        )
+def axis_of(name: str) -> tuple[int, float]:
+    """Number and sign of an axis such as "y", "+y" or "-z"; any other name is an `OptionError`."""
+    word = str(name)
+    axis = word.lstrip("+-").lower()
+    if axis not in ("x", "y", "z") or len(word) > 2:
+        raise OptionError(f"invalid axis {name!r}", "write x, y or z, with - for the opposite direction")
+    return "xyz".index(axis), -1.0 if word.startswith("-") else 1.0

@@ -1,23 +1,31 @@
-"""Fit a model's template to shapes: samples, orientation, prediction, refinement, verdict."""
+"""Fit a model's template to shapes: samples, orientation, prediction, refinement, verdict; and with known pairs."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit, axis_name, vertex_distance
-from meshmatch.fitting.fit_config import FitConfig, check_landmarks
-from meshmatch.fitting.part import cost, fit_part
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.nodes import Landmarks
+from meshmatch.fitting.part import fit_part
 from meshmatch.fitting.refinement import REFINEMENTS, Refinement
-from meshmatch.fitting.samples import Landmarks
 from meshmatch.fitting.task import FitTask, Registration
 from meshmatch.fitting.verdict import FAIR_RESIDUAL, empty_share, judge_registration
 from meshmatch.fitting.whole import fit_whole
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
+from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.template import Template
 
+_HINT = "one target vertex for each source vertex, both counted from 0"
 # All of these were set by hand.
 _EMPTY = 0.06  # a fit of the whole that leaves this share of the template without surface may be one of a part
 _OPEN = 0.3  # so may a bad one of a mesh with a boundary of so many sqrt(area)
@@ -28,13 +36,8 @@ _MISSING = 0.03  # and if it lacks that much of the surface
 class Fitter:
     """Fits the template of one model. Nothing in it changes, so several threads can share one.
 
-    Parameters
-    ----------
-    model : TrainedModel
-        What depends on it alone is built once for all its fitters, also if threads ask for it at the same time.
-    config : FitConfig, optional
-    progress : callable, optional
-        Called with (stage, name of the shape, share of the stage that is done); what it raises ends the fit.
+    What depends on the model alone is built once for all its fitters, also if threads ask for it at the same time.
+    ``progress`` is called with (stage, name of the shape, share of the stage that is done); what it raises ends the fit.
     """
 
     def __init__(
@@ -47,17 +50,8 @@ class Fitter:
     def fit(self, shape: Shape, landmarks: Landmarks | None = None) -> Fit:
         """Fit the template to a repaired shape; to a cloud without its outliers.
 
-        Parameters
-        ----------
-        shape : Shape
-            In any unit, turn and resolution.
-        landmarks : (template vertices (N,), positions (N, 3) in the shape's file), optional
-            Held by a fit of the whole; parts are not tried then.
-
-        Raises
-        ------
-        OptionError
-            Invalid axes, or up and front along the same axis; landmarks for a model without nodes.
+        The shape is in any unit, turn and resolution. Landmarks (template vertices (N,), positions (N, 3) in the shape's
+        file) are held by a fit of the whole, and parts are not tried then; `OptionError` for a model without nodes.
         """
         if landmarks is not None:
             check_landmarks(self.model)
@@ -68,7 +62,9 @@ class Fitter:
         found, partial = fit_whole(task, refinement.whole), False
         if landmarks is None and _may_be_part(found, refinement):
             part = fit_part(task, refinement.part)
-            partial = _is_part(part, found)
+            # A part explains the shape better than the whole, and lacks some of it.
+            closer = part.candidate.cost < _CLOSER * found.candidate.residual
+            partial = closer and part.candidate.share < 1 - _MISSING
             found = part if partial else found
         return _as_fit(found, partial, began)
 
@@ -86,12 +82,6 @@ def _may_be_part(whole: Registration, refinement: Refinement) -> bool:
         if whole.candidate.residual > FAIR_RESIDUAL:  # that of a cloud says how sparse and noisy it is
             return True
     return empty_share(whole.local, whole.surface.points) > _EMPTY
-
-
-def _is_part(part: Registration, whole: Registration) -> bool:
-    """Whether a fit as a part explains a shape better than one of the whole."""
-    closer = cost(part.candidate.residual, part.share) < _CLOSER * whole.candidate.residual
-    return closer and part.share < 1 - _MISSING
 
 
 def _as_fit(found: Registration, partial: bool, began: float) -> Fit:
@@ -120,3 +110,76 @@ def boundary_length(shape: Shape) -> float:
     """Length of the edges with one face, in the unit of the file."""
     ends = shape.verts[shape.edges.vertices[shape.edges.sizes == 1]]  # N 2 3
     return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum())
+
+
+def check_landmarks(model: TrainedModel) -> None:
+    """Refuse landmarks for a model without nodes, which could not hold them (`OptionError`)."""
+    if not model.has_nodes:
+        raise OptionError(
+            f"model {model.card.name} is pointwise: it has no nodes that landmarks could hold",
+            "leave out the landmarks, or use a model of another field",
+        )
+
+
+def template_vertices(
+    template: Template, fits: Sequence[Fit], places: Sequence[Float[Floats, "N 3"]]
+) -> Int[Ints, " N"]:
+    """Template vertices for N points given on several fitted shapes (file frames).
+
+    Each fit answers with the template vertex nearest to the point; the vertex nearest to the mean of the
+    answers on the resting template is taken, so no shape's fit decides alone.
+    """
+    verts = template.shape.verts
+    answers = [
+        verts[cKDTree(fit.points).query(fit.frame.apply(place))[1]] for fit, place in zip(fits, places, strict=True)
+    ]
+    return cKDTree(verts).query(np.mean(answers, axis=0))[1].astype(np.int64)
+
+
+def landmark_places(clean: Sequence[Repaired], landmarks: Sequence[ArrayLike]) -> list[Float[Floats, "N 3"]]:
+    """Where the landmarks of two shapes lie, in the frames of their files.
+
+    `OptionError` if these are not pairs of vertices, or a shape does not have one.
+    """
+    if len(landmarks) != 2:
+        raise OptionError(f"landmarks must be two lists of vertices, not {len(landmarks)}", _HINT)
+    places = [_places(part, chosen) for part, chosen in zip(clean, landmarks, strict=True)]
+    if len(places[0]) != len(places[1]):
+        raise OptionError("landmarks must come in pairs", _HINT)
+    return places
+
+
+def fits_with_landmarks(
+    model: TrainedModel,
+    clean: Sequence[Repaired],
+    fits: Sequence[Fit],
+    landmarks: tuple[Ints, Ints],
+    configs: Sequence[FitConfig],
+) -> tuple[list[Fit], list[Landmarks]]:
+    """Fit two repaired shapes again with known pairs: vertices (N,) of the source's file, and of the target's.
+
+    A pair is carried to the template through the first fits; the template point between the two answers is then pulled
+    to the landmark on both shapes. Returns the fits, and for each shape the template vertices (N,) and their places
+    (N, 3) in its file. Errors are those of `landmark_places`.
+    """
+    places = landmark_places(clean, landmarks)
+    at = template_vertices(model.template, fits, places)
+    known = [(at, place) for place in places]
+    found = [
+        Fitter(model, config).fit(part.shape, held) for config, part, held in zip(configs, clean, known, strict=True)
+    ]
+    return found, known
+
+
+def _places(part: Repaired, vertices: ArrayLike) -> Float[Floats, "N 3"]:
+    """Where vertices of a shape's file lie."""
+    chosen = np.asarray(vertices)
+    if chosen.ndim != 1 or len(chosen) == 0 or chosen.dtype.kind not in "iu" or chosen.min() < 0:
+        raise OptionError("landmarks must be lists of vertex numbers", _HINT)
+    if chosen.max() >= len(part.original_to_repaired):
+        raise OptionError(
+            f"landmark vertex {chosen.max()} is not on {part.shape.name}, which has "
+            f"{len(part.original_to_repaired)} vertices",
+            "numbers start at 0; the source comes first",
+        )
+    return part.shape.verts[part.original_to_repaired[chosen]]

@@ -10,7 +10,6 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.fields.field import Field, PointField, arap_energy, volume_energy
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.fit_config import LatentRefineConfig
-from meshmatch.fitting.samples import draw
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel, once_per_model
 from meshmatch.progress import Progress
@@ -20,17 +19,14 @@ from meshmatch.shapes.sampling import farthest_points
 class PaperEnergy:
     """The paper's energy of what a decoder answers: Chamfer distance to points drawn from samples, volume, rigidity.
 
-    Parameters
-    ----------
-    samples : OrientedPoints
-        In the core frame; ``config.points`` of them are drawn.
+    Samples are in the core frame.
     """
 
     def __init__(
         self, model: TrainedModel, samples: OrientedPoints, config: LatentRefineConfig, rng: np.random.Generator
     ) -> None:
         self.config = config
-        drawn = samples.points[draw(samples, config.points, rng)]
+        drawn = samples.drawn(config.points, rng)
         self.points = torch.from_numpy(drawn).float()
         self._tree = cKDTree(drawn)
         self._template = _on_template(model, min(config.points, model.template.shape.V))
@@ -61,13 +57,9 @@ def refine_code(
 ) -> Float[Floats, "K 3"]:
     """Node vectors of the code that fits samples (core frame) best, found by Adam.
 
-    The best of all codes is returned, so the energy never ends higher than it began.
-
-    Parameters
-    ----------
-    start : (K, 3), optional
-        Node vectors to start from, by default the network's own answer. What the encoder's code does not say
-        of them (the learned corrections, where the model has them) stays as a constant offset.
+    The best of all codes is returned, so the energy never ends higher than it began. The search starts from the network's
+    own answer, or from given node vectors. What the encoder's code does not say of them (the learned corrections, where
+    the model has them) stays as a constant offset.
     """
     energy_of = PaperEnergy(model, samples, config, rng)
     network = model.network
@@ -97,7 +89,9 @@ def _on_template(model: TrainedModel, P: int) -> tuple[torch.Tensor, PointField]
     """Template points (P, 3) and the field there."""
     verts = model.template.shape.verts
     verts = verts[farthest_points(verts, P)]
-    return torch.from_numpy(verts).float(), _in_torch(model.field(verts)).for_descent()
+    field = model.field(verts)
+    in_torch: PointField = Field.of(field) if isinstance(field, ShapeFunctions) else field
+    return torch.from_numpy(verts).float(), in_torch.for_descent()
 
 
 def _chamfer(moved: torch.Tensor, points: torch.Tensor, tree: cKDTree) -> torch.Tensor:
@@ -106,7 +100,3 @@ def _chamfer(moved: torch.Tensor, points: torch.Tensor, tree: cKDTree) -> torch.
     forward = torch.from_numpy(tree.query(here)[1])
     back = torch.from_numpy(cKDTree(here).query(points.numpy())[1])
     return (moved - points[forward]).square().sum(1).mean() + (moved[back] - points).square().sum(1).mean()
-
-
-def _in_torch(field: ShapeFunctions | PointField) -> PointField:
-    return Field.of(field) if isinstance(field, ShapeFunctions) else field

@@ -1,27 +1,40 @@
-"""The network's own fits: core frame, code and learned corrections, for a pose to start from; and their residual."""
+"""The network's own fits: core frame, code and learned corrections, for a pose to start from; and their residual.
+
+The network has no symmetry built in, so it may see a raised left arm and miss a right one. Where a category's template is
+symmetric, so is every question about a shape: asked about the mirrored samples, its answer mirrored back is another
+interpretation of the same pose.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Ints
-from meshmatch.fitting.mirror import Mirror, mirror_of
-from meshmatch.fitting.samples import draw
+from meshmatch.errors import TemplateError
+from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.models.inference import Network
-from meshmatch.models.trained import TrainedModel
+from meshmatch.models.trained import TrainedModel, once_per_model
 
 # How many points the network sees of tilted copies, in turn: thin samples tip it either way where it is in doubt.
 _VARIANT_POINTS = (700, 1400)
 _PREDICT_POINTS = 2048  # it sees of other samples
 _BATCH = 24  # clouds that it is asked about together: more save nothing, and take memory
+# Residual that a share of 0 has to be better by than one of 1: rather the whole than a part. Set by hand.
+_SHARE_COST = 0.004
+# Left and right are exchanged in the template frame, where bodies face along z and stand along y.
+_FLIP = np.array([-1.0, 1.0, 1.0])
+# Every mirrored vertex of a symmetric template is this near to another one (units of sqrt(area)). Set by hand.
+_SYMMETRIC = 0.01
+_RIDGE = 1e-6  # of the least squares, against the mean diagonal
 
 # Of samples in the core frame and node vectors (K, 3).
 Residual = Callable[[NodeSystem, OrientedPoints, Float[Floats, "K 3"]], float]
@@ -29,42 +42,81 @@ Residual = Callable[[NodeSystem, OrientedPoints, Float[Floats, "K 3"]], float]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One way to fit the template to samples.
+    """One way to fit the template to samples, taken to show the whole surface or a share of it."""
 
-    Attributes
-    ----------
-    pose : RigidPose
-        The core frame (local) in the frame of the samples.
-    vectors : (K, 3)
-        Node vectors, core frame.
-    residual : float
-        Mean distance, normals included, of template and samples (units of sqrt(area)).
-    """
+    pose: RigidPose  # the core frame (local) in the frame of the samples, once they have the size of their share
+    vectors: Float[Floats, "K 3"]  # node vectors, core frame
+    residual: float  # mean distance, normals included, of template and samples (units of sqrt(area))
+    share: float = 1.0  # of the whole surface (0..1) that the samples are taken to show
 
-    pose: RigidPose
-    vectors: Float[Floats, "K 3"]
-    residual: float
+    def local(self, samples: OrientedPoints) -> OrientedPoints:
+        """Samples of area 1 as large as their share, in the core frame."""
+        return sized(samples, self.share).to_local(self.pose)
+
+    @property
+    def cost(self) -> float:
+        """The residual, and a little for what is not visible: the smaller the part, the easier it lies on a template."""
+        return self.residual + _SHARE_COST * (1 - self.share)
+
+
+def best_first(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Candidates by their cost."""
+    return sorted(candidates, key=lambda candidate: candidate.cost)
+
+
+def sized(samples: OrientedPoints, share: float) -> OrientedPoints:
+    """Samples of area 1, scaled to area ``share``."""
+    return replace(samples, points=samples.points * np.sqrt(share))
+
+
+@dataclass(frozen=True, eq=False)
+class Mirror:
+    """The plane x = 0 of a symmetric template."""
+
+    # Takes node vectors to those that move the template as these move its mirror image, up to the flip.
+    exchange: Float[Floats, "K K"]
+
+    def points(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
+        """Points of the mirrored shape, in the core frame."""
+        return points * _FLIP
+
+    def vectors(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
+        """Node vectors of the mirrored deformation: x moves to M f(M x) where f moved it before."""
+        return self.exchange @ vectors * _FLIP
+
+
+@once_per_model
+def mirror_of(model: TrainedModel) -> Mirror | None:
+    """The mirror of a model's template; None where it is not symmetric, or its field has no nodes."""
+    template = model.template
+    verts = np.asarray(template.shape.verts)
+    distance = cKDTree(np.asarray(template.dense.verts)).query(verts * _FLIP)[0]
+    if not model.has_nodes or distance.max() > _SYMMETRIC:
+        return None
+    try:
+        there = model.field(verts * _FLIP)
+    except TemplateError:  # the mirrored side has too few nodes
+        return None
+    here = node_system(model).field
+    assert isinstance(here, ShapeFunctions) and isinstance(there, ShapeFunctions)
+    phi, across = _dense(here.phi), _dense(there.phi)
+    square = phi.T @ phi
+    square += _RIDGE * np.trace(square) / len(square) * np.eye(len(square))
+    return Mirror(np.asarray(np.linalg.solve(square, phi.T @ across), np.float64))
+
+
+def _dense(phi: Any) -> Floats:
+    return np.asarray(phi if isinstance(phi, np.ndarray) else phi.toarray(), dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
 class Predictor:
-    """The network, and what its answers move; draws its points with ``rng``.
-
-    Attributes
-    ----------
-    network : Network
-    system : NodeSystem
-    core : (C,) int
-        Vertices of the template by which the core frame is read off a fit.
-    mirror : Mirror, optional
-        Of a symmetric template: interpretations are then sought in the mirror too.
-    rng : numpy.random.Generator
-    """
+    """The network, and what its answers move; draws its points with ``rng``."""
 
     network: Network
     system: NodeSystem
-    core: Ints
-    mirror: Mirror | None
+    core: Ints  # vertices of the template by which the core frame is read off a fit
+    mirror: Mirror | None  # of a symmetric template: interpretations are then sought in the mirror too
     rng: np.random.Generator
 
     @classmethod
@@ -81,20 +133,14 @@ class Predictor:
     ) -> list[Candidate]:
         """For each start: predict, move the core frame to where the prediction puts the core, predict again.
 
-        Parameters
-        ----------
-        starts : sequence of (samples, pose)
-            Samples, and where their core frame is looked for first. All are asked for together, for the network's
-            weights are then read from memory once.
-        rounds, draws : int
-            Predictions, and how many draws of samples each is the mean of.
-        measure : (NodeSystem, samples in the core frame, node vectors) -> float, optional
-            The residual; `two_way_residual` if not given.
+        A start is samples, and where their core frame is looked for first. All are asked for together, for the
+        network's weights are then read from memory once. Each of ``rounds`` predictions is the mean of ``draws`` of the
+        samples. ``measure`` gives the residual; `two_way_residual` if there is none.
         """
         measure, poses = measure or two_way_residual, [pose for _, pose in starts]
         for turn in range(rounds):
             clouds = [
-                pose.to_local(samples.points[draw(samples, _PREDICT_POINTS, self.rng)])
+                pose.to_local(samples.drawn(_PREDICT_POINTS, self.rng))
                 for (samples, _), pose in zip(starts, poses, strict=True)
                 for _ in range(draws)
             ]
@@ -124,14 +170,8 @@ class Predictor:
         Where a limb could be one or the other, tilts and thinner samples tip the network either way, and the residual
         tells which interpretation is right. With a mirror, as many again are of the mirrored samples.
 
-        Parameters
-        ----------
-        local, coarse : OrientedPoints
-            Samples in the core frame: those to predict from, and those that give the residual.
-        pose : RigidPose
-            The core frame.
-        count, degrees : int, float
-            How many tilts, and how large they are (standard deviation about each axis).
+        It is predicted from the samples ``local``, and ``coarse`` ones give the residual; both are in the core frame,
+        which is ``pose``. There are ``count`` tilts with a standard deviation of ``degrees`` about each axis.
         """
         tilts = Rotation.from_rotvec(np.radians(degrees) * self.rng.standard_normal((count, 3))).as_matrix()
         found = self._tilted(local, tilts)
@@ -145,7 +185,7 @@ class Predictor:
         clouds = []
         for number, tilt in enumerate(tilts):
             size = _VARIANT_POINTS[number % len(_VARIANT_POINTS)]
-            clouds.append(samples.points[draw(samples, size, self.rng)] @ tilt.T)
+            clouds.append(samples.drawn(size, self.rng) @ tilt.T)
         found = self.network.predict(clouds)
         return [self.network.rotate_rows(vectors, tilt) for vectors, tilt in zip(found, tilts, strict=True)]
 

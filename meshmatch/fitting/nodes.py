@@ -9,13 +9,11 @@ cannot see.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.fitting.samples import Landmarks
+from meshmatch.fitting.fit_config import NodeRefineConfig
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.geometry.oriented import PAIR_WEIGHT, OrientedPoints, with_normals
 from meshmatch.geometry.triangles import vertex_areas
@@ -23,69 +21,10 @@ from meshmatch.geometry.triangles import vertex_areas
 _NEWTON_STEPS = 20  # at most: five are the rule, and convergence is quadratic
 _SHARERS = 16  # vertices of the template that share a point, at most
 
+# Template vertices and where they belong.
+Landmarks = tuple[Int[Ints, " N"], Float[Floats, "N 3"]]
 # Upper triangles H_p (V, 6) and right-hand sides H_p s_p (V, 3) of data terms, see `NodeSystem.solve`.
 Terms = tuple[Float[Floats, "V 6"], Float[Floats, "V 3"]]
-
-
-@dataclass(frozen=True)
-class NodeRefineConfig:
-    """Schedule and weights of the node refinement; lengths in units of sqrt(area). Set by hand.
-
-    Attributes
-    ----------
-    steps : int
-    strain_first, strain_last : float
-        Weight of the prior in the first step and in the last; it falls geometrically between them.
-    scale_first, scale_last : float
-        The same of the scale of the robust weight.
-    point_share : float
-        How much a pair pulls along the surface, against 1 across it.
-    normal_cosine : float
-        Pairs whose normals differ more do not count.
-    back_points : int
-        About how many samples look for their template vertex.
-    damping : float
-        Weight of the present node vectors, for those that nothing else holds.
-    landmark_weight : float
-        Of each landmark; all other pairs together have about 1.
-    shared : float
-        How much (0..1) samples pull at all of the template within about ``spread`` instead of at the nearest of it.
-    spread : float
-    """
-
-    steps: int = 10
-    strain_first: float = 0.003
-    strain_last: float = 0.0001
-    scale_first: float = 0.1
-    scale_last: float = 0.03
-    point_share: float = 0.3
-    normal_cosine: float = 0.2
-    back_points: int = 4000
-    damping: float = 1e-4
-    landmark_weight: float = 0.05
-    shared: float = 0.0
-    spread: float = 0.016
-
-    def for_noise(self, roughness: float) -> NodeRefineConfig:
-        """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`).
-
-        Noise does not tell across from along, and asks for the mean of many points rather than for the nearest: a wider
-        robust scale, a stiffer template, more points, shared pairs. Tuned on 14 hard pairs of SCAPE with noise of 1 % of
-        the diagonal.
-        """
-        return replace(
-            self,
-            strain_last=geometric_between(self.strain_last, 10 * self.strain_last, roughness),
-            scale_last=geometric_between(self.scale_last, 2 * self.scale_last, roughness),
-            point_share=geometric_between(self.point_share, max(self.point_share, 1.0), roughness),
-            back_points=round(geometric_between(self.back_points, 5 * self.back_points, roughness)),
-            shared=max(self.shared, roughness),
-        )
-
-
-def geometric_between(low: float, high: float, share: float) -> float:
-    """The number at a ``share`` (0..1) of the way from one to another, by ratio."""
-    return low if low <= 0 else low * (high / low) ** share
 
 
 def refine_nodes(
@@ -97,12 +36,7 @@ def refine_nodes(
 ) -> Float[Floats, "K 3"]:
     """Fit node vectors to samples in the core frame.
 
-    Parameters
-    ----------
-    vectors : (K, 3)
-        Where to start; their deformation gradients are the prior.
-    landmarks : (template vertices (N,), positions (N, 3)), optional
-        Pairs that the fit holds.
+    Deformation gradients of the vectors to start from are the prior. Landmarks are pairs that the fit holds.
     """
     start = system.deformation_gradient(vectors)
     for step in range(config.steps):
@@ -161,12 +95,8 @@ def pair_terms(
 ) -> Terms:
     """Data terms of the current pairs; their weights sum to about one, and follow those of the samples.
 
-    Parameters
-    ----------
-    scale : float
-        Of the robust weight.
-    one_sided : bool
-        The samples show a part of the shape: template vertices without a partner are left to the prior.
+    ``scale`` is that of the robust weight. Where pairs are ``one_sided``, the samples show a part of the shape: template
+    vertices without a partner are left to the prior.
     """
     surface = system.surface(vectors)
     if config.shared <= 0:
@@ -197,7 +127,7 @@ def _nearest_pairs(
     if one_sided:
         forward *= np.linalg.norm(moved - samples.points[to_samples], axis=1) < 3 * scale
 
-    some = _thinned(samples, config)
+    some = samples.thinned(config.back_points)
     to_template = cKDTree(features).query(with_normals(some.points, some.normals, PAIR_WEIGHT))[1]
     back = robust_weight(moved[to_template] - some.points, scale) / len(some.points)
     back *= (normals[to_template] * some.normals).sum(1) > config.normal_cosine
@@ -221,7 +151,7 @@ def _shared_pairs(
     Song, TPAMI 2010). A template among noisy points always has one close by, so it does not ask which; and directions
     across are its own.
     """
-    some, moved = _thinned(samples, config), surface.points
+    some, moved = samples.thinned(config.back_points), surface.points
     V = len(moved)
     distance, at = cKDTree(moved).query(some.points, min(_SHARERS, V))
     distance, at = distance.reshape(len(some.points), -1), at.reshape(len(some.points), -1)
@@ -238,10 +168,6 @@ def _shared_pairs(
     pull = _sums(at, share[:, None] * point, V)
     mean = pull / np.maximum(total, 1e-300)[:, None]
     return _summed(np.arange(V), mean, surface.normals, total, config.point_share, V)
-
-
-def _thinned(samples: OrientedPoints, config: NodeRefineConfig) -> OrientedPoints:
-    return samples.thinned(config.back_points)
 
 
 def _summed(

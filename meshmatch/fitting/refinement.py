@@ -1,52 +1,63 @@
 """From the network's candidates to the surface: the refinements that a user can choose, in one table.
 
-A new refinement is a line of `REFINEMENTS`, and its name in `meshmatch.fitting.choices`.
+A new refinement is a line of `REFINEMENTS`, and its name in `meshmatch.fitting.fit_config`.
+
+The surface alone hardly tells which of several interpretations of a pose is right: a crossed arm taken for the other one
+lies on it as well as the right one does. But points that are neighbours on the shape then belong far apart on the
+template: the map is discontinuous. Interpretations that differ are each refined in full, and judged by both.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import needs
-from meshmatch.fitting.candidates import CandidateScorer, Interpretation, averaged, choose
-from meshmatch.fitting.choices import Refine
-from meshmatch.fitting.completion import completed
-from meshmatch.fitting.network_fit import Candidate, one_way_residual, two_way_residual
+from meshmatch.fitting import fit_config
+from meshmatch.fitting.network_fit import Candidate, best_first, one_way_residual, two_way_residual, weighted_mean
 from meshmatch.fitting.nodes import refine_nodes
-from meshmatch.fitting.part import STAGE, PartCandidate, RefinePart, cost
-from meshmatch.fitting.task import FitTask
-from meshmatch.fitting.whole import RefineWhole
+from meshmatch.fitting.part import STAGE, completed
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.task import FitTask, Refine
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.topology import is_discontinuous
+from meshmatch.progress import Progress
 
-# Interpretations of a part that get a few steps each. Set by hand.
-_PART_FINALISTS = 5
+# All of these were set by hand. Lengths and residuals are in units of sqrt(area).
+_NEIGHBOURS = 6
+_DISCONTINUITY_COST = 0.1  # residual that a map discontinuous everywhere is worse by
+_CAP = 0.1  # beyond it a distance says no more
+# Interpretations differ where this share of the template's vertices lies that far apart.
+_SHARE, _FAR = 0.02, 0.1
+# Interpretations closer than that are the same, and of these so many at most are averaged.
+_NEAR, _MAX_AVERAGED = 0.05, 8
+_POOL = 24  # among how many of the best those that are unlike each other are looked for
+# One whose score is so many times the best one's after a few steps never caught up: on 78 bodies of SCAPE, FAUST and
+# SHREC'19 the order changed within 1.004.
+_BEHIND = 1.05
+_PART_FINALISTS = 5  # interpretations of a part that get a few steps each
 _SCREENED_SAMPLES = 4096  # enough to tell interpretations apart
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """What is done with the network's candidates, which come best first.
+    """What makes one fit of the network's candidates, for `fit_whole` and for `fit_part`.
 
-    Attributes
-    ----------
-    whole : (FitTask, list of Candidate) -> Candidate
-        For `fit_whole`.
-    part : (FitTask, list of PartCandidate) -> PartCandidate
-        For `fit_part`.
-    tries_parts : bool
-        Quick enough to find out whether a shape is a part where the user does not say.
+    ``tries_parts``: quick enough to find out whether a shape is a part where the user does not say.
     """
 
-    whole: RefineWhole
-    part: RefinePart
+    whole: Refine
+    part: Refine
     tries_parts: bool = True
 
 
-def _first(task: FitTask, candidates: list[Interpretation]) -> Interpretation:
+def _first(task: FitTask, candidates: list[Candidate]) -> Candidate:
     return candidates[0]
 
 
@@ -64,106 +75,189 @@ def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
 
 
 def _fit_nodes(task: FitTask, candidates: list[Candidate]) -> Candidate:
-    """The best of several interpretations, refined by Gauss-Newton on the nodes."""
-    found = _interpretations(task, candidates)
-    comparison = _WholeComparison(task, found)
-    return choose(found, task.config.finalists, comparison, task.progress.stage("refinement"))
-
-
-def _interpretations(task: FitTask, candidates: list[Candidate]) -> list[Candidate]:
-    """The candidates and variants of the best one, best first on the coarse samples."""
+    """The best of the candidates and of variants of the best one, refined by Gauss-Newton on the nodes."""
     config, coarse, pose = task.config, task.coarse, candidates[0].pose
     local = task.samples.to_local(pose)
     pool = task.predictor.variants(local, coarse.to_local(pose), pose, config.variants, config.tilt)
     for each in candidates:
         residual = two_way_residual(task.system, coarse.to_local(each.pose), each.vectors)
         pool.append(replace(each, residual=residual))
-    return sorted(pool, key=lambda candidate: candidate.residual)
+    found = best_first(pool)
+    return choose(found, config.finalists, _WholeComparison(task, found), task.progress.stage("refinement"))
 
 
-class _View:
-    """Samples by which interpretations are refined and compared."""
-
-    def __init__(self, task: FitTask, samples: OrientedPoints, roughness: float) -> None:
-        self._task, self.samples, self._roughness = task, samples, roughness
-
-    @cached_property
-    def scorer(self) -> CandidateScorer:
-        """Of these samples."""
-        return CandidateScorer(self._task.system, self.samples, self._roughness)
+def _fit_nodes_to_part(task: FitTask, candidates: list[Candidate]) -> Candidate:
+    """The best of several interpretations of a part, refined by Gauss-Newton on the nodes."""
+    return choose(candidates, _PART_FINALISTS, _PartComparison(task), task.progress.stage(STAGE, 0.6, 1.0))
 
 
-def _views(task: FitTask, roughness: float) -> dict[bool, _View]:
-    """What interpretations are refined in full with, and a little."""
-    few = task.samples.first(_SCREENED_SAMPLES)
-    return {True: _View(task, task.samples, roughness), False: _View(task, few, roughness)}
+REFINEMENTS: dict[fit_config.Refine, Refinement] = {
+    "none": Refinement(_first, _first),
+    "latent": Refinement(_search_code, _first, tries_parts=False),
+    "nodes": Refinement(_fit_nodes, _fit_nodes_to_part),
+}
+
+
+class Comparison(Protocol):
+    """How interpretations are refined and told apart."""
+
+    def refined(self, candidate: Candidate, in_full: bool) -> Candidate:
+        """An interpretation after all steps of its refinement, or after a few."""
+
+    def score(self, candidate: Candidate, in_full: bool) -> float:
+        """How well an interpretation fits that was refined in full, or a little; lower is better."""
+
+    def vertices(self, candidate: Candidate) -> Float[Floats, "V 3"]:
+        """Where an interpretation has the template's vertices, in one frame for all."""
+
+
+def choose(candidates: Sequence[Candidate], count: int, comparison: Comparison, progress: Progress) -> Candidate:
+    """The best of several interpretations (best first), refined; at most ``count`` that are unlike each other are tried."""
+    finalists: list[Candidate] = []
+    known: list[Floats] = []
+    for candidate in candidates[:_POOL]:
+        verts = comparison.vertices(candidate)
+        if len(finalists) < count and all(differ(verts, each) for each in known):
+            finalists.append(candidate)
+            known.append(verts)
+    if len(finalists) > 1:
+        finalists = _screened(finalists, comparison, progress)
+    refined = []
+    for number, candidate in enumerate(finalists):
+        refined.append(comparison.refined(candidate, in_full=True))
+        progress(0.6 + 0.4 * (number + 1) / len(finalists))
+    return min(refined, key=lambda each: comparison.score(each, True)) if len(refined) > 1 else refined[0]
+
+
+def _screened(candidates: list[Candidate], comparison: Comparison, progress: Progress) -> list[Candidate]:
+    """Those of several interpretations that a few steps neither bring together nor leave far behind, best first."""
+    rough = []
+    for number, candidate in enumerate(candidates):
+        found = comparison.refined(candidate, in_full=False)
+        rough.append((comparison.score(found, False), candidate, comparison.vertices(found)))
+        progress(0.6 * (number + 1) / len(candidates))
+    rough.sort(key=lambda entry: entry[0])
+    kept: list[tuple[Candidate, Floats]] = []
+    for score, candidate, verts in rough:
+        if score <= _BEHIND * rough[0][0] and all(differ(verts, other) for _, other in kept):
+            kept.append((candidate, verts))
+    return [candidate for candidate, _ in kept]
 
 
 class _WholeComparison:
-    """How interpretations of a whole are refined and told apart, see `meshmatch.fitting.candidates.Comparison`."""
+    """How interpretations of a whole are refined and told apart."""
 
-    def __init__(self, task: FitTask, candidates: list[Candidate]) -> None:
-        self._task, self._candidates = task, candidates
-        self._views = _views(task, task.roughness)
+    def __init__(self, task: FitTask, candidates: list[Candidate], roughness: float | None = None) -> None:
+        self.task, self._candidates = task, candidates
+        roughness = task.roughness if roughness is None else roughness
+        few = task.samples.first(_SCREENED_SAMPLES)
+        # by whether an interpretation is refined in full
+        self.scorers = {
+            in_full: CandidateScorer(task.system, samples, roughness)
+            for in_full, samples in ((True, task.samples), (False, few))
+        }
         self._landmarks = None
         if task.landmarks is not None:
             self._landmarks = task.landmarks[0], task.frame.apply(task.landmarks[1])
 
     def refined(self, candidate: Candidate, in_full: bool) -> Candidate:
-        task, config = self._task, self._task.config.nodes
+        task = self.task
         if in_full:
             candidate = averaged(task.system, candidate, self._candidates)
-        else:  # a few steps of the same schedule tell which interpretations the surface agrees with
-            config = replace(config, steps=task.config.screening)
         fixed = None
         if self._landmarks is not None:
             fixed = self._landmarks[0], candidate.pose.to_local(self._landmarks[1])
-        local = self._views[in_full].samples.to_local(candidate.pose)
+        local = candidate.local(self.scorers[in_full].samples)
         facing = local.facing(task.system.surface(candidate.vectors))
-        vectors = refine_nodes(task.system, facing, candidate.vectors, config, fixed)
-        return Candidate(candidate.pose, vectors, two_way_residual(task.system, local, vectors))
+        vectors = refine_nodes(task.system, facing, candidate.vectors, self.schedule(in_full), fixed)
+        return replace(candidate, vectors=vectors, residual=two_way_residual(task.system, local, vectors))
+
+    def schedule(self, in_full: bool) -> fit_config.NodeRefineConfig:
+        """All steps, or a few of the same schedule: they tell which interpretations the surface agrees with."""
+        config = self.task.config
+        return config.nodes if in_full else replace(config.nodes, steps=config.screening)
 
     def score(self, candidate: Candidate, in_full: bool) -> float:
-        view = self._views[in_full]
-        return view.scorer.score(view.samples.to_local(candidate.pose), candidate)
+        scorer = self.scorers[in_full]
+        return replace(candidate, residual=scorer.score(candidate.local(scorer.samples), candidate)).cost
 
     def vertices(self, candidate: Candidate) -> Float[Floats, "V 3"]:
-        return candidate.pose.to_world(self._task.system.moved(candidate.vectors))
+        moved = self.task.system.moved(candidate.vectors)
+        return candidate.pose.to_world(moved) / np.sqrt(candidate.share)
 
 
-def _fit_nodes_to_part(task: FitTask, candidates: list[PartCandidate]) -> PartCandidate:
-    """The best of several interpretations of a part, refined by Gauss-Newton on the nodes."""
-    progress = task.progress.stage(STAGE, 0.6, 1.0)
-    return choose(candidates, _PART_FINALISTS, _PartComparison(task), progress)
-
-
-class _PartComparison:
+class _PartComparison(_WholeComparison):
     """The same for interpretations of a part: what it does not show is held where the fit has it."""
 
     def __init__(self, task: FitTask) -> None:
-        self._task, self._views = task, _views(task, 0.0)
+        super().__init__(task, [], roughness=0.0)
 
-    def refined(self, candidate: PartCandidate, in_full: bool) -> PartCandidate:
-        task, config = self._task, self._task.config.nodes
-        if not in_full:
-            config = replace(config, steps=task.config.screening)
-        local, vectors = candidate.local(self._views[in_full].samples), candidate.fit.vectors
-        both = completed(task.system, local, vectors, candidate.share, np.random.default_rng(0))
-        vectors = refine_nodes(task.system, both, vectors, config)
-        residual = one_way_residual(task.system, local, vectors)
-        return replace(candidate, fit=Candidate(candidate.fit.pose, vectors, residual))
-
-    def score(self, candidate: PartCandidate, in_full: bool) -> float:
-        view = self._views[in_full]
-        return cost(view.scorer.score(candidate.local(view.samples), candidate.fit), candidate.share)
-
-    def vertices(self, candidate: PartCandidate) -> Float[Floats, "V 3"]:
-        moved = self._task.system.moved(candidate.fit.vectors)
-        return candidate.fit.pose.to_world(moved) / np.sqrt(candidate.share)
+    def refined(self, candidate: Candidate, in_full: bool) -> Candidate:
+        system = self.task.system
+        local = candidate.local(self.scorers[in_full].samples)
+        both = completed(system, local, candidate.vectors, candidate.share, np.random.default_rng(0))
+        vectors = refine_nodes(system, both, candidate.vectors, self.schedule(in_full))
+        return replace(candidate, vectors=vectors, residual=one_way_residual(system, local, vectors))
 
 
-REFINEMENTS: dict[Refine, Refinement] = {
-    "none": Refinement(_first, _first),
-    "latent": Refinement(_search_code, _first, tries_parts=False),
-    "nodes": Refinement(_fit_nodes, _fit_nodes_to_part),
-}
+class CandidateScorer:
+    """Scores candidates for one set of samples, in any frame and size: the lower the better.
+
+    ``roughness`` is that of a cloud (0..1, see `Shape.roughness`): normals estimated from noise say little, and squares
+    tell a limb that lies beside its points from one whose points scatter about it.
+    """
+
+    def __init__(self, system: NodeSystem, samples: OrientedPoints, roughness: float = 0.0) -> None:
+        self._system, self.samples, self._roughness = system, samples, roughness
+
+    @cached_property
+    def _neighbours(self) -> tuple[Ints, Ints]:
+        """Pairs of samples."""
+        count = min(_NEIGHBOURS + 1, len(self.samples.points))
+        index = self.samples.tree.query(self.samples.tree.data, count)[1]
+        return np.repeat(np.arange(len(index)), index.shape[1] - 1), index[:, 1:].reshape(-1)
+
+    def score(self, local: OrientedPoints, candidate: Candidate) -> float:
+        """Residual of a candidate and a cost for discontinuities; ``local``: the same samples in its core frame."""
+        residual, rough = candidate.residual, self._roughness
+        if rough > 0:
+            residual += rough * (self.scatter(local, candidate.vectors) - residual)
+        return residual + _DISCONTINUITY_COST * self.discontinuous_share(local, candidate.vectors)
+
+    def scatter(self, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
+        """Root of the mean squared distance of nearest points, both ways, normals left out (units of sqrt(area))."""
+        moved = self._system.moved(vectors)
+        forward = cKDTree(local.points).query(moved, distance_upper_bound=_CAP)[0]
+        back = cKDTree(moved).query(local.points, distance_upper_bound=_CAP)[0]
+        squares = [np.square(np.minimum(distance, _CAP)) for distance in (forward, back)]
+        return float(np.sqrt(0.5 * (squares[0].mean() + weighted_mean(squares[1], local.weights))))
+
+    def discontinuous_share(self, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
+        """Share (0..1) of neighbours among the samples that belong far apart on the template."""
+        surface = self._system.surface(vectors)
+        local = local.facing(surface)
+        home = self._system.verts[surface.tree.query(local.features)[1]]
+        start, end = self._neighbours
+        length = np.linalg.norm(local.points[start] - local.points[end], axis=1)
+        apart = is_discontinuous(np.linalg.norm(home[start] - home[end], axis=1), length)
+        weights = None if local.weights is None else local.weights[start] * local.weights[end]
+        return float(weighted_mean(apart, weights))
+
+
+def differ(here: Float[Floats, "V 3"], there: Float[Floats, "V 3"], far: float = _FAR) -> bool:
+    """Whether two interpretations have parts of the template in different places."""
+    return bool((np.linalg.norm(here - there, axis=1) > far).mean() > _SHARE)
+
+
+def averaged(system: NodeSystem, chosen: Candidate, candidates: Sequence[Candidate]) -> Candidate:
+    """A candidate with the mean node vectors of those that agree with it in the same core frame; best first.
+
+    Each prediction errs in its own way, and its stretch is what the refinement holds on to.
+    """
+    here = system.moved(chosen.vectors)
+    alike = [
+        other.vectors
+        for other in candidates
+        if other.pose is chosen.pose and not differ(here, system.moved(other.vectors), _NEAR)
+    ]
+    return replace(chosen, vectors=np.mean(alike[:_MAX_AVERAGED], axis=0)) if alike else chosen

@@ -38,22 +38,14 @@ _MAX_PRODUCTS = 20_000_000
 class NodeSystem:
     """A field on a template's vertices, arranged for repeated least squares on its node vectors.
 
-    With a field that is not linear it moves the template all the same, but there is nothing to `solve` for.
-
-    Parameters
-    ----------
-    shape : Shape
-        The template's mesh, template frame.
-    field : ShapeFunctions or PointwiseField
-        The model's field on the mesh's vertices.
-    strain_points : int
-        At how many of them, at most, strain is measured.
+    With a field that is not linear it moves the template all the same, but there is nothing to `solve` for. Strain is
+    measured at ``strain_points`` of the vertices, at most.
 
     Attributes
     ----------
     verts : (V, 3) template vertices, template frame
     faces : (F, 3)
-    field : ShapeFunctions or PointwiseField, on the vertices
+    field : on the vertices
     linear : whether there are node vectors, and with them what follows
     phi : (V, K), sparse or dense
     slopes : (3 G, K), gradient of the shape functions at G strain points
@@ -68,7 +60,9 @@ class NodeSystem:
         self.faces = np.asarray(shape.faces)
         self.linear = isinstance(field, ShapeFunctions)
         self.strain_points = farthest_points(self.verts, min(strain_points, len(self.verts)))
-        self._incidence = _vertex_faces(self.faces, len(self.verts))
+        F = len(self.faces)  # each vertex with the faces around it
+        corners = self.faces.T.reshape(-1), np.tile(np.arange(F), 3)
+        self._incidence = csr_matrix((np.ones(3 * F), corners), shape=(len(self.verts), F))
         self.field = field
         if isinstance(field, ShapeFunctions):
             self._compile(field)
@@ -79,7 +73,9 @@ class NodeSystem:
         rows = (3 * self.strain_points[:, None] + np.arange(3)).reshape(-1)
         self.slopes = field.gradient.astype(np.float64)[rows]
         row, column, self._pairs = _pair_products(self.phi)
-        self._order = _band_order(row, column, self.K)
+        # nodes in an order in which those that meet are near one another
+        graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (self.K, self.K))
+        self._order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(np.int64)
         self._band, self._place = _band_places(row, column, np.argsort(self._order))
         strain_pairs = self.slopes.T @ self.slopes
         if not isinstance(strain_pairs, np.ndarray):
@@ -116,21 +112,10 @@ class NodeSystem:
         damping: float,
         current: Float[Floats, "K 3"],
     ) -> Float[Floats, "K 3"]:
-        """Minimise sum_p |y_p - s_p|^2_{H_p} + strain sum_g |F_g - T_g|^2 + damping |u - current|^2.
+        """Minimise sum_p |y_p - s_p|^2_{H_p} + strain sum_g |F_g - T_g|^2 + damping |u - current|^2 over node vectors u.
 
-        Parameters
-        ----------
-        weights : (V, 6)
-            Upper triangle of H_p, order xx xy xz yy yz zz.
-        pulls : (V, 3)
-            Right-hand sides H_p s_p.
-        targets : (G, 3, 3)
-            T_g.
-        current : (K, 3)
-
-        Returns
-        -------
-        (K, 3) node vectors.
+        ``weights`` are upper triangles of H_p in the order xx xy xz yy yz zz, ``pulls`` right-hand sides H_p s_p, and
+        ``targets`` the T_g.
         """
         blocks = self._pairs @ weights  # pairs 6
         blocks[:, _DIAGONAL] += strain * self._strain_pairs[:, None]
@@ -195,12 +180,6 @@ def _pair_products(phi: Any) -> tuple[Ints, Ints, Any]:
     return pairs // K, pairs % K, products
 
 
-def _band_order(row: Ints, column: Ints, K: int) -> Int[Ints, " K"]:
-    """Nodes in an order in which those that meet are near one another."""
-    graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (K, K))
-    return reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(np.int64)
-
-
 def _band_places(row: Ints, column: Ints, rank: Int[Ints, " K"]) -> tuple[int, Int[Ints, "pairs 9"]]:
     """Half width of the band of the 3 K unknowns, and where the 3 x 3 block of every pair lies in it (pairs, 9).
 
@@ -211,9 +190,3 @@ def _band_places(row: Ints, column: Ints, rank: Int[Ints, " K"]) -> tuple[int, I
     i, j = 3 * rank[row][:, None] + a, 3 * rank[column][:, None] + b
     width = int(np.abs(i - j).max())
     return width, np.minimum(i, j) * (width + 1) + np.abs(i - j)
-
-
-def _vertex_faces(faces: Int[Ints, "F 3"], V: int) -> csr_matrix:
-    F = len(faces)
-    ones = np.ones(3 * F)
-    return csr_matrix((ones, (faces.T.reshape(-1), np.tile(np.arange(F), 3))), shape=(V, F))

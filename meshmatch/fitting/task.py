@@ -1,7 +1,8 @@
-"""What a fit in progress is about, and what it has found."""
+"""What a fit in progress is about, samples above all, and what it has found."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,46 +11,33 @@ import numpy as np
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.initial_frames import scan_frame
 from meshmatch.fitting.network_fit import Candidate, Predictor
-from meshmatch.fitting.samples import Landmarks, take_samples, without_outliers
+from meshmatch.fitting.nodes import Landmarks
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress
+from meshmatch.shapes.cloud import outlier_points
+from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
+
+# How much further than its neighbours from theirs an outlier is from its own, see `outlier_points`. Set by hand.
+_OUTLIER_RATIO = 1.3
 
 
 @dataclass(frozen=True, eq=False)
 class FitTask:
-    """One shape that is to be fitted.
-
-    Attributes
-    ----------
-    model : TrainedModel
-    config : FitConfig
-        For this model and the noise of this shape.
-    predictor : Predictor
-        The model's network, with the random numbers of this task.
-    shape : Shape
-        Repaired, in its file's frame.
-    roughness : float
-        Of the shape without outliers (0..1, see `Shape.roughness`).
-    frame : Frame
-        From the file to the frame of the samples: area about 1, centroid 0.
-    samples : OrientedPoints
-        Of the shape without outliers.
-    landmarks : (template vertices (N,), positions (N, 3) in the file), optional
-    progress : Progress
-    """
+    """One shape that is to be fitted."""
 
     model: TrainedModel
-    config: FitConfig
-    predictor: Predictor
-    shape: Shape
-    roughness: float
-    frame: Frame
-    samples: OrientedPoints
-    landmarks: Landmarks | None
+    config: FitConfig  # for this model and the noise of this shape
+    predictor: Predictor  # the model's network, with the random numbers of this task
+    shape: Shape  # repaired, in its file's frame
+    roughness: float  # of the shape without outliers (0..1, see `Shape.roughness`)
+    frame: Frame  # from the file to the frame of the samples: area about 1, centroid 0
+    samples: OrientedPoints  # of the shape without outliers
+    landmarks: Landmarks | None  # template vertices (N,), positions (N, 3) in the file
     progress: Progress
 
     @classmethod
@@ -66,17 +54,9 @@ class FitTask:
         rng = np.random.default_rng(config.seed)
         clean = without_outliers(shape)
         frame, samples = take_samples(clean, config.samples, rng, scan_frame(model, clean))
-        return cls(
-            model=model,
-            config=config,
-            predictor=Predictor.of(model, rng),
-            shape=shape,
-            roughness=clean.roughness,
-            frame=frame,
-            samples=samples,
-            landmarks=landmarks,
-            progress=progress or Progress(),
-        )
+        predictor = Predictor.of(model, rng)
+        progress = progress or Progress()
+        return cls(model, config, predictor, shape, clean.roughness, frame, samples, landmarks, progress)
 
     @property
     def system(self) -> NodeSystem:
@@ -94,22 +74,16 @@ class FitTask:
         return replace(self, frame=frame, samples=samples)
 
 
+# Of a task's candidates, best first, to the fit.
+Refine = Callable[[FitTask, list[Candidate]], Candidate]
+
+
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A candidate that a task ended with.
-
-    Attributes
-    ----------
-    task : FitTask
-        Frame and samples in the size that was found.
-    candidate : Candidate
-    share : float
-        How much of the whole surface (0..1) the shape is taken to show.
-    """
+    """A candidate that a task, with frame and samples in the size that was found, ended with."""
 
     task: FitTask
     candidate: Candidate
-    share: float = 1.0
 
     @cached_property
     def core_frame(self) -> Frame:
@@ -125,3 +99,23 @@ class Registration:
     def surface(self) -> OrientedPoints:
         """The template's vertices and normals as fitted, core frame."""
         return self.task.system.surface(self.candidate.vectors)
+
+
+def without_outliers(shape: Shape) -> Shape:
+    """A cloud without the points that lie apart from their neighbours; any other shape as it is.
+
+    An outlier among neighbours bends their normals and turns the signs of whole regions, and it counts as surface.
+    """
+    outlier = outlier_points(shape.verts, _OUTLIER_RATIO) if shape.is_cloud else np.zeros(0, bool)
+    return Shape(shape.verts[~outlier], shape.faces, shape.name) if outlier.any() else shape
+
+
+def take_samples(
+    shape: Shape, P: int, rng: np.random.Generator, frame: Frame | None = None
+) -> tuple[Frame, OrientedPoints]:
+    """A frame from a shape's file (by default to area 1, centroid 0), and P samples of the shape in that frame.
+
+    The outliers of a cloud are not drawn; the normals of a cloud are not signed.
+    """
+    frame = sqrt_area_frame(shape) if frame is None else frame
+    return frame, sample_surface(without_outliers(shape), P, rng).in_frame(frame)

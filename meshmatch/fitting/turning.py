@@ -11,7 +11,6 @@ every point may choose its own rotation anew (local and global steps of Sorkine 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
@@ -27,27 +26,16 @@ Path = Callable[[Float[Floats, " n"]], Float[Floats, "K 3"]]
 
 _MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
 _MAX_LOG = 5.0  # a stretch of 150, which only a far extrapolation reaches
+_ROUNDS = 3  # of local and global steps; their damping, and before it that of the first solve. Set by hand.
+_DAMPING_FIRST, _DAMPING = 1e-7, 1e-4
 _MIN_COST = 1e-6  # of an edge over which rotations do not change: a graph drops edges of cost 0
-
-
-@dataclass(frozen=True)
-class TurnConfig:
-    """Rounds of local and global steps; damping of the first solve and of these. Set by hand."""
-
-    rounds: int = 3
-    damping_first: float = 1e-7
-    damping: float = 1e-4
 
 
 class RotationBlend:
     """Weighted means of N rotations in each of several keys; exact at the keys.
 
     In the tangent space at the mean of the keys: for two keys that is the shortest turn from one to the other at
-    constant speed. The order of the keys does not matter.
-
-    Parameters
-    ----------
-    keys : sequence of (N, 3, 3)
+    constant speed. The order of the keys, each (N, 3, 3), does not matter.
     """
 
     def __init__(self, keys: Sequence[Floats]) -> None:
@@ -64,12 +52,7 @@ class RotationBlend:
 
 
 class StretchBlend:
-    """Weighted means, by logarithms, of symmetric stretches.
-
-    Parameters
-    ----------
-    keys : sequence of (N, 3, 3) logarithms
-    """
+    """Weighted means of symmetric stretches, given by their logarithms (N, 3, 3)."""
 
     def __init__(self, keys: Sequence[Floats]) -> None:
         self._logs = np.stack(keys)
@@ -96,20 +79,11 @@ def polar(F: Float[Floats, "N 3 3"]) -> tuple[Float[Floats, "N 3 3"], Float[Floa
 class FieldPath:
     """The poses between several fits of one template, by what the field does at its strain points.
 
-    Parameters
-    ----------
-    system : NodeSystem
-    keys : sequence of (K, 3)
-        Node vectors of the fits, each in its core frame.
-    core : (C,) int
-        Vertices of the template that stay in the middle.
+    Keys are node vectors (K, 3) of the fits, each in its core frame; vertices of the core stay in the middle.
     """
 
-    def __init__(
-        self, system: NodeSystem, keys: Sequence[Floats], core: Int[Ints, " C"], config: TurnConfig | None = None
-    ) -> None:
-        self._system, self._config = system, config or TurnConfig()
-        self._keys = np.stack(keys)
+    def __init__(self, system: NodeSystem, keys: Sequence[Floats], core: Int[Ints, " C"]) -> None:
+        self._system, self._keys = system, np.stack(keys)
         parts = [polar(system.deformation_gradient(key)) for key in keys]
         rotations = [rotation for rotation, _ in parts]
         self.stretches = StretchBlend([logs for _, logs in parts])
@@ -121,12 +95,15 @@ class FieldPath:
 
     def __call__(self, weights: Float[Floats, " n"]) -> Float[Floats, "K 3"]:
         """Node vectors for weights of the keys that sum to one."""
-        config, stretch = self._config, self.stretches.at(weights)
+        stretch = self.stretches.at(weights)
         straight = np.tensordot(weights, self._keys, 1)
-        vectors = self._solve(self._rotations(weights) @ stretch, config.damping_first, straight, straight)
-        for _ in range(config.rounds):
+        turned = self._joints.at(weights)
+        for level in self._levels:
+            turned[level] = turned[self._parent[level]] @ turned[level]
+        vectors = self._solve(turned @ stretch, _DAMPING_FIRST, straight, straight)
+        for _ in range(_ROUNDS):
             own = nearest_rotations(self._system.deformation_gradient(vectors), stretch)
-            vectors = self._solve(own @ stretch, config.damping, vectors, straight)
+            vectors = self._solve(own @ stretch, _DAMPING, vectors, straight)
         return vectors
 
     def _from_parent(self, rotations: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
@@ -135,12 +112,6 @@ class FieldPath:
         child = np.flatnonzero(self._parent >= 0)
         relative[child] = rotations[self._parent[child]].transpose(0, 2, 1) @ rotations[child]
         return relative
-
-    def _rotations(self, weights: Float[Floats, " n"]) -> Float[Floats, "G 3 3"]:
-        whole = self._joints.at(weights)
-        for level in self._levels:
-            whole[level] = whole[self._parent[level]] @ whole[level]
-        return whole
 
     def _solve(
         self,
@@ -186,20 +157,15 @@ def _spanning_order(
 
 def _neighbours(system: NodeSystem) -> tuple[Ints, Ints]:
     """Pairs (a < b) of strain points whose regions of the surface touch."""
-    G = len(system.strain_points)
+    V, G = len(system.verts), len(system.strain_points)
     edges = np.concatenate([system.faces[:, [0, 1]], system.faces[:, [1, 2]], system.faces[:, [2, 0]]])
-    pairs = _regions(system, edges)[edges]
-    pairs = np.sort(pairs[(pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])], axis=1)
-    code = np.unique(pairs[:, 0] * G + pairs[:, 1])
-    return code // G, code % G
-
-
-def _regions(system: NodeSystem, edges: Int[Ints, "E 2"]) -> Int[Ints, " V"]:
-    """The nearest strain point of every vertex along the surface; -1 out of reach."""
-    V = len(system.verts)
     length = np.linalg.norm(system.verts[edges[:, 0]] - system.verts[edges[:, 1]], axis=1)
     graph = csr_matrix((np.maximum(length, 1e-12), (edges[:, 0], edges[:, 1])), (V, V))
     found = dijkstra(graph, directed=False, indices=system.strain_points, min_only=True, return_predecessors=True)
     number = np.full(V + 1, -1)
-    number[system.strain_points] = np.arange(len(system.strain_points))
-    return number[np.where(found[2] < 0, V, found[2])]
+    number[system.strain_points] = np.arange(G)
+    region = number[np.where(found[2] < 0, V, found[2])]  # the nearest strain point along the surface, -1 out of reach
+    pairs = region[edges]
+    pairs = np.sort(pairs[(pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])], axis=1)
+    code = np.unique(pairs[:, 0] * G + pairs[:, 1])
+    return code // G, code % G

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Float, Floats
-from meshmatch.fitting.completion import area_share, visible_vertices
+from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.fitting.fit import Reason, Verdict
 from meshmatch.fitting.network_fit import two_way_residual, weighted_mean
 from meshmatch.fitting.system import NodeSystem
@@ -20,6 +19,9 @@ from meshmatch.shapes.shape import Shape
 GOOD_RESIDUAL, FAIR_RESIDUAL, PART_RESIDUAL = 0.0285, 0.031, 0.027
 # Further from the other surface than this (units of sqrt(area)), a point of shape or template is without counterpart.
 _REACH = 0.06
+# A template vertex is visible if a sample is this near, and if the nearest sample belongs this near to the vertex on the
+# resting template (units of sqrt(area)). Set by hand.
+_NEAR, _HOME = 0.06, 0.06
 # Shares without counterpart up to which a fit is good, and fair. Set by hand.
 _GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
 # More noise than this (units of sqrt(area), 3.4 cm on a person) is a wrong fit rather than noise.
@@ -50,18 +52,12 @@ def judge(
 
     Parameters
     ----------
-    residual : float
-        Of the fit: `two_way_residual`, or `one_way_residual` of a part.
-    local : OrientedPoints
-        Samples of the shape in the core frame.
-    points : (V, 3)
-        Template vertices as fitted, core frame.
-    allowance : float
-        The part of the residual that the shape itself explains (see `cloud_allowance`); squares add up.
-    partial : bool
-        The shape shows a part only: template without surface is as expected, and such a fit is fair at best.
-    hidden : float, optional
-        Of a part, the share (0..1) of the template that it does not show, where that is known better than by distance.
+    residual : of the fit, `two_way_residual`, or `one_way_residual` of a part
+    local : samples of the shape in the core frame
+    points : (V, 3) template vertices as fitted, core frame
+    allowance : the part of the residual that the shape itself explains (see `cloud_allowance`); squares add up
+    partial : the shape shows a part only: template without surface is as expected, and such a fit is fair at best
+    hidden : of a part, the share (0..1) of the template that it does not show, where known better than by distance
     """
     good, fair = (PART_RESIDUAL, PART_RESIDUAL) if partial else (GOOD_RESIDUAL, FAIR_RESIDUAL)
     reasons = []
@@ -119,4 +115,23 @@ def cloud_allowance(
     cloud = Shape(drawn + noise * rng.standard_normal(drawn.shape), np.empty((0, 3), np.int64))
     expected = two_way_residual(system, OrientedPoints(cloud.verts, cloud.vertex_normals, signed=False), vectors)
     clear = two_way_residual(system, clean, vectors)
-    return float(np.sqrt(max(expected**2 - clear**2, 0.0)))
+    return unexplained(expected, clear)
+
+
+def visible_vertices(system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> Bool[Bools, " V"]:
+    """Whether samples (core frame) show each vertex of the template as fitted.
+
+    Vertices beyond a cut have the edge of the samples near by, but the edge belongs elsewhere on the template.
+    """
+    surface = system.surface(vectors)
+    local = local.facing(surface)
+    distance, nearest = local.tree.query(surface.features)
+    home = surface.tree.query(local.features)[1]
+    away = np.linalg.norm(system.verts[home[nearest]] - system.verts, axis=1)
+    return np.asarray((distance < _NEAR) & (away < _HOME))
+
+
+def area_share(system: NodeSystem, vertices: Bool[Bools, " V"]) -> float:
+    """Share (0..1) of the resting template's area around some vertices."""
+    area = Shape(system.verts, system.faces).vertex_areas
+    return float(area[vertices].sum() / area.sum())

@@ -1,38 +1,49 @@
-"""Fits of a shape that is taken for complete: orientation, prediction, scale of a cloud, refinement."""
+"""Fits of a shape that is taken for complete: orientation, prediction, scale of a cloud, refinement.
+
+The area of a cloud is only estimated, too small where points are few and noisy, and outliers look like surface. The
+network's own fit knows better: its template has the area of a body, and a point far from it, with few others around, is
+not on its surface.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
-from meshmatch.fitting.cloud_scale import estimate_scale
+import numpy as np
+from scipy.spatial import cKDTree
+
+from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.fitting.initial_frames import frames_to_try
-from meshmatch.fitting.network_fit import Candidate
-from meshmatch.fitting.task import FitTask, Registration
+from meshmatch.fitting.network_fit import Candidate, best_first
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.task import FitTask, Refine, Registration
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.progress import Progress
 
-_BEHIND = 1.1  # times the best residual: candidates further behind say nothing about a cloud's scale. Set by hand.
+# All of these were set by hand.
+_ROUNDS = 3
+_MAX_CHANGE = 1.3  # of the scale, in all: more is a wrong fit, not a wrong area
+_FAR = 0.06  # from the template, units of sqrt(area)
+_ISOLATED = 1.5  # reach of the nearest points, against the median of the cloud
+_NEIGHBOURS = 8
+_SETTLED = 0.005  # a relative change of the scale that ends the search
+_BEHIND = 1.1  # times the best residual: candidates further behind say nothing about a cloud's scale
 
-# Of candidates, best first, to the fit.
-RefineWhole = Callable[[FitTask, list[Candidate]], Candidate]
+FitAgain = Callable[[OrientedPoints, RigidPose], Candidate]
 
 
-def fit_whole(task: FitTask, refine: RefineWhole) -> Registration:
-    """Fit the template to a shape that is taken for complete; ``refine`` turns the network's candidates into one fit.
-
-    Raises
-    ------
-    OptionError
-        Axes of the user that are invalid, or up and front along the same axis.
-    """
+def fit_whole(task: FitTask, refine: Refine) -> Registration:
+    """Fit the template to a shape that is taken for complete; ``refine`` turns the network's candidates into one fit."""
     orientation = task.progress.stage("orientation")
     candidates = _screened(task, orientation.between(0.0, 0.7))
     if task.shape.is_cloud:
         task, candidates = _rescaled(task, candidates)
     careful = task.predictor.fit_all([(task.samples, each.pose) for each in candidates[: task.config.careful]])
     orientation(1.0)
-    return Registration(task, refine(task, _best_first(careful)))
+    return Registration(task, refine(task, best_first(careful)))
 
 
 def _screened(task: FitTask, progress: Progress) -> list[Candidate]:
@@ -44,7 +55,7 @@ def _screened(task: FitTask, progress: Progress) -> list[Candidate]:
     coarse = task.coarse
     found = task.predictor.fit_all([(coarse, pose) for pose in frames], rounds=care, draws=care)
     progress(1.0)
-    return _best_first(found)
+    return best_first(found)
 
 
 def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list[Candidate]]:
@@ -63,5 +74,37 @@ def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list
     return task.rescaled(scale, samples), [first, *others]
 
 
-def _best_first(candidates: list[Candidate]) -> list[Candidate]:
-    return sorted(candidates, key=lambda candidate: candidate.residual)
+def estimate_scale(
+    system: NodeSystem, samples: OrientedPoints, candidate: Candidate, fit_again: FitAgain
+) -> tuple[float, OrientedPoints, Candidate]:
+    """Rescale samples of a cloud (area 1 by estimate) by the network's fit, drop outliers, fit again, a few times.
+
+    Returns the scale, by which lengths of the old frame are to be divided; the samples that are left, in the new frame;
+    and their fit.
+    """
+    isolated = isolated_points(samples.points)
+    resting = vertex_areas(system.verts, system.faces).sum()
+    total = 1.0
+    for _ in range(_ROUNDS):
+        moved, pose = system.moved(candidate.vectors), candidate.pose
+        step = np.sqrt(vertex_areas(moved, system.faces).sum() / resting)
+        step = np.clip(step, 1 / _MAX_CHANGE / total, _MAX_CHANGE / total)
+        far = cKDTree(pose.to_world(moved)).query(samples.points)[0] > _FAR
+        keep = ~(far & isolated)
+        total *= step
+        samples, isolated = samples.rows(keep), isolated[keep]
+        samples = replace(samples, points=samples.points / step)
+        candidate = fit_again(samples, RigidPose(pose.rotation, pose.center / step))
+        if keep.all() and abs(step - 1) < _SETTLED:
+            break
+    return float(total), samples, candidate
+
+
+def isolated_points(points: Float[Floats, "P 3"]) -> Bool[Bools, " P"]:
+    """Whether the nearest few points lie further away than is usual on the cloud.
+
+    Samples of a small cloud repeat its points; copies of a point do not count as its neighbours.
+    """
+    own, which = np.unique(points, axis=0, return_inverse=True)
+    reach = cKDTree(own).query(own, min(_NEIGHBOURS + 1, len(own)))[0][:, -1]
+    return np.asarray((reach > _ISOLATED * np.median(reach))[which.reshape(-1)])

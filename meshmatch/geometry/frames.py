@@ -13,21 +13,11 @@ from meshmatch.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A similarity: the way from a file's own coordinates into a model's, and back.
+    """A similarity: the way from a file's own coordinates into a model's, and back."""
 
-    Parameters
-    ----------
-    scale : float
-        Length in the file that becomes 1. Positive.
-    rotation : (3, 3) float64
-        Applied after centering; orthonormal, determinant +1.
-    center : (3,) float64
-        The file's point that becomes the origin.
-    """
-
-    scale: float
-    rotation: Float[Floats, "3 3"]
-    center: Float[Floats, " 3"]
+    scale: float  # length in the file that becomes 1; positive
+    rotation: Float[Floats, "3 3"]  # applied after centering; orthonormal, determinant +1
+    center: Float[Floats, " 3"]  # the file's point that becomes the origin
 
     def __post_init__(self) -> None:
         rotation = read_only(self.rotation, np.float64, "a frame's rotation")
@@ -73,18 +63,10 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class RigidPose:
-    """Where a body's own (local) coordinates lie in the world: world = rotation local + center.
+    """Where a body's own (local) coordinates lie in the world: world = rotation local + center."""
 
-    Parameters
-    ----------
-    rotation : (3, 3) float64
-        Orthonormal, determinant +1.
-    center : (3,) float64
-        The world's point that is the local origin.
-    """
-
-    rotation: Float[Floats, "3 3"]
-    center: Float[Floats, " 3"]
+    rotation: Float[Floats, "3 3"]  # orthonormal, determinant +1
+    center: Float[Floats, " 3"]  # the world's point that is the local origin
 
     @classmethod
     def identity(cls) -> RigidPose:

@@ -23,22 +23,14 @@ _REACH = 0.5
 
 @dataclass(frozen=True, eq=False)
 class OrientedPoints:
-    """Samples of a surface: points with unit normals.
-
-    Parameters
-    ----------
-    points, normals : (P, 3) float64
-    signed : bool
-        False if the normals are estimated, as a cloud's are: which side is out is then a guess, wrong for whole regions
-        where points are few and noisy.
-    weights : (P,) float64, optional
-        How far each point is trusted: 1 fully, 0 not at all.
-    """
+    """Samples of a surface: points with unit normals."""
 
     points: Float[Floats, "P 3"]
     normals: Float[Floats, "P 3"]
+    # False if the normals are estimated, as a cloud's are: which side is out is then a guess, wrong for whole regions
+    # where points are few and noisy.
     signed: bool = True
-    weights: Float[Floats, " P"] | None = None
+    weights: Float[Floats, " P"] | None = None  # how far each point is trusted: 1 fully, 0 not at all
 
     @property
     def features(self) -> Float[Floats, "P 6"]:
@@ -70,6 +62,12 @@ class OrientedPoints:
     def thinned(self, P: int) -> OrientedPoints:
         """About P of the samples, evenly taken from their order, which must be random."""
         return self.rows(slice(None, None, max(1, len(self.points) // P)))
+
+    def drawn(self, count: int, rng: np.random.Generator) -> Float[Floats, "N 3"]:
+        """Points of at most ``count`` different samples, drawn evenly, or by their weights if they have some."""
+        share = None if self.weights is None else self.weights / self.weights.sum()
+        available = len(self.points) if share is None else np.count_nonzero(share)
+        return self.points[rng.choice(len(self.points), min(count, available), replace=False, p=share)]
 
     def facing(self, reference: OrientedPoints) -> OrientedPoints:
         """The same samples; normals without a sure sign are turned to agree with those of the nearest reference points."""

@@ -56,23 +56,13 @@ def face_parts(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " F"]:
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """The edges of faces, sorted once for several questions.
+    """The edges of faces, sorted once for several questions."""
 
-    Parameters
-    ----------
-    ordered : (3 F,) int64
-        Twice the number of each edge of each face, plus 1 if the face runs from the smaller vertex to the
-        larger.
-    begins, sizes : (E,) int64
-        Where each edge begins in `ordered`, and how many faces it has.
-    stride : int
-        The number of the edge between vertices i < j is i * stride + j.
-    """
-
+    # Twice the number of each edge of each face, plus 1 if the face runs from the smaller vertex to the larger.
     ordered: Int[Ints, " F_times_3"]
-    begins: Int[Ints, " E"]
-    sizes: Int[Ints, " E"]
-    stride: int
+    begins: Int[Ints, " E"]  # where each edge begins in `ordered`
+    sizes: Int[Ints, " E"]  # and how many faces it has
+    stride: int  # the number of the edge between vertices i < j is i * stride + j
 
     @property
     def vertices(self) -> Int[Ints, "E 2"]:
@@ -107,12 +97,8 @@ def directed_edges(faces: Int[Ints, "F 3"]) -> Int[Ints, " F_times_3"]:
 
 def open_edges(faces: Int[Ints, "F 3"]) -> Int[Ints, "N 2"]:
     """(N, 2) vertices of the edges that have one face."""
-    V = _stride(faces)
-    keys = np.sort(edge_keys(faces, V))
-    alone = np.ones(len(keys), bool)
-    alone[1:] &= keys[1:] != keys[:-1]
-    alone[:-1] &= keys[1:] != keys[:-1]
-    return np.stack([keys[alone] // V, keys[alone] % V], axis=1)
+    edges = edges_of(faces)
+    return edges.vertices[edges.sizes == 1]
 
 
 def edge_keys(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " F_times_3"]:

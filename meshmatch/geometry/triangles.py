@@ -45,11 +45,6 @@ def triangle_areas(verts: Float[Floats, "V 3"], faces: Int[NDArray[Any], "F 3"])
     return np.asarray(0.5 * np.sqrt(squared_lengths(triangle_vectors(verts, faces))))
 
 
-def triangle_normals(verts: Float[Floats, "V 3"], faces: Int[NDArray[Any], "F 3"]) -> Float[Floats, "F 3"]:
-    """Unit normal of each triangle; zeros for one without area."""
-    return unit(triangle_vectors(verts, faces))
-
-
 def vertex_areas(verts: Float[Floats, "V 3"], faces: Int[NDArray[Any], "F 3"]) -> Float[Floats, " V"]:
     """A third of the area of the triangles around each vertex."""
     return share_areas(triangle_areas(verts, faces), faces, len(verts))

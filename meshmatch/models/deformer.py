@@ -17,16 +17,8 @@ from meshmatch.fields.field import Field, PointField, apply_shape_functions
 from meshmatch.fields.pointwise import TURN_ROWS, PointwiseField, code_rows, turned_rows
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.geometry.kernels import Kernel
+from meshmatch.models import layers
 from meshmatch.models.config import NetworkConfig
-from meshmatch.models.layers import (
-    BasisEncoder,
-    FlatDecoder,
-    NodeDecoder,
-    PointDecoder,
-    PointEncoder,
-    residual_mlp,
-    two_way_offsets,
-)
 
 
 def rotation_from_six(six: Float[torch.Tensor, "B 6"]) -> Float[torch.Tensor, "B 3 3"]:
@@ -40,15 +32,9 @@ def rotation_from_six(six: Float[torch.Tensor, "B 6"]) -> Float[torch.Tensor, "B
 class Deformer(nn.Module):
     """Aligner, encoder, decoder and correctors around one template's nodes.
 
-    Parameters
-    ----------
-    nodes
-        Control nodes in the template frame.
-    anchors, anchor_phi
-        Points of the template where a correction looks at the scan, and the field's shape functions there; None where
-        the field has no nodes.
-    basis, align_basis
-        Basis points of encoder and aligner; ignored (may be empty) where the config does not use them.
+    Nodes and anchors are in the template frame: anchors are where a correction looks at the scan, ``anchor_phi`` the
+    field's shape functions there, None where the field has no nodes. Basis points of encoder and aligner are ignored (may
+    be empty) where the config does not use them.
     """
 
     def __init__(
@@ -69,20 +55,21 @@ class Deformer(nn.Module):
         self.register_buffer("nodes", nodes)
         self.register_buffer("anchors", anchors)
         self.register_buffer("anchor_phi", anchor_phi)
+        self.encoder: layers.BasisEncoder | layers.PointEncoder
         if config.encoder == "basis":
-            self.encoder: BasisEncoder | PointEncoder = BasisEncoder(basis, config.width, config.depth, config.code)
+            self.encoder = layers.BasisEncoder(basis, config.width, config.depth, config.code)
         else:
-            self.encoder = PointEncoder(config.code)
-        self.decoder: FlatDecoder | NodeDecoder | PointDecoder
+            self.encoder = layers.PointEncoder(config.code)
+        self.decoder: layers.FlatDecoder | layers.NodeDecoder | layers.PointDecoder
         rows = K
         if not has_nodes(config.field):
-            self.decoder, rows = PointDecoder(config.code, config.width), code_rows(config.code)
+            self.decoder, rows = layers.PointDecoder(config.code, config.width), code_rows(config.code)
         elif config.decoder == "flat":
-            self.decoder = FlatDecoder(config.code, config.width, 1, K)
+            self.decoder = layers.FlatDecoder(config.code, config.width, 1, K)
         else:
-            self.decoder = NodeDecoder(config.code, nodes, config.width)
-        self.aligner = BasisEncoder(align_basis, config.align_width, 2, 9) if config.align_basis else None
-        self.corrector = residual_mlp(A * 10, config.correct_width, 1, 3 * rows) if config.corrections else None
+            self.decoder = layers.NodeDecoder(config.code, nodes, config.width)
+        self.aligner = layers.BasisEncoder(align_basis, config.align_width, 2, 9) if config.align_basis else None
+        self.corrector = layers.residual_mlp(A * 10, config.correct_width, 1, 3 * rows) if config.corrections else None
 
     @property
     def K(self) -> int:
@@ -95,23 +82,19 @@ class Deformer(nn.Module):
 
         ``nodes`` are the template's, in their own precision.
         """
-        if isinstance(self.decoder, PointDecoder):
+        if isinstance(self.decoder, layers.PointDecoder):
             return self.pointwise_field(points)
         return Field.of(shape_functions(self.config.field, points, nodes, radius, kernel))
 
     def pointwise_field(self, points: Float[Floats, "P 3"]) -> PointwiseField:
         """The field of a pointwise network."""
-        assert isinstance(self.decoder, PointDecoder)
+        assert isinstance(self.decoder, layers.PointDecoder)
         at = torch.from_numpy(np.array(points)).float()
         return PointwiseField(at, at, self.decoder.displacement, self.config.code)
 
     def rotate_rows(self, vectors: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
-        """Rows of the deformation whose moved points (rows) are those of ``vectors`` times ``turn``."""
-        if isinstance(self.decoder, PointDecoder):
-            return turned_rows(vectors, turn)
-        nodes = self.nodes.double().cpu().numpy()
-        # A node at q moves to Q^T (q + u), so its vector in the turned frame is that minus q.
-        return (nodes + vectors) @ turn - nodes
+        assert isinstance(self.decoder, layers.PointDecoder)  # `NodeNetwork` turns node vectors
+        return turned_rows(vectors, turn)
 
     def align(
         self, features: Float[torch.Tensor, "B N 3"]
@@ -126,20 +109,18 @@ class Deformer(nn.Module):
     ) -> Float[torch.Tensor, "B R 3"]:
         """One learned registration step: better rows from rows and scan points, both in the core frame."""
         assert self.corrector is not None
-        moved = self._at_anchors(vectors)  # B A 3
-        seen = two_way_offsets(self.anchors + moved, points)
+        if isinstance(self.decoder, layers.PointDecoder):
+            motion = self.decoder.displacement
+            moved = PointwiseField(self.anchors, self.anchors, motion, self.config.code).displacement(vectors)
+        else:
+            assert self.anchor_phi is not None
+            moved = apply_shape_functions(self.anchor_phi, vectors)  # B A 3
+        seen = layers.two_way_offsets(self.anchors + moved, points)
         features = torch.cat([seen[..., :6] * 10.0, seen[..., 6:], moved * 3.0], -1)
         change = 0.1 * self.corrector(features.flatten(1)).unflatten(-1, (-1, 3))
-        if isinstance(self.decoder, PointDecoder):
+        if isinstance(self.decoder, layers.PointDecoder):
             change = nn.functional.pad(change, (0, 0, 0, TURN_ROWS))  # the code alone is learned
         return vectors + change
-
-    def _at_anchors(self, vectors: torch.Tensor) -> torch.Tensor:
-        if isinstance(self.decoder, PointDecoder):
-            motion = self.decoder.displacement
-            return PointwiseField(self.anchors, self.anchors, motion, self.config.code).displacement(vectors)
-        assert self.anchor_phi is not None
-        return apply_shape_functions(self.anchor_phi, vectors)
 
     def forward(self, points: Float[torch.Tensor, "B P 3"]) -> Float[torch.Tensor, "B R 3"]:
         """The rows of scans in the core frame; with nodes, these are their vectors."""
@@ -157,23 +138,19 @@ class Deformer(nn.Module):
 
     @torch.inference_mode()
     def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B R 3"]:
-        """Rows for several clouds, of any number of points each, in their core frames."""
         return np.stack([_array(self(self._tensor(cloud)))[0] for cloud in clouds])
 
     @torch.inference_mode()
     def read_frames(self, offsets: Float[Floats32, "B M 3"]) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
-        """Rotations R and centers t of the core, scan = R core + t, from offsets of basis points to nearest points."""
         R, t = self.align(torch.from_numpy(5 * offsets).to(self.nodes.device))
         return _array(R), _array(t)
 
     @torch.inference_mode()
     def encode(self, cloud: Float[Floats, "P 3"]) -> Float[Floats, " D"]:
-        """The code of a cloud in its core frame."""
         return _array(self.encoder(self.encoder.features(self._tensor(cloud))))[0]
 
     @torch.inference_mode()
     def decode(self, code: Float[Floats, " D"]) -> Float[Floats, "R 3"]:
-        """The rows of a code, without corrections."""
         return _array(self.decoder(self._tensor(code)))[0]
 
     def _tensor(self, array: Floats) -> torch.Tensor:

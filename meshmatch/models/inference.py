@@ -18,6 +18,7 @@ from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.models.config import NetworkConfig
 
 _EPSILON = np.float32(1e-5)  # of layer and batch norms, as in torch
+_POINT_SIZES = (126, 128, 256, 512, 1024)  # of the layers of `models.layers.PointEncoder`
 
 
 class Network(Protocol):
@@ -29,37 +30,25 @@ class Network(Protocol):
     @property
     def align_basis(self) -> Float[Floats32, "M 3"]:
         """Basis points of the aligner."""
-        ...
 
     def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B R 3"]:
         """Rows for several clouds, of any number of points each, in their core frames."""
-        ...
 
     def read_frames(self, offsets: Float[Floats32, "B M 3"]) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
         """Rotations R and centers t of the core, scan = R core + t, from offsets of basis points to nearest points."""
-        ...
 
     def encode(self, cloud: Float[Floats, "P 3"]) -> Float[Floats, " D"]:
         """The code of a cloud in its core frame."""
-        ...
 
     def decode(self, code: Float[Floats, " D"]) -> Float[Floats, "R 3"]:
         """The rows of a code, without corrections."""
-        ...
 
     def rotate_rows(self, rows: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
         """Rows of the deformation whose moved points (rows) are those of ``rows`` times ``turn``."""
-        ...
 
 
 class NodeNetwork:
-    """A network whose answers are node vectors.
-
-    Parameters
-    ----------
-    config : NetworkConfig
-    weights : arrays by the names of `models.deformer.Deformer`
-    """
+    """A network whose answers are node vectors; weights have the names of `models.deformer.Deformer`."""
 
     def __init__(self, config: NetworkConfig, weights: Mapping[str, np.ndarray]) -> None:
         self.config, self.weights = config, weights
@@ -104,14 +93,9 @@ class NodeNetwork:
         angle = np.float32(2 * np.pi) * cloud[:, None, :] * frequencies[:, None]
         x = np.concatenate([np.sin(angle), np.cos(angle)], -1).reshape(len(cloud), -1)
         x /= np.float32(np.sqrt(3 * len(frequencies)))
-        layers = sorted(
-            int(name.split(".")[2]) for name in self.weights if name.startswith("encoder.points.") and
-            name.endswith(".running_mean")
-        )  # fmt: skip
-        for norm in layers:
-            x = self._batch_norm(f"encoder.points.{norm}", self._linear(f"encoder.points.{norm - 1}", x))
-            if norm != layers[-1]:
-                x = np.maximum(x, 0)
+        for layer in range(0, 3 * len(_POINT_SIZES) - 3, 3):
+            x = np.maximum(x, 0) if layer else x
+            x = self._batch_norm(f"encoder.points.{layer + 1}", self._linear(f"encoder.points.{layer}", x))
         return self._linear("encoder.head.3", np.maximum(self._linear("encoder.head.0", x.max(0)), 0))
 
     def _decode(self, codes: Float[Floats32, "B D"]) -> Float[Floats32, "B K 3"]:
@@ -132,12 +116,8 @@ class NodeNetwork:
         anchors, phi = self.weights["anchors"], self.weights["anchor_phi"]
         B, K, _ = vectors.shape
         moved = (phi @ vectors.transpose(1, 0, 2).reshape(K, -1)).reshape(len(phi), B, 3).transpose(1, 0, 2)
-        seen = np.stack(
-            [
-                _two_way_offsets(anchors + own, cloud, tree)
-                for own, cloud, tree in zip(moved, clouds, trees, strict=True)
-            ]
-        )
+        triples = zip(anchors + moved, clouds, trees, strict=True)
+        seen = np.stack([_two_way_offsets(placed, cloud, tree) for placed, cloud, tree in triples])
         features = np.concatenate([10 * seen[..., :6], seen[..., 6:], 3 * moved], -1)
         change = self._residual_mlp("corrector", features.reshape(B, -1))
         return vectors + np.float32(0.1) * change.reshape(B, -1, 3)
@@ -173,24 +153,24 @@ def weight_shapes(config: NetworkConfig, K: int) -> dict[str, tuple[int, ...]]:
     """Shapes of the weights and buffers of a network with K nodes, by name; not for pointwise fields."""
     found: dict[str, tuple[int, ...]] = {"nodes": (K, 3), "anchors": (K, 3), "anchor_phi": (K, K)}
 
-    def linear(name: str, inputs: int, outputs: int, rest: tuple[int, ...] = (), bias: bool = True) -> None:
-        found[f"{name}.weight"] = (outputs, inputs, *rest)
-        if bias:
-            found[f"{name}.bias"] = (outputs,)
+    def linear(name: str, inputs: int, outputs: int, *rest: int) -> None:
+        found.update({f"{name}.weight": (outputs, inputs, *rest), f"{name}.bias": (outputs,)})
 
-    def norm(name: str, width: int, batch: bool) -> None:
+    def norm(name: str, width: int) -> None:
         found.update({f"{name}.weight": (width,), f"{name}.bias": (width,)})
-        if batch:
-            found.update({f"{name}.running_mean": (width,), f"{name}.running_var": (width,)})
-            found[f"{name}.num_batches_tracked"] = ()
+
+    def batch_norm(name: str, width: int) -> None:
+        norm(name, width)
+        found.update({f"{name}.running_mean": (width,), f"{name}.running_var": (width,)})
+        found[f"{name}.num_batches_tracked"] = ()
 
     def residual_mlp(name: str, inputs: int, width: int, depth: int, outputs: int) -> None:
         linear(f"{name}.0", inputs, width)
         for block in range(1, depth + 1):
-            norm(f"{name}.{block}.norm", width, False)
+            norm(f"{name}.{block}.norm", width)
             linear(f"{name}.{block}.widen", width, width)
             linear(f"{name}.{block}.narrow", width, width)
-        norm(f"{name}.{depth + 1}", width, False)
+        norm(f"{name}.{depth + 1}", width)
         linear(f"{name}.{depth + 3}", width, outputs)
 
     code, width = config.code, config.width
@@ -199,11 +179,9 @@ def weight_shapes(config: NetworkConfig, K: int) -> dict[str, tuple[int, ...]]:
         residual_mlp("encoder.network", 3 * config.basis, width, config.depth, code)
     else:
         found["encoder.frequencies"] = (21,)
-        at, sizes = 0, (126, 128, 256, 512, 1024)
-        for inputs, outputs in pairwise(sizes):
-            linear(f"encoder.points.{at}", inputs, outputs, (1,))
-            norm(f"encoder.points.{at + 1}", outputs, True)
-            at += 3
+        for number, (inputs, outputs) in enumerate(pairwise(_POINT_SIZES)):
+            linear(f"encoder.points.{3 * number}", inputs, outputs, 1)
+            batch_norm(f"encoder.points.{3 * number + 1}", outputs)
         linear("encoder.head.0", 1024, 1024)
         linear("encoder.head.3", 1024, code)
     if config.decoder == "flat":
@@ -211,12 +189,11 @@ def weight_shapes(config: NetworkConfig, K: int) -> dict[str, tuple[int, ...]]:
     else:
         found["decoder.nodes"] = (K, 3)
         linear("decoder.from_code", code, width)
-        linear("decoder.from_node", 3, width, bias=False)
-        norm("decoder.network.0", width, True)
-        linear("decoder.network.2", width, width // 2)
-        norm("decoder.network.3", width // 2, True)
-        linear("decoder.network.5", width // 2, width // 4)
-        norm("decoder.network.6", width // 4, True)
+        found["decoder.from_node.weight"] = (width, 3)
+        batch_norm("decoder.network.0", width)
+        for layer, inputs in ((2, width), (5, width // 2)):
+            linear(f"decoder.network.{layer}", inputs, inputs // 2)
+            batch_norm(f"decoder.network.{layer + 1}", inputs // 2)
         linear("decoder.network.8", width // 4, 3)
     if config.align_basis:
         found["aligner.basis"] = (config.align_basis, 3)
@@ -235,7 +212,7 @@ def rotation_from_six(six: Float[Floats, "B 6"]) -> Float[Floats, "B 3 3"]:
     return np.stack([a, b, np.cross(a, b)], -1)
 
 
-def quick_tree(points: Float[Floats32, "P 3"]) -> cKDTree:
+def quick_tree(points: Float[Floats32, "P D"]) -> cKDTree:
     """A tree that is asked a few times only: built quickly rather than balanced."""
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
 

@@ -7,6 +7,7 @@ the rows that a field reads: one displacement vector per node, or the code itsel
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -59,27 +60,39 @@ def two_way_offsets(
 class ResidualBlock(nn.Module):
     """x + W2 gelu(W1 norm(x)), a pre-norm residual layer of constant width."""
 
-    def __init__(self, width: int, dropout: float = 0.0) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(width)
         self.widen = nn.Linear(width, width)
-        self.dropout = nn.Dropout(dropout)
         self.narrow = nn.Linear(width, width)
         nn.init.zeros_(self.narrow.weight)
         nn.init.zeros_(self.narrow.bias)
 
     def forward(self, x: Float[torch.Tensor, "*B W"]) -> Float[torch.Tensor, "*B W"]:
-        return x + self.narrow(self.dropout(nn.functional.gelu(self.widen(self.norm(x)))))
+        return x + self.narrow(nn.functional.gelu(self.widen(self.norm(x))))
 
 
 def residual_mlp(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequential:
     """inputs -> width, ``depth`` residual blocks, -> outputs."""
     blocks = [ResidualBlock(width) for _ in range(depth)]
     last = nn.Linear(width, outputs)
-    # Start near zero: an untrained deformer then leaves its template almost at rest.
+    _start_near_zero(last)
+    return nn.Sequential(nn.Linear(inputs, width), *blocks, nn.LayerNorm(width), nn.GELU(), last)
+
+
+def _start_near_zero(last: nn.Module) -> None:
+    """An untrained deformer then leaves its template almost at rest."""
+    assert isinstance(last, nn.Linear)
     nn.init.normal_(last.weight, std=2e-3)
     nn.init.zeros_(last.bias)
-    return nn.Sequential(nn.Linear(inputs, width), *blocks, nn.LayerNorm(width), nn.GELU(), last)
+
+
+def _shared_mlp(width: int, norm: Callable[[int], nn.Module]) -> nn.Sequential:
+    """What is left of an MLP shared over points after its first layer: three halving layers, three numbers."""
+    layers: list[nn.Module] = [norm(width), nn.ReLU()]
+    for a, b in ((width, width // 2), (width // 2, width // 4)):
+        layers += [nn.Linear(a, b), norm(b), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(width // 4, 3))
 
 
 class BasisEncoder(nn.Module):
@@ -154,12 +167,7 @@ class NodeDecoder(nn.Module):
         self.register_buffer("nodes", nodes)
         self.from_code = nn.Linear(code, width)
         self.from_node = nn.Linear(3, width, bias=False)
-        sizes = [width, width // 2, width // 4]
-        layers: list[nn.Module] = [nn.BatchNorm1d(width), nn.ReLU()]
-        for a, b in pairwise(sizes):
-            layers += [nn.Linear(a, b), nn.BatchNorm1d(b), nn.ReLU()]
-        layers.append(nn.Linear(sizes[-1], 3))
-        self.network = nn.Sequential(*layers)
+        self.network = _shared_mlp(width, nn.BatchNorm1d)
 
     def forward(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B K 3"]:
         """Node vectors of codes."""
@@ -179,14 +187,8 @@ class PointDecoder(nn.Module):
         super().__init__()
         self.from_code = nn.Linear(code, width)
         self.from_point = nn.Linear(3, width, bias=False)
-        sizes = [width, width // 2, width // 4]
-        layers: list[nn.Module] = [nn.LayerNorm(width), nn.ReLU()]
-        for a, b in pairwise(sizes):
-            layers += [nn.Linear(a, b), nn.LayerNorm(b), nn.ReLU()]
-        last = nn.Linear(sizes[-1], 3)
-        nn.init.normal_(last.weight, std=2e-3)  # untrained it leaves its template almost at rest
-        nn.init.zeros_(last.bias)
-        self.network = nn.Sequential(*layers, last)
+        self.network = _shared_mlp(width, nn.LayerNorm)
+        _start_near_zero(self.network[-1])
 
     def forward(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B R 3"]:
         return pack(code)

@@ -55,10 +55,7 @@ class TrainedModel:
     def field(self, points: Float[Floats, "P 3"]) -> ShapeFunctions | PointwiseField:
         """The field on points of the template's frame, with the kernel that the network was trained with.
 
-        Raises
-        ------
-        TemplateError
-            A point has too few nodes in reach.
+        `TemplateError` where a point has too few nodes in reach.
         """
         config, nodes, radius = self.inference.config, self.template.nodes, self.template.radius
         if has_nodes(config.field):
@@ -110,10 +107,7 @@ def torch_network(model: TrainedModel) -> Deformer:
 def load_network(path: str | Path, config: NetworkConfig, K: int) -> Network:
     """A network for K nodes with the weights of a file, in evaluation mode. A pointwise one needs torch.
 
-    Raises
-    ------
-    ModelError
-        The file is damaged, or holds the weights of another network.
+    `ModelError` if the file is damaged, or holds the weights of another network.
     """
     if has_nodes(config.field):
         return NodeNetwork(config, load_weights(path, weight_shapes(config, K)))
@@ -127,13 +121,8 @@ def load_network(path: str | Path, config: NetworkConfig, K: int) -> Network:
 def trained_model(card: ModelCard, template_file: Path, weights_file: Path) -> TrainedModel:
     """The model of a card, from files that are safe to read; `meshmatch.models.registry.load_model` finds them.
 
-    Raises
-    ------
-    ModelError
-        A kernel that is not known here, weights that are not those of the card's network, or a template that is not the
-        one the model was trained with.
-    TemplateError
-        The template's file is damaged.
+    `ModelError` for a kernel that is not known here, weights that are not those of the card's network, or a template that
+    is not the one the model was trained with; `TemplateError` if its file is damaged.
     """
     template = load_template(template_file)
     if template.hash != card.template_hash or template.K != card.field["nodes"]:

@@ -10,8 +10,8 @@ from meshmatch.fitting.agree import AgreeConfig, Member, agree, agreed_fits, mea
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.nodes import NodeRefineConfig
-from meshmatch.fitting.samples import Landmarks
 from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.task import Landmarks
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel

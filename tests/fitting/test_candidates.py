@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshmatch.fitting.candidates import CandidateScorer, averaged, choose, differ
 from meshmatch.fitting.network_fit import Candidate
+from meshmatch.fitting.refinement import CandidateScorer, averaged, choose, differ
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints

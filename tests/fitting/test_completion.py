@@ -1,6 +1,7 @@
 """Parts completed by the template: what counts as visible, what stands in, and a body that was cut."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,11 +9,11 @@ from scipy.spatial import cKDTree
 
 from meshmatch.api.inputs import as_model
 from meshmatch.experiments.partial import part_of
-from meshmatch.fitting.completion import area_share, completed, visible_vertices
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import Candidate
-from meshmatch.fitting.part import PartCandidate
+from meshmatch.fitting.part import completed
 from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.verdict import area_share, visible_vertices
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape
@@ -141,12 +142,12 @@ def test_what_is_seen_is_measured_by_area(system: NodeSystem) -> None:
 
 def test_a_candidate_knows_its_size_and_what_it_costs() -> None:
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    fit = Candidate(RigidPose(turn, np.array([1.0, 0, 0])), np.zeros((1, 3)), 0.02)
+    fit = Candidate(RigidPose(turn, np.array([1.0, 0, 0])), np.zeros((1, 3)), 0.02, share=0.25)
     scan = OrientedPoints(np.array([[4.0, 2, 0]]), np.array([[1.0, 0, 0]]))
-    local = PartCandidate(0.25, fit).local(scan)
+    local = fit.local(scan)
     assert np.allclose(local.points, (np.array([[2.0, 1, 0]]) - [1, 0, 0]) @ turn)
     assert np.allclose(local.normals, scan.normals @ turn)
-    assert PartCandidate(0.25, fit).cost > PartCandidate(0.5, fit).cost > fit.residual
+    assert fit.cost > replace(fit, share=0.5).cost > fit.residual
 
 
 def test_half_of_a_body_is_read_as_what_it_is(remembered_fits: Callable) -> None:

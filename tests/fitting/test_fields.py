@@ -16,7 +16,7 @@ from meshmatch.errors import ModelError, OptionError
 from meshmatch.fields.shape_functions import FIELDS, ShapeFunctions
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import Blend
-from meshmatch.fitting.dense import dense_shape
+from meshmatch.fitting.fit import dense_shape
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig

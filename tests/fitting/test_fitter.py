@@ -12,18 +12,15 @@ import pytest
 from meshmatch.cli import main
 from meshmatch.errors import OptionError
 from meshmatch.fields.field import PointField
-from meshmatch.fitting.choices import REFINE_NAMES, Refine
 from meshmatch.fitting.fit import Fit, axis_name
-from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import Fitter
-from meshmatch.fitting.landmarks import template_vertices
+from meshmatch.fitting.fit_config import REFINE_NAMES, FitConfig, Refine
+from meshmatch.fitting.fitter import Fitter, template_vertices
+from meshmatch.fitting.initial_frames import axis_vector
 from meshmatch.fitting.latent import LatentRefineConfig
-from meshmatch.fitting.mirror import Mirror
-from meshmatch.fitting.network_fit import Candidate, Predictor
-from meshmatch.fitting.orientation import axis_vector
+from meshmatch.fitting.network_fit import Candidate, Mirror, Predictor
 from meshmatch.fitting.refinement import REFINEMENTS
-from meshmatch.fitting.samples import take_samples
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.task import take_samples
 from meshmatch.fitting.verdict import FAIR_RESIDUAL, GOOD_RESIDUAL, judge
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import OrientedPoints

@@ -12,9 +12,8 @@ import torch
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
-from meshmatch.fitting.choices import Refine
-from meshmatch.fitting.dense import dense_shape
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit import dense_shape
+from meshmatch.fitting.fit_config import FitConfig, Refine
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy
 from meshmatch.fitting.refinement import REFINEMENTS

@@ -9,8 +9,7 @@ import pytest
 
 from meshmatch.api.inputs import as_model
 from meshmatch.fields.shape_functions import ShapeFunctions
-from meshmatch.fitting.mirror import Mirror, mirror_of
-from meshmatch.fitting.network_fit import Predictor
+from meshmatch.fitting.network_fit import Mirror, Predictor, mirror_of
 from meshmatch.fitting.system import node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.models.trained import TrainedModel

@@ -8,12 +8,12 @@ import pytest
 from meshmatch.api.inputs import validated
 from meshmatch.api.matching import register
 from meshmatch.errors import InputError
-from meshmatch.fitting.candidates import CandidateScorer
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import one_way_residual, two_way_residual
-from meshmatch.fitting.samples import take_samples, without_outliers
+from meshmatch.fitting.refinement import CandidateScorer
 from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.task import take_samples, without_outliers
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape

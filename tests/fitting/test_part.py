@@ -15,12 +15,11 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import boundary_length
 from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
-from meshmatch.fitting.network_fit import one_way_residual
-from meshmatch.fitting.part import SHARES, cost
+from meshmatch.fitting.network_fit import Candidate, one_way_residual
+from meshmatch.fitting.part import SHARES
 from meshmatch.fitting.refinement import REFINEMENTS
-from meshmatch.fitting.samples import take_samples
 from meshmatch.fitting.system import node_system
-from meshmatch.fitting.task import FitTask
+from meshmatch.fitting.task import FitTask, take_samples
 from meshmatch.fitting.verdict import empty_share, judge
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
@@ -44,7 +43,7 @@ def test_the_boundary_by_hand() -> None:
 
 
 def test_a_smaller_share_costs_more() -> None:
-    costs = [cost(0.02, share) for share in SHARES]
+    costs = [Candidate(RigidPose.identity(), np.zeros((1, 3)), 0.02, share).cost for share in SHARES]
     assert costs[0] == 0.02
     assert all(more > less for less, more in pairwise(costs))
 
@@ -131,7 +130,7 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
         monkeypatch.setattr(part, "judge_registration", lambda found, partial, verdict=verdict: (verdict, ()))
         asked.clear()
         best = part.fit_part(task, REFINEMENTS["none"].part)
-        found[verdict] = cost(best.candidate.residual, best.share)
+        found[verdict] = best.candidate.cost
         assert asked == ({(48, 2, False)} if verdict == "fair" else {(48, 2, False), (96, 8, True)})
     assert found["poor"] <= found["fair"]
     assert (found["poor"] < found["fair"]) or not wide_is_better
