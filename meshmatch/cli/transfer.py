@@ -35,22 +35,22 @@ def transfer_color(
     They are interpolated within the faces of SRC. The VALUE of --blank is a number, one number for each column
     (1,0,0), or a colour (#ff0000).
     """
-    from meshmatch.transfer import value_files
+    from meshmatch.transfer import vertex_files
 
     transfer = Transfer(source, target, output, maps, run, picture)
-    (value_files.check_color_suffix if values is None else value_files.check_values_suffix)(output)
+    (vertex_files.check_color_suffix if values is None else vertex_files.check_values_suffix)(output)
     with transfer.outputs(values) as (temporary,):
         a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
-        given = None if values is None else value_files.load_values(values, a)
-        here = value_files.light_of(a) if given is None else given.numbers
+        given = None if values is None else vertex_files.load_values(values, a)
+        here = vertex_files.light_of(a) if given is None else given.numbers
         columns = 1 if here.ndim == 1 else here.shape[1]
-        rule = rules.rule(None if rules.blank is None else value_files.parse_blank(rules.blank, columns).tolist())
+        rule = rules.rule(None if rules.blank is None else vertex_files.parse_blank(rules.blank, columns).tolist())
         if given is None:
             result = meshmatch.transfer_colors(a, b, transfer, rule=rule)
-            value_files.save_colors(temporary, b, result.data)
+            vertex_files.save_colors(temporary, b, result.data)
         else:
             result = meshmatch.transfer_values(a, b, given.numbers, transfer, rule=rule)
-            value_files.save_values(temporary, value_files.Values(result.data, given.names), b)
+            vertex_files.save_values(temporary, vertex_files.Values(result.data, given.names), b)
     low = transfer.tell_low(result.low, rule.minimum)
     what = "colours" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
     transfer.console.say(f"wrote {output}: {what} for the {b.V} vertices of {transfer.names[1]}")
@@ -58,7 +58,7 @@ def transfer_color(
         from meshmatch.render.compose import compose_light, compose_values
 
         if given is None:
-            shown = compose_light((a, b), (here, value_files.light(result.data)))
+            shown = compose_light((a, b), (here, vertex_files.light(result.data)))
         else:
             title = given.names[0] if given.names else str(values and values.stem)
             title += "" if columns == 1 else f" (the first of {columns} numbers)"
@@ -140,7 +140,7 @@ def transfer_weights(
     """
     import numpy as np
 
-    from meshmatch.transfer.weight_files import check_weights_suffix, load_weights, save_weights
+    from meshmatch.transfer.vertex_files import check_weights_suffix, load_weights, save_weights
 
     transfer = Transfer(source, target, output, maps, run, picture)
     rule = meshmatch.ConfidenceRule(min_confidence, fill)

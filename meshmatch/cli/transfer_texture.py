@@ -59,7 +59,7 @@ def transfer_texture(
     TGT in their order, and copies at texture seams follow; an obj has exactly the vertices and faces of TGT.
     """
     from meshmatch.shapes import textured_files
-    from meshmatch.transfer.value_files import parse_color, save_colors
+    from meshmatch.transfer.vertex_files import parse_color, save_colors
 
     transfer = Transfer(source, target, output, maps, run, picture)
     size, uv, image = texture.size, texture.uv, texture.image

@@ -32,8 +32,8 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
-from meshmatch.templates.prepared_folder import Scale, frame_of
-from meshmatch.templates.unregistered import unit_frame
+from meshmatch.templates.prepared_folder import frame_of
+from meshmatch.templates.template import Scale, unit_frame
 from meshmatch.training.recipes import clouds, small_data
 from meshmatch.training.train import CardFacts, train
 

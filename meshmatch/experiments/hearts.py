@@ -48,8 +48,8 @@ from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
+from meshmatch.templates.prepared_folder import medoid
 from meshmatch.templates.template import Template
-from meshmatch.templates.unregistered import medoid
 
 TRUTH = ".truth.npy"
 WAYS = ("meshmonk", "unregistered", "registered")

@@ -17,8 +17,7 @@ from meshmatch.models.inference import Network, quick_tree
 from meshmatch.models.trained import TrainedModel, once_per_model
 from meshmatch.shapes.normalise import ALIGNS, align
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.prepared_folder import SCALES
-from meshmatch.templates.unregistered import template_radius, template_samples, unit_frame
+from meshmatch.templates.template import SCALES, template_radius, template_samples, unit_frame
 
 # All of these were set by hand.
 _ALIGNED = 4  # orientations that are tried where the alignment has to search

@@ -18,10 +18,10 @@ from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
 from meshmatch.shapes.normalise import Align, sqrt_area_frame
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates import prepared_folder
 from meshmatch.templates.make import LOW_FACES, NodeConfig, low_mesh, make_template
-from meshmatch.templates.prepared_folder import Scale, registered_stack, rotation_range, same_faces, save_samples
-from meshmatch.templates.template import Template, save_arrays, save_template
-from meshmatch.templates.unregistered import MAX_RESIDUAL, collect_samples, find_landmarks, medoid, read_landmarks
+from meshmatch.templates.prepared_folder import MAX_RESIDUAL, find_landmarks
+from meshmatch.templates.template import Scale, Template, save_arrays, save_template
 
 MIN_FACES = 50
 MIN_POINTS = 100
@@ -111,10 +111,10 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     first, own = _template_shape(folder, config, found, notes)
     low = low_mesh(first.shape, config.faces, config.decimate)
     vertices = first.kept_vertex[low[0]]
-    stack = registered_stack(first, found, vertices, notes)
+    stack = prepared_folder.registered_stack(first, found, vertices, notes)
     registered = len(stack) > 0
-    how: Align = rotation_range(stack, first.original.verts[vertices]) if registered else "rigid"
-    how = config.align or how
+    found_how = prepared_folder.rotation_range(stack, first.original.verts[vertices]) if registered else "rigid"
+    how: Align = config.align or found_how
     name = folder.resolve().name
     made = make_template(first.shape, name, config.nodes, low=low)
     made = replace(made, source=f"{first.original.name} of {folder.name}")
@@ -123,7 +123,7 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         template_marks = _template_landmarks(first, None if own is None else marks[own], marks)
         # the way from the template's file to its frame, read off two of its vertices' places
         template_marks = sqrt_area_frame(Shape(first.shape.verts[low[0]], low[1], name)).apply(template_marks)
-    samples, frames, residuals = collect_samples(
+    samples, frames, residuals = prepared_folder.collect_samples(
         *(made, found, marks, template_marks, how, config.scale, config.nodes.seed), progress.between(0.5, 1.0)
     )
     if not registered and np.median(residuals) > MAX_RESIDUAL:
@@ -142,7 +142,8 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         if residual > MAX_RESIDUAL and not registered:
             notes.append(f"{clean.original.name} is not much like the template: {100 * residual:.0f} % apart")
     save_template(made, output / "template.safetensors")
-    save_samples(samples, output / "points.safetensors")
+    arrays = {name: getattr(samples, name) for name in prepared_folder.ARRAYS}
+    save_arrays(output / "points.safetensors", arrays, {"align": samples.align, "scale": samples.scale})
     save_arrays(output / "shapes.safetensors", {"verts": stack})
     names = tuple(clean.original.name for clean in found)
     words: dict[str, Any] = {
@@ -169,14 +170,13 @@ def _read_shapes(
     """The usable shapes of a folder, repaired, and the landmarks of each."""
     files = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
     landmark_files = find_landmarks(config.landmarks, folder, files)
-    files = [path for path in files if path not in landmark_files]
-    landmark_files = find_landmarks(config.landmarks, folder, files)
-    if not files:
+    pairs = [pair for pair in zip(files, landmark_files, strict=True) if pair[0] not in landmark_files]
+    if not pairs:
         raise InputError(f"no shapes in {folder}", f"files that end in {', '.join(SUFFIXES)} are read")
     make_folder(output / "normalised")
     found: list[Repaired] = []
     marks: list[Float[Floats, "L 3"] | None] = []
-    for number, (path, file) in enumerate(zip(files, landmark_files, strict=True)):
+    for number, (path, file) in enumerate(pairs):
         try:
             clean = _check_size(repair(load_shape(path)))
         except MeshmatchError as error:
@@ -184,8 +184,8 @@ def _read_shapes(
         else:
             notes += [f"{path.name}: {note}" for note in clean.notes]
             found.append(clean)
-            marks.append(None if file is None else read_landmarks(file, clean))
-        progress((number + 1) / len(files))
+            marks.append(None if file is None else prepared_folder.read_landmarks(file, clean))
+        progress((number + 1) / len(pairs))
     if not found:
         raise InputError(f"no shape in {folder} could be used", notes[0])
     return found, marks
@@ -214,8 +214,8 @@ def _template_shape(
                 return clean, number
         return _template_file(path), None
     number, why = next((k for k, clean in enumerate(found) if not clean.shape.is_cloud), 0), ""
-    if len(found) > 1 and not same_faces(found[number], found):
-        number = medoid(found, config.align or "rigid", config.scale, config.nodes.seed)
+    if len(found) > 1 and not prepared_folder.same_faces(found[number], found):
+        number = prepared_folder.medoid(found, config.align or "rigid", config.scale, config.nodes.seed)
         why = ", which lies nearest to all others on average"
     notes.append(f"template: {found[number].original.name}{why}")
     return found[number], number

@@ -1,33 +1,44 @@
-"""What a prepared folder holds: registered shapes, and samples of all shapes, for one template.
+"""What a prepared folder holds for one template: samples of all shapes with the landmarks that are known on them, and
+registered shapes. Collected, written and read.
 
-Shapes are registered if every file has the vertices and triangles of the template's.
+Shapes are registered if every file has the vertices and triangles of the template's. Landmarks are points that are known
+on each of a folder's shapes, in one order.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
-from meshmatch.errors import InputError
-from meshmatch.geometry.frames import kabsch
-from meshmatch.shapes.normalise import ALIGNS, Align
+from meshmatch.errors import InputError, OptionError
+from meshmatch.geometry.frames import Frame, kabsch
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.progress import Progress
+from meshmatch.shapes.input_files import read_npy
+from meshmatch.shapes.normalise import ALIGNS, Align, align, residual
 from meshmatch.shapes.repair import Repaired
-from meshmatch.templates.template import Template, save_arrays
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.templates.template import SCALES, Scale, Template, template_radius, template_samples, unit_frame
 
 T = TypeVar("T")
-Scale = Literal["area", "sphere"]
-SCALES: tuple[Scale, ...] = get_args(Scale)
 SMALL_DATA = 100
 """Fewer registered shapes than this are learned by a network that finds no orientation: the card says it. Set by hand."""
+MAX_RESIDUAL = 0.12
+"""Mean distance (units of sqrt(area), normals included) from which two aligned shapes differ in kind. Set by hand."""
+_MIN_SAMPLES, _MAX_SAMPLES = 1024, 4096  # of a shape
+_ALL_SAMPLES = 200_000  # of a folder
+_COMPARED = 40  # shapes among which the medoid is looked for
 _ALIKE = 30.0  # degrees: registered shapes that are turned less stand alike; set by hand
-_ARRAYS = ("points", "normals", "landmarks", "template_landmarks")
+ARRAYS = ("points", "normals", "landmarks", "template_landmarks")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +87,113 @@ def rotation_range(stack: Float[Floats32, "N V 3"], like: Float[Floats, "V 3"]) 
     return "near" if min(cosines) > np.cos(np.radians(_ALIKE)) else "rigid"
 
 
-def save_samples(samples: ShapeSamples, path: Path) -> None:
-    """Write the arrays as one safetensors file."""
-    arrays = {name: getattr(samples, name) for name in _ARRAYS}
-    save_arrays(path, arrays, {"align": samples.align, "scale": samples.scale})
+def medoid(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int) -> int:
+    """The shape, a mesh if there is one, with the smallest mean distance to all others, or of many to some of them."""
+    pool = [k for k, one in enumerate(shapes) if not one.shape.is_cloud] or list(range(len(shapes)))
+    pool = [pool[k] for k in np.unique(np.linspace(0, len(pool) - 1, min(len(pool), _COMPARED)).astype(int))]
+    aligned: list[OrientedPoints] = []
+    for k in pool:
+        shape = shapes[k].shape
+        part = sample_surface(shape, 800, np.random.default_rng(seed)).in_frame(unit_frame(shape, scale, 0.5))
+        aligned.append(part.to_local(align(part, aligned[0], how)[0].pose) if aligned else part)
+    distance = np.zeros((len(aligned), len(aligned)))
+    for i, j in combinations(range(len(aligned)), 2):
+        distance[i, j] = distance[j, i] = residual(aligned[j], aligned[i])
+    return pool[int(distance.sum(1).argmin())]
+
+
+def collect_samples(
+    template: Template,
+    shapes: Sequence[Repaired],
+    landmarks: Sequence[Float[Floats, "L 3"] | None],
+    template_landmarks: Float[Floats, "L 3"] | None,
+    how: Align,
+    scale: Scale,
+    seed: int,
+    progress: Progress,
+) -> tuple[ShapeSamples, list[Frame], list[float]]:
+    """Bring every shape to the template's frame and sample it: samples, the frame of every shape (file to template),
+    and the residual of every aligned shape against the template.
+
+    A shape's landmarks are in its file's frame, NaN where missing; those of the template are in the template's.
+    """
+    target, radius = template_samples(template), template_radius(template)
+    P = int(np.clip(_ALL_SAMPLES // len(shapes), _MIN_SAMPLES, _MAX_SAMPLES))
+    rng = np.random.default_rng(seed)
+    places = np.zeros((0, 3)) if template_landmarks is None else template_landmarks
+    points, normals, frames, residuals = [], [], [], []
+    known = np.full((len(shapes), len(places), 3), np.nan, np.float32)
+    for number, (one, marks) in enumerate(zip(shapes, landmarks, strict=True)):
+        frame = unit_frame(one.shape, scale, radius)
+        part = sample_surface(one.shape, P, rng).in_frame(frame)
+        best = align(part, target, how)[0]
+        part = part.to_local(best.pose)
+        points.append(part.points)
+        normals.append(part.normals)
+        frames.append(frame.compose(best.pose.frame))
+        residuals.append(best.residual)
+        if len(places) and marks is not None:
+            known[number] = frames[-1].apply(marks)
+        progress((number + 1) / len(shapes))
+    vertices = np.linalg.norm(template.shape.verts - places[:, None], axis=2).argmin(1).astype(np.int64)
+    stack = [np.stack(each).astype(np.float32) for each in (points, normals)]
+    return ShapeSamples(stack[0], stack[1], known, vertices, how, scale), frames, residuals
+
+
+def read_landmarks(file: Path, clean: Repaired) -> Float[Floats, "L 3"]:
+    """Landmarks of a shape, in its file's frame; NaN for a missing one.
+
+    The file holds vertices (L,), -1 for a missing one, or positions (L, 3); `InputError` if it cannot be read, or names
+    a vertex that is not there.
+    """
+    try:
+        if file.suffix == ".npy":
+            values = read_npy(file)
+        else:
+            delimiter = "," if "," in file.read_text(encoding="utf-8") else None
+            with warnings.catch_warnings():  # of a file without numbers, which is refused below
+                warnings.simplefilter("ignore", UserWarning)
+                values = np.asarray(np.loadtxt(file, delimiter=delimiter))
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read the landmarks {file.name}", "numbers, one point a line") from error
+    if values.ndim == 2 and values.shape[1] == 3 and values.dtype.kind in "fiu":
+        return values.astype(np.float64)
+    numbers = values.dtype.kind in "fiu" and values.ndim == 1 and len(values)
+    if not numbers or not np.array_equal(values, np.round(values)):
+        raise InputError(
+            f"{file.name} holds no landmarks",
+            "either one vertex a line (-1: missing), or x, y and z of a point on each line",
+        )
+    for outside in values[(values < -1) | (values >= clean.original.V)]:
+        raise InputError(
+            f"{file.name} names vertex {outside:.0f}, but {clean.original.name} has {clean.original.V}",
+            "vertices are counted from 0; -1 is a missing one",
+        )
+    points = clean.shape.verts[clean.original_to_repaired[values.astype(np.int64)]].copy()
+    points[values < 0] = np.nan
+    return points
+
+
+def find_landmarks(where: str | Path | None, folder: Path, files: Sequence[Path]) -> list[Path | None]:
+    """The landmark file of every shape: in a folder of their own, or beside the shapes with a suffix.
+
+    `OptionError` if none of the shapes has one.
+    """
+    if where is None:
+        return [None] * len(files)
+    place, suffixes = folder, [str(where)]
+    if Path(where).is_dir():
+        place, suffixes = Path(where), [".landmarks.npy", ".npy", ".landmarks.txt", ".txt"]
+    found = []
+    for file in files:
+        names = (place / f"{file.stem}{suffix}" for suffix in suffixes)
+        found.append(next((name for name in names if name.is_file() and name != file), None))
+    if not any(found):
+        raise OptionError(
+            f"no shape of {folder} has landmarks at {where}",
+            "give a folder of NAME.npy files, or their suffix beside the shapes, such as .landmarks.npy",
+        )
+    return found
 
 
 def read_samples(folder: str | Path, template: Template) -> ShapeSamples:
@@ -87,7 +201,7 @@ def read_samples(folder: str | Path, template: Template) -> ShapeSamples:
 
     def samples(arrays: dict[str, np.ndarray], words: dict[str, str]) -> ShapeSamples:
         found = ShapeSamples(
-            **{name: arrays[name] for name in _ARRAYS},
+            **{name: arrays[name] for name in ARRAYS},
             align=next(how for how in ALIGNS if how == words["align"]),
             scale=next(kind for kind in SCALES if kind == words["scale"]),
         )

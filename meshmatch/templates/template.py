@@ -1,4 +1,4 @@
-"""A template bundle: the mesh that is moved, its control nodes and its labels."""
+"""A template bundle: the mesh that is moved, its control nodes and its labels; and how a shape is brought to its size."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -14,10 +15,16 @@ from safetensors.numpy import save_file
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, TemplateError
+from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.outputs import replace_on_success
+from meshmatch.shapes.normalise import sqrt_area_frame, unit_sphere_frame
+from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 
+Scale = Literal["area", "sphere"]
+SCALES: tuple[Scale, ...] = get_args(Scale)
 SCHEMA = 1
 _ARRAYS = ("verts", "faces", "dense_verts", "dense_faces", "nodes", "labels", "core")
 
@@ -136,3 +143,21 @@ def read_template(name: str | Path) -> Template:
         return load_template(path)
     inside = bundled_folder() / "human" / f"{name}.safetensors"
     return load_template(inside if inside.is_file() else path)
+
+
+def unit_frame(shape: Shape, scale: Scale, radius: float) -> Frame:
+    """A shape's frame before it is turned: area 1, or the template's `template_radius` around its centroid."""
+    if scale == "area":
+        return sqrt_area_frame(shape)
+    frame = unit_sphere_frame(shape)
+    return Frame(frame.scale / radius, frame.rotation, frame.center)
+
+
+def template_radius(template: Template) -> float:
+    """Distance of the furthest vertex from the template's centroid."""
+    return float(np.linalg.norm(template.shape.verts, axis=1).max())
+
+
+def template_samples(template: Template) -> OrientedPoints:
+    """What shapes are aligned to."""
+    return sample_surface(template.shape, 3000, np.random.default_rng(0))

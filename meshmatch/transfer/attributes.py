@@ -126,22 +126,17 @@ def _sampled_votes(
         code = np.where(found.face >= 0, labels[found.face], NO_LABEL)
     else:
         at = corners_of(source.faces, found.face, found.vertex)
-        rows = np.repeat(np.arange(len(at)), 3)
-        places = csr_array((found.barycentric.ravel(), (rows, at.ravel())), (len(at), source.V))
-        code = most_votes(places @ _one_hot(labels))
+        code = most_votes(_corner_matrix(at, source.V, found.barycentric) @ _one_hot(labels))
     known = code >= 0
     return _ones(voter[known], code[known], (target.F, max(int(labels.max(initial=-1)) + 1, 1)))
 
 
 def lattice(rows: int) -> Float[Floats, "P 3"]:
     """Barycentric centers of the rows^2 equal triangles into which a triangle is cut."""
-    points = []
-    for i in range(rows):
-        for j in range(rows - i):
-            points.append((i + 1 / 3, j + 1 / 3))
-            if j < rows - i - 1:
-                points.append((i + 2 / 3, j + 2 / 3))
-    first, second = np.array(points).T / rows
+    across = np.add.outer(np.arange(rows), np.arange(rows))
+    first, second = (
+        np.concatenate([np.argwhere(across < rows) + 1 / 3, np.argwhere(across < rows - 1) + 2 / 3]).T / rows
+    )
     return np.stack([1.0 - first - second, first, second], axis=1)
 
 
@@ -164,13 +159,14 @@ def _vertex_votes(back: VertexMap, source: Shape, labels: Ints, on_faces: bool) 
     direct = _ones(inside, back.face[inside], (len(within), source.F))
     at = _ones(outside, back.index[outside], (len(within), source.V))
     area = source.face_areas / max(float(source.face_areas.max()), 1e-300) + 1e-12
-    entries = np.repeat(area, 3), (source.faces.ravel(), np.repeat(np.arange(source.F), 3))
-    return csr_array(csr_array(direct + at @ csr_array(entries, shape=(source.V, source.F))) @ _one_hot(labels))
+    around = csr_array(_corner_matrix(source.faces, source.V, area[:, None]).T)
+    return csr_array(csr_array(direct + at @ around) @ _one_hot(labels))
 
 
-def _corner_matrix(corners: Int[Ints, "N 3"], V: int) -> csr_array:
-    """(N, V) sparse: 1 for each corner."""
-    return _ones(np.repeat(np.arange(len(corners)), 3), corners.ravel(), (len(corners), V))
+def _corner_matrix(corners: Ints, V: int, weights: Floats | float = 1.0) -> csr_array:
+    """(N, V) sparse: the weights (N, 3) of corners (N, 3)."""
+    values = np.broadcast_to(weights, corners.shape).ravel()
+    return csr_array((values, (np.repeat(np.arange(len(corners)), 3), corners.ravel())), (len(corners), V))
 
 
 def _one_hot(labels: Int[Ints, " N"]) -> csr_array:

@@ -36,15 +36,12 @@ _CHUNK = 1 << 16
 
 @dataclass(frozen=True)
 class BakeOptions:
-    """How a texture is baked. `OptionError` for sizes that are out of range, and choices that contradict each other.
+    """How a texture of ``size`` texels along each side is baked, by so many threads (``workers``).
 
-    size : texels along each side
-    samples : ``samples x samples`` points in a texel that covers a seam or much detail of the source; one elsewhere
-    padding : texels between charts of a new atlas; 0 also leaves the texels past the seams empty
-    min_confidence : texels with less are of low confidence
-    fill : give those the colours of their neighbours in the atlas
-    blank : give them this colour, sRGB and alpha in 0..1
-    workers : threads
+    A texel that covers a seam or much detail of the source is seen at ``samples x samples`` points, others at one.
+    ``padding`` texels lie between charts of a new atlas; 0 also leaves the texels past the seams empty. Texels of less
+    than ``min_confidence`` can get the colours of their neighbours in the atlas (``fill``), or one colour, sRGB and alpha
+    in 0..1 (``blank``). `OptionError` for sizes that are out of range, and choices that contradict each other.
     """
 
     size: int = 2048
@@ -63,16 +60,13 @@ class BakeOptions:
             raise OptionError(f"workers must be 1 or more, not {self.workers}")
         if self.fill and self.blank is not None:
             raise OptionError("fill and blank contradict each other", "choose one of them")
-        if not 16 <= self.size <= _LARGEST:
-            raise OptionError(
-                f"a texture has 16 to {_LARGEST} texels a side, not {self.size}", "1024 or 2048 suit most"
-            )
+        size, most = self.size, self.size // 4
+        if not 16 <= size <= _LARGEST:
+            raise OptionError(f"a texture has 16 to {_LARGEST} texels a side, not {size}", "1024 or 2048 suit most")
         if not 1 <= self.samples <= 8:
             raise OptionError(f"a texel takes 1 to 8 samples each way, not {self.samples}", "2 or 3 suit most")
-        if not 0 <= self.padding <= self.size // 4:
-            raise OptionError(
-                f"padding of {self.padding} texels does not go with {self.size}", f"choose 0 to {self.size // 4}"
-            )
+        if not 0 <= self.padding <= most:
+            raise OptionError(f"padding of {self.padding} texels does not go with {size}", f"choose 0 to {most}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,11 +186,8 @@ def _painted(
 
 
 def _store(pixels: Pixels, at: Ints, colors: Floats32) -> None:
-    out = np.empty((len(at), 4), np.uint8)
-    for k in range(3):
-        out[:, k] = bytes_of(colors[k])
-    out[:, 3] = np.round(np.clip(colors[3], 0, 1) * 255)
-    pixels[at] = out
+    pixels[at, :3] = bytes_of(colors[:3]).T
+    pixels[at, 3] = np.round(np.clip(colors[3], 0, 1) * 255)
 
 
 def _fill_and_blank(image: Pixels, painted: Bools, low: Bools, options: BakeOptions, alpha: Alpha) -> Alpha:

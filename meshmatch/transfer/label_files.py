@@ -83,7 +83,7 @@ def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
     `InputError` if the file is missing or damaged, or its count fits neither; `OptionError` if it fits both.
     """
     readers = {
-        ".npy": lambda path: (_read_npy(path), None),
+        ".npy": lambda path: (_listed(read_npy(path)), None),
         ".csv": lambda path: _read_csv(path, (shape.V, shape.F)),
         ".txt": lambda path: ([line.strip() for line in table_files.read_text(path).rstrip().splitlines()], None),
         ".json": lambda path: _read_json(path, shape, on),
@@ -97,10 +97,14 @@ def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
 
 def labels_of(values: ArrayLike, shape: Shape, on: On | None = None) -> Labels:
     """Labels of the vertices or faces of `shape` from an array of whole numbers or words; see `load_labels`."""
-    array = np.asarray(values)
+    return _labels("the array", _listed(np.asarray(values)), shape, on)
+
+
+def _listed(array: NDArray[Any]) -> list[Any]:
     if array.ndim != 1 or array.dtype.kind not in "iufbUO":
         raise InputError(f"labels must be a list of (N,), not an array of {array.shape} {array.dtype}", _HINT)
-    return _labels("the array", array.tolist(), shape, on)
+    labels: list[Any] = array.tolist()
+    return labels
 
 
 def _labels(name: str, values: Sequence[Any], shape: Shape, on: str | None) -> Labels:
@@ -146,14 +150,6 @@ def _word(name: str, raw: Any) -> str | None:
     if not isinstance(raw, str | int | None):
         raise InputError(f"{name}: a label is a whole number or a word, not {str(raw)[:40]!r}", _HINT)
     return None if raw in (None, "") else plain_text(" ".join(str(raw).split()))
-
-
-def _read_npy(path: Path) -> list[Any]:
-    values = read_npy(path)
-    if values.dtype.kind not in "iufbU" or values.ndim != 1:
-        raise InputError(f"it holds an array of {values.shape} {values.dtype}, not labels")
-    labels: list[Any] = values.tolist()
-    return labels
 
 
 def _read_csv(path: Path, counts: tuple[int, int]) -> tuple[list[str], str | None]:
@@ -205,9 +201,12 @@ def save_labels(path: Path, labels: Labels, shape: Shape) -> None:
     `OptionError` if the suffix is not one of `LABEL_SUFFIXES`, or a label is too large a number for the format.
     """
     suffix = check_labels_suffix(path)
+    largest = {".npy": 2**63, ".ply": 2**31}.get(suffix)
+    if largest and not labels.are_words and any(not -largest <= int(name) < largest for name in labels.names):
+        bits = largest.bit_length()
+        raise OptionError(f"{path.name}: this format holds labels of at most {bits} bits", "choose .csv or .json")
     cells = [labels.names[code] for code in labels.codes.tolist()]
     if suffix == ".npy":
-        _check_range(path, labels, 64)
         table_files.write_npy(path, np.array(cells, np.str_ if labels.are_words else np.int64))
     elif suffix == ".txt":
         path.write_text("".join(f"{cell}\n" for cell in cells), encoding="utf-8")
@@ -220,17 +219,10 @@ def save_labels(path: Path, labels: Labels, shape: Shape) -> None:
         _write_ply(path, labels, shape)
 
 
-def _check_range(path: Path, labels: Labels, bits: int) -> None:
-    """`OptionError` for numbers of more bits."""
-    if not labels.are_words and any(not -(2 ** (bits - 1)) <= int(name) < 2 ** (bits - 1) for name in labels.names):
-        raise OptionError(f"{path.name}: this format holds labels of at most {bits} bits", "choose .csv or .json")
-
-
 def _write_ply(path: Path, labels: Labels, shape: Shape) -> None:
     """Whole numbers as they are; words by their number, which comments in the header explain."""
     from meshmatch.shapes.formats import ply
 
-    _check_range(path, labels, 32)
     numbers = [k if labels.are_words else int(name) for k, name in enumerate(labels.names)]
     comments = [f"label {k} {name}" for k, name in enumerate(labels.names)] if labels.are_words else []
     known = [k if name not in ("", -1) else -1 for k, name in enumerate(labels.names)]

@@ -117,17 +117,15 @@ def replace_low_values(
     values: Floats, low: Bool[Bools, " V"], target: Shape, blank: Floats | float | None = None, fill: bool = False
 ) -> tuple[Floats, LowConfidence]:
     """Values (V,) or (V, D) of the target; those of low confidence, or nan, are left blank, filled in, or kept."""
-    table = values if values.ndim == 2 else values[:, None]
+    table = values.reshape(len(values), -1)
     low = low | ~np.isfinite(table).all(axis=1)
-    N, count = len(low), int(low.sum())
+    count, blanked, filled = int(low.sum()), 0, 0
     if fill:
-        out, filled = diffuse(vertex_graph(target), ~low, table)
-        return out.reshape(values.shape), LowConfidence(N, count, 0, int(filled.sum()))
-    if blank is not None:
-        out = table.copy()
-        out[low] = blank
-        return out.reshape(values.shape), LowConfidence(N, count, count)
-    return values, LowConfidence(N, count)
+        table, done = diffuse(vertex_graph(target), ~low, table)
+        filled = int(done.sum())
+    elif blank is not None:
+        table, blanked = np.where(low[:, None], blank, table), count
+    return table.reshape(values.shape), LowConfidence(len(low), count, blanked, filled)
 
 
 def replace_low_weights(

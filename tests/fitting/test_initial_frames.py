@@ -12,7 +12,7 @@ from meshmatch.fitting.initial_frames import aligned_frames, scan_frame
 from meshmatch.models.config import NetworkConfig
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.unregistered import template_radius
+from meshmatch.templates.template import template_radius
 from tests.fitting.eggs import bent_egg, egg_model, scan_of
 
 PLAIN = NetworkConfig(code=16, width=32, depth=1, basis=24, align_basis=0, corrections=0)

@@ -14,9 +14,8 @@ from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, Prepared, prepare
-from meshmatch.templates.prepared_folder import is_registered, read_samples
-from meshmatch.templates.template import load_template
-from meshmatch.templates.unregistered import find_landmarks, medoid, read_landmarks, template_radius, unit_frame
+from meshmatch.templates.prepared_folder import find_landmarks, is_registered, medoid, read_landmarks, read_samples
+from meshmatch.templates.template import load_template, template_radius, unit_frame
 from tests.conftest import icosphere
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.35)

@@ -10,7 +10,7 @@ import pytest
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.value_files import Values, light_of, load_values, parse_blank, save_colors, save_values, seen
+from meshmatch.transfer.vertex_files import Values, light_of, load_values, parse_blank, save_colors, save_values, seen
 from tests.conftest import icosphere
 
 SHAPE = icosphere(1)
@@ -106,7 +106,8 @@ def test_what_stands_for_nothing(text: str, columns: int, expected: list[float])
 
 
 @pytest.mark.parametrize(
-    ("text", "columns"), [("red", 3), ("#ff00", 3), ("#gg0000", 3), ("1,2", 3), ("", 1), ("#ff0000", 1)]
+    ("text", "columns"),
+    [("red", 3), ("#ff00", 3), ("#gg0000", 3), ("#٣٣٣٣٣٣", 3), ("#+f+f+f", 3), ("1,2", 3), ("", 1), ("#ff0000", 1)],
 )
 def test_what_cannot_stand_for_nothing(text: str, columns: int) -> None:
     with pytest.raises(OptionError, match="needed"):

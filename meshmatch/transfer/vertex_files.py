@@ -1,4 +1,6 @@
-"""Numbers and colours of each vertex, from files and to files.
+"""Numbers, colours and skin weights of each vertex, from files and to files.
+
+Numbers are
 
 =====  ========================================================================
 .npy   (V,) or (V, D) float64
@@ -8,23 +10,39 @@
 
 Colours go into shape files: .ply, .obj, .off, .glb. They are mixed as light; a `Shape` has them as screens show them
 (sRGB), whatever its file has.
+
+Skin weights are in .npz and .json with the same names, also read from the skins of glb and gltf:
+
+=======  =========================================================================================
+format   ``meshmatch skin weights 1``
+names    (J,) text: the joints (bones)
+joints   (V, N) int32: joints of each vertex, by their place in `names`; the heaviest first
+weights  (V, N) float32: how much of each; a row sums to 1, unused places hold joint 0 and weight 0
+=======  =========================================================================================
+
+N is the most that any vertex has. Also read: `weights` (V, J) without `joints`, one column for each joint.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import csr_array, issparse
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps import table_files
+from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_linear, to_srgb
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.input_files import read_npy
+from meshmatch.shapes.input_files import read_npy, read_npz
 from meshmatch.shapes.shape import Shape
 
 VALUE_SUFFIXES = (".npy", ".csv", ".ply")
@@ -34,6 +52,11 @@ check_color_suffix = partial(table_files.check_suffix, suffixes=_COLOR_SUFFIXES,
 _HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy or .csv"
 # Properties that a ply has already.
 _RESERVED = {"x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a"}
+WEIGHT_SUFFIXES = (".npz", ".json")
+check_weights_suffix = partial(table_files.check_suffix, suffixes=WEIGHT_SUFFIXES, what="skin weights")
+_WEIGHTS_FORMAT = "meshmatch skin weights 1"
+_WEIGHTS_HINT = "arrays 'joints' (V, N) and 'weights' (V, N), or 'weights' (V, J) alone; 'names' (J,)"
+_MAX_JOINTS = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,18 +140,15 @@ def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:
     `OptionError` for any other text, or not as many numbers as there are columns.
     """
     try:
-        if text.startswith("#"):
-            # int() also reads "+f" and "0x", which are no colours
-            digits = text[1:] if len(text) == 7 and text[1:].isalnum() else ""
-            numbers = [int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4)]
+        if re.fullmatch("#[0-9a-fA-F]{6}", text):
+            numbers = [byte / 255 for byte in bytes.fromhex(text[1:])]
         else:
             numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         numbers = []
     if len(numbers) == 3 and columns == 4:
         numbers.append(1.0)
-    if len(numbers) == 1:
-        return np.full(columns, numbers[0])
+    numbers *= columns if len(numbers) == 1 else 1
     if len(numbers) != columns:
         raise OptionError(
             f"--blank {text}: {columns} number{'s are' if columns > 1 else ' is'} needed",
@@ -189,3 +209,112 @@ def save_colors(path: Path, shape: Shape, colors: Float[Floats, "V 4"]) -> None:
         save_values(path, Values(colors, ("red", "green", "blue", "alpha")), shape)
     else:
         save_shape(path, Shape(shape.verts, shape.faces, shape.name, colors, shape.invalid))
+
+
+@dataclass(frozen=True, eq=False)
+class SkinWeights:
+    """How much each joint moves each vertex."""
+
+    matrix: csr_array  # (V, J), not negative; rows sum to 1, or to 0 for a vertex that nothing moves
+    names: tuple[str, ...]  # of the joints
+
+
+def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
+    """Read skin weights of the vertices of `shape`, from .npz, .json, .glb or .gltf.
+
+    `InputError` if the file is missing or damaged, holds no weights, or not those of `shape`.
+    """
+    from meshmatch.shapes.formats.gltf_attributes import read_skin
+
+    readers = {
+        ".npz": lambda path: _from_record(read_npz(path, ("format", "names", "joints", "weights"))),
+        ".json": lambda path: _from_record(table_files.read_json(path)),
+        ".glb": lambda path: read_skin(path, path.read_bytes()),
+        ".gltf": lambda path: read_skin(path, path.read_bytes()),
+    }
+    matrix, names = table_files.read_by_suffix(path, readers, "skin weights", _WEIGHTS_HINT)
+    return SkinWeights(_normalized(Path(path).name, matrix, shape), names)
+
+
+def weights_of(matrix: csr_array | ArrayLike, shape: Shape) -> SkinWeights:
+    """Skin weights of the vertices of `shape` from a table (V, J), dense or sparse; joints are named by number.
+
+    `InputError` if these are not numbers, not a row for each vertex, or negative.
+    """
+    sparse = csr_array(matrix if issparse(matrix) else _table("weights", matrix, np.float64), dtype=np.float64)
+    return SkinWeights(_normalized("the array", sparse, shape), tuple(str(joint) for joint in range(sparse.shape[1])))
+
+
+def _from_record(record: Any) -> tuple[csr_array, tuple[str, ...]]:
+    if not isinstance(record, Mapping) or "weights" not in record:
+        raise InputError("there is no 'weights' in it")
+    weights = _table("weights", record["weights"], np.float64)
+    joints = _table("joints", record["joints"], np.int64) if "joints" in record else None
+    if "names" in record:
+        names = tuple(plain_text(str(word)) for word in np.ravel(np.asarray(record["names"], np.str_)))
+    else:
+        count = weights.shape[1] if joints is None else int(joints.max(initial=-1)) + 1
+        names = tuple(f"joint {k}" for k in range(max(min(count, _MAX_JOINTS), 1)))
+    if joints is None:
+        if weights.shape[1] != len(names):
+            raise InputError(f"there are {weights.shape[1]} columns for {len(names)} names")
+        return csr_array(weights), names
+    if joints.shape != weights.shape:
+        raise InputError(f"'joints' is an array of {joints.shape}, but 'weights' of {weights.shape}")
+    row, column = np.nonzero(weights)
+    used = joints[row, column]
+    if len(used) and not 0 <= used.min() <= used.max() < len(names):
+        raise InputError(f"it names joint {used.max()}, but there are {len(names)}", "they count from 0")
+    return csr_array((weights[row, column], (row, used)), (len(weights), len(names))), names
+
+
+def _table(key: str, values: ArrayLike, kind: type) -> np.ndarray:
+    """An array (V, N) of finite numbers, whole ones where `kind` is an integer."""
+    try:
+        array = np.asarray(values)
+        if array.ndim != 2 or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+            raise ValueError(f"an array of {array.shape} {array.dtype}")
+        if kind is np.int64 and (array != np.round(array)).any():
+            raise ValueError("its numbers are not whole")
+    except ValueError as error:
+        raise InputError(f"'{key}' is not a table of numbers: {error}", _WEIGHTS_HINT) from error
+    return array.astype(kind)
+
+
+def _normalized(name: str, matrix: csr_array, shape: Shape) -> csr_array:
+    """Weights (V, J) checked to be of `shape`, and with rows that sum to 1."""
+    if matrix.shape[0] != shape.V:
+        raise InputError(
+            f"{name} has weights of {matrix.shape[0]} vertices, but {shape.name or 'the source'} has {shape.V}",
+            "one row is needed for each vertex of the source, in the order of its file",
+        )
+    matrix.sum_duplicates()
+    if matrix.nnz and matrix.data.min() < 0:
+        raise InputError(f"{name}: a weight is negative ({matrix.data.min():g})", "weights are shares from 0 to 1")
+    total = np.asarray(matrix.sum(axis=1)).ravel()
+    if not (total > 0).any():
+        raise InputError(f"{name}: all weights are 0", "is it the right file?")
+    scale = np.where(total > 0, 1.0 / np.where(total > 0, total, 1.0), 0.0)
+    matrix = csr_array(matrix * scale[:, None])
+    matrix.eliminate_zeros()
+    return matrix
+
+
+def save_weights(path: Path, weights: SkinWeights) -> None:
+    """Write skin weights; `OptionError` if the suffix is not one of `WEIGHT_SUFFIXES`."""
+    suffix = check_weights_suffix(path)
+    matrix = csr_array(weights.matrix)
+    V = matrix.shape[0]
+    rows = np.repeat(np.arange(V), np.diff(matrix.indptr))
+    order = np.lexsort((matrix.indices, -matrix.data, rows))
+    place = np.arange(len(order)) - matrix.indptr[rows[order]]
+    N = int(np.diff(matrix.indptr).max(initial=1))
+    joints, shares = np.zeros((V, N), np.int32), np.zeros((V, N), np.float32)
+    joints[rows[order], place] = matrix.indices[order]
+    shares[rows[order], place] = matrix.data[order]
+    if suffix == ".npz":
+        names = np.array(weights.names, np.str_)
+        table_files.write_npz(path, {"format": _WEIGHTS_FORMAT, "names": names, "joints": joints, "weights": shares})
+    else:
+        record = {"format": _WEIGHTS_FORMAT, "names": weights.names, "joints": joints.tolist()}
+        table_files.write_json(path, record | {"weights": table_files.short_floats(shares)})
