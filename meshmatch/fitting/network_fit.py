@@ -186,7 +186,7 @@ class Predictor:
         for number, tilt in enumerate(tilts):
             size = _VARIANT_POINTS[number % len(_VARIANT_POINTS)]
             clouds.append(samples.drawn(size, self.rng) @ tilt.T)
-        found = self.network.predict(clouds)
+        found = list(self.network.predict(clouds)) if clouds else []
         return [self.network.rotate_rows(vectors, tilt) for vectors, tilt in zip(found, tilts, strict=True)]
 
 
