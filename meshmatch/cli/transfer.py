@@ -8,7 +8,7 @@ from typer import Option
 import meshmatch
 from meshmatch.cli.options import RuleOptions, RunOptions, grouped, output_option
 from meshmatch.cli.transfer_options import MapOptions, MapOptionsWithPairs, Picture, Source, Target, Transfer
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, OptionError
 
 _FAR = 0.02  # of the size of a shape: a landmark this far from its surface is worth a warning
 On = Literal["vertices", "faces"]
@@ -28,6 +28,11 @@ def transfer_color(
     values: Path | None = Option(
         None, metavar="FILE", help="Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colours."
     ),
+    directions: bool = Option(
+        False,
+        "--directions",
+        help="The numbers of --values are directions, such as normals: turn them with the surface.",
+    ),
     picture: Picture = None,
 ) -> None:
     """Transfer vertex colours, or other numbers per vertex.
@@ -37,6 +42,8 @@ def transfer_color(
     """
     from meshmatch.transfer import vertex_files
 
+    if directions and values is None:
+        raise OptionError("--directions is for numbers", "give them with --values")
     transfer = Transfer(source, target, output, maps, run, picture)
     (vertex_files.check_color_suffix if values is None else vertex_files.check_values_suffix)(output)
     with transfer.outputs(values) as (temporary,):
@@ -49,7 +56,7 @@ def transfer_color(
             result = meshmatch.transfer_colors(a, b, transfer, rule=rule)
             vertex_files.save_colors(temporary, b, result.data)
         else:
-            result = meshmatch.transfer_values(a, b, given.numbers, transfer, rule=rule)
+            result = meshmatch.transfer_values(a, b, given.numbers, transfer, directions=directions, rule=rule)
             vertex_files.save_values(temporary, vertex_files.Values(result.data, given.names), b)
     low = transfer.tell_low(result.low, rule.minimum)
     what = "colours" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"

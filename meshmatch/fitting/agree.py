@@ -76,7 +76,7 @@ def agreed_fits(
         local = None
         if landmarks is not None:
             local = landmarks[number][0], fit.frame.apply(landmarks[number][1])
-        samples = _samples(shape, fit, config)
+        samples = _samples(shape, fit, config).facing(system.surface(fit.vectors))
         members.append(Member(samples, fit.vectors, how.for_noise(shape.roughness), local, fit.partial))
     agreed = []
     for shape, fit, vectors in zip(shapes, fits, agree(system, members, config.nodes), strict=True):
@@ -91,7 +91,7 @@ def _samples(shape: Shape, fit: Fit, config: FitConfig) -> OrientedPoints:
     config = config.for_noise(shape.roughness)
     frame, samples = take_samples(shape, config.samples, np.random.default_rng(config.seed))
     points = fit.frame.apply(frame.undo(samples.points))
-    return OrientedPoints(points, samples.normals @ frame.rotation @ fit.frame.rotation.T)
+    return replace(samples, points=points, normals=samples.normals @ frame.rotation @ fit.frame.rotation.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,7 +107,10 @@ def without_outliers(shape: Shape) -> Shape:
     An outlier among neighbours bends their normals and turns the signs of whole regions, and it counts as surface.
     """
     outlier = outlier_points(shape.verts, _OUTLIER_RATIO) if shape.is_cloud else np.zeros(0, bool)
-    return Shape(shape.verts[~outlier], shape.faces, shape.name) if outlier.any() else shape
+    if not outlier.any():
+        return shape
+    weights = None if shape.weights is None else shape.weights[~outlier]
+    return Shape(shape.verts[~outlier], shape.faces, shape.name, weights=weights)
 
 
 def take_samples(

@@ -1,4 +1,4 @@
-"""A trained network evaluated with NumPy: what fitting asks of it, without torch.
+"""What fitting asks of a trained network (`Network`, on whatever device), and its answers from NumPy (`NodeNetwork`).
 
 The layers are few, dense and small: their weights are read from memory once for a batch, so that twenty clouds cost about
 as much as four. `models.deformer` is the same network for training; a test holds both to the same answers.

@@ -152,7 +152,8 @@ def _result(
     new = np.full(shape.V, -1, np.int64)
     new[chosen] = np.arange(len(chosen))
     colors = None if shape.colors is None else shape.colors[chosen]
-    repaired = Shape(shape.verts[chosen], new[faces], shape.name, colors)
+    weights = None if shape.weights is None else shape.weights[chosen]
+    repaired = Shape(shape.verts[chosen], new[faces], shape.name, colors, weights=weights)
     stands = twin if valid.all() else twin[_valid_neighbour(shape, valid)]
     answer = new[stands]
     lost = np.flatnonzero(answer < 0)

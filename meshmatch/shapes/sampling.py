@@ -45,7 +45,8 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
         chosen = _draw_points(areas, P, rng)
         weights, face = np.tile([1.0, 0.0, 0.0], (P, 1)), np.full(P, -1, np.int64)
         normals = shape.vertex_normals[chosen]
-        return Samples(shape.verts[chosen], normals, signed=False, face=face, barycentric=weights, vertex=chosen)
+        trust = None if shape.weights is None else shape.weights[chosen]
+        return Samples(shape.verts[chosen], normals, False, trust, face=face, barycentric=weights, vertex=chosen)
     # side="right" steps over faces without area
     face = np.searchsorted(total, rng.random(P) * total[-1], side="right").astype(np.int64)
     face = np.minimum(face, np.flatnonzero(areas)[-1])
@@ -55,7 +56,8 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
     corners = shape.faces[face]  # P 3
     points = interpolate(shape.verts, corners, weights)
     vertex = corners[np.arange(P), weights.argmax(axis=1)]
-    return Samples(points, shape.face_normals[face], face=face, barycentric=weights, vertex=vertex)
+    trust = None if shape.weights is None else (weights * shape.weights[corners]).sum(axis=1)
+    return Samples(points, shape.face_normals[face], True, trust, face=face, barycentric=weights, vertex=vertex)
 
 
 def farthest_points(points: Float[Floats, "N 3"], K: int, start: int = 0) -> Int[Ints, " K"]:

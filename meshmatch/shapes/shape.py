@@ -38,6 +38,8 @@ class Shape:
         True for a vertex whose position in the file was not a number. Such a vertex keeps its place in the
         order (the map answers for it too) but its `verts` row is only a stand-in, and faces that touch it
         have no area.
+    weights : (V,) float64, optional
+        How far a fit trusts each vertex, from 0 (not at all) to 1; fully where not given.
 
     `InputError`: wrong array shapes, no vertices, a position that is not finite, or a face that names no vertex.
     """
@@ -47,6 +49,7 @@ class Shape:
     name: str = ""
     colors: Float[Floats, "V 4"] | None = None
     invalid: Bool[Bools, " V"] | None = None
+    weights: Float[Floats, " V"] | None = None
 
     def __post_init__(self) -> None:
         label = self.name or "the shape"
@@ -76,7 +79,11 @@ class Shape:
         if invalid is not None and invalid.shape != (V,):
             raise InputError(f"{label}: invalid must be an array of ({V},), not {invalid.shape}")
         invalid = invalid if invalid is not None and invalid.any() else None
-        for name, array in (("verts", verts), ("faces", faces), ("colors", colors), ("invalid", invalid)):
+        weights = None if self.weights is None else read_only(self.weights, np.float64, label)
+        if weights is not None and (weights.shape != (V,) or not ((weights >= 0) & (weights <= 1)).all()):
+            raise InputError(f"{label}: weights must be {V} numbers from 0 to 1", "one for each vertex")
+        arrays = {"verts": verts, "faces": faces, "colors": colors, "invalid": invalid, "weights": weights}
+        for name, array in arrays.items():
             object.__setattr__(self, name, array)
 
     @classmethod

@@ -109,6 +109,17 @@ def test_values_of_a_finer_copy(run: Run, pair: Path) -> None:
     assert "3 numbers each" in answer.err
 
 
+def test_directions_turn_with_the_surface(run: Run, pair: Path) -> None:
+    """Normals of a ball on a finer one that was turned."""
+    a, b = load_shape("a.ply"), load_shape("b.ply")
+    save_shape("b.ply", Shape(b.verts[:, [1, 2, 0]], b.faces))
+    save_map("ab.npz", VertexMap.between(a, load_shape("b.ply"), np.arange(a.V), verdict="good"))
+    well(run(*call("transfer-color", "--values", "values.npy", "--directions", out="v.npy")))
+    normals = load_shape("b.ply").vertex_normals
+    assert (np.load("v.npy") * normals).sum(axis=1).min() > 0.99
+    assert run(*call("transfer-color", "--directions")).status == 1
+
+
 def test_values_by_csv_and_in_a_ply(run: Run, pair: Path) -> None:
     Path("heat.csv").write_text("heat\n" + "".join(f"{z}\n" for z in load_shape("a.ply").verts[:, 2].tolist()))
     well(run(*call("transfer-color", "--values", "heat.csv", out="v.csv")))
