@@ -18,7 +18,5 @@ def bundled_folder() -> Path:
         return installed
     if (package.parent / "pyproject.toml").is_file() and beside.is_dir():
         return beside
-    raise TemplateError(
-        f"the templates and models that come with meshmatch are neither in {installed} nor in {beside}",
-        "the installation is incomplete: install meshmatch again",
-    )
+    problem = f"the templates and models that come with meshmatch are neither in {installed} nor in {beside}"
+    raise TemplateError(problem, "the installation is incomplete: install meshmatch again")

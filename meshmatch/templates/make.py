@@ -208,8 +208,7 @@ def _parts_allowed(shape: Shape, parts: Int[Ints, " V"], touched: list, own: Int
     """Drop candidates that touch a part which does not border on their own."""
     count = int(parts.max()) + 1
     joined = np.eye(count, dtype=bool)
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        joined[parts[shape.faces[:, a]], parts[shape.faces[:, b]]] = True
+    joined[parts[shape.faces], parts[shape.faces[:, [1, 2, 0]]]] = True
     joined |= joined.T
     return np.array([joined[parts[at], np.unique(parts[hits])].all() for at, hits in zip(own, touched, strict=True)])
 

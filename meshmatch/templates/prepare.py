@@ -92,10 +92,8 @@ def prepare(
     labels = config.labels
     if labels is not None:
         if len(labels) != clean.original.V:
-            raise InputError(
-                f"there are {len(labels)} labels, but {clean.original.name} has {clean.original.V} vertices",
-                "give one label for every vertex of the file",
-            )
+            problem = f"there are {len(labels)} labels, but {clean.original.name} has {clean.original.V} vertices"
+            raise InputError(problem, "give one label for every vertex of the file")
         labels = labels[clean.kept_vertex]
     low = low_mesh(clean.shape, config.faces, config.decimate)
     made = make_template(clean.shape, shapes.stem, config.nodes, labels=labels, low=low)
@@ -227,15 +225,11 @@ def _template_landmarks(
     """Landmarks of the template's shape, if all shapes have as many; `InputError` otherwise."""
     sizes = {len(each) for each in marks if each is not None}
     if len(sizes) > 1:
-        raise InputError(
-            f"landmark files of {min(sizes)} and of {max(sizes)} points",
-            "row k is the same point on every shape: write -1 where it is missing",
-        )
+        problem = f"landmark files of {min(sizes)} and of {max(sizes)} points"
+        raise InputError(problem, "row k is the same point on every shape: write -1 where it is missing")
     if own is None or not np.isfinite(own).all():
-        raise InputError(
-            f"the template {first.original.name} has no landmarks, or not all of them",
-            "choose with --template a shape of the folder on which every landmark is known",
-        )
+        problem = f"the template {first.original.name} has no landmarks, or not all of them"
+        raise InputError(problem, "choose with --template a shape of the folder on which every landmark is known")
     return own
 
 

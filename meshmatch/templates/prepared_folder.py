@@ -160,15 +160,11 @@ def read_landmarks(file: Path, clean: Repaired) -> Float[Floats, "L 3"]:
         return values.astype(np.float64)
     numbers = values.dtype.kind in "fiu" and values.ndim == 1 and len(values)
     if not numbers or not np.array_equal(values, np.round(values)):
-        raise InputError(
-            f"{file.name} holds no landmarks",
-            "either one vertex a line (-1: missing), or x, y and z of a point on each line",
-        )
+        problem = f"{file.name} holds no landmarks"
+        raise InputError(problem, "either one vertex a line (-1: missing), or x, y and z of a point on each line")
     for outside in values[(values < -1) | (values >= clean.original.V)]:
-        raise InputError(
-            f"{file.name} names vertex {outside:.0f}, but {clean.original.name} has {clean.original.V}",
-            "vertices are counted from 0; -1 is a missing one",
-        )
+        problem = f"{file.name} names vertex {outside:.0f}, but {clean.original.name} has {clean.original.V}"
+        raise InputError(problem, "vertices are counted from 0; -1 is a missing one")
     points = clean.shape.verts[clean.original_to_repaired[values.astype(np.int64)]].copy()
     points[values < 0] = np.nan
     return points

@@ -113,10 +113,8 @@ def _labels(name: str, values: Sequence[Any], shape: Shape, on: str | None) -> L
     fits = [kind for kind, size in sizes.items() if size == len(values) and on in (None, kind)]
     owner = shape.name or "the source"
     if len(fits) == 2:
-        raise OptionError(
-            f"{name} has {len(values)} labels, and {owner} as many vertices as faces",
-            "say which with --on vertices or --on faces",
-        )
+        problem = f"{name} has {len(values)} labels, and {owner} as many vertices as faces"
+        raise OptionError(problem, "say which with --on vertices or --on faces")
     if not fits:
         raise InputError(
             f"{name} has {len(values)} labels, but {owner} has {shape.V} vertices and {shape.F} faces"
@@ -186,10 +184,8 @@ def _read_json(path: Path, shape: Shape, on: On | None) -> tuple[list[Any], str 
     for part, members in record.items():
         whole = isinstance(members, list) and all(type(member) is int for member in members)
         if not whole or (members and not 0 <= min(members) <= max(members) < len(labels)):
-            raise InputError(
-                f"'{part[:40]}' is not a list of {members_are} of {shape.name or 'the source'}",
-                f"its {members_are} are 0 to {len(labels) - 1}",
-            )
+            problem = f"'{part[:40]}' is not a list of {members_are} of {shape.name or 'the source'}"
+            raise InputError(problem, f"its {members_are} are 0 to {len(labels) - 1}")
         for member in members:
             labels[member] = part if labels[member] is None else labels[member]
     return labels, members_are

@@ -5,8 +5,7 @@ the inverse of a map. Where several parts of the image pass by, the most trustwo
 with confidence, near, and never a triangle that the map has pulled apart.
 
 The search is exact for triangles of any size, which an image needs: a map stretches some and shrinks others, and
-leaves vertices without a triangle. `meshmatch.maps.surface` asks only the triangles around the nearest vertex, which is
-faster but misses large ones; `meshmatch.transfer.surface_walk` needs to know where a search begins.
+leaves vertices without a triangle. `meshmatch.maps.surface` says how other searches differ.
 """
 
 from __future__ import annotations
@@ -105,9 +104,8 @@ class MappedMesh:
         the places should be.
         """
         points = np.asarray(points, np.float64)
-        facing = np.zeros((len(points), 3)) if normals is None else np.asarray(normals, np.float64)
-        about = None if near is None else np.asarray(near, np.float64) / self._source_unit
-        item, weights = self._search(points, facing, workers, about)
+        facing = np.zeros((len(points), 3)) if normals is None else normals
+        item, weights = self._search(points, facing, workers, None if near is None else near / self._source_unit)
         corners = self.corners[item]
         distance = np.sqrt(squared_lengths(interpolate(self.points, corners, weights) - points))
         beyond = np.maximum(distance - self._gap, 0.0)

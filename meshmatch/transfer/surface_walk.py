@@ -1,8 +1,7 @@
 """Closest points on the surface that colours are taken from, by walking over it.
 
 A search begins at a known face, and goes from face to face over shared edges. So it never changes to another sheet that
-merely passes by, and neighbouring points end at neighbouring places: the tree searches of `meshmatch.maps.surface` and
-`meshmatch.transfer.mapped_mesh` keep neither, and are too slow for millions of texels.
+merely passes by, and neighbouring points end at neighbouring places, which a search in a tree does not grant.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.topology import same_rows
-from meshmatch.geometry.triangles import blend, closest_on_triangles, interpolate, squared_lengths, triangle_areas
+from meshmatch.geometry.triangles import blend, closest_on_triangles, squared_lengths, triangle_areas
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import length_of
 
@@ -31,20 +30,16 @@ class SurfaceWalker:
         self.faces = shape.faces
         self.same = same_rows(shape.verts)[shape.faces]  # corners by position: seams do not separate
         self.opposite, self.opposite_edge = _neighbours(shape.faces, self.same)
-        a, b, c = (self.verts[shape.faces[:, k]] for k in range(3))
+        corners = self.verts[shape.faces]
         self.areas = triangle_areas(self.verts, shape.faces)
-        first, second = duals(b - a, c - a)
+        first, second = duals(corners)
         self._flat = (first == 0).all(axis=1) & (second == 0).all(axis=1)
-        self._table = list(np.concatenate([a, first, second], axis=1).T.astype(np.float32, order="C"))
+        self._table = list(np.concatenate([corners[:, 0], first, second], axis=1).T.astype(np.float32, order="C"))
         self._opposite = list(np.ascontiguousarray(self.opposite.T))
         self.face_of_vertex = np.full(shape.V, -1, np.int64)  # a face at each vertex; -1 where there is none
         self.face_of_vertex[shape.faces[::-1].ravel()] = np.repeat(np.arange(shape.F - 1, -1, -1), 3)
         self._unfit = self._flat if shape.invalid is None else self._flat | shape.invalid[shape.faces].any(axis=1)
         self._tree: cKDTree | None = None
-
-    def places(self, face: NDArray[np.integer], weights: NDArray[np.floating]) -> Floats:
-        """(N, 3) points of faces (N,) by weights (N, 3)."""
-        return interpolate(self.verts, self.faces[face], weights)
 
     def closest(self, points: Floats32, face: Ints32) -> tuple[Ints32, Floats32, Floats32]:
         """The closest place on the surface that a walk reaches from points (3, N), beginning on faces (N,), -1 where
@@ -149,10 +144,11 @@ def weighted(a: list[Floats32] | Floats32, b: list[Floats32]) -> Floats32:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def duals(first: Floats, second: Floats) -> tuple[Floats, Floats]:
-    """Vectors (F, 3) whose products with a point of a triangle, seen from its first corner, are the weights of
+def duals(corners: Floats) -> tuple[Floats, Floats]:
+    """Vectors (F, 3) whose products with a point of a triangle (F, 3, 3), seen from its first corner, are the weights of
     its second and third; zeros for a triangle without area.
     """
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     a, b, c = squared_lengths(first), np.einsum("ni,ni->n", first, second), squared_lengths(second)
     determinant = a * c - b * b
     flat = determinant <= 1e-14 * a * c

@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
-from meshmatch.geometry.triangles import cross_product, squared_lengths
+from meshmatch.geometry.triangles import cross_product, interpolate, squared_lengths
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Alpha, Appearance, Material
 from meshmatch.shapes.shape import Shape
@@ -146,8 +146,7 @@ def _densities(walker: SurfaceWalker, materials: tuple[Material, ...], material:
     """
     sizes = np.array([(0, 0) if m.image is None else m.image.shape[1::-1] for m in materials], np.float64)
     corners = uv * sizes[material][:, None]
-    a, b, c = (walker.verts[walker.faces[:, k]] for k in range(3))
-    first, second = duals(b - a, c - a)
+    first, second = duals(walker.verts[walker.faces])
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     u, v = (one[:, k : k + 1] * first + two[:, k : k + 1] * second for k in range(2))
     density = reach_of(u, v)
@@ -281,7 +280,7 @@ def images_of(walker: SurfaceWalker, back: VertexMap) -> tuple[Floats, Ints]:
     """(V_target, 3) where each vertex of the target lies on the source, and (V_target,) a face of the source there."""
     image = walker.verts[back.index]
     inside = np.flatnonzero(back.face >= 0)
-    image[inside] = walker.places(back.face[inside], back.barycentric[inside])
+    image[inside] = interpolate(walker.verts, walker.faces[back.face[inside]], back.barycentric[inside])
     return image, np.where(back.face >= 0, back.face, walker.face_of_vertex[back.index])
 
 
@@ -295,8 +294,7 @@ def _inverse(corners: Floats) -> Floats:
 
 def _jacobians(target: Shape, image: Floats, continuous: Bools) -> Floats:
     """(V, 3, 3) the Jacobian of the map at each vertex: the area-weighted mean of the continuous faces around."""
-    a, b, c = (target.verts[target.faces[:, k]] for k in range(3))
-    first, second = duals(b - a, c - a)
+    first, second = duals(target.verts[target.faces])
     steps = image[:, 1] - image[:, 0], image[:, 2] - image[:, 0]
     jacobian = np.einsum("fi,fj->fij", steps[0], first) + np.einsum("fi,fj->fij", steps[1], second)
     weight = np.where(continuous, target.face_areas, 0.0)

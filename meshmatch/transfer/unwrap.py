@@ -50,10 +50,8 @@ def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Ke
     """
     name = shape.name or "the target"
     if shape.is_cloud:
-        raise OptionError(
-            f"{name} is a point cloud, which has no surface for a texture",
-            "its points can have colours: end the output in .ply",
-        )
+        problem = f"{name} is a point cloud, which has no surface for a texture"
+        raise OptionError(problem, "its points can have colours: end the output in .ply")
     if not (shape.face_areas > 0).any():
         raise InputError(f"{name} has no triangle with an area", "is it a mesh?")
     words, note = f"{name} has no texture coordinates to keep", ""
@@ -127,10 +125,8 @@ def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
         grid = min(size, _GRID)
         uv = _packed(charts, faces, grid, padding * grid / size)
     except (RuntimeError, IndexError) as error:
-        raise InputError(
-            f"{shape.name or 'the target'} cannot be unwrapped ({error})",
-            "unwrap it in a modelling program, and use --uv keep",
-        ) from error
+        problem = f"{shape.name or 'the target'} cannot be unwrapped ({error})"
+        raise InputError(problem, "unwrap it in a modelling program, and use --uv keep") from error
     out = np.zeros((shape.F, 3, 2))
     # Room at the border too: a repeated image goes on there with its other side.
     margin = min(_MARGIN, padding) / size

@@ -150,10 +150,8 @@ def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:
         numbers.append(1.0)
     numbers *= columns if len(numbers) == 1 else 1
     if len(numbers) != columns:
-        raise OptionError(
-            f"--blank {text}: {columns} number{'s are' if columns > 1 else ' is'} needed",
-            "such as nan, 0, 0.5,0.5,0.5 or #808080",
-        )
+        problem = f"--blank {text}: {columns} number{'s are' if columns > 1 else ' is'} needed"
+        raise OptionError(problem, "such as nan, 0, 0.5,0.5,0.5 or #808080")
     return np.array(numbers)
 
 
@@ -164,10 +162,8 @@ def light_of(shape: Shape, colors: ArrayLike | None = None) -> Float[Floats, "V 
     """
     if colors is None:
         if shape.colors is None:
-            raise InputError(
-                f"{shape.name or 'the source'} has no vertex colours",
-                "give numbers with --values, or transfer its texture: meshmatch transfer-texture",
-            )
+            problem = f"{shape.name or 'the source'} has no vertex colours"
+            raise InputError(problem, "give numbers with --values, or transfer its texture: meshmatch transfer-texture")
         return light(shape.colors)
     table = checked_colors(np.asarray(colors, np.float64))
     if len(table) != shape.V or table.ndim != 2:
@@ -284,10 +280,8 @@ def _table(key: str, values: ArrayLike, kind: type) -> np.ndarray:
 def _normalized(name: str, matrix: csr_array, shape: Shape) -> csr_array:
     """Weights (V, J) checked to be of `shape`, and with rows that sum to 1."""
     if matrix.shape[0] != shape.V:
-        raise InputError(
-            f"{name} has weights of {matrix.shape[0]} vertices, but {shape.name or 'the source'} has {shape.V}",
-            "one row is needed for each vertex of the source, in the order of its file",
-        )
+        problem = f"{name} has weights of {matrix.shape[0]} vertices, but {shape.name or 'the source'} has {shape.V}"
+        raise InputError(problem, "one row is needed for each vertex of the source, in the order of its file")
     matrix.sum_duplicates()
     if matrix.nnz and matrix.data.min() < 0:
         raise InputError(f"{name}: a weight is negative ({matrix.data.min():g})", "weights are shares from 0 to 1")
