@@ -69,9 +69,8 @@ class NodeConfig:
 def low_mesh(
     shape: Shape, faces: int = LOW_FACES, quality: Quality = "fast"
 ) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
-    """Decimate onto a subset of the shape's own vertices, or triangulate a cloud: kept indices, faces.
-
-    Whatever belongs to a vertex (weights, labels, positions on registered shapes) is then kept by indexing.
+    """Decimate onto some of the shape's own vertices, or triangulate a cloud: kept indices, by which all that belongs
+    to vertices is kept too, and faces.
     """
     if shape.is_cloud:
         return triangulate_cloud(shape, faces)
@@ -179,9 +178,8 @@ def _complete(
 def _allowed(
     shape: Shape, config: NodeConfig, candidates: Float[Floats, "N 3"], labels: Int[Ints, " V"] | None, samples: Samples
 ) -> Iterator[Bool[Bools, " N"]]:
-    """Which candidates a strategy keeps; a weaker rule follows, for when one leaves some vertices without nodes.
-
-    Clusters narrower than the radius (fingers, ears) leave no candidate near them: then a coarser clustering is tried.
+    """Which candidates a strategy keeps; then those of milder rules, for where clusters narrower than the radius
+    (fingers, ears) leave no candidate near them.
     """
     if config.strategy == "uniform" or shape.is_cloud:
         yield np.ones(len(candidates), bool)
@@ -232,9 +230,8 @@ def edge_graph(shape: Shape) -> coo_matrix:
 
 
 def spectral_clusters(shape: Shape, clusters: int, rng: np.random.Generator) -> Int[Ints, " V"]:
-    """k-means on the global point signature (Rustamov 2007) of Laplace-Beltrami eigenvectors.
-
-    Returns labels from 0, at most ``clusters`` of them, none without a vertex.
+    """Labels from 0, at most ``clusters`` and none without a vertex: k-means on the global point signature (Rustamov
+    2007) of Laplace-Beltrami eigenvectors.
     """
     stiffness, mass = robust_laplacian.mesh_laplacian(shape.verts, shape.faces)
     count = min(_FUNCTIONS + 1, shape.V - 2)

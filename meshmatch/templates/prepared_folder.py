@@ -112,10 +112,8 @@ def collect_samples(
     seed: int,
     progress: Progress,
 ) -> tuple[ShapeSamples, list[Frame], list[float]]:
-    """Bring every shape to the template's frame and sample it: samples, the frame of every shape (file to template),
-    and the residual of every aligned shape against the template.
-
-    A shape's landmarks are in its file's frame, NaN where missing; those of the template are in the template's.
+    """Every shape in the template's frame, sampled; the frame of each (file to template), and its residual against the
+    template. A shape's landmarks are in its file's frame, NaN where missing; the template's in the template's.
     """
     target, radius = template_samples(template), template_radius(template)
     P = int(np.clip(_ALL_SAMPLES // len(shapes), _MIN_SAMPLES, _MAX_SAMPLES))
@@ -141,10 +139,8 @@ def collect_samples(
 
 
 def read_landmarks(file: Path, clean: Repaired) -> Float[Floats, "L 3"]:
-    """Landmarks of a shape, in its file's frame; NaN for a missing one.
-
-    The file holds vertices (L,), -1 for a missing one, or positions (L, 3); `InputError` if it cannot be read, or names
-    a vertex that is not there.
+    """Landmarks of a shape, in its file's frame, from vertices (L,) or positions (L, 3); -1 or NaN for a missing one.
+    `InputError` if the file cannot be read, or names a vertex that is not there.
     """
     try:
         if file.suffix == ".npy":
@@ -171,10 +167,7 @@ def read_landmarks(file: Path, clean: Repaired) -> Float[Floats, "L 3"]:
 
 
 def find_landmarks(where: str | Path | None, folder: Path, files: Sequence[Path]) -> list[Path | None]:
-    """The landmark file of every shape: in a folder of their own, or beside the shapes with a suffix.
-
-    `OptionError` if none of the shapes has one.
-    """
+    """The landmark file of every shape, in a folder or beside it with a suffix; `OptionError` if none has one."""
     if where is None:
         return [None] * len(files)
     place, suffixes = folder, [str(where)]

@@ -69,9 +69,8 @@ class Template:
 
     @cached_property
     def hash(self) -> str:
-        """First 16 hex digits of the SHA-256 of everything that a model depends on.
-
-        Labels and dense mesh are left out: they change neither what node vectors mean nor which fits go together.
+        """First 16 hex digits of the SHA-256 of all that a model depends on. Labels and dense mesh are left out: they
+        change neither what node vectors mean nor which fits go together.
         """
         digest = hashlib.sha256()
         for array in (self.shape.verts, self.shape.faces, self.nodes, np.array([self.radius]), self.core):

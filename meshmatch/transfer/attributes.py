@@ -26,10 +26,8 @@ _LARGE = 4.0
 
 
 def pull_values(back: VertexMap, values: Floats) -> Floats:
-    """Numbers (V_source,) or (V_source, D) on the target: (V_target,) or (V_target, D).
-
-    As `VertexMap.apply`, except that a value that is not finite takes no part, unless it has more than half of the
-    weight: then the result is nan.
+    """Numbers (V_source,) or (V_source, D) on the target, as by `VertexMap.apply`. A value that is not finite takes no
+    part, unless it has more than half of the weight: then the result is nan.
     """
     values = np.asarray(values, np.float64)
     matrix = back.sparse()
@@ -46,9 +44,8 @@ def pull_directions(
 ) -> Float[Floats, "V_target 3"]:
     """Unit vectors at the target's vertices from vectors, such as normals, at the source's; each in its file's frame.
 
-    Around each vertex of the target the rotation is taken that best turns the edges and the normal of the source
-    there into those of the target (Kabsch); vectors that cancel become zeros. `InputError` if one of the shapes is a
-    point cloud, or there is not one vector for each vertex.
+    They are turned as the edges and the normal around each vertex are (Kabsch); vectors that cancel become zeros.
+    `InputError` if one of the shapes is a point cloud, or there is not one vector for each vertex.
     """
     if source.is_cloud or target.is_cloud:
         raise InputError("directions need meshes, not point clouds", "transfer them as plain numbers")
@@ -84,10 +81,8 @@ def pull_labels(
 def pull_face_labels(
     back: VertexMap, source: Shape, target: Shape, labels: Int[Ints, " N"], on_faces: bool, workers: int = 1
 ) -> Int[Ints, " F_target"]:
-    """Labels of the target's faces.
-
-    Where everything around the places of its three corners has one label, a face has it too. Elsewhere evenly
-    spread points of the face look up the source, and the label that most of them find wins.
+    """Labels of the target's faces. Where everything around the places of its corners has one label, a face has it too;
+    elsewhere the one that most of its evenly spread points find on the source.
     """
     # Whatever occurs around the places of a face's corners, however small its weight.
     touched = _corner_matrix(corners_of(source.faces, back.face, back.index), source.V)
@@ -194,9 +189,8 @@ def most_votes(votes: csr_array) -> Int[Ints, " N"]:
 
 
 def pull_weights(back: VertexMap, weights: csr_array, max_joints: int = 4) -> csr_array:
-    """Skin weights (V_source, J) on the target (V_target, J), interpolated; rows have at most `max_joints`, and sum to 1.
-
-    A vertex stays without weights where the source has none.
+    """Skin weights (V_source, J) on the target (V_target, J): rows have at most `max_joints`, and sum to 1, or to 0
+    where the source has none.
     """
     return largest_weights(csr_array(back.sparse() @ weights), max_joints)
 

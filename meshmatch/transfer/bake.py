@@ -91,10 +91,8 @@ def transfer_texture(
     options: BakeOptions = BakeOptions(),  # frozen
     progress: Callable[[float], None] = lambda share: None,
 ) -> Baked:
-    """Bake the look of a source's file (`load_appearance`) for a target mesh, along a map from target to source.
-
-    The atlas is one for the size and padding of the options (`atlas_of`); `progress` is called with the share that is
-    done.
+    """Bake the look of a source's file (`load_appearance`) for a target mesh, along a map from target to source, into
+    an atlas (`atlas_of`) for the options' size and padding; `progress` is called with the share that is done.
     """
     walker, sampler = _arranged(source, look)
     uv = atlas.uv

@@ -67,9 +67,7 @@ class Labels:
 
 
 def named(codes: Ints, given: Labels, on: On, blank: str | None) -> Labels:
-    """Labels of a target by the names of `given`. Entries without one get `blank`; if that is not given, -1
-    among numbers, and an empty word among words.
-    """
+    """Labels of a target by the names of `given`; others are `blank`, by default -1 among numbers, "" among words."""
     empty: Label = given.check_blank(blank) if blank is not None else ("" if given.are_words else -1)
     if (codes >= 0).all():
         return Labels(codes, given.names, on)
@@ -78,9 +76,8 @@ def named(codes: Ints, given: Labels, on: On, blank: str | None) -> Labels:
 
 
 def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
-    """Read labels of the vertices or faces of `shape`; their count tells which, unless the file or `on` does.
-
-    `InputError` if the file is missing or damaged, or its count fits neither; `OptionError` if it fits both.
+    """Labels of the vertices or faces of `shape`; their count tells which, unless the file or `on` does. `InputError`
+    if it fits neither, `OptionError` if it fits both.
     """
     readers = {
         ".npy": lambda path: (_listed(read_npy(path)), None),
@@ -192,9 +189,8 @@ def _read_json(path: Path, shape: Shape, on: On | None) -> tuple[list[Any], str 
 
 
 def save_labels(path: Path, labels: Labels, shape: Shape) -> None:
-    """Write labels of `shape`; see the module for the formats. All codes must have a name.
-
-    `OptionError` if the suffix is not one of `LABEL_SUFFIXES`, or a label is too large a number for the format.
+    """Write labels of `shape`, each with a name; `OptionError` for another suffix than `LABEL_SUFFIXES`, or too large a
+    number for the format.
     """
     suffix = check_labels_suffix(path)
     largest = {".npy": 2**63, ".ply": 2**31}.get(suffix)

@@ -71,8 +71,7 @@ def at_vertices(shape: Shape, vertex: Int[Ints, " N"], names: tuple[str, ...] = 
 def at_points(
     shape: Shape, points: Float[Floats, "N 3"], names: tuple[str, ...] = ()
 ) -> tuple[Landmarks, Float[Floats, " N"]]:
-    """Landmarks at the points of a surface (or cloud) nearest to points of its frame, and how far these are from it.
-
+    """Landmarks at the points of a surface (or cloud) nearest to points of its frame, and how far these are from it;
     `InputError` if a point is not finite, or lies far from the shape.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
@@ -93,10 +92,7 @@ def at_points(
 def at_faces(
     shape: Shape, face: Int[Ints, " N"], barycentric: Float[Floats, "N 3"], names: tuple[str, ...] = ()
 ) -> Landmarks:
-    """Landmarks in faces, by the weights of their corners.
-
-    `InputError` for a face that the shape does not have, or weights that do not sum to 1.
-    """
+    """Landmarks in faces, by weights of corners; `InputError` if there is no such face, or they do not sum to 1."""
     face, weights = np.asarray(face, np.int64), np.asarray(barycentric, np.float64).reshape(-1, 3)
     _refuse(
         (face < 0) | (face >= shape.F),
@@ -140,10 +136,8 @@ def joined(parts: Sequence[Landmarks], order: Ints | None = None) -> Landmarks:
 
 
 def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: Landmarks) -> Landmarks:
-    """Landmarks of the source on the target, exactly on its surface; `forward` is a map from source to target.
-
-    A vertex goes where the map puts it. A point of a face goes to the surface nearest to the mean of where its
-    corners go; where the map is discontinuous there, with its heaviest corner.
+    """Landmarks of the source on the surface of the target, along a map from source to target. A point of a face goes
+    nearest to the mean of where its corners go; where the map is discontinuous there, with its heaviest corner.
     """
     at = landmarks.vertex
     vertex, face, weights = forward.index[at], forward.face[at], forward.barycentric[at]
@@ -162,9 +156,8 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
 
 
 def load_landmarks(path: str | Path, shape: Shape) -> tuple[Landmarks, float]:
-    """Read landmarks of `shape`, in the order of the file; and the largest distance from a position to the surface.
-
-    `InputError` if the file is missing or damaged, holds no landmark, or one that is not on `shape`.
+    """Landmarks of `shape`, in the order of the file, and the largest distance from a position to the surface;
+    `InputError` if there is none, or one is not on `shape`.
     """
     readers = {".csv": _read_csv, ".json": _read_json, ".pp": _read_pp, ".txt": _read_vertices, ".npy": _read_vertices}
 

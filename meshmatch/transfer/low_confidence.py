@@ -23,10 +23,7 @@ _NEIGHBOURS = 8  # of a point of a cloud
 
 @dataclass(frozen=True)
 class LowConfidence:
-    """How many entries a result has, and how many of low confidence; how many of all were left blank, and filled in.
-
-    The rest of `low` was kept as it came.
-    """
+    """How many entries a result has, how many of low confidence, and of all left blank, or filled in; others are kept."""
 
     total: int
     low: int
@@ -35,9 +32,8 @@ class LowConfidence:
 
 
 def vertex_graph(shape: Shape) -> csr_array:
-    """(V, V) sparse, symmetric: lengths of the edges of a mesh, or to the nearest points in a cloud.
-
-    Vertices at one place are joined, so that texture seams do not separate.
+    """(V, V) sparse, symmetric: lengths of the edges of a mesh, or to the nearest points in a cloud. Vertices at one
+    place are joined, so that texture seams do not separate.
     """
     if shape.is_cloud:
         near = cKDTree(shape.verts).query(shape.verts, min(_NEIGHBOURS + 1, shape.V))[1].reshape(shape.V, -1)
@@ -87,10 +83,10 @@ def nearest_known(graph: csr_array, known: Bools) -> Ints:
 
 
 def diffuse(graph: csr_array, known: Bools, values: Floats) -> tuple[Floats, Bools]:
-    """Values (N, D) with the unknown rows filled in: each is the mean of its neighbours, weighted by 1 / distance.
+    """Values (N, D) with the unknown rows filled in, and (N,) which rows were; those that no known row reaches stay.
 
-    That is the discrete harmonic function with the known values as its boundary; solved by conjugate gradients. The
-    second result (N,) says which rows were filled in; those that no known row reaches stay as they were.
+    They are the discrete harmonic function with the known values as its boundary, by conjugate gradients: each is the
+    mean of its neighbours, weighted by 1 / distance.
     """
     nearest = nearest_known(graph, known)
     ask = ~known & (nearest >= 0)
@@ -151,7 +147,7 @@ def replace_low_labels(
     labels: Int[Ints, " N"], low: Bool[Bools, " N"], target: Shape, blank: bool, fill: bool, on_faces: bool
 ) -> tuple[Int[Ints, " N"], LowConfidence]:
     """Labels of the target's vertices or faces; those of low confidence are left blank (-1), taken from the nearest
-    other vertex or face along the surface, or kept.
+    known ones along the surface, or kept.
     """
     low = low | (labels < 0)
     out, filled = labels.copy(), 0

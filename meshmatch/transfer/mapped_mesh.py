@@ -98,10 +98,7 @@ class MappedMesh:
         near: Float[Floats, "N 3"] | None = None,
     ) -> MappedFootpoints:
         """Points on the source of points on the target, in its file's frame, where it has these unit normals (zeros
-        where unknown).
-
-        `near` selects the right one of two sheets that touch: points of the source, in its file's frame, near which
-        the places should be.
+        where unknown). `near` are points of the source, in its file's frame, which select one of two sheets that touch.
         """
         points = np.asarray(points, np.float64)
         facing = np.zeros((len(points), 3)) if normals is None else normals
@@ -118,10 +115,8 @@ class MappedMesh:
         return MappedFootpoints(vertex, face, weights, distance, confidence)
 
     def _search(self, points: Floats, normals: Floats, workers: int, near: Floats | None) -> tuple[Ints, Floats]:
-        """The best item of each point, a triangle or a lone vertex, and the weights of its corners.
-
-        Centers come nearest first, so that a search ends where no further item can be better. That is exact
-        until `_MAX_TRIED` items of a size have been tried for a point.
+        """The best item of each point, a triangle or a lone vertex, and the weights of its corners. Nearest centers
+        come first, and none after which no item can be better: exact until `_MAX_TRIED` of a size have been tried.
         """
         N = len(points)
         best, item, weights = np.full(N, np.inf), np.zeros(N, np.int64), np.zeros((N, 3))
@@ -184,9 +179,8 @@ class MappedMesh:
 
 
 def discontinuous_faces(source_to_target: VertexMap, source: Shape, target: Shape) -> Bool[Bools, " F_source"]:
-    """True for a face whose image on the target is far longer than the face itself.
-
-    A map to vertices alone moves each point by up to an edge of the target, which is allowed for.
+    """True for a face whose image on the target is far longer than the face itself, and than the edges of a target to
+    whose vertices the map was rounded.
     """
     if source.is_cloud:
         return np.zeros(0, bool)
@@ -224,9 +218,8 @@ def length_of(shape: Shape) -> float:
 
 
 def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
-    """A map from target to source, from one from source to target; `InputError` as `VertexMap.for_shapes`.
-
-    Confidence falls with the distance to the image: it is low where nothing of the source was mapped to.
+    """A map from target to source, from one from source to target; `InputError` as `VertexMap.for_shapes`. Its
+    confidence falls with the distance to the image: it is low where nothing of the source was mapped to.
     """
     checked = source_to_target.for_shapes(source, target)
     identical = bool((checked.index == np.arange(source.V)).all() and (checked.face < 0).all())
@@ -259,10 +252,8 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
 
 
 def _meeting_vertices(found: VertexMap, source: Shape, V: int) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
-    """Target vertices on which several source vertices meet, and of these the one nearest to their mean.
-
-    A map of vertex numbers to a coarser target puts a patch of the source on each vertex, and any of it would be
-    closest.
+    """Target vertices on which several source vertices meet, and of these, any of which would be closest, the one
+    nearest to their mean: a map of vertex numbers to a coarser target puts a patch of the source on each vertex.
     """
     highest = np.zeros(V)
     rows = np.flatnonzero(found.on_vertex)

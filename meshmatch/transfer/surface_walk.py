@@ -115,9 +115,8 @@ class SurfaceWalker:
 
 
 class PointWalker(SurfaceWalker):
-    """A point cloud as a walker: each point with its two nearest neighbours stands for a face.
-
-    A walk is a search for the nearest point; weights fall with the square of the distance.
+    """A point cloud as a walker: each point with its two nearest neighbours stands for a face, a walk is a search for
+    the nearest point, and weights fall with the square of the distance.
     """
 
     def __init__(self, shape: Shape) -> None:
@@ -157,10 +156,8 @@ def duals(corners: Floats) -> tuple[Floats, Floats]:
 
 
 def _neighbours(faces: Ints, same: Ints) -> tuple[Ints32, NDArray[np.int8]]:
-    """The face across each edge (F, 3), -1 for none, and which of its edges that is; edge k is opposite corner k.
-
-    Edges that two faces share by their vertices come first; then those that meet at the same places. Where more
-    than two meet there is no telling which goes on, so none does.
+    """The face across each edge (F, 3), -1 for none, and which of its edges that is; edge k is opposite corner k. Edges
+    of two faces by their vertices come before those by their places; where more than two meet, none goes on.
     """
     F = len(faces)
     opposite = np.full(3 * F, -1, np.int64)

@@ -110,9 +110,8 @@ def _meaning(used: list[Material]) -> tuple[Alpha, float, bool]:
 
 
 def known_texels(material: Material, uv: Floats) -> Bools | None:
-    """(H, W) True for the texels of an image that lie on the surface, by the coordinates (F, 3, 2) of its faces.
-
-    None where it is not worth asking: an image that is tiled, or laid over itself many times.
+    """(H, W) True for the texels of an image on the surface, by the coordinates (F, 3, 2) of its faces; None where it
+    is not worth asking: an image that is tiled, or laid over itself many times.
     """
     assert material.image is not None
     height, width = material.image.shape[:2]
@@ -140,9 +139,8 @@ def _texels_at(points: Floats, material: Material, shape: tuple[int, ...]) -> tu
 
 
 def _densities(walker: SurfaceWalker, materials: tuple[Material, ...], material: Ints, uv: Floats) -> Floats32:
-    """(F,) texels of its image that lie along a unit of length on each face; one on the whole face without an image.
-
-    As an area has them, or half of what the densest direction has if that is more.
+    """(F,) texels of its image along a unit of length on each face (one on the whole face without an image): as an area
+    has them, or half of what the densest direction has if that is more.
     """
     sizes = np.array([(0, 0) if m.image is None else m.image.shape[1::-1] for m in materials], np.float64)
     corners = uv * sizes[material][:, None]

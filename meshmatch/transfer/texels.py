@@ -33,10 +33,8 @@ def rows_of(corners: Floats) -> Ints:
 
 
 def texels_in(corners: Floats) -> Iterator[tuple[Ints, Ints, Ints]]:
-    """Face, column and row of each texel whose center lies in one of the triangles (F, 3, 2), some millions at a time.
-
-    The triangles' coordinates count texels: column, row. A center on an edge belongs to one of the two triangles that
-    share it. Rows and columns are not bounded.
+    """Face, column and row of each texel, not bounded, whose center lies in one of the triangles (F, 3, 2), which count
+    texels; some millions at a time. A center on an edge belongs to one of the two triangles that share it.
     """
     order = np.lexsort((corners[:, :, 0], corners[:, :, 1]), axis=1)
     top, middle, low = (np.take_along_axis(corners, order[:, k, None, None], axis=1)[:, 0] for k in range(3))
@@ -70,8 +68,8 @@ def _crossing(begin: Floats, end: Floats, y: Floats) -> Floats:
 
 
 def faces_on(corners: Floats, size: int) -> tuple[Ints32, int]:
-    """The triangle on each texel of a square image, (size, size) with -1 for none, and how many texels are held
-    more than once. Where several hold one, the last stays.
+    """The triangle on each texel of a square image, (size, size), the last of several and -1 for none; and how many
+    texels are held more than once.
     """
     found = np.full(size * size, -1, np.int32)
     total = 0
@@ -105,10 +103,8 @@ def beside_another(values: Ints32) -> Bools:
 
 
 def fill(pixels: Pixels, weight: Floats32) -> list[Pixels]:
-    """All levels of (H, W, 4) pixels, these first, each half as large as the one before, down to one texel.
-
-    Texels count by their weight (H, W), and where it is 0 they are filled, in place; if nothing at all is known,
-    everything counts.
+    """All levels of (H, W, 4) pixels, these first, each half as large as the one before, down to one texel. Those whose
+    weight (H, W) is 0 are filled, in place; if nothing at all is known, everything counts.
     """
     levels, weights = [pixels], [weight if (weight > 0).any() else np.ones_like(weight)]
     while max(levels[-1].shape[:2]) > 1:
@@ -157,9 +153,8 @@ def _sum_of_fours(values: Floats32) -> Floats32:
 
 
 class Pyramid:
-    """The image of a material with its smaller levels, ready to be looked up.
-
-    What is not `known` (H, W), or fully transparent, is made up from its surroundings.
+    """The image of a material with its smaller levels; what is not `known` (H, W), or fully transparent, is made up
+    from its surroundings.
     """
 
     def __init__(self, material: Material, known: Bools | None = None) -> None:

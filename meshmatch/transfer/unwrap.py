@@ -42,11 +42,10 @@ class Atlas:
 
 
 def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Keep = "auto") -> Atlas:
-    """The coordinates to bake an image of `size` with: the file's own (F, 3, 2) where they are valid ("auto"), these
-    or an error ("keep"), or new ones, with at least `padding` texels between charts.
+    """The coordinates to bake an image of `size` with: the file's own (F, 3, 2) where they are valid ("auto"), these or
+    an error ("keep"), or new ones, with at least `padding` texels between charts.
 
-    `OptionError` for a cloud, or if there are none to keep, or they are not valid; `InputError` if no triangle has an
-    area, or xatlas fails.
+    `OptionError` for a cloud, or coordinates to keep that are not valid; `InputError` without area, or if xatlas fails.
     """
     name = shape.name or "the target"
     if shape.is_cloud:
@@ -135,9 +134,8 @@ def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
 
 
 def _packed(charts: Floats, faces: Ints, grid: int, padding: float) -> Floats:
-    """(N, 2) charts side by side in a square, on a grid of about `grid`, at least `padding` of it apart.
-
-    xatlas finds a width and a height by itself; the most square of a few attempts wins.
+    """(N, 2) charts side by side on a grid of about `grid`, at least `padding` of it apart: the most square of a few
+    attempts, as xatlas finds a width and a height by itself.
     """
     area = float(_flat_areas(charts[faces]).sum())
     best, most = charts, 0.0

@@ -68,10 +68,7 @@ class Values:
 
 
 def load_values(path: str | Path, shape: Shape) -> Values:
-    """Read numbers of the vertices of `shape`.
-
-    `InputError` if the file is missing or damaged, holds no numbers, or not one row for each vertex.
-    """
+    """Read numbers of the vertices of `shape`; `InputError` if there is not one row for each."""
     readers = {".npy": _read_npy, ".csv": _read_csv, ".txt": _read_csv}
     found = table_files.read_by_suffix(path, readers, "values", _HINT)
     name, rows = Path(path).name, len(found.numbers)
@@ -135,10 +132,7 @@ def save_values(path: Path, values: Values, shape: Shape) -> None:
 
 
 def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:
-    """The values to write where nothing is known, from the user's text: a number, numbers, or #rrggbb.
-
-    `OptionError` for any other text, or not as many numbers as there are columns.
-    """
+    """What the user's text says: a number, one for each column, or #rrggbb; `OptionError` if it says none of these."""
     try:
         if re.fullmatch("#[0-9a-fA-F]{6}", text):
             numbers = [byte / 255 for byte in bytes.fromhex(text[1:])]
@@ -156,9 +150,8 @@ def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:
 
 
 def light_of(shape: Shape, colors: ArrayLike | None = None) -> Float[Floats, "V 4"]:
-    """Light of the vertices of a shape, from its own colours or from others (V, 3 or 4) as screens show them.
-
-    `InputError` if it has no vertex colours; or not one for each vertex, within 0..1.
+    """Light of the vertices of a shape, from its own colours (`InputError` if it has none) or from others (V, 3 or 4)
+    as screens show them.
     """
     if colors is None:
         if shape.colors is None:
@@ -216,10 +209,7 @@ class SkinWeights:
 
 
 def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
-    """Read skin weights of the vertices of `shape`, from .npz, .json, .glb or .gltf.
-
-    `InputError` if the file is missing or damaged, holds no weights, or not those of `shape`.
-    """
+    """Skin weights of the vertices of `shape`, from .npz, .json, .glb or .gltf; `InputError` if not its own."""
     from meshmatch.shapes.formats.gltf_attributes import read_skin
 
     readers = {
@@ -233,9 +223,8 @@ def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
 
 
 def weights_of(matrix: csr_array | ArrayLike, shape: Shape) -> SkinWeights:
-    """Skin weights of the vertices of `shape` from a table (V, J), dense or sparse; joints are named by number.
-
-    `InputError` if these are not numbers, not a row for each vertex, or negative.
+    """Skin weights of the vertices of `shape` from a table (V, J), dense or sparse, of numbers that are not negative
+    (`InputError`); joints are named by number.
     """
     sparse = csr_array(matrix if issparse(matrix) else _table("weights", matrix, np.float64), dtype=np.float64)
     return SkinWeights(_normalized("the array", sparse, shape), tuple(str(joint) for joint in range(sparse.shape[1])))
