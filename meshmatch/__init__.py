@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from meshmatch.api.evaluation import evaluate as evaluate
     from meshmatch.api.interpolation import Interpolation as Interpolation
     from meshmatch.api.interpolation import InterpolationOptions as InterpolationOptions
     from meshmatch.api.interpolation import interpolate as interpolate
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from meshmatch.api.results import ConfidenceRule as ConfidenceRule
     from meshmatch.api.results import MatchResult as MatchResult
     from meshmatch.api.results import Transferred as Transferred
+    from meshmatch.api.results import evaluate as evaluate
     from meshmatch.api.texture import TexturedResult as TexturedResult
     from meshmatch.api.texture import transfer_texture as transfer_texture
     from meshmatch.api.transfer import find_maps as find_maps
@@ -61,7 +61,7 @@ _HOMES = {
     "TexturedResult": "meshmatch.api.texture",
     "Transferred": "meshmatch.api.results",
     "VertexMap": "meshmatch.maps.vertex_map",
-    "evaluate": "meshmatch.api.evaluation",
+    "evaluate": "meshmatch.api.results",
     "find_maps": "meshmatch.api.transfer",
     "interpolate": "meshmatch.api.interpolation",
     "load_map": "meshmatch.maps.files",

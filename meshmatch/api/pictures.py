@@ -94,15 +94,13 @@ def _composed(
         maps = find_maps(shapes[0], shapes[1], match)
         return compose_match(shapes[0], shapes[1], maps.forward, maps.rotations, look)
     if values is not None:
-        tables = [
-            as_numbers(own, f"values of {shape.name or 'the shape'}") for own, shape in zip(values, shapes, strict=True)
-        ]
-        for table, shape in zip(tables, shapes, strict=True):
+        tables = []
+        for numbers, shape in zip(values, shapes, strict=True):
+            what = f"values of {shape.name or 'the shape'}"
+            tables.append(table := as_numbers(numbers, what))
             if table.ndim not in (1, 2) or len(table) != shape.V:
-                raise InputError(
-                    f"values of {shape.name or 'the shape'} must be an array of ({shape.V},), not {table.shape}",
-                    "one number or one colour for each vertex, and one array for each shape",
-                )
+                hint = "one number or one colour for each vertex, and one array for each shape"
+                raise InputError(f"{what} must be an array of ({shape.V},), not {table.shape}", hint)
         return compose_values(shapes, tables)
     if labels is not None:
         pairs = zip(labels, shapes, strict=True)

@@ -1,17 +1,24 @@
-"""What matching and transfers give back, and the maps in both directions that transfers follow."""
+"""What matching and transfers give back, the maps in both directions that transfers follow, and how good a map is."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Generic, TypeVar
 
-from meshmatch.arrays import Float, Floats
-from meshmatch.errors import OptionError
+import numpy as np
+from numpy.typing import ArrayLike
+
+from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
-from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.maps.evaluate import Evaluation, evaluate_map
+from meshmatch.maps.files import load_map
+from meshmatch.maps.vertex_map import VertexMap, check_map
+from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
@@ -127,3 +134,42 @@ class Transferred(Generic[T]):
     confidence: Float[Floats, " N"]
     low: LowConfidence
     maps: MapPair
+
+
+def evaluate(
+    found: MatchResult | VertexMap | str | Path,
+    source: ShapeLike,
+    target: ShapeLike,
+    truth: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+    *,
+    seed: int = 0,
+) -> Evaluation:
+    """Measure a map: its coverage, its distortion, and its errors where the truth is known.
+
+    Errors are geodesic distances on the target, over the square root of its area; or in centimetres with the target
+    scaled to 1.9 square metres, the skin of a person. ``found`` is a map, or its file; the shapes are as in `match`.
+    ``truth`` is the true target vertex of every source vertex (V_source,); or N vertices of the source and those of the
+    target, ((N,), (N,)). ``seed`` is of the random pairs of points between which distortion is measured.
+
+    `MeshmatchError`: the map or the truth belongs to other shapes, or is something else.
+    """
+    source, target = as_shape(source, "source"), as_shape(target, "target")
+    if isinstance(found, str | Path):
+        found = load_map(found, source, target)
+    vertex_map = found.map if isinstance(found, MatchResult) else found
+    check_map(vertex_map)
+    known: list[Ints] = []
+    if truth is not None:
+        pair = truth if isinstance(truth, tuple) and len(truth) == 2 else (np.arange(source.V), truth)
+        for numbers in map(np.asarray, pair):
+            if numbers.dtype.kind not in "iu":
+                hint = "integers, counted from 0"
+                raise InputError(f"the truth must be numbers of vertices, not {numbers.dtype}", hint)
+            known.append(numbers.astype(np.int64))
+        if known[0].ndim != 1 or known[0].shape != known[1].shape:
+            raise InputError(
+                f"the truth has {known[0].shape} vertices of the source and {known[1].shape} of the target",
+                "give one target vertex for every source vertex, or a pair of lists of the same length",
+            )
+    with thread_limit(1):
+        return evaluate_map(vertex_map, source, target, *known, rng=np.random.default_rng(seed))

@@ -17,7 +17,7 @@ import numpy as np
 from meshmatch.errors import OptionError
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
 from meshmatch.outputs import replace_on_success
-from meshmatch.render.legend import readable
+from meshmatch.render.scales import readable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,10 +52,8 @@ def check_chart(path: str | Path) -> None:
 def draw_curves(
     curves: Mapping[str, Errors], path: str | Path, limit: float = 20.0, *, unit: Literal["cm", "x100"] = "cm"
 ) -> None:
-    """Draw cumulative error curves, at least one: the share of points (vertical) with at most this error.
-
-    ``limit`` is the right end of the axis in ``unit``: centimeters on a target scaled to 1.9 m² (a person's skin), or
-    hundredths of sqrt(area).
+    """Draw cumulative error curves, at least one: the share of points (vertical) with at most this error, up to ``limit``
+    in ``unit``: centimeters on a target scaled to 1.9 m² (a person's skin), or hundredths of sqrt(area).
     """
     if not curves or not limit > 0 or unit not in _UNITS:
         raise OptionError(f"a curve needs errors, a positive limit and a unit of {', '.join(_UNITS)}")
@@ -79,13 +77,9 @@ def draw_lines(
     ylabel: str,
     marks: Mapping[float, str],
 ) -> None:
-    """Draw lines by name, at most as many as there are `COLORS`: places, and values of 0 or more there.
-
-    ``marks`` are places with a name, drawn as vertical lines.
-    """
+    """Draw lines by name: places, and values of 0 or more there. ``marks`` are places with a name: vertical lines."""
     with saved(path, 6.4, 3.6) as figure:
         axes = figure.subplots()
-        axes.set_xlabel(short(xlabel))
         for number, (name, (x, y)) in enumerate(lines.items()):
             axes.plot(x, y, marker="o", clip_on=False, label=short(name, 40), **pen(number))
         places = np.concatenate([x for x, _ in lines.values()])
@@ -94,11 +88,9 @@ def draw_lines(
             # Names at the sides stay inside the chart.
             share = (place - places.min()) / max(float(np.ptp(places)), 1e-9)
             side = "left" if share < 0.2 else "right" if share > 0.8 else "center"
-            offset: dict[str, Any] = {"xytext": (0, 4), "textcoords": "offset points"}
-            axes.annotate(
-                short(name, 30), (place, 1), xycoords=("data", "axes fraction"), ha=side, color=_GREY, **offset
-            )
-        axes.set_ylabel(short(ylabel))
+            at: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+            axes.annotate(short(name, 30), (place, 1), (0, 4), ha=side, color=_GREY, **at)
+        axes.set(xlabel=short(xlabel), ylabel=short(ylabel))
         axes.set_ylim(bottom=0)
         figure.legend(loc="outside upper left", ncols=max(1, min(len(lines), 88 // (6 + max(map(len, lines))))))
 
@@ -106,11 +98,9 @@ def draw_lines(
 def draw_losses(
     path: str | Path, steps: Sequence[int], terms: Mapping[str, Sequence[float]], validation: Mapping[int, float]
 ) -> None:
-    """Draw the losses of a training over its steps on logarithmic axes: the total and the validation error large, the
-    other terms small below.
-
-    ``steps`` (N,) increase; ``terms`` have a name and (N,) values, of which those not positive or not finite are left
-    out; ``validation`` is the error on held-out shapes at some steps: dots joined by a line.
+    """Draw the losses of a training over its steps (N,) on logarithmic axes: the total and the validation error (on
+    held-out shapes, at some steps) large, the other terms small below. ``terms`` have a name and (N,) values, of which
+    those not positive or not finite are left out.
     """
     known = {name: list(zip(steps, values, strict=True)) for name, values in list(terms.items())[:_MOST_TERMS]}
     known["validation"] = sorted(validation.items())
@@ -148,10 +138,7 @@ def draw_losses(
 
 @contextmanager
 def saved(path: str | Path, width: float, height: float) -> Iterator[Figure]:
-    """An empty figure (inches), which is written to ``path`` when the block ends well.
-
-    Styles are set for the block alone, over matplotlib's own defaults, whatever the user's matplotlibrc says.
-    """
+    """An empty figure (inches), written when the block ends well; for the block alone our style replaces the user's."""
     check_chart(path)
     import matplotlib
     from matplotlib.figure import Figure

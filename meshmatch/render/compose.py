@@ -19,9 +19,8 @@ from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import Rotations, same_side, upright
 from meshmatch.render.figures import Panel
-from meshmatch.render.legend import Legend
 from meshmatch.render.picture import Look, render_shapes
-from meshmatch.render.scales import CLAY, Scale, label_swatches, position_colors
+from meshmatch.render.scales import CLAY, Legend, Scale, label_swatches, position_colors
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.colors import UNKNOWN, label_colors, to_srgb
 from meshmatch.shapes.shape import Shape
@@ -62,12 +61,12 @@ class Composition:
 
     def rotated(self, rotations: Sequence[Float[Floats, "3 3"] | None]) -> Composition:
         """With these rotations into y up, z to the viewer."""
-        pairs = zip(self.panels, rotations, strict=True)
-        return replace(self, panels=tuple(replace(panel, rotation=turn) for panel, turn in pairs))
+        panels = [replace(panel, rotation=turn) for panel, turn in zip(self.panels, rotations, strict=True)]
+        return replace(self, panels=tuple(panels))
 
-    def render(self, path: str | Path, look: Look | None = None) -> tuple[int, int]:
+    def render(self, path: str | Path, look: Look = Look()) -> tuple[int, int]:
         """Draw it as a PNG; width and height in pixels. See `render_shapes` for the errors."""
-        return render_shapes(self.panels, path, replace(look or Look(), legend=self.legend))
+        return render_shapes(self.panels, path, replace(look, legend=self.legend))
 
 
 def compose_shapes(
@@ -88,13 +87,13 @@ def compose_shapes(
 
 
 def compose_match(
-    source: Shape, target: Shape, vertex_map: VertexMap, rotations: Rotations = (None, None), look: Look | None = None
+    source: Shape, target: Shape, vertex_map: VertexMap, rotations: Rotations = (None, None), look: Look = Look()
 ) -> Composition:
     """The source colored by position and the target in the colors that the map transfers to it; grey: unmatched.
 
     `InputError` where the map does not belong to these shapes.
     """
-    turns = _same_side(source, target, vertex_map, look, rotations)
+    turns = same_side(source, target, vertex_map, rotations, look.up, look.front)
     here = position_colors(source, turns[0])
     there = matched_colors(here, vertex_map, invert_map(vertex_map, source, target), source)
     panels = _painted((source, target), (here, there))
@@ -113,14 +112,14 @@ def matched_colors(
     return np.where(matched[:, None], pull_values(back, colors), UNKNOWN)
 
 
-def compose_confidence(source: Shape, target: Shape, vertex_map: VertexMap, look: Look | None = None) -> Composition:
+def compose_confidence(source: Shape, target: Shape, vertex_map: VertexMap, look: Look = Look()) -> Composition:
     """Source and target colored by the confidence of the map: low is dark."""
     scale = Scale(0.0, 1.0, "confidence of the map", reverse=True)
     maps = vertex_map, invert_map(vertex_map, source, target)
     panels = _painted((source, target), [scale.colors(each.confidence) for each in maps])
     record = {"confidence_mean": float(vertex_map.confidence.mean())}
     shown = Composition(panels, scale, "the confidence of the map", record)
-    return shown.rotated(_same_side(source, target, vertex_map, look))
+    return shown.rotated(same_side(source, target, vertex_map, up=look.up, front=look.front))
 
 
 def compose_errors(
@@ -131,7 +130,7 @@ def compose_errors(
     errors: Errors,
     unit: ErrorUnit = "cm",
     limits: tuple[float, float] | None = None,
-    look: Look | None = None,
+    look: Look = Look(),
 ) -> Composition:
     """Source and target colored by the errors at ``known`` points, given as vertices of source and target."""
     factor, title = _ERROR_UNITS[unit]
@@ -141,7 +140,7 @@ def compose_errors(
     gaps = any((np.asarray(panel.colors) == UNKNOWN).all(axis=1).any() for panel in panels)
     record = {"points": int(values.size), "mean_cm": errors.mean_cm, "mean_x100": 100 * errors.mean}
     shown = Composition(tuple(panels), replace(scale, unknown=gaps), "the errors of the map", record)
-    return shown.rotated(_same_side(source, target, vertex_map, look))
+    return shown.rotated(same_side(source, target, vertex_map, up=look.up, front=look.front))
 
 
 def _painted_points(shape: Shape, vertices: Int[Ints, " N"], values: Float[Floats, " N"], scale: Scale) -> Panel:
@@ -223,9 +222,7 @@ def compose_labels(
     names: Sequence[str],
     on_faces: Sequence[bool] | None = None,
 ) -> Composition:
-    """Shapes with one color per label: ``codes`` give for each vertex, or face where ``on_faces``, of each shape its index
-    in ``names``; negative: no label.
-    """
+    """Shapes with one color per label: each vertex, or face, has its index in ``names``; negative: no label."""
     colors = [label_colors(own) for own in codes]
     panels = [
         Panel(shape, None if faces else own, shape.name, sharp=True, face_colors=own if faces else None)
@@ -256,10 +253,3 @@ def _with_points(
 ) -> Panel:
     plain = np.tile(PALE, (shape.V, 1))
     return Panel(shape, plain, shape.name, points=points, point_colors=colors, point_radius=radius)
-
-
-def _same_side(
-    source: Shape, target: Shape, vertex_map: VertexMap, look: Look | None, rotations: Rotations = (None, None)
-) -> Rotations:
-    look = look or Look()
-    return same_side(source, target, vertex_map, rotations, look.up, look.front)

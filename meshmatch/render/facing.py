@@ -60,9 +60,7 @@ def upright(rotation: Rotation) -> Rotation:
     """
     axis = int(np.abs(rotation[1]).argmax())
     upward = np.sign(rotation[1, axis]) * np.eye(3)[axis]
-    if rotation[1] @ upward < _NEAR_AXIS:
-        return rotation
-    return _standing(upward, rotation[2])
+    return rotation if rotation[1] @ upward < _NEAR_AXIS else _standing(upward, rotation[2])
 
 
 def same_side(
@@ -73,10 +71,8 @@ def same_side(
     up: str | None = None,
     front: str | None = None,
 ) -> tuple[Rotation, Rotation]:
-    """Rotations of source and target into y up, z to the viewer that show both from the same side.
-
-    ``rotations`` are those of fits (`Frame.rotation`), if known; otherwise the named axes count, and without these the
-    source is oriented by its own shape and the target by the map.
+    """Rotations of source and target into y up, z to the viewer that show both from the same side: those of fits
+    (`Frame.rotation`), if known; else by the named axes; else the source's by its own shape, the target's by the map.
     """
     first, second = (None if rotation is None else upright(rotation) for rotation in rotations)
     if first is None:

@@ -15,20 +15,9 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
+from meshmatch.render import surface
 from meshmatch.render.facing import facing
 from meshmatch.render.scales import CLAY, Color
-from meshmatch.render.surface import (
-    Paint,
-    Rows,
-    Surface,
-    TexturePaint,
-    VertexPaint,
-    balls,
-    corners_of,
-    discs,
-    face_paint,
-    mesh_surface,
-)
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.shape import Shape
@@ -72,30 +61,15 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A panel in view coordinates, its foot at the origin.
-
-    ``box`` is left, bottom; right, top of all that is seen. ``spot`` is where its shadow falls: x, y, half width, half
-    height of an ellipse in the picture plane. ``hollow``: the shape itself is glass.
+    """A panel in view coordinates, its foot at the origin: what is solid and what is glass; left, bottom; right, top of
+    all that is seen; the ellipse where its shadow falls (as in `Ground`); and whether the shape itself is glass.
     """
 
-    solid: list[Surface]
-    glass: list[Surface]
+    solid: list[surface.Surface]
+    glass: list[surface.Surface]
     box: Float[Floats, "2 2"]
     spot: Float[Floats, " 4"]
     hollow: bool
-
-
-@dataclass(frozen=True, eq=False)
-class _Pose:
-    """How a shape of a file becomes a figure: turned, then set on its ``foot`` and scaled, then tilted."""
-
-    rotation: Float[Floats, "3 3"]
-    foot: Float[Floats, " 3"]
-    scale: float
-    camera: Float[Floats, "3 3"]
-
-    def view(self, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
-        return np.asarray((points @ self.rotation.T - self.foot) / self.scale @ self.camera.T)
 
 
 def rotation_about_x(degrees: float) -> Float[Floats, "3 3"]:
@@ -123,57 +97,63 @@ def build_figure(panel: Panel, up: str | None, front: str | None, turn: float, t
     if not 0.2 * longest < scale < 2 * longest:
         scale = longest if longest > 0 else 1.0
     foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    pose = _Pose(rotation, foot, scale, rotation_about_x(tilt))
-    skin = _skin(shape, _paint(panel, scale), pose)
+    camera = rotation_about_x(tilt)
+
+    def view(points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
+        return np.asarray((points @ rotation.T - foot) / scale @ camera.T)
+
+    skin = _skin(shape, view(shape.verts), _paint(panel, scale), camera @ rotation)
     solid, glass = ([], [skin]) if panel.glass else ([skin], [])
     if len(points):
         radius = 0.011 if panel.point_radius is None else panel.point_radius / scale
-        solid.append(balls(pose.view(points), radius, _linear(panel.point_colors, len(points), _NODE_COLOR)))
+        solid.append(surface.balls(view(points), radius, _linear(panel.point_colors, len(points), _NODE_COLOR)))
     if panel.over is not None:
-        veil = VertexPaint(_linear(None, panel.over.V, _VEIL_COLOR), panel.over.faces)
-        glass.append(_skin(panel.over, veil, pose))
+        veil = surface.VertexPaint(_linear(None, panel.over.V, _VEIL_COLOR), panel.over.faces)
+        glass.append(_skin(panel.over, view(panel.over.verts), veil, camera @ rotation))
     used = np.concatenate([part.extent for part in [*solid, *glass]])[:, :2]
     width, _, depth = (high - low) / scale / 2
     spot = np.array([0.0, 0.0, width + _SHADOW, (depth + _SHADOW) * max(np.sin(np.radians(tilt)), 0.0)])
     return Figure(solid, glass, np.stack([used.min(axis=0), used.max(axis=0)]), spot, panel.glass)
 
 
-def _seen_vertices(shape: Shape) -> Rows:
+def _seen_vertices(shape: Shape) -> surface.Rows:
     """Neither those without a position nor those that no face uses; at least one."""
     if shape.is_cloud:
         return np.arange(shape.V) if shape.invalid is None else np.flatnonzero(~shape.invalid)
-    used = corners_of(shape.faces[_valid_faces(shape)], shape.V)
+    used = surface.corners_of(shape.faces[_valid_faces(shape)])
     return used if len(used) else np.zeros(1, np.int64)
 
 
-def _valid_faces(shape: Shape) -> Rows:
+def _valid_faces(shape: Shape) -> surface.Rows:
     """Indices of the faces whose corners all have a position."""
     if shape.invalid is None:
         return np.arange(shape.F)
     return np.flatnonzero(~shape.invalid[shape.faces].any(axis=1))
 
 
-def _paint(panel: Panel, scale: float) -> Paint:
+def _paint(panel: Panel, scale: float) -> surface.Paint:
     shape = panel.shape
     if panel.face_colors is not None:
-        return face_paint(_linear(panel.face_colors, shape.F, CLAY))
+        return surface.face_paint(_linear(panel.face_colors, shape.F, CLAY))
     look = panel.appearance
     if panel.colors is None and look is not None and not shape.is_cloud:
-        return TexturePaint(look, shape, scale)
+        return surface.TexturePaint(look, shape, scale)
     if panel.colors is None and look is not None and look.colors is not None:
-        return VertexPaint(np.nan_to_num(look.colors[:, :3]), shape.faces)
+        return surface.VertexPaint(np.nan_to_num(look.colors[:, :3]), shape.faces)
     given = panel.colors if panel.colors is not None else shape.colors
-    return VertexPaint(_linear(given, shape.V, CLAY), shape.faces, panel.sharp)
+    return surface.VertexPaint(_linear(given, shape.V, CLAY), shape.faces, panel.sharp)
 
 
-def _skin(shape: Shape, paint: Paint, pose: _Pose) -> Surface:
-    verts = pose.view(shape.verts)
+def _skin(
+    shape: Shape, verts: Float[Floats, "V 3"], paint: surface.Paint, rotation: Float[Floats, "3 3"]
+) -> surface.Surface:
+    """A shape with its vertices as they are seen; the rotation turns its normals."""
     if not shape.is_cloud:
         valid = _valid_faces(shape)
         if not len(valid):  # embree needs a triangle even for an empty scene
-            return mesh_surface(verts[:1], np.zeros((1, 3), np.int64), face_paint(np.ones((1, 3))))
-        return mesh_surface(verts, shape.faces, paint, None if len(valid) == shape.F else valid)
-    colors = paint.colors if isinstance(paint, VertexPaint) else np.tile(to_linear(np.array(CLAY)), (shape.V, 1))
+            return surface.mesh_surface(verts[:1], np.zeros((1, 3), np.int64), surface.face_paint(np.ones((1, 3))))
+        return surface.mesh_surface(verts, shape.faces, paint, None if len(valid) == shape.F else valid)
+    colors = paint.colors if isinstance(paint, surface.VertexPaint) else _linear(None, shape.V, CLAY)
     drawn = _seen_vertices(shape)
     drawn = drawn[:: max(1, -(-len(drawn) // MOST_POINTS))]
     # The distance of each point to its fifth neighbor: discs as large nearly close the surface.
@@ -181,9 +161,9 @@ def _skin(shape: Shape, paint: Paint, pose: _Pose) -> Surface:
     spacing = near[:, -1] if len(drawn) > 1 else np.full(len(drawn), 0.05)
     typical = float(np.clip(np.median(spacing), 1e-3, 0.06))
     if len(drawn) < _SPARSE:
-        return balls(verts[drawn], 0.5 * typical, colors[drawn])
-    normals = shape.vertex_normals[drawn] @ (pose.camera @ pose.rotation).T
-    return discs(verts[drawn], normals, 1.1 * np.clip(spacing, 0.4 * typical, 1.6 * typical), colors[drawn])
+        return surface.balls(verts[drawn], 0.5 * typical, colors[drawn])
+    normals = shape.vertex_normals[drawn] @ rotation.T
+    return surface.discs(verts[drawn], normals, 1.1 * np.clip(spacing, 0.4 * typical, 1.6 * typical), colors[drawn])
 
 
 def _linear(colors: ArrayLike | None, count: int, plain: Color) -> Float[Floats, "count 3"]:

@@ -16,7 +16,7 @@ from meshmatch.errors import OptionError
 from meshmatch.outputs import replace_on_success
 from meshmatch.render import raster
 from meshmatch.render.figures import Figure, Panel, build_figure, rotation_about_x
-from meshmatch.render.legend import Ink, Legend, draw_legend, fitting, legend_height, write
+from meshmatch.render.scales import Ink, Legend, draw_legend, fitting, legend_height, write
 from meshmatch.render.scene import Ground, Scene
 from meshmatch.shapes.colors import to_linear, to_srgb
 

@@ -6,7 +6,7 @@ pixel. Work proceeds in bands of rows, so that memory does not grow with the pic
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,6 @@ from meshmatch.render.scene import Hits, Scene, Vectors
 from meshmatch.render.shading import BLOCK, GROUND_BLOCK, Shares, shade, shadow, visibility
 from meshmatch.render.surface import Rows
 
-Seen = Float[Floats32, "P 2"]
-"""Shares of lamp and sky that reach what the pixels of a band show."""
 BAND = 100_000
 """Pixels worked on at once."""
 MOST_POINTS = 6_000_000
@@ -64,18 +62,13 @@ def draw(scene: Scene, viewport: Viewport) -> Layer:
     H, W = viewport.height, viewport.width
     whole = Layer(np.zeros((H, W, 3), np.float32), np.zeros((H, W), np.float32), np.full((H, W), -np.inf, np.float32))
     # Columns and rows in which anything can be, with a margin of one pixel.
-    low, high = (scene.bounds - [viewport.left, viewport.top]) / viewport.pixel
+    pixel = viewport.pixel
+    low, high = (scene.bounds - [viewport.left, viewport.top]) / pixel
     left, right = np.clip([np.floor(low[0]) - 1, np.ceil(high[0]) + 1], 0, W).astype(int).tolist()
     top, bottom = np.clip([np.floor(-high[1]) - 1, np.ceil(-low[1]) + 1], 0, H).astype(int).tolist()
     if left >= right or top >= bottom:
         return whole
-    part = replace(
-        viewport,
-        width=right - left,
-        height=bottom - top,
-        left=viewport.left + left * viewport.pixel,
-        top=viewport.top - top * viewport.pixel,
-    )
+    part = Viewport(right - left, bottom - top, viewport.left + left * pixel, viewport.top - top * pixel, pixel)
     inner = slice(top, bottom), slice(left, right)
     drawn = Layer(whole.light[inner], whole.alpha[inner], whole.depth[inner])
     edges = edge_points(scene, part)
@@ -86,13 +79,7 @@ def draw(scene: Scene, viewport: Viewport) -> Layer:
 
 
 def _band(
-    scene: Scene,
-    viewport: Viewport,
-    edges: Float[Floats32, "E 3"],
-    first: int,
-    last: int,
-    corner: tuple[int, int],
-    whole: Layer,
+    scene: Scene, viewport: Viewport, edges: Vectors, first: int, last: int, corner: tuple[int, int], whole: Layer
 ) -> None:
     """Draw rows of a viewport whose corner is at this column and row of the picture, from where blocks are counted."""
     low, high = max(0, first - _HALO), min(viewport.height, last + _HALO)
@@ -151,10 +138,7 @@ def composite(glass: Layer, base: Layer, reach: float) -> Layer:
 
 
 def _smooth(values: Float[Floats32, "H W 2"], hits: Hits, which: Bool[Bools, "H W"], pixel: float, side: int) -> None:
-    """Filter visibility in place over blocks of pixels of this side, as far as they belong to one surface.
-
-    Only pixels ``which`` take part.
-    """
+    """Filter visibility of pixels ``which`` in place over blocks of this side, as far as they belong to one surface."""
     if not which.any():
         return
     rows, columns = (np.flatnonzero(which.any(axis=axis)) for axis in (1, 0))
@@ -206,21 +190,35 @@ def _fine(
     scene: Scene,
     viewport: Viewport,
     hits: Hits,
-    seen: Seen,
+    seen: Float[Floats32, "P 2"],
     low: int,
     corner: tuple[int, int],
     chosen: Rows,
     places: Float[Floats, "R 2"],
 ) -> tuple[Vectors, Float[Floats32, " N"]]:
-    """Light times alpha, and alpha, of chosen pixels of a band, each the mean over places in it."""
+    """Light times alpha, and alpha, of chosen pixels of a band, each the mean over places in it.
+
+    Visibility is that of the pixels around, where they lie on the same surface.
+    """
     shape = (len(hits.face) // viewport.width, viewport.width)
     row, column = np.divmod(np.repeat(chosen, len(places)), shape[1])
     right, down = np.tile(places, (len(chosen), 1)).T
     rays = viewport.at(column + 0.5 + right, row + low + 0.5 + down)
     finer = scene.look(*rays, viewport.pixel / np.sqrt(len(places)))
     met = np.flatnonzero(finer.face != -1)
+    total, weights = np.zeros((len(met), 2), np.float32), np.zeros(len(met), np.float32)
+    for down, right in ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)):
+        there = np.clip(row[met] + down, 0, shape[0] - 1) * shape[1] + np.clip(column[met] + right, 0, shape[1] - 1)
+        gap = np.einsum("ni,ni->n", hits.place[there] - finer.place[met], finer.flat[met])
+        turn = np.einsum("ni,ni->n", hits.normal[there], finer.normal[met])
+        face = hits.face[there]
+        alike = ((face >= 0) == (finer.face[met] >= 0)) & (face != -1)
+        weight = _same_surface(gap, turn, viewport.pixel) * alike
+        total += weight[:, None] * seen[there]
+        weights += weight
+    known = weights > 0.05
     light_seen = np.ones((len(row), 2), np.float32)
-    light_seen[met], known = _reused(finer, met, row[met], column[met], hits, seen, shape, viewport.pixel)
+    light_seen[met[known]] = total[known] / weights[known, None]
     missing = met[~known]
     # Each ray of a pixel uses other directions, whichever band it is in.
     number = missing % len(places)
@@ -231,27 +229,7 @@ def _fine(
     return light.reshape(len(chosen), -1, 3).mean(axis=1), alpha.reshape(len(chosen), -1).mean(axis=1)
 
 
-def _reused(
-    finer: Hits, met: Rows, row: Rows, column: Rows, hits: Hits, seen: Seen, shape: tuple[int, int], pixel: float
-) -> tuple[Shares, Bool[Bools, " N"]]:
-    """Visibility of fine rays from the pixels around them that lie on the same surface, and where there is one."""
-    place, flat, normal = finer.place[met], finer.flat[met], finer.normal[met]
-    solid = finer.face[met] >= 0
-    total, weights = np.zeros((len(met), 2), np.float32), np.zeros(len(met), np.float32)
-    for down, right in ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)):
-        there = np.clip(row + down, 0, shape[0] - 1) * shape[1] + np.clip(column + right, 0, shape[1] - 1)
-        gap = np.einsum("ni,ni->n", hits.place[there] - place, flat)
-        turn = np.einsum("ni,ni->n", hits.normal[there], normal)
-        face = hits.face[there]
-        weight = _same_surface(gap, turn, pixel) * (((face >= 0) == solid) & (face != -1))
-        total += weight[:, None] * seen[there]
-        weights += weight
-    known = weights > 0.05
-    total[known] /= weights[known, None]
-    return total, known
-
-
-def edge_points(scene: Scene, viewport: Viewport) -> Float[Floats32, "N 3"]:
+def edge_points(scene: Scene, viewport: Viewport) -> Vectors:
     """Points along all edges of the scene, not more than a pixel apart: column, row, depth."""
     column = (scene.verts[:, 0] - np.float32(viewport.left)) / np.float32(viewport.pixel)
     row = (np.float32(viewport.top) - scene.verts[:, 1]) / np.float32(viewport.pixel)
@@ -271,9 +249,7 @@ def edge_points(scene: Scene, viewport: Viewport) -> Float[Floats32, "N 3"]:
     return np.concatenate(parts)
 
 
-def _slivers(
-    edges: Float[Floats32, "N 3"], low: int, depth: Float[Floats32, "H W"], viewport: Viewport
-) -> Bool[Bools, "H W"]:
+def _slivers(edges: Vectors, low: int, depth: Float[Floats32, "H W"], viewport: Viewport) -> Bool[Bools, "H W"]:
     """Pixels, from row ``low`` on, in which an edge lies in front of everything that the rays around it hit."""
     H, W = depth.shape
     row, column = edges[:, 1] - low, edges[:, 0]

@@ -1,12 +1,18 @@
-"""What the colors of a picture mean: places on a shape, numbers, and labels."""
+"""What the colors of a picture mean, places on a shape, numbers, and labels, and the legend that says so.
+
+Words are in the font that Pillow includes.
+"""
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
+from PIL import Image, ImageDraw, ImageFont
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
@@ -14,11 +20,14 @@ from meshmatch.shapes.colors import UNKNOWN, label_colors, oklab_to_linear, to_s
 from meshmatch.shapes.shape import Shape
 
 Color = tuple[float, float, float]
+Ink = tuple[int, int, int]
 CLAY: Color = (0.85, 0.82, 0.78)
 # Lightness, chroma, hue in degrees (Oklab). Lightness alone orders them, so a grey print can be read too.
 _WARM = ((0.93, 0.025, 85), (0.86, 0.12, 88), (0.74, 0.165, 58), (0.58, 0.20, 28), (0.40, 0.15, 2), (0.27, 0.10, 335))
 _COLD = ((0.93, 0.025, 85), (0.80, 0.09, 230), (0.62, 0.14, 252), (0.44, 0.15, 264), (0.30, 0.11, 275))
 _FINE = 256
+_NO_CHARACTER = "\ufffe"
+_FINER = 4  # shapes are drawn this many times larger and then shrunk: smooth corners
 
 
 def position_colors(shape: Shape, rotation: Float[Floats, "3 3"] | None = None) -> Float[Floats, "V 3"]:
@@ -40,11 +49,10 @@ def position_colors(shape: Shape, rotation: Float[Floats, "3 3"] | None = None) 
 
 @dataclass(frozen=True)
 class Scale:
-    """A scale from numbers to colors.
+    """A scale from numbers to colors; ``title`` is what is measured, with its unit.
 
     Numbers beyond ``low`` and ``high`` take the color of the end; ``beyond`` says whether there are some below, and above.
-    ``title`` is what is measured, with its unit. ``reverse``: low numbers deserve attention, such as confidence.
-    ``unknown``: some have no value.
+    ``reverse``: low numbers deserve attention, such as confidence. ``unknown``: some have no value.
     """
 
     low: float
@@ -59,9 +67,7 @@ class Scale:
             raise OptionError(f"a scale cannot run from {self.low:g} to {self.high:g}", "the lower number comes first")
 
     @classmethod
-    def of(
-        cls, values: ArrayLike, title: str = "", limits: tuple[float, float] | None = None, *, reverse: bool = False
-    ) -> Scale:
+    def of(cls, values: ArrayLike, title: str = "", limits: tuple[float, float] | None = None) -> Scale:
         """A scale for these numbers: round ends, from 0 if they are not negative and reach down to it.
 
         A few numbers far above the others do not count; the legend then says that there are some.
@@ -70,7 +76,7 @@ class Scale:
         finite = numbers[np.isfinite(numbers)]
         low, high = limits or (_round_ends(finite) if len(finite) else (0.0, 1.0))
         beyond = bool((finite < low - 1e-9 * abs(low)).any()), bool((finite > high + 1e-9 * abs(high)).any())
-        return cls(float(low), float(high), title, reverse, beyond, len(finite) < len(numbers))
+        return cls(float(low), float(high), title, beyond=beyond, unknown=len(finite) < len(numbers))
 
     def colors(self, values: ArrayLike) -> Float[Floats, "N 3"]:
         """sRGB colors in 0..1 of numbers (N,); grey for nan."""
@@ -92,10 +98,8 @@ class Scale:
         inner = inner[(inner > self.low + 0.3 * step) & (inner < self.high - 0.3 * step)]
         places = [self.low, *inner.tolist(), self.high]
         words = [f"{0.0 if abs(place) < 1e-9 * step else place:.4g}" for place in places]
-        if self.beyond[0]:
-            words[0] = f"< {words[0]}"
-        if self.beyond[1]:
-            words[-1] = f"> {words[-1]}"
+        for end, sign, some in zip((0, -1), "<>", self.beyond, strict=True):
+            words[end] = f"{sign} {words[end]}" if some else words[end]
         return list(zip(places, words, strict=True))
 
 
@@ -151,3 +155,139 @@ def label_swatches(labels: ArrayLike, names: Sequence[str] = (), most: int = 24)
         words.append(f"and {len(present) - len(shown)} more")
         entries.append(UNKNOWN)
     return Swatches(tuple(words), tuple(entries))
+
+
+Legend = Scale | Swatches
+
+
+@lru_cache(maxsize=64)
+def _font(size: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size=max(size, 6.0))
+
+
+def width_of(text: str, size: float) -> float:
+    """How many pixels a line takes whose font has this size in pixels."""
+    return float(_font(size).getlength(text))
+
+
+def readable(text: str) -> str:
+    """The text on one line in letters that the font has: without accents if necessary, else "?"."""
+    out = []
+    for letter in " ".join(text.split()):
+        plain = letter if _has(letter) else unicodedata.normalize("NFKD", letter)
+        kept = "".join(part for part in plain if _has(part) and not unicodedata.combining(part))
+        out.append(kept or ("" if unicodedata.combining(letter) else "?"))
+    return "".join(out)
+
+
+@lru_cache(maxsize=4096)
+def _has(letter: str) -> bool:
+    if unicodedata.category(letter).startswith("C"):
+        return False
+    wanted, missing = (_font(32.0).getmask(part) for part in (letter, _NO_CHARACTER))
+    return (wanted.size, bytes(wanted)) != (missing.size, bytes(missing))
+
+
+def fitting(text: str, size: float, room: float) -> tuple[str, float]:
+    """The text and its size so that it fits into ``room`` pixels: smaller first, then cut in the middle."""
+    text = readable(text)
+    while size > 9 and width_of(text, size) > room:
+        size *= 0.95
+    kept, whole = min(len(text), 400), text
+    while width_of(text, size) > room and kept > 2:
+        kept -= 1
+        text = f"{whole[: (kept + 1) // 2]}…{whole[len(whole) - kept // 2 :]}"
+    return text, size
+
+
+def write(image: Image.Image, place: tuple[float, float], text: str, size: float, ink: Ink, anchor: str = "mm") -> None:
+    """Write a line; ``anchor`` as in Pillow. On a picture with alpha the letters are opaque."""
+    ImageDraw.Draw(image).text(place, text, fill=ink, font=_font(size), anchor=anchor)
+
+
+def legend_height(legend: Legend, width: int, unit: float) -> int:
+    """Rows of pixels that a legend needs under a picture of this width; ``unit`` is its font size."""
+    if isinstance(legend, Scale):
+        return round((4.1 if legend.title else 2.9) * unit)
+    lines = len(_lines(legend, width, unit))
+    return round((0.8 + 1.75 * lines + (1.6 if legend.title else 0)) * unit)
+
+
+def draw_legend(image: Image.Image, legend: Legend, top: int, unit: float, ink: Ink) -> None:
+    """Draw a centered legend into a picture, from row ``top`` on."""
+    y = top + 0.2 * unit
+    if legend.title:
+        text, size = fitting(legend.title, unit, 0.94 * image.width)
+        write(image, (image.width / 2, y + 0.6 * unit), text, size, ink)
+        y += (1.5 if isinstance(legend, Scale) else 1.6) * unit
+    if isinstance(legend, Scale):
+        _draw_bar(image, legend, y, unit, ink)
+    else:
+        _draw_swatches(image, legend, y, unit, ink)
+
+
+def _draw_bar(image: Image.Image, scale: Scale, y: float, unit: float, ink: Ink) -> None:
+    W = image.width
+    length, thick = round(min(0.62 * W, 26 * unit)), max(4, round(0.75 * unit))
+    left = (W - length) // 2
+    share = (np.arange(length) + 0.5) / length
+    row = np.round(255 * scale.colors(scale.low + share * (scale.high - scale.low))).astype(np.uint8)
+    _paste(image, Image.fromarray(np.tile(row, (thick, 1, 1))), left, round(y), thick / 2)
+    y += thick + 0.35 * unit
+    taken = -np.inf
+    for place, words in scale.ticks():
+        x = left + length * (place - scale.low) / (scale.high - scale.low)
+        half = width_of(words, 0.9 * unit) / 2
+        if x - half < taken + 0.4 * unit:
+            continue  # no room beside the one before
+        taken = x + half
+        ends = (x, y - 0.25 * unit), (x, y - 0.02 * unit)
+        ImageDraw.Draw(image).line(ends, fill=ink, width=max(1, round(0.08 * unit)))
+        write(image, (x, y + 0.08 * unit), words, 0.9 * unit, ink, "mt")
+    x = left + length + 1.6 * unit
+    room = W - x - thick - unit
+    if scale.unknown and room > 3 * unit:
+        words, size = fitting("no value", 0.9 * unit, room)
+        _paste(image, _patch(thick, UNKNOWN), round(x), round(y - thick - 0.35 * unit), 0.25 * thick)
+        write(image, (x + thick + 0.5 * unit, y - thick / 2 - 0.35 * unit), words, size, ink, "lm")
+
+
+def _lines(swatches: Swatches, width: int, unit: float) -> list[list[tuple[int, str, float]]]:
+    """Entries (number, words, width in pixels) in lines that fit."""
+    lines: list[list[tuple[int, str, float]]] = [[]]
+    used = 0.0
+    for number, name in enumerate(swatches.names):
+        words, size = fitting(name, unit, 0.9 * width - 1.6 * unit)
+        wide = width_of(words, size) + 2.7 * unit
+        if lines[-1] and used + wide > 0.92 * width:
+            lines.append([])
+            used = 0.0
+        lines[-1].append((number, words, wide))
+        used += wide
+    return lines
+
+
+def _draw_swatches(image: Image.Image, swatches: Swatches, y: float, unit: float, ink: Ink) -> None:
+    side = max(4, round(0.95 * unit))
+    for line in _lines(swatches, image.width, unit):
+        x = (image.width - sum(wide for _, _, wide in line) + 1.2 * unit) / 2
+        for number, words, wide in line:
+            _paste(image, _patch(side, swatches.colors[number]), round(x), round(y + 0.4 * unit), 0.3 * side)
+            text, size = fitting(words, unit, wide - 2.7 * unit + 1)
+            write(image, (x + side + 0.45 * unit, y + 0.4 * unit + side / 2), text, size, ink, "lm")
+            x += wide
+        y += 1.75 * unit
+
+
+def _patch(side: int, color: Color) -> Image.Image:
+    red, green, blue = (round(255 * part) for part in color)
+    return Image.new("RGB", (side, side), (red, green, blue))
+
+
+def _paste(image: Image.Image, patch: Image.Image, left: int, top: int, radius: float) -> None:
+    """Put a patch into a picture, its corners round."""
+    W, H = patch.size
+    mask = Image.new("L", (W * _FINER, H * _FINER), 0)
+    frame = (0, 0, W * _FINER - 1, H * _FINER - 1)
+    ImageDraw.Draw(mask).rounded_rectangle(frame, radius=radius * _FINER, fill=255)
+    image.paste(patch, (left, top), mask.resize((W, H), Image.Resampling.BOX))

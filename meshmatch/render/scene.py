@@ -26,19 +26,13 @@ Numbers = Float[Floats, " N"]
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """A plane that only receives shadows: points x with ``x @ normal = height``, near some spots of the picture.
-
-    ``spots`` are ellipses in the picture plane, outside of which nothing is drawn: x, y, half width, half height.
+    """A plane that only receives shadows: points x with ``x @ normal = height``, within ``spots`` of the picture: ellipses
+    by x, y, half width, half height.
     """
 
     normal: Float[Floats, " 3"]
     height: float
     spots: Float[Floats, "K 4"]
-
-    def depth(self, x: Numbers, y: Numbers) -> Numbers:
-        """z of the plane at points of the picture."""
-        a, b, c = self.normal
-        return np.asarray((self.height - a * x - b * y) / c)
 
     def strength(self, x: Numbers, y: Numbers) -> Float[Floats32, " N"]:
         """How strongly shadows are drawn at points of the picture, 0 to 1: they fade out towards the rims."""
@@ -130,7 +124,9 @@ class Scene:
             strength = self.ground.strength(x[missed], y[missed])
             there, strength = missed[strength > 0], strength[strength > 0]
             face[there] = -2
-            hits.place[there] = np.stack([x[there], y[there], self.ground.depth(x[there], y[there])], axis=1)
+            a, b, c = self.ground.normal
+            depth = (self.ground.height - a * x[there] - b * y[there]) / c
+            hits.place[there] = np.stack([x[there], y[there], depth], axis=1)
             hits.flat[there] = hits.normal[there] = self.ground.normal
             hits.color[there] = strength[:, None]
         return hits

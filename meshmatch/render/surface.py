@@ -32,19 +32,14 @@ averaged.
 _INVISIBLE = 0.05  # an alpha below this is meant to be invisible
 
 
-def corners_of(faces: Int[Ints, "F 3"], V: int) -> Rows:
-    """The vertices of some face, in order; of V there are."""
-    seen = np.zeros(V, bool)
-    seen[faces] = True
-    return np.flatnonzero(seen)
+def corners_of(faces: Int[Ints, "F 3"]) -> Rows:
+    """The vertices of some face, in order."""
+    return np.flatnonzero(np.bincount(faces.ravel()))
 
 
 @dataclass(frozen=True, eq=False)
 class VertexPaint:
-    """Colors of the vertices of triangles.
-
-    ``sharp``: each point has the color of the corner nearest to it, for labels; otherwise colors are interpolated.
-    """
+    """Colors of vertices, interpolated in triangles; ``sharp``: each point has that of its nearest corner, for labels."""
 
     colors: Float[AnyFloats, "V 3"]
     faces: Int[Ints, "F 3"]
@@ -66,9 +61,8 @@ def face_paint(colors: Float[AnyFloats, "F 3"]) -> Paint:
 
 
 class TexturePaint:
-    """Paint by the materials of a file: image times factor times vertex color, as glTF defines it.
-
-    ``shape`` is of the same file, and ``scale`` the length in it that is 1 in view coordinates.
+    """Paint by the materials of a file, as glTF defines it: image times factor times vertex color. ``scale`` is the length
+    in the file that is 1 in view coordinates.
     """
 
     def __init__(self, look: Appearance, shape: Shape, scale: float) -> None:
@@ -139,7 +133,7 @@ class Surface:
     @cached_property
     def extent(self) -> Float[AnyFloats, "2 3"]:
         """Lowest and highest corner of all triangles."""
-        drawn = self.verts[corners_of(self.faces, len(self.verts))]
+        drawn = self.verts[corners_of(self.faces)]
         return np.stack([drawn.min(axis=0), drawn.max(axis=0)])
 
     def moved(self, right: float) -> Surface:

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from meshmatch.render import legend as module
-from meshmatch.render.legend import draw_legend, fitting, legend_height, readable, width_of, write
+from meshmatch.render import scales as module
 from meshmatch.render.picture import lay_out
-from meshmatch.render.scales import Scale, Swatches
+from meshmatch.render.scales import Scale, Swatches, draw_legend, fitting, legend_height, readable, width_of, write
 from meshmatch.shapes.colors import label_colors
 
 INK = (10, 20, 30)

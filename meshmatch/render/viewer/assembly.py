@@ -48,10 +48,8 @@ def small_integers(values: NDArray[np.int64]) -> NDArray[Any]:
 
 
 def pack(arrays: Mapping[str, NDArray[Any]]) -> tuple[list[dict[str, Any]], str]:
-    """A table ``[{name, kind, start, length}]`` and the text that holds the arrays.
-
-    Little-endian, each array at a multiple of 4 bytes, zlib (RFC 1950), base64. The kind is the name of
-    JavaScript's typed array; the start is in bytes and the length in numbers.
+    """A table ``[{name, kind, start, length}]`` and the text that holds the arrays: little-endian, each at a multiple of 4
+    bytes, zlib (RFC 1950), base64. The kind is JavaScript's typed array; the start is in bytes, the length in numbers.
     """
     table, parts, start = [], [], 0
     for name, array in arrays.items():

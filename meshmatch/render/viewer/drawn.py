@@ -29,9 +29,9 @@ _ODD = 3.0  # more than this between the sizes drawn, and the map is no guide to
 class Drawn:
     """The part of a shape that is drawn, in the file's own frame and unit.
 
-    ``faces`` is empty where points are drawn. ``normals`` are the same on both sides of a texture seam, and zeros where
-    there is none. ``vertex`` is the vertex of the file that each row stands for, and ``file_face`` the face of the file
-    that each triangle is: empty where the surface is drawn coarser. ``note`` says what was left out, if anything.
+    ``faces`` is empty where points are drawn. ``normals`` are the same on both sides of a texture seam, zeros where there
+    is none. ``vertex`` is the vertex of the file that each row stands for, ``file_face`` the face of the file that each
+    triangle is: empty where the surface is drawn coarser. ``note`` says what was left out, if anything.
     """
 
     verts: Float[Floats, "N 3"]
@@ -53,7 +53,7 @@ class Drawn:
     @cached_property
     def used(self) -> Int[Ints, " U"]:
         """Rows that can be seen: those of a face, or every point."""
-        return corners_of(self.faces, len(self.verts)) if len(self.faces) else np.arange(len(self.verts))
+        return corners_of(self.faces) if len(self.faces) else np.arange(len(self.verts))
 
 
 def draw(shape: Shape, most: int = MOST) -> Drawn:
@@ -69,11 +69,11 @@ def draw(shape: Shape, most: int = MOST) -> Drawn:
     smooth = Shape(shape.verts, joined[faces]).vertex_normals[joined]
     if shape.V <= most:
         return Drawn(shape.verts, faces, smooth, np.arange(shape.V), sound)
-    kept = corners_of(joined[faces], shape.V)
+    kept = corners_of(joined[faces])
     number = np.empty(shape.V, np.int64)
     number[kept] = np.arange(len(kept))
     coarse = decimate(Shape(shape.verts[kept], number[joined[faces]]), 2 * int(_LEAN * most))
-    used = corners_of(faces, shape.V)
+    used = corners_of(faces)
     if coarse.V > most:  # nothing that holds together: a heap of single triangles
         return _some_points(shape, used, most)
     # Each vertex of the coarse mesh stands for the nearest one of the file that faces the same way.
@@ -131,10 +131,8 @@ def boxes(
 
 
 def relative_size(source: Shape, target: Shape, there: VertexMap) -> float:
-    """Length on the target of what has length 1 on the source.
-
-    Compares short distances, which a pose hardly changes, where the map is confident, without those that it
-    has torn; 1 where no pair of vertices tells.
+    """Length on the target of what has length 1 on the source: by short distances, which a pose hardly changes, where the
+    map is confident, without those that it has torn; 1 where no pair of vertices tells.
     """
     if source.is_cloud:
         some = np.arange(source.V)[:: max(1, source.V // _PAIRS)]
@@ -152,10 +150,8 @@ def relative_size(source: Shape, target: Shape, there: VertexMap) -> float:
 
 
 def upright(source: Shape, target: Shape, there: VertexMap, given: Rotations = (None, None)) -> tuple[Floats, Floats]:
-    """Rotations (3, 3) of both shapes to y up, z front.
-
-    The source's is guessed unless it is given. The target's, unless it is given, shows matched points from the same
-    side; with a poor map it is that of the source.
+    """Rotations (3, 3) of both shapes to y up, z front. Unless they are given, the source's is guessed, and the target's
+    shows matched points from the same side; with a poor map it is that of the source.
     """
     own = np.asarray(facing(source) if given[0] is None else given[0], np.float64)
     if given[1] is not None:

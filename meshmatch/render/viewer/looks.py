@@ -36,11 +36,7 @@ _DRAWN = 256  # pixels along a side up to which an image is kept without loss: i
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """One look on two shapes.
-
-    ``side`` says whose look it is; source and target have it ``worn``, one of them carried. ``own`` is what the other
-    one has in its own file, if anything.
-    """
+    """The look of ``side`` as both shapes have it ``worn``; ``own`` is what the other has in its file, if anything."""
 
     side: Literal["source", "target"]
     worn: tuple[Appearance, Appearance]
@@ -104,10 +100,8 @@ def _carried(
 
 
 def dress(look: Appearance, shape: Shape, part: Drawn) -> tuple[Arrays, dict[str, Any] | None]:
-    """Arrays and words of a look on what is drawn of a shape.
-
-    A skin where there is an image and the triangles are the file's own; else ``paint`` (N, 3), a colour for each
-    vertex that is drawn, without words.
+    """Arrays and words of a look on what is drawn of a shape: a skin where there is an image and the triangles are the
+    file's own; else ``paint`` (N, 3), a colour for each vertex that is drawn, without words.
     """
     if len(part.file_face) and (look.textured or len(look.materials) > 1):
         return _skin(look, part)

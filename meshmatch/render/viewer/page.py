@@ -49,10 +49,9 @@ def write_page(
 ) -> PageReport:
     """Write a page that shows two shapes side by side, and for each point of one its match on the other.
 
-    The source is coloured by position, the target by its colours carried along the map. The same input gives
-    the same bytes. ``rotations`` are as `Frame.rotation` of a fit; the source's is guessed if not given, and the target's
-    then follows from the map. ``names`` are shown instead of the shapes' own. ``looks`` are what they wear, for the button
-    that shows it.
+    The source is coloured by position, the target by its colours carried along the map. The same input gives the same
+    bytes. ``rotations`` are as `Frame.rotation` of a fit; the source's is guessed if not given, and the target's then
+    follows from the map. ``names`` are shown instead of the shapes' own, and ``looks`` by a button.
 
     `OptionError` for a suffix that is no page's, `InputError` for a map that is not of these shapes, `OutputError` where
     the file cannot be written.
@@ -69,13 +68,21 @@ def write_page(
     arrays: dict[str, NDArray[Any]] = {}
     words: dict[str, Any] = {}
     for k, side in enumerate(("source", "target")):
-        own = _arrays(parts[k], cubes[k], maps[k], tints[k])
-        own["place"] = scaled(cubes[1 - k].place(maps[k].points(shapes[1 - k])[parts[k].vertex]), np.uint16)
-        if not np.array_equal(parts[k].vertex, np.arange(shapes[k].V)):
-            own["vertex"] = small_integers(parts[k].vertex)
-        words[side] = _words(shapes[k], shown[k], parts[k], cubes[k])
+        part, box, rows = parts[k], cubes[k], parts[k].vertex
+        own = {  # a row for each vertex that is drawn (see `drawing.js`)
+            "position": scaled(box.place(part.verts), np.uint16),
+            "normal": scaled(part.normals @ box.rotation.T, np.int8),
+            "color": scaled(tints[k][rows], np.uint8),
+            "confidence": scaled(maps[k].confidence[rows], np.uint8),
+            "match": small_integers(maps[k].index[rows]),
+            "face": small_integers(part.faces),
+            "place": scaled(cubes[1 - k].place(maps[k].points(shapes[1 - k])[rows]), np.uint16),
+        }
+        if not np.array_equal(rows, np.arange(shapes[k].V)):
+            own["vertex"] = small_integers(rows)
+        words[side] = _words(shapes[k], shown[k], part, box)
         for name, look in looks.of(k) if looks is not None else []:
-            worn, words[side][name] = dress(look, shapes[k], parts[k])
+            worn, words[side][name] = dress(look, shapes[k], part)
             own |= {f"{name}.{key}": array for key, array in worn.items()}
         arrays |= {f"{side}.{name}": array for name, array in own.items()}
     words |= {"look": None, "own": False} if looks is None else looks.words
@@ -90,19 +97,6 @@ def write_page(
     size = write_html(Path(path), "viewer", SCRIPTS, words, arrays, f"{shown[0]} → {shown[1]}")
     notes = tuple(f"{name}: {part.note}" for name, part in zip(shown, parts, strict=True) if part.note)
     return PageReport((len(parts[0].vertex), len(parts[1].vertex)), notes, size)
-
-
-def _arrays(part: Drawn, box: Box, found: VertexMap, tint: Floats) -> dict[str, NDArray[Any]]:
-    """What the page holds of one shape, a row for each vertex that is drawn (see `drawing.js`)."""
-    rows = part.vertex
-    return {
-        "position": scaled(box.place(part.verts), np.uint16),
-        "normal": scaled(part.normals @ box.rotation.T, np.int8),
-        "color": scaled(tint[rows], np.uint8),
-        "confidence": scaled(found.confidence[rows], np.uint8),
-        "match": small_integers(found.index[rows]),
-        "face": small_integers(part.faces),
-    }
 
 
 def _words(shape: Shape, name: str, part: Drawn, box: Box) -> dict[str, Any]:
