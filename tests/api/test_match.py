@@ -65,6 +65,7 @@ def test_a_wrong_axis_is_obeyed_and_judged(dancer: Shape) -> None:
     assert upside_down.residual > right.residual
 
 
+@pytest.mark.slow
 def test_landmarks_are_honoured(dancer: Shape, both) -> None:
     climber = meshmatch.load_shape(SAMPLES / "climber.ply")
     source = np.array([100, 900])

@@ -11,6 +11,7 @@ from meshmatch.models.card import read_card, write_card
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
+from meshmatch.training import recipes
 from meshmatch.training.loop import StepReport
 from tests.cli.conftest import Run
 from tests.conftest import icosphere
@@ -72,7 +73,8 @@ def test_from_a_folder_to_a_map(run: Run, eggs: Path, tmp_path: Path) -> None:
     assert np.load(tmp_path / "map.npy").shape == (162,)
 
 
-def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small network that finds no orientation: the card says how shapes are turned."""
     folder = tmp_path / "eggs"
     folder.mkdir()
@@ -101,6 +103,9 @@ def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path) -> None:
     )
     assert answer.status == 0, answer.err
     assert np.load(tmp_path / "map.npy").shape == (162,)
+    plain = recipes.paper()
+    few = replace(plain, train=replace(plain.train, shapes=2), scan=replace(plain.scan, points=200))
+    monkeypatch.setattr(recipes, "paper", lambda: few)
     words = ("--steps", "1", "--preset", "paper", "-q")
     assert run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "papers", *words).status == 0
     papers = read_card(tmp_path / "papers" / "card.json")

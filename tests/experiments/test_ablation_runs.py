@@ -81,6 +81,7 @@ def test_cells_differ_in_representation_and_constraints_alone() -> None:
         assert not chosen.scan.upright
 
 
+@pytest.mark.slow
 def test_where_a_rule_leaves_too_few_nodes_all_are_taken(prepared: Path) -> None:
     setting = Setting()
     assert setting.rule(BASE) == "parts"

@@ -65,6 +65,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> str:
     return " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 def test_a_run_is_tables_figures_and_a_line_and_goes_on(
     places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
 ) -> None:

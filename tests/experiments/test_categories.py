@@ -209,6 +209,7 @@ def rows_of(text: str) -> tuple[dict, dict[str, dict]]:
 QUICK = ["--steps", "2", "--threads", "1", "--nodes", "60", "--radius", "0.35", "--minutes", "1"]
 
 
+@pytest.mark.slow
 def test_hearts_from_end_to_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

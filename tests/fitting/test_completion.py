@@ -150,6 +150,7 @@ def test_a_candidate_knows_its_size_and_what_it_costs() -> None:
     assert fit.cost > replace(fit, share=0.5).cost > fit.residual
 
 
+@pytest.mark.slow
 def test_half_of_a_body_is_read_as_what_it_is(remembered_fits: Callable) -> None:
     body = load_shape(bundled_folder() / "samples" / "dancer.ply")
     half, used = part_of(body, "cut", 0)

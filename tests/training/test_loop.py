@@ -266,6 +266,7 @@ class Joined(torch.utils.data.Dataset):
         return Batch(*(torch.cat(both) for both in pair))
 
 
+@pytest.mark.slow
 def test_two_processes_learn_as_one_that_sees_both_their_batches(egg: Template, tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
