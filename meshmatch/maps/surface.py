@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import blend, closest_on_triangles, interpolate, squared_lengths
-from meshmatch.maps.map_checks import corners_of
+from meshmatch.maps.vertex_map import corners_of
 
 # By how much a neighbour whose normal points the other way (2 units) is further away than it is, in units of
 # sqrt(area): enough to separate the sides of a thin wall. A larger weight would move points along the surface to where
@@ -31,18 +31,10 @@ _CHUNK = 8192
 
 @dataclass(frozen=True, eq=False)
 class Footpoints:
-    """Closest points on a surface to N queries.
+    """Closest points on a surface to N queries, and how far they are, in the unit of the surface.
 
-    Parameters
-    ----------
-    vertex : (N,) int64
-        A vertex near the point: the corner with the largest weight, or the one that the search began with.
-    face : (N,) int64
-        -1 where the point is the vertex itself (always for a cloud).
-    barycentric : (N, 3) float64
-        Weights of the face's corners; (1, 0, 0) where the face is -1.
-    distance : (N,) float64
-        From each query, in the unit of the surface.
+    `vertex` is the corner with the largest weight, or the one that the search began with. `face` is -1 where the point
+    is the vertex itself (always for a cloud); its corners' weights are then (1, 0, 0).
     """
 
     vertex: Int[Ints, " N"]
@@ -65,16 +57,8 @@ class Footpoints:
 class Surface:
     """A mesh (or cloud) arranged for many closest-point queries; lengths in units of sqrt(area).
 
-    Parameters
-    ----------
-    verts : (V, 3)
-    faces : (F, 3)
-        F = 0 for a cloud.
-    normals : (V, 3)
-        Unit normals, zeros where unknown.
-    resting : (V, 3), optional
-        Where each vertex belongs on the resting template. Queries with a resting place of their own then find the
-        right one of two sheets that touch, such as a hand on a thigh.
+    `normals` are of unit length, zeros where unknown. `resting` is where each vertex belongs on the resting template:
+    queries with such a place of their own find the right one of two sheets that touch, such as a hand on a thigh.
     """
 
     def __init__(
@@ -85,7 +69,9 @@ class Surface:
         resting: Float[Floats, "V 3"] | None = None,
     ) -> None:
         self.verts, self.faces = verts, faces
-        self._start, self._around = _faces_around(faces, len(verts))
+        # the faces at every vertex, one vertex after the other
+        self._around = np.argsort(faces.reshape(-1), kind="stable") // 3
+        self._start = np.concatenate([[0], np.cumsum(np.bincount(faces.reshape(-1), minlength=len(verts)))])
         self._used = np.flatnonzero(np.diff(self._start)) if len(faces) else np.arange(len(verts))
         self._tree = cKDTree(_features(verts, normals, resting)[self._used])
 
@@ -137,11 +123,3 @@ class Surface:
 def _features(points: Floats, normals: Floats, resting: Floats | None) -> Floats:
     parts = [points, NORMAL_WEIGHT * normals]
     return np.concatenate(parts if resting is None else [*parts, RESTING_WEIGHT * resting], 1)
-
-
-def _faces_around(faces: Ints, V: int) -> tuple[Ints, Ints]:
-    """Faces at every vertex in compressed rows: start (V + 1,), face (3 F,)."""
-    corner = faces.reshape(-1)
-    order = np.argsort(corner, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=V))])
-    return start, order // 3

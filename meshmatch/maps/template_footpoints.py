@@ -41,8 +41,7 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
     near the median of its neighbours.
     """
     points, normals = in_core_frame(shape, fit)
-    template_normals = vertex_normals(fit.points, fit.faces)
-    surface = Surface(fit.points, fit.faces, template_normals, fit.resting)
+    surface = Surface(fit.points, fit.faces, vertex_normals(fit.points, fit.faces), fit.resting)
     found = closest_footpoints(shape, fit, workers)
 
     def resting(foot: Footpoints) -> Floats:

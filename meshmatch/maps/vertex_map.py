@@ -6,23 +6,22 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, as_numbers, frozen
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.map_checks import UNKNOWN, check_faces, check_range, checked_arrays, corners_of
 from meshmatch.shapes.shape import Shape
 
+UNKNOWN = -1
+"""A number of vertices that is not known."""
 DIRECTION = "index[i] is the vertex of the target matched to vertex i of the source"
 VERDICTS = ("good", "fair", "poor", "unknown")
 _OTHER_MESH = (
     "match these two again; a map needs one entry for each vertex of the source, in the order of its file, and one "
     "kept as .npy or .csv goes by the count of vertices alone"
 )
-
-
 _READ_WITH_SHAPES = "read it with load_map(path, source, target)"
 
 
@@ -34,28 +33,15 @@ class VertexMap:
     Valid once built; its arrays are read-only. `VertexMap.between` fills in names, counts and hashes from two
     shapes; `for_shapes` does so for a map that was read from a file.
 
-    Parameters
-    ----------
-    source, target
-        Names of the two shapes, for people.
-    index
-        Target vertex of each source vertex.
-    face
-        Target face in which the matched point lies; -1 where it is the vertex ``index[i]`` itself (always for a cloud).
-    barycentric
-        Weights of that face's corners: not negative, rows sum to 1. (1, 0, 0) where the face is -1.
-    confidence
-        0 (a guess) to 1 (certain). All 1 where nothing is known about it (see `verdict`).
-    verdict
-        "good", "fair" or "poor", of the map as a whole; "unknown" if it was read from a file that does not say.
-    reasons
-        Why it is not good, a line each.
-    source_vertices, target_vertices
-        Vertex counts; -1 for an unknown target count (a plain list of indices does not contain it).
-    source_hash, target_hash
-        `Shape.hash` of both; empty where not known.
-    target_faces
-        The target's triangles, whose corners ``barycentric`` weights; not written to files.
+    `index` has the target vertex of each source vertex, `face` the target face in which the matched point lies (-1 where
+    it is that vertex itself; always for a cloud), `barycentric` the weights of that face's corners: not negative, rows
+    sum to 1, (1, 0, 0) where the face is -1. `confidence` goes from 0 (a guess) to 1 (certain, and where nothing is
+    known about it). `verdict` is "good", "fair" or "poor", of the map as a whole, or "unknown" if a file does not say;
+    `reasons` why it is not good, a line each.
+
+    `source` and `target` are names, for people; `source_vertices` and `target_vertices` counts, the latter -1 where not
+    known (a plain list of indices does not contain it); both hashes are `Shape.hash`, empty where not known.
+    `target_faces` are the target's triangles, whose corners `barycentric` weights; they are not written to files.
 
     `InputError`: arrays of the wrong shape or kind, an index outside the target, weights that do not sum to 1, or an
     unknown verdict.
@@ -77,9 +63,8 @@ class VertexMap:
 
     def __post_init__(self) -> None:
         label = f"the map {self.source or 'source'} -> {self.target or 'target'}"
-        size, arrays = checked_arrays(
-            label, self.index, self.face, self.barycentric, self.confidence, self.target_vertices
-        )
+        arrays = self._checked_arrays(label)
+        size = len(arrays["index"])
         if self.source_vertices not in (UNKNOWN, size):
             raise InputError(f"{label} has {size} entries for {self.source_vertices} vertices of the source")
         if self.verdict not in VERDICTS:
@@ -90,6 +75,32 @@ class VertexMap:
             check_faces(self.face, len(self.target_faces), label)
         object.__setattr__(self, "reasons", tuple(str(reason) for reason in self.reasons))
         object.__setattr__(self, "source_vertices", size)
+
+    def _checked_arrays(self, label: str) -> dict[str, NDArray[np.generic]]:
+        """Copies of the arrays, if they are what the class says."""
+        vertex = _whole_numbers(self.index, f"{label}: index")
+        if vertex.ndim != 1 or vertex.size == 0:
+            raise InputError(f"{label}: index must be a list of (V_source,) vertices, not an array of {vertex.shape}")
+        if self.target_vertices != UNKNOWN and self.target_vertices < 1:
+            raise InputError(f"{label}: a target needs vertices, not {self.target_vertices}")
+        check_range(vertex, self.target_vertices, label)
+        size = len(vertex)
+        faces = np.full(size, -1) if self.face is None else _whole_numbers(self.face, f"{label}: face")
+        vertices_alone = np.tile([1.0, 0.0, 0.0], (size, 1))
+        weights = np.array(vertices_alone if self.barycentric is None else self.barycentric, np.float64)
+        trust = np.array(np.ones(size) if self.confidence is None else self.confidence, np.float32)
+        arrays = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
+        for name, array in arrays.items():
+            shape = (size, 3) if name == "barycentric" else (size,)
+            if array.shape != shape:
+                raise InputError(f"{label}: {name} must be an array of {shape}, not {array.shape}")
+        if faces.min() < -1:
+            raise InputError(f"{label}: face {int(faces.min())} does not exist")
+        if not (weights >= -1e-9).all() or not np.allclose(weights.sum(axis=1), 1.0, atol=1e-6):
+            raise InputError(f"{label}: barycentric weights must be 0 or more and sum to 1")
+        if not ((trust >= 0) & (trust <= 1)).all():
+            raise InputError(f"{label}: confidence must lie in 0..1")
+        return arrays
 
     @classmethod
     def between(cls, source: Shape, target: Shape, index: ArrayLike, **rest: Any) -> VertexMap:
@@ -201,9 +212,8 @@ class VertexMap:
         """The functional map C of this map (Ovsjanikov et al. 2012), which goes the other way: it takes coefficients
         of a function on the *target* to those of the pulled-back function on the *source*.
 
-        ``basis_source @ C`` is the least-squares fit to ``apply(basis_target)``.
-
-        A basis (V, K) has linearly independent functions on the vertices, such as Laplacian eigenvectors, a column each.
+        ``basis_source @ C`` is the least-squares fit to ``apply(basis_target)``. A basis (V, K) has linearly independent
+        functions on the vertices, such as Laplacian eigenvectors, a column each.
 
         `InputError`: as `apply`; the source's functions do not have a row for each vertex; or a value is not finite.
         """
@@ -228,11 +238,9 @@ class VertexMap:
             ends = _named(self.target, self.target_vertices, self.target_hash)
             starts = _named(other.source, other.source_vertices, other.source_hash)
             backwards = ends == _named(other.target, other.target_vertices, other.target_hash)
-            what = (
-                f"cannot join {_way(self)} with {_way(other)}: the first ends on {ends}, the second starts on {starts}"
-            )
+            what = f"cannot join {_way(self)} with {_way(other)}: the first ends on {ends}, the second starts on"
             hint = "the second runs the wrong way round" if backwards else "the first must end where the second starts"
-            raise InputError(what, hint)
+            raise InputError(f"{what} {starts}", hint)
         check_range(self.index, other.source_vertices, _way(self))
         worse = max(self.verdict, other.verdict, key=("good", "fair", "unknown", "poor").index)
         return replace(
@@ -260,6 +268,41 @@ def check_map(found: object) -> None:
             f"{type(found).__name__} is not a map",
             "pass a VertexMap: a MatchResult has one as .map, and VertexMap.between makes one of an index",
         )
+
+
+def check_faces(face: Int[Ints, " V_source"], target_faces: int, label: str) -> None:
+    """Refuse faces that a target of so many does not have (`InputError`)."""
+    if face.max() >= target_faces:
+        raise InputError(f"{label} names face {int(face.max())}, but its target has only {target_faces} faces")
+
+
+def corners_of(faces: Int[Ints, "F 3"] | None, face: Int[Ints, " N"], vertex: Int[Ints, " N"]) -> Int[Ints, "N 3"]:
+    """Corners of faces (N,); where the face is -1, three times the vertex itself."""
+    corners = np.repeat(vertex[:, None], 3, axis=1)
+    inside = face >= 0
+    if faces is not None:
+        corners[inside] = faces[face[inside]]
+    return corners
+
+
+def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None:
+    if index.min() < 0:
+        first = int(np.argmin(index))
+        raise InputError(f"{label}: vertex {first} is matched to {int(index.min())}; indices start at 0")
+    if target_vertices != UNKNOWN and index.max() >= target_vertices:
+        one_based = index.min() >= 1 and index.max() == target_vertices
+        matched = f"{label}: vertex {int(np.argmax(index))} is matched to vertex {int(index.max())}"
+        hint = "it looks 1-based: subtract 1" if one_based else "is it a map to another shape, or the other way round?"
+        raise InputError(f"{matched}, but the target has only {target_vertices} vertices", hint)
+
+
+def _whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
+    array = np.asarray(values)
+    if array.dtype.kind == "f" and np.isfinite(array).all() and (array == np.round(array)).all():
+        return array.astype(np.int64)  # MATLAB's numbers are doubles
+    if array.dtype.kind not in "iu":
+        raise InputError(f"{label} must be whole numbers, not {array.dtype}")
+    return np.array(array, dtype=np.int64)
 
 
 def _side(side: str, shape: Shape) -> dict[str, Any]:

@@ -13,8 +13,7 @@ from scipy.sparse import csr_array
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import triangle_areas
-from meshmatch.maps.map_checks import corners_of
-from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals
 

@@ -26,8 +26,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps import table_files
-from meshmatch.maps.map_checks import corners_of
-from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals

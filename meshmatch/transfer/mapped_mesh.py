@@ -18,10 +18,9 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths, unit
-from meshmatch.maps.map_checks import corners_of
 from meshmatch.maps.surface import Footpoints
 from meshmatch.maps.template_footpoints import reassign_islands
-from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
 
 # All set by hand; lengths in units of sqrt(area).

@@ -8,7 +8,7 @@ import pytest
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps import build
-from meshmatch.maps.noisy_clouds import expectation, is_noisy, most_likely_points, noise_level
+from meshmatch.maps.build import expectation, is_noisy, most_likely_points, noise_level
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 
