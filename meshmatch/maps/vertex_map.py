@@ -76,7 +76,7 @@ class VertexMap:
         object.__setattr__(self, "reasons", tuple(str(reason) for reason in self.reasons))
         object.__setattr__(self, "source_vertices", size)
 
-    def _checked_arrays(self, label: str) -> dict[str, NDArray[np.generic]]:
+    def _checked_arrays(self, label: str) -> dict[str, NDArray[Any]]:
         """Copies of the arrays, if they are what the class says."""
         vertex = _whole_numbers(self.index, f"{label}: index")
         if vertex.ndim != 1 or vertex.size == 0:
@@ -89,7 +89,7 @@ class VertexMap:
         vertices_alone = np.tile([1.0, 0.0, 0.0], (size, 1))
         weights = np.array(vertices_alone if self.barycentric is None else self.barycentric, np.float64)
         trust = np.array(np.ones(size) if self.confidence is None else self.confidence, np.float32)
-        arrays = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
+        arrays: dict[str, NDArray[Any]] = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
         for name, array in arrays.items():
             shape = (size, 3) if name == "barycentric" else (size,)
             if array.shape != shape:

@@ -28,8 +28,7 @@ def local_areas(points: Float[Floats, "V 3"]) -> Float[Floats, " V"]:
     """
     if len(points) < 4:
         return np.zeros(len(points))
-    part, distance, index = _neighbourhoods(points)
-    k, noise = _size(part, index)
+    part, distance, _, k, noise = _neighbourhoods(points)
     squared = distance**2
     discs = np.pi * squared[:, 1 : k + 1].sum(axis=1) / (0.5 * k * (k + 1))
     # a lone point far away stands for no more than its share
@@ -53,8 +52,7 @@ def estimate_normals(points: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
     """
     if len(points) < 4:
         return np.zeros((len(points), 3))
-    part, _, index = _neighbourhoods(points)
-    k, _ = _size(part, index)
+    part, _, index, k, _ = _neighbourhoods(points)
     found = np.linalg.eigh(_spread(part, index[:, : k + 1]))[1][:, :, 0]
     near = index[:, 1 : min(k, 8) + 1]
     pairs = np.stack([np.repeat(np.arange(len(part)), near.shape[1]), near.ravel()], axis=1)
@@ -71,10 +69,7 @@ def estimate_normals(points: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
 
 def roughness(points: Float[Floats, "V 3"]) -> float:
     """How noisy a cloud is beside its spacing, 0..1: about 0 for a clean one, 1 for noise of 1 % of the diagonal."""
-    if len(points) < 20:
-        return 0.0
-    part, _, index = _neighbourhoods(points)
-    return _size(part, index)[1]
+    return 0.0 if len(points) < 20 else _neighbourhoods(points)[4]
 
 
 def outlier_points(points: Float[Floats, "V 3"], far: float = 3.0) -> Bool[Bools, " V"]:
@@ -104,10 +99,20 @@ def _part(points: Floats) -> Floats:
     return points[np.sort(np.random.default_rng(0).choice(len(points), LARGEST, replace=False))]
 
 
-def _neighbourhoods(points: Floats) -> tuple[Floats, Floats, Ints]:
-    """The points to judge by, and distance and index (P, k + 1) of their neighbours, themselves first."""
+def _neighbourhoods(points: Floats) -> tuple[Floats, Floats, Ints, int, float]:
+    """The points to judge by; distance and index (P, most + 1) of their neighbours, themselves first; how many of these
+    to look at; and how thick noise makes the cloud beside its spacing, in 0..1."""
     part = np.ascontiguousarray(_part(points), float)
-    return part, *_neighbours(part.tobytes())
+    distance, index = _neighbours(part.tobytes())
+    most = index.shape[1] - 1
+    few = min(int(np.clip(len(part) // 100, 12, 18)), most)
+    some = slice(None, None, max(len(part) // 3000, 1))
+    values = np.linalg.eigvalsh(_spread(part, index[some, : min(12, most) + 1]))
+    thick = np.median(values[:, 0] / np.maximum(values[:, 1], np.maximum(1e-15 * values[:, 2], 1e-300)))
+    # measured on bodies: below 0.15 without noise, 0.2 at noise of 0.3 % of the diagonal, 0.5 at 1 %
+    blend = float(np.clip((thick - 0.15) / 0.35, 0.0, 1.0))
+    k = round(few ** (1.0 - blend) * most**blend)
+    return part, distance, index, max(k, min(3, most)), blend
 
 
 @lru_cache(maxsize=4)
@@ -119,18 +124,6 @@ def _neighbours(data: bytes) -> tuple[Floats, Ints]:
     distance, index = cKDTree(part).query(part, min(max(len(part) // 200, 18), len(part) - 1) + 1)
     distance.flags.writeable = index.flags.writeable = False
     return distance, index
-
-
-def _size(part: Floats, index: Ints) -> tuple[int, float]:
-    """How many neighbours to look at, and how thick noise makes the cloud beside its spacing, in 0..1."""
-    few = min(int(np.clip(len(part) // 100, 12, 18)), index.shape[1] - 1)
-    some = slice(None, None, max(len(part) // 3000, 1))
-    values = np.linalg.eigvalsh(_spread(part, index[some, : min(12, index.shape[1] - 1) + 1]))
-    thick = np.median(values[:, 0] / np.maximum(values[:, 1], np.maximum(1e-15 * values[:, 2], 1e-300)))
-    # measured on bodies: below 0.15 without noise, 0.2 at noise of 0.3 % of the diagonal, 0.5 at 1 %
-    blend = float(np.clip((thick - 0.15) / 0.35, 0.0, 1.0))
-    k = round(few ** (1.0 - blend) * (index.shape[1] - 1) ** blend)
-    return max(k, min(3, index.shape[1] - 1)), blend
 
 
 def _spread(points: Floats, index: Ints) -> Floats:

@@ -88,10 +88,8 @@ def find_parts(
 ) -> tuple[Bool[Bools, " F"], int, int, int, float]:
     """Judge the connected parts of a mesh; `cross` as in `flat_faces`.
 
-    Returns
-    -------
-    Faces of outlier parts; how many parts are outliers, and how many are not; how many of the latter are big but lie
-    far from the rest; and the share of the surface that these have, in 0..1.
+    Returns the faces of outlier parts; how many parts are outliers, and how many are not; how many of the latter are
+    big but lie far from the rest; and the share of the surface that these have, in 0..1.
     """
     part = face_parts(faces, len(verts))
     if part.max() == 0:

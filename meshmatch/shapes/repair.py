@@ -23,20 +23,12 @@ from meshmatch.shapes.shape import Shape
 class Repaired:
     """A shape that is fit for work, and how it relates to the one that it came from.
 
-    Parameters
-    ----------
-    shape
-        All its vertices are valid and, in a mesh, used by a face.
-    original_to_repaired
-        The repaired vertex that stands for each original one: itself, its twin at the same position, or if it
-        was dropped the nearest one. The nearest to a vertex without a position is a valid corner of one of
-        its faces, or if there is none the nearest in the file's order.
-    kept_vertex, kept_face
-        The original vertex (increasing) or face that each repaired one is; corners may be turned, or stand for twins.
-    notes
-        What was found and done, a line each; empty for a shape that was fine.
-    far_parts
-        Big parts that lie far from the largest one: perhaps two objects in one file. They are kept.
+    All vertices of `shape` are valid and, in a mesh, used by a face. `original_to_repaired` is the vertex that stands
+    for each original one: itself, its twin at the same position, or if it was dropped the nearest one. The nearest to a
+    vertex without a position is a valid corner of one of its faces, or if there is none the nearest in the file's
+    order. `kept_vertex` and `kept_face` are the original vertex (increasing) or face that each repaired one is; corners
+    may be turned, or stand for twins. `notes` say what was found and done, a line each; none for a shape that was fine.
+    `far_parts` counts big parts that lie far from the largest one: perhaps two objects in one file. They are kept.
     """
 
     shape: Shape
@@ -147,8 +139,7 @@ def _result(
     if len(chosen) == 0:
         raise InputError(f"{shape.name or 'the shape'} has no usable vertex", "is it a mesh or a point cloud at all?")
     if len(chosen) == shape.V and not notes:
-        every = np.arange(shape.V)
-        return Repaired(shape, every, every, (), shape, which)
+        return Repaired(shape, chosen, chosen, (), shape, which)
     new = np.full(shape.V, -1, np.int64)
     new[chosen] = np.arange(len(chosen))
     colors = None if shape.colors is None else shape.colors[chosen]

@@ -24,22 +24,12 @@ if TYPE_CHECKING:
 class Shape:
     """A triangle mesh, or a point cloud if it has no faces. Valid once built; its arrays are read-only.
 
-    Parameters
-    ----------
-    verts : (V, 3) float64
-        Positions in the file's own frame and unit. Always finite.
-    faces : (F, 3) int64
-        Corners of each triangle; (0, 3) for a cloud.
-    name : str
-        For people: usually the file's name without its folder.
-    colors : (V, 4) float64, optional
-        Red, green, blue as screens show them (sRGB), and alpha, in 0..1; whatever the file has.
-    invalid : (V,) bool, optional
-        True for a vertex whose position in the file was not a number. Such a vertex keeps its place in the
-        order (the map answers for it too) but its `verts` row is only a stand-in, and faces that touch it
-        have no area.
-    weights : (V,) float64, optional
-        How far a fit trusts each vertex, from 0 (not at all) to 1; fully where not given.
+    `verts` are positions in the file's own frame and unit, always finite; `faces` the corners of each triangle, (0, 3)
+    for a cloud; `name` is for people: usually the file's name without its folder. `colors` are red, green, blue as
+    screens show them (sRGB), and alpha, in 0..1; whatever the file has. `invalid` is True for a vertex whose position in
+    the file was not a number: it keeps its place in the order (the map answers for it too) but its `verts` row is only
+    a stand-in, and faces that touch it have no area. `weights` say how far a fit trusts each vertex, from 0 (not at all)
+    to 1; fully where not given.
 
     `InputError`: wrong array shapes, no vertices, a position that is not finite, or a face that names no vertex.
     """

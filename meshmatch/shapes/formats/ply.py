@@ -78,14 +78,10 @@ def write(
     face: Mapping[str, NDArray[Any]] | None = None,
     comments: Sequence[str] = (),
 ) -> None:
-    """Binary little-endian; positions as float where that loses nothing, else double.
+    """Binary little-endian; positions as float where that loses nothing, else double; `comments` go into the header.
 
-    Parameters
-    ----------
-    vertex, face : arrays (V,) or (F,) by name, optional
-        Further properties: uint8, int32, or else double. Names are words of ASCII letters, digits and "_".
-    comments : sequence of str
-        Lines for the header.
+    `vertex` and `face` are further properties, arrays (V,) or (F,) by name: uint8, int32, or else double. Names are
+    words of ASCII letters, digits and "_".
     """
     with np.errstate(over="ignore"):  # what is too large for a float is not equal to it
         single = bool((shape.verts.astype(np.float32) == shape.verts).all())
