@@ -49,7 +49,7 @@ def _is_list(file: Path) -> bool:
 
 
 def _shape(file: Path) -> Json:
-    from meshmatch.geometry.topology import face_parts
+    from meshmatch.geometry.triangles import face_parts
     from meshmatch.shapes.files import load_shape
     from meshmatch.shapes.normalise import guess_unit, long_axis
     from meshmatch.shapes.repair import repair

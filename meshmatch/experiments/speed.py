@@ -31,7 +31,7 @@ from meshmatch.errors import MeshmatchError, OptionError
 from meshmatch.experiments import roofline as roofs
 from meshmatch.experiments import runner, stages
 from meshmatch.experiments.charts import draw_stack
-from meshmatch.geometry.topology import edge_keys
+from meshmatch.geometry.triangles import edge_keys
 from meshmatch.render.charts import check_chart
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape, save_shape

@@ -73,10 +73,13 @@ def agreed_fits(
         how = replace(how, strain=how.strain * model.card.stiffness)
     members = []
     for number, (shape, fit) in enumerate(zip(shapes, fits, strict=True)):
-        local = None
-        if landmarks is not None:
-            local = landmarks[number][0], fit.frame.apply(landmarks[number][1])
-        samples = _samples(shape, fit, config).facing(system.surface(fit.vectors))
+        known = None if landmarks is None else landmarks[number]
+        local = None if known is None else (known[0], fit.frame.apply(known[1]))
+        own = config.for_noise(shape.roughness)
+        frame, samples = take_samples(shape, own.samples, np.random.default_rng(own.seed))
+        points = fit.frame.apply(frame.undo(samples.points))
+        normals = samples.normals @ frame.rotation @ fit.frame.rotation.T
+        samples = replace(samples, points=points, normals=normals).facing(system.surface(fit.vectors))
         members.append(Member(samples, fit.vectors, how.for_noise(shape.roughness), local, fit.partial))
     agreed = []
     for shape, fit, vectors in zip(shapes, fits, agree(system, members, config.nodes), strict=True):
@@ -84,14 +87,6 @@ def agreed_fits(
         distance = vertex_distance(points, fit.frame.apply(shape.verts))
         agreed.append(replace(fit, vectors=vectors, points=points, vertex_distance=distance))
     return agreed
-
-
-def _samples(shape: Shape, fit: Fit, config: FitConfig) -> OrientedPoints:
-    """Samples of a shape in the core frame of its fit."""
-    config = config.for_noise(shape.roughness)
-    frame, samples = take_samples(shape, config.samples, np.random.default_rng(config.seed))
-    points = fit.frame.apply(frame.undo(samples.points))
-    return replace(samples, points=points, normals=samples.normals @ frame.rotation @ fit.frame.rotation.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,14 +11,13 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
+from meshmatch.fitting.candidates import fit_part, fit_whole
 from meshmatch.fitting.fit import Fit, axis_name, vertex_distance
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.nodes import Landmarks
-from meshmatch.fitting.part import fit_part
 from meshmatch.fitting.refinement import REFINEMENTS, Refinement
 from meshmatch.fitting.task import FitTask, Registration
 from meshmatch.fitting.verdict import FAIR_RESIDUAL, empty_share, judge_registration
-from meshmatch.fitting.whole import fit_whole
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.repair import Repaired
@@ -143,7 +142,17 @@ def landmark_places(clean: Sequence[Repaired], landmarks: Sequence[ArrayLike]) -
     """
     if len(landmarks) != 2:
         raise OptionError(f"landmarks must be two lists of vertices, not {len(landmarks)}", _HINT)
-    places = [_places(part, chosen) for part, chosen in zip(clean, landmarks, strict=True)]
+    places = []
+    for part, vertices in zip(clean, landmarks, strict=True):
+        chosen, V = np.asarray(vertices), len(part.original_to_repaired)
+        if chosen.ndim != 1 or len(chosen) == 0 or chosen.dtype.kind not in "iu" or chosen.min() < 0:
+            raise OptionError("landmarks must be lists of vertex numbers", _HINT)
+        if chosen.max() >= V:
+            raise OptionError(
+                f"landmark vertex {chosen.max()} is not on {part.shape.name}, which has {V} vertices",
+                "numbers start at 0; the source comes first",
+            )
+        places.append(part.shape.verts[part.original_to_repaired[chosen]])
     if len(places[0]) != len(places[1]):
         raise OptionError("landmarks must come in pairs", _HINT)
     return places
@@ -169,17 +178,3 @@ def fits_with_landmarks(
         Fitter(model, config).fit(part.shape, held) for config, part, held in zip(configs, clean, known, strict=True)
     ]
     return found, known
-
-
-def _places(part: Repaired, vertices: ArrayLike) -> Float[Floats, "N 3"]:
-    """Where vertices of a shape's file lie."""
-    chosen = np.asarray(vertices)
-    if chosen.ndim != 1 or len(chosen) == 0 or chosen.dtype.kind not in "iu" or chosen.min() < 0:
-        raise OptionError("landmarks must be lists of vertex numbers", _HINT)
-    if chosen.max() >= len(part.original_to_repaired):
-        raise OptionError(
-            f"landmark vertex {chosen.max()} is not on {part.shape.name}, which has "
-            f"{len(part.original_to_repaired)} vertices",
-            "numbers start at 0; the source comes first",
-        )
-    return part.shape.verts[part.original_to_repaired[chosen]]

@@ -85,16 +85,12 @@ def frames_of_part(
         return frames, []
     up, front = _axes(config)
     if up is not None or front is not None:
-        return frames, _along_body(forced_frames(up, front))
-    if not wide:
-        return frames, []
-    axes = np.concatenate([np.eye(3), -np.eye(3)])
-    return frames, _along_body([pose for axis in axes for pose in forced_frames(axis, None, 8)])
-
-
-def _along_body(poses: list[RigidPose]) -> list[RigidPose]:
-    """Every pose with its origin at several places along its own up axis."""
-    return [RigidPose(pose.rotation, pose.center + away * pose.rotation[:, 1]) for pose in poses for away in _ALONG]
+        turned = forced_frames(up, front)
+    else:
+        axes = np.concatenate([np.eye(3), -np.eye(3)]) if wide else np.empty((0, 3))
+        turned = [pose for axis in axes for pose in forced_frames(axis, None, 8)]
+    spread = [RigidPose(pose.rotation, pose.center + away * pose.rotation[:, 1]) for pose in turned for away in _ALONG]
+    return frames, spread
 
 
 def _axes(config: FitConfig) -> tuple[Float[Floats, " 3"] | None, Float[Floats, " 3"] | None]:

@@ -20,13 +20,13 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import needs
 from meshmatch.fitting import fit_config
+from meshmatch.fitting.candidates import STAGE, completed
 from meshmatch.fitting.network_fit import Candidate, best_first, one_way_residual, two_way_residual, weighted_mean
 from meshmatch.fitting.nodes import refine_nodes
-from meshmatch.fitting.part import STAGE, completed
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import FitTask, Refine
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.geometry.topology import is_discontinuous
+from meshmatch.geometry.triangles import is_discontinuous
 from meshmatch.progress import Progress
 
 # All of these were set by hand. Lengths and residuals are in units of sqrt(area).

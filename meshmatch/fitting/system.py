@@ -26,7 +26,7 @@ from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 
 if TYPE_CHECKING:
-    from meshmatch.fields.pointwise import PointwiseField
+    from meshmatch.fields.field import PointwiseField
 
 # Where the upper triangle xx xy xz yy yz zz belongs in a 3 x 3 block, row by row.
 _BLOCK = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
@@ -41,19 +41,11 @@ class NodeSystem:
     With a field that is not linear it moves the template all the same, but there is nothing to `solve` for. Strain is
     measured at ``strain_points`` of the vertices, at most.
 
-    Attributes
-    ----------
-    verts : (V, 3) template vertices, template frame
-    faces : (F, 3)
-    field : on the vertices
-    linear : whether there are node vectors, and with them what follows
-    phi : (V, K), sparse or dense
-    slopes : (3 G, K), gradient of the shape functions at G strain points
-    strain_points : (G,) the vertices that these are
+    ``verts`` (V, 3) and ``faces`` (F, 3) are the template's, in its frame; ``strain_points`` (G,) numbers of vertices.
     """
 
-    phi: Any
-    slopes: Any
+    phi: Any  # (V, K), sparse or dense, where the field is linear
+    slopes: Any  # (3 G, K), gradient of the shape functions at the strain points
 
     def __init__(self, shape: Shape, field: ShapeFunctions | PointwiseField, strain_points: int = 1500) -> None:
         self.verts = np.asarray(shape.verts)

@@ -1,1 +1,1 @@
-"""Geometry of plain arrays: frames, triangles, oriented points, topology."""
+"""Geometry of plain arrays: frames, oriented points, triangles."""

@@ -31,9 +31,8 @@ class Frame:
         proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
         if not proper:
             raise InputError("a frame's rotation must be orthonormal with determinant +1")
-        object.__setattr__(self, "scale", float(self.scale))
-        object.__setattr__(self, "rotation", rotation)
-        object.__setattr__(self, "center", center)
+        for name, value in (("scale", float(self.scale)), ("rotation", rotation), ("center", center)):
+            object.__setattr__(self, name, value)
 
     @classmethod
     def identity(cls) -> Frame:

@@ -1,13 +1,20 @@
-"""Triangles: areas, normals, values between their corners, closest points."""
+"""Triangles: areas, normals, closest points; and which rows, edges and faces belong together, by sorting."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Float, Floats, Int
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+
+# Neighbours are discontinuous if their images are further apart than this (sqrt(area)) plus so many times their own
+# distance. Set by hand.
+_GAP, _STRETCH = 0.06, 3.0
+_CHUNK = 65_536  # edges at a time
+_MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 
 
 def cross_product(a: Float[Floats, "N 3"], b: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
@@ -115,3 +122,132 @@ def closest_on_triangles(
             result[rows, i] = 1 - t[closer]
             result[rows, j] = t[closer]
     return result
+
+
+def same_rows(rows: Float[Floats, "N D"] | Int[Ints, "N D"]) -> Int[Ints, " N"]:
+    """(N,) for each row the first row that is equal to it: itself where it is the first. 0.0 equals -0.0."""
+    own = np.arange(len(rows))
+    if len(rows) < 2:
+        return own
+    hashed = _hash(rows)
+    ordered = np.sort(hashed)
+    if not (ordered[1:] == ordered[:-1]).any():
+        return own
+    order = np.argsort(hashed)
+    ordered = hashed[order]
+    begins = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    sizes = np.diff(np.append(begins, len(rows)))
+    first = np.empty(len(rows), np.int64)
+    first[order] = np.repeat(np.minimum.reduceat(order, begins), sizes)
+    if (rows == rows[first]).all():
+        return first
+    # two different rows with one hash: the slow way
+    _, index, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return np.asarray(index[inverse.ravel()], np.int64)
+
+
+def face_parts(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " F"]:
+    """(F,) number of the connected part that each face is in; faces that share a vertex are connected."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    F = len(faces)
+    # faces x vertices: each face points to its three corners, which needs no sorting
+    indices = np.asarray(faces.ravel() + F, np.int32 if V + F < 2**31 else np.int64)
+    pointers = np.concatenate([np.arange(0, 3 * F + 1, 3), np.full(V, 3 * F)]).astype(indices.dtype)
+    graph = csr_array((np.ones(3 * F, np.int8), indices, pointers), shape=(F + V, F + V))
+    _, label = connected_components(graph, directed=False)
+    used = np.zeros(F + V, np.int64)  # a vertex without a face is no part
+    used[label[:F]] = 1
+    return np.asarray((np.cumsum(used) - 1)[label[:F]])
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """The edges of faces, sorted once for several questions."""
+
+    # Twice the number of each edge of each face, plus 1 if the face runs from the smaller vertex to the larger.
+    ordered: Int[Ints, " F_times_3"]
+    begins: Int[Ints, " E"]  # where each edge begins in `ordered`
+    sizes: Int[Ints, " E"]  # and how many faces it has
+    stride: int  # the number of the edge between vertices i < j is i * stride + j
+
+    @property
+    def vertices(self) -> Int[Ints, "E 2"]:
+        """(E, 2) the two vertices of each edge, the smaller first; sorted."""
+        return np.stack(np.divmod(self.ordered[self.begins] >> 1, self.stride), axis=1)
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many edges have one face (open), and how many have more than two (non-manifold)."""
+        return int((self.sizes == 1).sum()), int((self.sizes > 2).sum())
+
+    @property
+    def disagreeing(self) -> Bool[Bools, " pairs"]:
+        """For each edge of exactly two faces: do both run along it the same way?"""
+        two = self.begins[self.sizes == 2]
+        return np.asarray(self.ordered[two] == self.ordered[two + 1])
+
+
+def edges_of(faces: Int[Ints, "F 3"]) -> Edges:
+    """Sort the edges of `faces`."""
+    ordered = np.sort(directed_edges(faces))
+    group = ordered >> 1
+    begins = np.flatnonzero(np.diff(group, prepend=-1))
+    return Edges(ordered, begins, np.diff(np.append(begins, len(group))), _stride(faces))
+
+
+def directed_edges(faces: Int[Ints, "F 3"]) -> Int[Ints, " F_times_3"]:
+    """(3 F,) the numbers that `Edges.ordered` sorts: F of the edges 0-1, then of 1-2, then of 2-0."""
+    columns = np.ascontiguousarray(faces.T)
+    return 2 * edge_keys(faces, _stride(faces)) + (columns < columns[[1, 2, 0]]).ravel()
+
+
+def open_edges(faces: Int[Ints, "F 3"]) -> Int[Ints, "N 2"]:
+    """(N, 2) vertices of the edges that have one face."""
+    edges = edges_of(faces)
+    return edges.vertices[edges.sizes == 1]
+
+
+def edge_keys(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " F_times_3"]:
+    """(3 F,) a number for each edge of each face, the same both ways: F of the edges 0-1, then 1-2, 2-0."""
+    columns = np.ascontiguousarray(faces.T)
+    start, end = columns.ravel(), columns[[1, 2, 0]].ravel()
+    return np.asarray(np.minimum(start, end) * V + np.maximum(start, end))
+
+
+def _stride(faces: Ints) -> int:
+    return int(faces.max()) + 1 if len(faces) else 1
+
+
+def is_watertight(faces: Int[Ints, "F 3"]) -> bool:
+    """True if every edge has exactly two faces."""
+    return len(faces) > 0 and edges_of(faces).counts == (0, 0)
+
+
+def _hash(rows: Floats | Ints) -> NDArray[np.uint64]:
+    bits = np.ascontiguousarray(rows + 0 if rows.dtype.kind == "i" else rows + 0.0).view(np.uint64)
+    total = np.zeros(len(rows), np.uint64)
+    for k in range(rows.shape[1]):
+        total ^= bits[:, k]
+        total *= _MIX[k % 3]
+        total ^= total >> np.uint64(29)
+    return total
+
+
+def edge_lengths(points: Float[Floats, "V 3"], edges: Int[Ints, "E 2"]) -> Float[Floats, " E"]:
+    """Distance of the two ends of each edge, by parts: millions of edges cost no more memory than their lengths."""
+    length = np.empty(len(edges))
+    for low in range(0, len(edges), _CHUNK):
+        part = slice(low, low + _CHUNK)
+        apart = points[edges[part, 0]] - points[edges[part, 1]]
+        length[part] = np.sqrt(np.einsum("ni,ni->n", apart, apart))
+    return length
+
+
+def is_discontinuous(apart: Float[Floats, " N"], length: Float[Floats, " N"]) -> Bool[Bools, " N"]:
+    """Whether images of neighbours lie much further ``apart`` than the neighbours do, as at a tear of the map.
+
+    ``length`` is the distance of the neighbours; both are in units of sqrt(area).
+    """
+    return np.asarray(apart >= _GAP + _STRETCH * length)

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.geometry.topology import edges_of, same_rows
+from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.shape import Shape
 
 CHUNK_BYTES = 64_000_000

@@ -16,8 +16,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.fitting.fit import Fit
-from meshmatch.geometry.topology import edge_lengths, is_discontinuous
-from meshmatch.geometry.triangles import interpolate, vertex_normals
+from meshmatch.geometry.triangles import edge_lengths, interpolate, is_discontinuous, vertex_normals
 from meshmatch.maps.surface import Footpoints, Surface
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape

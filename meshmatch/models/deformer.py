@@ -13,12 +13,19 @@ import torch
 from torch import nn
 
 from meshmatch.arrays import Float, Floats, Floats32
-from meshmatch.fields.field import Field, PointField, apply_shape_functions
-from meshmatch.fields.pointwise import TURN_ROWS, PointwiseField, code_rows, turned_rows
+from meshmatch.fields.field import (
+    TURN_ROWS,
+    Field,
+    PointField,
+    PointwiseField,
+    apply_shape_functions,
+    code_rows,
+    turned_rows,
+)
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models import layers
-from meshmatch.models.config import NetworkConfig
+from meshmatch.models.inference import NetworkConfig
 
 
 def rotation_from_six(six: Float[torch.Tensor, "B 6"]) -> Float[torch.Tensor, "B 3 3"]:
@@ -93,8 +100,10 @@ class Deformer(nn.Module):
         return PointwiseField(at, at, self.decoder.displacement, self.config.code)
 
     def rotate_rows(self, vectors: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
-        assert isinstance(self.decoder, layers.PointDecoder)  # `NodeNetwork` turns node vectors
-        return turned_rows(vectors, turn)
+        if isinstance(self.decoder, layers.PointDecoder):
+            return turned_rows(vectors, turn)
+        nodes = self.nodes.double().cpu().numpy()  # as `NodeNetwork` does
+        return (nodes + vectors) @ turn - nodes
 
     def align(
         self, features: Float[torch.Tensor, "B N 3"]

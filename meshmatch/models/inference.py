@@ -1,4 +1,4 @@
-"""What fitting asks of a trained network (`Network`, on whatever device), and its answers from NumPy (`NodeNetwork`).
+"""What a network is made of; what fitting asks of it (`Network`, on whatever device), and NumPy's answers (`NodeNetwork`).
 
 The layers are few, dense and small: their weights are read from memory once for a batch, so that twenty clouds cost about
 as much as four. `models.deformer` is the same network for training; a test holds both to the same answers.
@@ -7,18 +7,71 @@ as much as four. `models.deformer` is the same network for training; a test hold
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import erf
 
 from meshmatch.arrays import Float, Floats, Floats32
-from meshmatch.models.config import NetworkConfig
+from meshmatch.errors import ModelError
+from meshmatch.fields.shape_functions import FIELDS, FieldName
 
 _EPSILON = np.float32(1e-5)  # of layer and batch norms, as in torch
 _POINT_SIZES = (126, 128, 256, 512, 1024)  # of the layers of `models.layers.PointEncoder`
+_MAX = {
+    "code": 4096, "width": 8192, "depth": 64, "basis": 8192,
+    "align_basis": 8192, "align_width": 8192, "corrections": 64, "correct_width": 8192,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes and choices of a deformer; saved in the model card (cards without ``field`` have moving least squares).
+
+    The defaults were chosen on generated bodies (docs/results.md, ablations).
+
+    A pointwise field has a decoder of its own, whatever ``decoder`` says.
+    """
+
+    encoder: Literal["basis", "point"] = "basis"
+    decoder: Literal["flat", "node"] = "flat"
+    code: int = 512
+    width: int = 768
+    depth: int = 2
+    basis: int = 768
+    align_basis: int = 512
+    align_width: int = 512
+    corrections: int = 3
+    correct_width: int = 640
+    field: FieldName = "mls"
+
+    def __post_init__(self) -> None:
+        # A card may come from anywhere: bound what building the network allocates.
+        if self.encoder not in ("basis", "point") or self.decoder not in ("flat", "node"):
+            raise ModelError(f"unknown network: encoder {self.encoder!r}, decoder {self.decoder!r}", "update meshmatch")
+        if self.field not in FIELDS:
+            raise ModelError(f"unknown field {self.field!r}, only {', '.join(FIELDS)}", "update meshmatch")
+        for name, limit in _MAX.items():
+            value = getattr(self, name)
+            if type(value) is not int or not 0 <= value <= limit:
+                raise ModelError(f"network option {name} must be an integer from 0 to {limit}, not {value!r}")
+
+    @staticmethod
+    def from_dict(values: dict) -> NetworkConfig:
+        known = NetworkConfig.__dataclass_fields__
+        unknown = sorted(set(values) - set(known))
+        if unknown:
+            raise ModelError(f"unknown network options: {', '.join(unknown)}", "update meshmatch")
+        return NetworkConfig(**values)
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+
+PAPER = NetworkConfig(encoder="point", decoder="node", width=1024, align_basis=0, corrections=0)
 
 
 class Network(Protocol):

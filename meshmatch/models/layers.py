@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from meshmatch.arrays import Float, Int
-from meshmatch.fields.pointwise import pack
+from meshmatch.fields.field import pack
 from meshmatch.models.inference import quick_tree
 
 

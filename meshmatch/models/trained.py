@@ -15,12 +15,11 @@ from meshmatch.fields.shape_functions import ShapeFunctions, has_nodes, shape_fu
 from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.card import ModelCard
 from meshmatch.models.checkpoint import load_weights
-from meshmatch.models.config import NetworkConfig
-from meshmatch.models.inference import Network, NodeNetwork, weight_shapes
+from meshmatch.models.inference import Network, NetworkConfig, NodeNetwork, weight_shapes
 from meshmatch.templates.template import Template, load_template
 
 if TYPE_CHECKING:
-    from meshmatch.fields.pointwise import PointwiseField
+    from meshmatch.fields.field import PointwiseField
     from meshmatch.models.deformer import Deformer
 
 _DERIVING = threading.RLock()

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
-from meshmatch.geometry.topology import same_rows
-from meshmatch.geometry.triangles import vertex_normals
+from meshmatch.geometry.triangles import same_rows, vertex_normals
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.texels import Pyramid

@@ -10,7 +10,7 @@ import numpy as np
 
 from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError, OptionError
-from meshmatch.geometry.topology import edges_of, is_watertight
+from meshmatch.geometry.triangles import edges_of, is_watertight
 from meshmatch.shapes.shape import Shape
 
 Quality = Literal["fast", "meshlab"]

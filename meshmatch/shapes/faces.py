@@ -8,8 +8,15 @@ from __future__ import annotations
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.geometry.topology import Edges, directed_edges, edge_keys, face_parts, open_edges, same_rows
-from meshmatch.geometry.triangles import squared_lengths
+from meshmatch.geometry.triangles import (
+    Edges,
+    directed_edges,
+    edge_keys,
+    face_parts,
+    open_edges,
+    same_rows,
+    squared_lengths,
+)
 
 OUTLIER_SHARE = 0.02
 """A part with less than this share of the largest part's area is an outlier. This and the next two are set by hand."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.geometry.topology import edges_of, same_rows
+from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
 from meshmatch.shapes.faces import duplicate_faces, find_parts, flat_faces, seams, turn_faces
 from meshmatch.shapes.shape import Shape

@@ -12,8 +12,15 @@ import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, frozen, read_only
 from meshmatch.errors import InputError
-from meshmatch.geometry.topology import Edges, edges_of
-from meshmatch.geometry.triangles import average_normals, share_areas, squared_lengths, triangle_vectors, unit
+from meshmatch.geometry.triangles import (
+    Edges,
+    average_normals,
+    edges_of,
+    share_areas,
+    squared_lengths,
+    triangle_vectors,
+    unit,
+)
 from meshmatch.shapes.cloud import estimate_normals, local_areas, roughness
 
 if TYPE_CHECKING:

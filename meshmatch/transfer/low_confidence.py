@@ -14,7 +14,7 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Floats, Int, Ints
-from meshmatch.geometry.topology import same_rows
+from meshmatch.geometry.triangles import same_rows
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import NO_LABEL, largest_weights
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Floats, Floats32, Ints, Ints32
-from meshmatch.geometry.topology import same_rows
-from meshmatch.geometry.triangles import blend, closest_on_triangles, squared_lengths, triangle_areas
+from meshmatch.geometry.triangles import blend, closest_on_triangles, same_rows, squared_lengths, triangle_areas
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import length_of
 

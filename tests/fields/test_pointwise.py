@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fields.pointwise import PointwiseField, code_rows, jacobian, pack, turned_rows, unpack
+from meshmatch.fields.field import PointwiseField, code_rows, jacobian, pack, turned_rows, unpack
 from meshmatch.models.layers import PointDecoder
 
 D = 7

@@ -10,7 +10,7 @@ from meshmatch.geometry.kernels import Kernel
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.card import write_card
 from meshmatch.models.checkpoint import save_weights
-from meshmatch.models.config import NetworkConfig
+from meshmatch.models.inference import NetworkConfig
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.agree import AgreeConfig, agreed_fits
+from meshmatch.fitting.candidates import estimate_scale, isolated_points
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import Candidate, two_way_residual
 from meshmatch.fitting.nodes import pair_terms, refine_nodes
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.verdict import GOOD_RESIDUAL, cloud_allowance, judge
-from meshmatch.fitting.whole import estimate_scale, isolated_points
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.sampling import sample_surface

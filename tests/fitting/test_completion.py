@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 
 from meshmatch.api.inputs import as_model
 from meshmatch.experiments.partial import part_of
+from meshmatch.fitting.candidates import completed
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import Candidate
-from meshmatch.fitting.part import completed
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.verdict import area_share, visible_vertices
 from meshmatch.geometry.frames import RigidPose

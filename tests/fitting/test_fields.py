@@ -22,7 +22,7 @@ from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.nodes import refine_nodes
 from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.models.config import NetworkConfig
+from meshmatch.models.inference import NetworkConfig
 from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape
@@ -85,7 +85,7 @@ def test_every_part_of_the_network_learns(field: str) -> None:
 
 
 def test_what_has_no_weight_is_not_computed(monkeypatch: pytest.MonkeyPatch, pointwise: TrainedModel) -> None:
-    monkeypatch.setattr("meshmatch.fields.pointwise.jacobian", None)
+    monkeypatch.setattr("meshmatch.fields.field.jacobian", None)
     egg, model = pointwise.template, pointwise.network
     bare = CorrespondenceLoss(volume=0, arap=0, blend=0)
     terms = bare(model, small_data(egg, model)[0], small_points(egg, model=model), torch.Generator())

@@ -10,13 +10,13 @@ import pytest
 from meshmatch.api.inputs import as_model
 from meshmatch.api.matching import Matcher
 from meshmatch.errors import OptionError
-from meshmatch.fitting import part
+from meshmatch.fitting import candidates
+from meshmatch.fitting.candidates import SHARES
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import boundary_length
 from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
 from meshmatch.fitting.network_fit import Candidate, one_way_residual
-from meshmatch.fitting.part import SHARES
 from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.system import node_system
 from meshmatch.fitting.task import FitTask, take_samples
@@ -126,10 +126,10 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
 
     found = {}
     for verdict in ("fair", "poor"):
-        monkeypatch.setattr(part, "frames_of_part", frames)
-        monkeypatch.setattr(part, "judge_registration", lambda found, partial, verdict=verdict: (verdict, ()))
+        monkeypatch.setattr(candidates, "frames_of_part", frames)
+        monkeypatch.setattr(candidates, "judge_registration", lambda found, partial, verdict=verdict: (verdict, ()))
         asked.clear()
-        best = part.fit_part(task, REFINEMENTS["none"].part)
+        best = candidates.fit_part(task, REFINEMENTS["none"].part)
         found[verdict] = best.candidate.cost
         assert asked == ({(48, 2, False)} if verdict == "fair" else {(48, 2, False), (96, 8, True)})
     assert found["poor"] <= found["fair"]

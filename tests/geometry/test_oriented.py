@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import NORMAL_WEIGHT, OrientedPoints, with_normals
-from meshmatch.geometry.topology import edge_lengths, is_discontinuous
+from meshmatch.geometry.triangles import edge_lengths, is_discontinuous
 
 
 def ball(signed: bool = True) -> OrientedPoints:

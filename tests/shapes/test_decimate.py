@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError, OptionError
-from meshmatch.geometry.topology import is_watertight
+from meshmatch.geometry.triangles import is_watertight
 from meshmatch.shapes import decimate as module
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape

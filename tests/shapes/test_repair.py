@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError
-from meshmatch.geometry.topology import edges_of, is_watertight, same_rows
+from meshmatch.geometry.triangles import edges_of, is_watertight, same_rows
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape

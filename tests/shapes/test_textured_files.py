@@ -8,8 +8,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError, OutputError
-from meshmatch.geometry.topology import same_rows
-from meshmatch.geometry.triangles import closest_on_triangles
+from meshmatch.geometry.triangles import closest_on_triangles, same_rows
 from meshmatch.shapes import textured_files
 from meshmatch.shapes.appearance import png_bytes
 from meshmatch.shapes.colors import LINEAR_OF_BYTE

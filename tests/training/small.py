@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from meshmatch.geometry.kernels import Kernel
-from meshmatch.models.config import NetworkConfig
 from meshmatch.models.deformer import Deformer
+from meshmatch.models.inference import NetworkConfig
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
 from meshmatch.templates.template import Template

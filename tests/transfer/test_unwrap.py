@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError, OptionError
-from meshmatch.geometry.topology import face_parts
+from meshmatch.geometry.triangles import face_parts
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer import unwrap
 from meshmatch.transfer.texels import faces_on, grown

@@ -12,7 +12,7 @@ from PIL import Image
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.geometry.topology import same_rows
+from meshmatch.geometry.triangles import same_rows
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.viewer.assembly import scaled, small_integers
 from meshmatch.render.viewer.drawn import Drawn

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.geometry.topology import same_rows
-from meshmatch.geometry.triangles import dot, vertex_normals
+from meshmatch.geometry.triangles import dot, same_rows, vertex_normals
 from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape

@@ -1,4 +1,8 @@
-"""Fits of a part: one side of a body, or what is left of it beyond a cut.
+"""The network's candidates for a shape that is taken for complete, or for a part, and the fit that refinement makes of them.
+
+The area of a cloud is only estimated, too small where points are few and noisy, and outliers look like surface. The
+network's own fit knows better: its template has the area of a body, and a point far from it, with few others around, is
+not on its surface.
 
 A part does not say how large the whole is, so its share of the surface is one more thing to try. What the samples show
 must lie on the template; what the template has besides is left to the network and to the prior on its gradient.
@@ -10,23 +14,35 @@ the network wants it, and nothing beyond a cut is pulled onto its edge.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats
-from meshmatch.fitting.initial_frames import frames_of_part
+from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
 from meshmatch.fitting.network_fit import Candidate, Predictor, best_first, one_way_residual, sized
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import FitTask, Refine, Registration
 from meshmatch.fitting.verdict import area_share, judge_registration, visible_vertices
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.progress import Progress
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
+# How the scale and the outliers of a cloud are found. Set by hand.
+_ROUNDS = 3
+_MAX_CHANGE = 1.3  # of the scale, in all: more is a wrong fit, not a wrong area
+_FAR = 0.06  # from the template, units of sqrt(area)
+_ISOLATED = 1.5  # reach of the nearest points, against the median of the cloud
+_NEIGHBOURS = 8
+_SETTLED = 0.005  # a relative change of the scale that ends the search
+_BEHIND = 1.1  # times the best residual: candidates further behind say nothing about a cloud's scale
+
+FitAgain = Callable[[OrientedPoints, RigidPose], Candidate]
 STAGE = "fitting as a part"
 # Shares of the surface that a part may show, and all that follows, were set by hand.
 SHARES = (1.0, 0.8, 0.62, 0.48, 0.36)
@@ -40,6 +56,77 @@ _COMPLETED = (14, 7, 4)
 _VARIED = 2  # candidates of which variants are sought
 _COARSE = 2048
 _MAX_ADDED = 3  # points that complete the samples, for each of them, at most
+
+
+def fit_whole(task: FitTask, refine: Refine) -> Registration:
+    """Fit the template to a shape that is taken for complete; ``refine`` turns the network's candidates into one fit."""
+    orientation = task.progress.stage("orientation")
+    orientation(0.0)
+    # A cloud's residual says little before its core frame is found; a second round finds it.
+    care = 2 if task.shape.is_cloud else 1
+    starts = [(task.coarse, pose) for pose in frames_to_try(task.model, task.samples, task.config)]
+    candidates = best_first(task.predictor.fit_all(starts, rounds=care, draws=care))
+    orientation(0.7)
+    if task.shape.is_cloud:
+        task, candidates = _rescaled(task, candidates)
+    careful = task.predictor.fit_all([(task.samples, each.pose) for each in candidates[: task.config.careful]])
+    orientation(1.0)
+    return Registration(task, refine(task, best_first(careful)))
+
+
+def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list[Candidate]]:
+    """The task and the best candidates of a cloud in the scale, and without the outliers, that the best fit tells."""
+
+    def fit_again(samples: OrientedPoints, pose: RigidPose) -> Candidate:
+        return task.predictor.fit(samples, pose, draws=1)
+
+    near = _BEHIND * candidates[0].residual
+    best = [each for each in candidates[: task.config.careful] if each.residual <= near]
+    estimates = [estimate_scale(task.system, task.samples, candidate, fit_again) for candidate in best]
+    scale, samples, first = min(estimates, key=lambda estimate: estimate[2].residual)
+    others = [
+        Candidate(RigidPose(each.pose.rotation, each.pose.center / scale), each.vectors, each.residual) for each in best
+    ]
+    return task.rescaled(scale, samples), [first, *others]
+
+
+def estimate_scale(
+    system: NodeSystem,
+    samples: OrientedPoints,
+    candidate: Candidate,
+    fit_again: Callable[[OrientedPoints, RigidPose], Candidate],
+) -> tuple[float, OrientedPoints, Candidate]:
+    """Rescale samples of a cloud (area 1 by estimate) by the network's fit, drop outliers, fit again, a few times.
+
+    Returns the scale, by which lengths of the old frame are to be divided; the samples that are left, in the new frame;
+    and their fit.
+    """
+    isolated = isolated_points(samples.points)
+    resting = vertex_areas(system.verts, system.faces).sum()
+    total = 1.0
+    for _ in range(_ROUNDS):
+        moved, pose = system.moved(candidate.vectors), candidate.pose
+        step = np.sqrt(vertex_areas(moved, system.faces).sum() / resting)
+        step = np.clip(step, 1 / _MAX_CHANGE / total, _MAX_CHANGE / total)
+        far = cKDTree(pose.to_world(moved)).query(samples.points)[0] > _FAR
+        keep = ~(far & isolated)
+        total *= step
+        samples, isolated = samples.rows(keep), isolated[keep]
+        samples = replace(samples, points=samples.points / step)
+        candidate = fit_again(samples, RigidPose(pose.rotation, pose.center / step))
+        if keep.all() and abs(step - 1) < _SETTLED:
+            break
+    return float(total), samples, candidate
+
+
+def isolated_points(points: Float[Floats, "P 3"]) -> Bool[Bools, " P"]:
+    """Whether the nearest few points lie further away than is usual on the cloud.
+
+    Samples of a small cloud repeat its points; copies of a point do not count as its neighbours.
+    """
+    own, which = np.unique(points, axis=0, return_inverse=True)
+    reach = cKDTree(own).query(own, min(_NEIGHBOURS + 1, len(own)))[0][:, -1]
+    return np.asarray((reach > _ISOLATED * np.median(reach))[which.reshape(-1)])
 
 
 def fit_part(task: FitTask, refine: Refine) -> Registration:
@@ -65,7 +152,13 @@ def _search(task: FitTask, refine: Refine, wide: bool) -> Registration:
         progress(0.4 + 0.2 * (number + 1) / len(_COMPLETED))
     candidates = best_first(candidates)
     for candidate in candidates[:_VARIED]:
-        candidates += _variants(task, candidate)
+        # other interpretations of the completed samples
+        local, config = candidate.local(task.samples), task.config
+        whole = completed(task.system, local, candidate.vectors, candidate.share, task.predictor.rng)
+        near = local.first(_COARSE)
+        for each in task.predictor.variants(whole, near, candidate.pose, config.variants, config.tilt):
+            residual = one_way_residual(task.system, local, each.vectors)
+            candidates.append(replace(each, residual=residual, share=candidate.share))
     best = refine(task, best_first(candidates))
     root = float(np.sqrt(best.share))
     return Registration(task.rescaled(1 / root, sized(task.samples, best.share)), best)
@@ -109,28 +202,14 @@ def _fitted_again(task: FitTask, candidates: Sequence[Candidate]) -> list[Candid
         growth = np.sqrt(shares[-1] / candidate.share)
         starts.append((replace(whole, points=whole.points * growth), RigidPose.identity()))
     found = []
-    again = task.predictor.fit_all(starts, measure=_unmeasured)
+    # unmeasured: the residual is that of other samples, once these are placed
+    again = task.predictor.fit_all(starts, measure=lambda *_: 0.0)
     for candidate, fit, share in zip(candidates, again, shares, strict=True):
         last = candidate.pose
         pose = RigidPose(last.rotation, np.sqrt(share / candidate.share) * last.center) @ fit.pose
         placed = replace(fit, pose=pose, share=share)
         found.append(replace(placed, residual=one_way_residual(system, placed.local(task.samples), fit.vectors)))
     return found
-
-
-def _unmeasured(*_: object) -> float:
-    return 0.0  # the residual is that of other samples, once these are placed
-
-
-def _variants(task: FitTask, candidate: Candidate) -> list[Candidate]:
-    """Other interpretations of the completed samples."""
-    local = candidate.local(task.samples)
-    whole = completed(task.system, local, candidate.vectors, candidate.share, task.predictor.rng)
-    near, pose, config = local.first(_COARSE), candidate.pose, task.config
-    return [
-        replace(each, residual=one_way_residual(task.system, local, each.vectors), share=candidate.share)
-        for each in task.predictor.variants(whole, near, pose, config.variants, config.tilt)
-    ]
 
 
 def completed(
