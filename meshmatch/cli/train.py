@@ -205,7 +205,7 @@ def train(
     known = None if how.poses is None else load_poses(how.poses, how.pose_share)
     bodies = Bodies(how.template, how.identities, known) if how.shapes is None or known is not None else None
     facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, how.start)
-    if not how.fresh and training.checkpoint_in(output).is_file():
+    if not how.fresh and (output / training.CHECKPOINT).is_file():
         console.say(f"going on from the checkpoint in {output}; --fresh starts anew")
     reports: list[StepReport] = []
 

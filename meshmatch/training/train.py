@@ -17,7 +17,6 @@ import torch
 from meshmatch.errors import InputError, OptionError
 from meshmatch.models.card import ModelCard, check_name, write_card
 from meshmatch.models.checkpoint import save_weights
-from meshmatch.models.deformer import Deformer
 from meshmatch.models.registry import CARD, TEMPLATE, WEIGHTS, load_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import make_folder
@@ -31,38 +30,26 @@ from meshmatch.training.loop import StepReport, Trainer
 from meshmatch.training.losses import CorrespondenceLoss, held_out_error
 from meshmatch.training.recipes import Recipe, recipe_for
 
+CHECKPOINT = Path("checkpoint", "last.safetensors")  # in the model folder
 VALIDATION_SEED = 999_983
 """Of the batch that no training sees and every training is measured on."""
 
 
 @dataclass(frozen=True)
 class CardFacts:
-    """What a training is told about its model; goes onto the card.
+    """What a training is told about its model; goes onto the card, see `ModelCard`.
 
-    Parameters
-    ----------
-    name, category, data : str
-        Where empty: the name of the output folder, that of the folder of shapes ("human" for bodies), and a sentence
-        about the shapes.
-    licence : str
-        Under which terms the weights may be used.
-    stiffness : float
-        How firmly two fits hold a common stretch of the template: 1 suits bodies; 0.05 what differs more from shape to
-        shape, such as organs.
-    start : model, optional
-        Whose weights the training begins with: a loaded model, its name or its folder. It must have the same template,
-        network and kernel.
-    frame : dict, optional
-        How a fit finds orientation and scale, see `ModelCard`; by default as the training's shapes and network say.
+    Empty words are found out. The weights of ``start`` (a model of the same template, network and kernel, its name or
+    folder) begin the training.
     """
 
-    name: str = ""
-    category: str = ""
-    data: str = ""
+    name: str = ""  # of the output folder
+    category: str = ""  # the name of the folder of shapes; "human" for bodies
+    data: str = ""  # a sentence about the shapes
     licence: str = "unstated"
-    stiffness: float = 1.0
+    stiffness: float = 1.0  # 0.05 suits what differs more from shape to shape than bodies do, such as organs
     start: TrainedModel | str | Path | None = None
-    frame: dict[str, str] | None = None
+    frame: dict[str, str] | None = None  # as the training's shapes and network say
 
 
 def train(
@@ -76,37 +63,17 @@ def train(
     progress: ProgressCallback | None = None,
     report: Callable[[StepReport], None] | None = None,
 ) -> Path:
-    """Train a model, or go on training it from the checkpoint in its folder, exactly.
+    """Train a model, or (with ``resume``) go on training it from the checkpoint in its folder, exactly; returns the folder.
 
-    Parameters
-    ----------
-    output : path
-        The model folder. It receives ``checkpoint/last.safetensors`` on the way and, at every stop,
-        ``template.safetensors``, ``weights.safetensors`` and last ``card.json``.
-    shapes : path, optional
-        A folder that `prepare` made, which also has the template; generated human ``bodies`` where not given.
-    recipe : Recipe, optional
-        By default `recipe_for` of the shapes; ``recipe_for(shapes, ...).changed(steps=..., minutes=...)`` is another.
-    resume : bool
-        Go on from the folder's checkpoint, if there is one.
-    progress, report : callable, optional
-        Called with (stage, name, share); and with losses and validation every 50 steps.
+    The folder ``output`` receives ``checkpoint/last.safetensors`` on the way and, at every stop, ``template.safetensors``,
+    ``weights.safetensors`` and last ``card.json``. It learns from ``shapes``, a folder that `prepare` made, which also has
+    the template, or else from generated human ``bodies``. The recipe is `recipe_for` of the shapes unless another is given,
+    such as ``recipe_for(shapes, ...).changed(steps=..., minutes=...)``. ``progress`` is called with (stage, name, share),
+    ``report`` with losses and validation every 50 steps.
 
-    Returns
-    -------
-    Path
-        The model folder.
-
-    Raises
-    ------
-    InputError
-        No prepared folder, or too few shapes.
-    OptionError
-        Choices that do not go together, or the extra ``train`` is not installed.
-    ModelError
-        A name that cannot be one, or a checkpoint of another training.
-    OutputError
-        The folder cannot be written.
+    `InputError` if the folder is not prepared or has too few shapes; `OptionError` for choices that do not go together, or
+    if the extra ``train`` is not installed; `ModelError` for a name that cannot be one, or a checkpoint of another
+    training; `OutputError` if the folder cannot be written.
     """
     output = Path(output)
     facts = facts or CardFacts()
@@ -168,25 +135,29 @@ def train_model(
     kernel.
     """
     output = Path(output)
-    checkpoint = checkpoint_in(output)
+    checkpoint = output / CHECKPOINT
     make_folder(checkpoint.parent)
     config, kernel = recipe.train, recipe.kernel
     points: Any
-    data: Any
+    data: Any = source
     if isinstance(source, ShapeSamples):
         if len(source.points) < 2:
             hint = "prepare a folder of several; ten or more are better"
             raise InputError("one shape is too few to learn from", hint)
         data = setup.build_cloud_dataset(source, config, recipe.scan)
-        model = setup.build_deformer(template, data, recipe.network, recipe.scan, kernel, config.seed)
-        _begin(model, template, recipe, facts)
+    model = setup.build_deformer(template, data, recipe.network, recipe.scan, kernel, config.seed)
+    if isinstance(start := facts.start, TrainedModel):
+        theirs = start.template.hash, start.network.config, start.card.field["kernel"]
+        if theirs != (template.hash, recipe.network, kernel):
+            hint = "start from a model of the same template and preset, or from nothing"
+            raise OptionError(f"model {start.card.name} has another template, network or kernel", hint)
+        model.load_state_dict(start.network.state_dict())
+    if isinstance(source, ShapeSamples):
         data = replace(data, encoder=deepcopy(model.encoder).cpu())
         points = setup.build_surface_points(template, kernel, model, source.template_landmarks)
         facts = replace(facts, frame=facts.frame or {"orientation": source.align, "scale": source.scale})
         few = {"shapes": min(32, 2 * len(source.points))}
     else:
-        model = setup.build_deformer(template, source, recipe.network, recipe.scan, kernel, config.seed)
-        _begin(model, template, recipe, facts)
         points = setup.build_loss_points(template, kernel, model)
         size = config.shapes, config.scans_per_shape
         data = setup.build_dataset(template, source, model, recipe.scan, *size, config.seed, config.steps)
@@ -204,23 +175,6 @@ def train_model(
         trainer.model.load_state_dict(trainer.averaged_state())
         export(trainer, template, output, recipe, facts, held_out_error(trainer.model, held_out, trainer.points))
     return output
-
-
-def checkpoint_in(output: str | Path) -> Path:
-    """Where the checkpoint of a training into a folder lies."""
-    return Path(output) / "checkpoint" / "last.safetensors"
-
-
-def _begin(model: Deformer, template: Template, recipe: Recipe, facts: CardFacts) -> None:
-    """Take the weights of the model that a training starts from, if it does."""
-    start = facts.start
-    if not isinstance(start, TrainedModel):
-        return
-    theirs = start.template.hash, start.network.config, start.card.field["kernel"]
-    if theirs != (template.hash, recipe.network, recipe.kernel):
-        hint = "start from a model of the same template and preset, or from nothing"
-        raise OptionError(f"model {start.card.name} has another template, network or kernel", hint)
-    model.load_state_dict(start.network.state_dict())
 
 
 def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, facts: CardFacts, score: float) -> None:
