@@ -21,13 +21,7 @@ _TWICE = 1.0  # seconds within which a second signal is the same one: `timeout` 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Words after the program's name; those of the process if not given.
-    """
+    """Run the command line, by default the words after the process's name, and return its exit status."""
     debug = os.environ.get(DEBUG_VARIABLE, "") not in ("", "0")
     with _kill_as_interrupt() as killed:
         try:

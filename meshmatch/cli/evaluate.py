@@ -7,7 +7,6 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import options
-from meshmatch.cli.output_paths import check_outputs
 from meshmatch.cli.words import Console, print_json, print_rows
 from meshmatch.errors import OptionError
 
@@ -23,12 +22,10 @@ def evaluate(
     truth: options.Truth = None,
     points: options.Points = None,
     threshold: float = Option(15.0, min=0.0, metavar="CM", help="Give the share of errors over this many cm."),
-    curve: Path | None = Option(
-        None, metavar="FILE", help="Draw the cumulative error curve, .png, .svg or .pdf (needs the truth)."
+    curve: Path | None = options.optional(
+        "FILE", "Draw the cumulative error curve, .png, .svg or .pdf (needs the truth)."
     ),
-    picture: Path | None = Option(
-        None, metavar="PNG", help="Draw both shapes, the errors as a color map (needs the truth)."
-    ),
+    picture: Path | None = options.optional("PNG", "Draw both shapes, the errors as a color map (needs the truth)."),
     unit: options.ErrorUnit = Option(
         "cm", help="Of curve and picture: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100."
     ),
@@ -45,7 +42,7 @@ def evaluate(
     for what, file in (("curve", curve), ("picture", picture)):
         if file is not None and not told:
             raise OptionError(f"a {what} of errors needs the truth", "give it with --truth or --points")
-    check_outputs([map_file, source, target, truth, *(points or ())], chart=curve, picture=picture)
+    options.check_outputs([map_file, source, target, truth, *(points or ())], chart=curve, picture=picture)
     shapes = meshmatch.load_shape(source), meshmatch.load_shape(target)
     found = meshmatch.load_map(map_file, *shapes)
     known = options.load_truth(truth, points, shapes[0])
@@ -60,8 +57,7 @@ def evaluate(
             from meshmatch.render.compose import compose_errors
 
             compose_errors(*shapes, found, known, result.errors, unit).render(picture)
-    for reason in found.reasons:
-        Console().say(f"note: {reason}")
+    Console().say(*(f"note: {reason}" for reason in found.reasons))
     if json:
         print_json(dict(result.as_dict(threshold)))
     else:

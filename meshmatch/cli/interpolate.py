@@ -8,8 +8,7 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import words
-from meshmatch.cli.options import FitOptions, RunOptions, grouped, output_option
-from meshmatch.cli.output_paths import check_outputs
+from meshmatch.cli.options import FitOptions, RunOptions, check_outputs, grouped, optional, output_option
 from meshmatch.cli.words import Console, Json, print_json
 from meshmatch.errors import OptionError
 from meshmatch.models.registry import locate_model
@@ -24,7 +23,7 @@ class SequenceOptions:
     """What the shapes between two shapes are."""
 
     frames: int = Option(9, "--frames", "-n", min=2, max=1000, help="Number of shapes.")
-    through: list[Path] | None = Option(None, metavar="C", help="A shape to pass on the way; may be repeated.")
+    through: list[Path] | None = optional("C", "A shape to pass on the way; may be repeated.")
     start: float = Option(0.0, "--from", metavar="T", help="Time of the first shape; below 0 is before A.")
     stop: float = Option(1.0, "--to", metavar="T", help="Time of the last shape; above 1 is beyond B.")
     mesh: Literal["source", "template"] = Option(
@@ -39,9 +38,7 @@ class SequenceOptions:
         "source: all as A; auto: files, unless the files seem to have different units.",
     )
     format: Literal["ply", "obj", "off", "glb"] = Option("ply", help="Format of the files in a folder.")
-    plot: Path | None = Option(
-        None, metavar="FILE", help="Plot how well each shape keeps volume and distances: .png, .svg or .pdf."
-    )
+    plot: Path | None = optional("FILE", "Plot how well each shape keeps volume and distances: .png, .svg or .pdf.")
 
 
 @grouped
@@ -142,8 +139,7 @@ def _plot(path: Path, result: "meshmatch.Interpolation", met: Met) -> None:
 
 
 def _tell(console: Console, result: "meshmatch.Interpolation", files: list[Path], asked: str) -> None:
-    for note in result.notes:
-        console.say(note)
+    console.say(*result.notes)
     for file, fit in zip(files, result.fits, strict=True):
         console.say(f"{file.name}: {words.fit_words(fit)}")
         words.tell_verdict(console, fit.verdict, fit.reasons, f"the fit of {file.name}")

@@ -6,8 +6,7 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import options, words
-from meshmatch.cli.options import FitOptions, PairOptions, RunOptions, grouped, output_option
-from meshmatch.cli.output_paths import check_outputs
+from meshmatch.cli.options import FitOptions, PairOptions, RunOptions, check_outputs, grouped, output_option
 from meshmatch.cli.words import Console, print_json
 from meshmatch.models.registry import locate_model
 from meshmatch.outputs import replace_on_success
@@ -21,7 +20,7 @@ def match(
     output: Path = output_option("MAP", "The map; its suffix chooses the format: .npy .npz .csv .txt .mat .json."),
     how: PairOptions,
     run: RunOptions,
-    picture: Path | None = Option(None, metavar="PNG", help="Draw both shapes, corresponding points in one colour."),
+    picture: Path | None = options.optional("PNG", "Draw both shapes, corresponding points in one colour."),
 ) -> None:
     """Match every vertex of one shape to another.
 
@@ -68,7 +67,7 @@ def register(
     how: FitOptions,
     run: RunOptions,
     dense: bool = Option(False, "--dense", help="Write the template in its full resolution."),
-    picture: Path | None = Option(None, metavar="PNG", help="Draw the template over the shape, coloured by distance."),
+    picture: Path | None = options.optional("PNG", "Draw the template over the shape, coloured by distance."),
 ) -> None:
     """Fit the model's template to one shape.
 
@@ -94,8 +93,7 @@ def register(
         from meshmatch.render.compose import compose_fit
 
         compose_fit(loaded, fitted, fit.frame.rotation).render(picture)
-    for note in fit.notes:
-        console.say(note)
+    console.say(*fit.notes)
     console.say(f"fitted the template of {how.model} to {loaded.name}: {words.fit_words(fit)}")
     words.tell_verdict(console, fit.verdict, fit.reasons)
     console.say(f"wrote {output}: {fitted.V} vertices, {fitted.F} faces ({fit.seconds:.1f} s)")

@@ -1,4 +1,5 @@
-"""Options that several verbs share: each group is spelled once, and `grouped` adds it to a verb's own options.
+"""Options that several verbs share, and what is checked before the work: each group is spelled once, and `grouped` adds
+it to a verb's own options.
 
 A group is built by `grouped` alone: the defaults of its fields are typer's descriptions of the options.
 """
@@ -6,7 +7,9 @@ A group is built by `grouped` alone: the defaults of its fields are typer's desc
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
@@ -17,6 +20,7 @@ from typer import Argument, Option
 import meshmatch
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit_config import Refine
+from meshmatch.outputs import replace_on_success
 
 if TYPE_CHECKING:
     from meshmatch.arrays import Ints
@@ -54,6 +58,11 @@ def output_option(metavar: str, help: str) -> Any:
     return Option(..., "--output", "-o", metavar=metavar, help=help)
 
 
+def optional(metavar: str, help: str) -> Any:
+    """An option that stands for nothing where it is not given."""
+    return Option(None, metavar=metavar, help=help)
+
+
 def check_axes(up: Axis | None, front: Axis | None) -> None:
     """Refuse up and front along one axis (`OptionError`)."""
     if up is not None and front is not None and up[-1] == front[-1]:
@@ -65,6 +74,43 @@ def check_truth(truth: Path | None, points: tuple[Path, Path] | None) -> bool:
     if truth is not None and points is not None:
         raise OptionError("--truth and --points both give the truth", "choose one of them")
     return truth is not None or points is not None
+
+
+def check_outputs(
+    inputs: Iterable[Path | None], *outputs: Path | None, picture: Path | None = None, chart: Path | None = None
+) -> None:
+    """Refuse, before the work, what could not be written after it. What is None is not wanted.
+
+    `OptionError` if the picture is no PNG, the chart of an unknown kind, or anything would replace an input or another
+    output; `OutputError` if picture or chart cannot be written. (Other outputs are claimed while the work is done.)
+    """
+    if chart is not None:
+        from meshmatch.render.charts import check_chart
+
+        check_chart(chart)
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise OptionError(f"{picture.name}: a picture is a PNG", "end the name in .png")
+    taken = {os.path.realpath(path): "is an input of this command" for path in inputs if path is not None}
+    for path in (*outputs, chart, picture):
+        if path is None:
+            continue
+        real = os.path.realpath(path)  # Path.resolve refuses links that lead in a circle
+        if real in taken:
+            raise OptionError(f"cannot write {path}: it {taken[real]}", "choose another name for the output")
+        taken[real] = "is an output of this command already"
+    for path in (chart, picture):
+        check_writable(path)
+
+
+def check_writable(path: Path | None) -> None:
+    """Refuse a file that cannot be written (`OutputError`), long before it is."""
+    if path is not None:
+        with suppress(_Enough), replace_on_success(path):
+            raise _Enough
+
+
+class _Enough(Exception):
+    """The file can be made."""
 
 
 def load_truth(
@@ -193,7 +239,7 @@ class RuleOptions:
     """What is written where the map is not to be trusted."""
 
     fill: bool = Option(False, "--fill", help="Replace values of low confidence by those of their neighbours.")
-    blank: str | None = Option(None, metavar="VALUE", help="Or write VALUE there. Default: keep them as they are.")
+    blank: str | None = optional("VALUE", "Or write VALUE there. Default: keep them as they are.")
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for a value to be trusted.")
 
     def rule(self, blank: float | str | Sequence[float] | None = None) -> meshmatch.ConfidenceRule:

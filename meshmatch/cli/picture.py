@@ -9,7 +9,6 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import options, words
-from meshmatch.cli.output_paths import check_outputs
 from meshmatch.cli.transfer_options import Transfer, ViewMapOptions
 from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import ModelError, OptionError
@@ -30,37 +29,30 @@ View = Literal["quarter", "front", "left", "right", "back", "above"]
 class PictureOptions:
     """What is shown."""
 
-    map: Path | None = Option(
-        None, metavar="MAP", help="Of two shapes, SOURCE TARGET, a map: matched places in one colour."
-    )
+    map: Path | None = options.optional("MAP", "Of two shapes, SOURCE TARGET, a map: matched places in one colour.")
     confidence: bool = Option(False, "--confidence", help="With --map: its confidence, as a color map.")
     truth: options.Truth = None
     points: options.Points = None
     unit: options.ErrorUnit = Option("cm", help="Of errors: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100.")
-    values: list[Path] | None = Option(
-        None,
-        metavar="FILE",
-        help="A number per vertex, as a color map (.npy .csv); or three, as a colour. Once for each shape.",
+    values: list[Path] | None = options.optional(
+        "FILE", "A number per vertex, as a color map (.npy .csv); or three, as a colour. Once for each shape."
     )
-    title: str | None = Option(None, metavar="TEXT", help="What the numbers of --values are, with their unit.")
-    range: tuple[float, float] | None = Option(
-        None, metavar="LOW HIGH", help="Ends of the scale of a heat; chosen if not given."
+    title: str | None = options.optional("TEXT", "What the numbers of --values are, with their unit.")
+    range: tuple[float, float] | None = options.optional(
+        "LOW HIGH", "Ends of the scale of a heat; chosen if not given."
     )
-    labels: list[Path] | None = Option(
-        None, metavar="FILE", help="A label for each vertex or face (.npy .csv .txt .json). Once for each shape."
+    labels: list[Path] | None = options.optional(
+        "FILE", "A label for each vertex or face (.npy .csv .txt .json). Once for each shape."
     )
     on: Literal["vertices", "faces"] | None = Option(
         None, help="What the labels belong to; told by their count if not given."
     )
-    fit: str | None = Option(
-        None,
-        metavar="MESH|MODEL",
-        help="Over one shape: the template that `meshmatch register` laid on it, or a model whose template is "
+    fit: str | None = options.optional(
+        "MESH|MODEL",
+        "Over one shape: the template that `meshmatch register` laid on it, or a model whose template is "
         "laid on it now. The distance is drawn as a color map.",
     )
-    image: Path | None = Option(
-        None, metavar="FILE", help="A texture for a shape whose file names none, or another one."
-    )
+    image: Path | None = options.optional("FILE", "A texture for a shape whose file names none, or another one.")
     plain: bool = Option(False, "--plain", help="Without textures, colours and nodes.")
     seed: options.Seed = 0
 
@@ -107,9 +99,7 @@ class LookOptions:
     view: View = Option("quarter", help="The side that is shown.")
     up: options.Axis | None = Option(None, help="The files' axis that points up. Guessed if not given.")
     front: options.Axis | None = Option(None, help="The files' axis that the shapes face. Guessed if not given.")
-    size: str | None = Option(
-        None, metavar="WxH", help="Width and height in pixels, such as 1200x800. Fitted if not given."
-    )
+    size: str | None = options.optional("WxH", "Width and height in pixels, such as 1200x800. Fitted if not given.")
     background: str = Option("white", metavar="COLOR", help="white, dark, transparent, or a colour such as #e8f0f8.")
     ground: bool = Option(True, "--ground/--no-ground", help="Whether shadows fall.")
 
@@ -118,19 +108,15 @@ class LookOptions:
         from meshmatch.render.picture import VIEWS, Look
 
         options.check_axes(self.up, self.front)
-        return Look(_size(self.size), self.background, self.up, self.front, *VIEWS[self.view], self.ground)
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    """Width and height of words such as 1200x800 (`OptionError` if invalid)."""
-    if text is None:
-        return None
-    found = re.fullmatch("([0-9]+)x([0-9]+)", text.lower())
-    if found is None:
-        raise OptionError(f"invalid size '{text}'", "give width and height in pixels, such as 1200x800")
-    if max(map(len, found.groups())) > 9:
-        raise OptionError(f"a picture of {text} pixels is too large", "give a size such as 1200x800")
-    return int(found[1]), int(found[2])
+        size = None
+        if self.size is not None:
+            found = re.fullmatch("([0-9]+)x([0-9]+)", self.size.lower())
+            if found is None:
+                raise OptionError(f"invalid size '{self.size}'", "give width and height in pixels, such as 1200x800")
+            if max(map(len, found.groups())) > 9:
+                raise OptionError(f"a picture of {self.size} pixels is too large", "give a size such as 1200x800")
+            size = int(found[1]), int(found[2])
+        return Look(size, self.background, self.up, self.front, *VIEWS[self.view], self.ground)
 
 
 @options.grouped
@@ -144,9 +130,7 @@ def picture(
     output: Path = options.output_option("PNG", "The picture."),
     shown: PictureOptions,
     how: LookOptions,
-    name: list[str] | None = Option(
-        None, metavar="TEXT", help="Text below a shape, once for each. Default: the file's name."
-    ),
+    name: list[str] | None = options.optional("TEXT", "Text below a shape, once for each. Default: the file's name."),
     names: bool = Option(True, "--names/--no-names", help="Write the names."),
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -160,7 +144,7 @@ def picture(
         problem = f"{len(shapes)} shapes need {len(shapes)} names, not {len(name)}"
         raise OptionError(problem, "give --name once for each shape")
     look = how.look()
-    check_outputs([*shapes, *shown.files], picture=output)
+    options.check_outputs([*shapes, *shown.files], picture=output)
     console = Console(quiet)
     subjects = [_load_subject(path, shown) for path in shapes]
     made = _compose(shown, subjects, look, console)
@@ -284,8 +268,7 @@ def view(
     transfer = Transfer(source, target, output, maps, run)
     with transfer.outputs() as (temporary,):
         page = meshmatch.view(source, target, temporary, transfer, up=maps.up, front=maps.front, names=transfer.names)
-    for note in page.notes:
-        transfer.console.say(note)
+    transfer.console.say(*page.notes)
     transfer.console.say(f"wrote {output} ({page.size / 1e6:.1f} MB): open it in a browser")
     record = {"drawn_vertices": list(page.drawn), "bytes": page.size}
     transfer.print_record(record, page.maps, float(page.maps.forward.confidence.mean()))

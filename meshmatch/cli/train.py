@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from typer import Argument, Option
 
-from meshmatch.cli import options
-from meshmatch.cli.output_paths import check_chart, check_writable
+from meshmatch.cli.options import Json, Quiet, Seed, Threads, check_writable, grouped, optional, output_option
 from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import needs
 from meshmatch.models.card import read_card
@@ -24,10 +23,9 @@ if TYPE_CHECKING:
 class PrepareOptions:
     """How shapes are made ready."""
 
-    template: str | None = Option(
-        None,
-        metavar="SHAPE",
-        help="The shape that becomes the template: a name in the folder, or any mesh or cloud. Default: the folder's "
+    template: str | None = optional(
+        "SHAPE",
+        "The shape that becomes the template: a name in the folder, or any mesh or cloud. Default: the folder's "
         "first where all are registered, else the one nearest to all others.",
     )
     align: Literal["none", "near", "rigid"] | None = Option(
@@ -38,10 +36,9 @@ class PrepareOptions:
     scale: Literal["area", "sphere"] = Option(
         "area", help="What is made equal to the template's: surface area, or the radius around the centroid."
     )
-    landmarks: str | None = Option(
-        None,
-        metavar="WHERE",
-        help="Known points of the shapes: a folder of NAME.npy, or a suffix beside them such as .landmarks.npy "
+    landmarks: str | None = optional(
+        "WHERE",
+        "Known points of the shapes: a folder of NAME.npy, or a suffix beside them such as .landmarks.npy "
         "(docs/formats.md).",
     )
     strategy: Literal["parts", "spectral", "geodesic", "uniform"] = Option(
@@ -49,9 +46,7 @@ class PrepareOptions:
         help="Which nodes are rejected: those between two parts (needs --labels), between two spectral clusters, near "
         "two points far apart along the surface, or none.",
     )
-    labels: Path | None = Option(
-        None, metavar="FILE", help="The part of every vertex of a single shape: one number a line, from 0."
-    )
+    labels: Path | None = optional("FILE", "The part of every vertex of a single shape: one number a line, from 0.")
     nodes: int = Option(320, min=4, max=10_000, help="Number of control nodes.")
     radius: float = Option(0.13, min=1e-6, help="Support radius of a node, in units of sqrt(surface area).")
     faces: int = Option(10_000, min=100, help="Triangles of the low resolution.")
@@ -59,17 +54,17 @@ class PrepareOptions:
         "fast",
         help="How the low resolution is made: fast, or slowly with better triangles by MeshLab (extra `meshlab`).",
     )
-    seed: options.Seed = 0
+    seed: Seed = 0
 
 
-@options.grouped
+@grouped
 def prepare(
     *,
     shapes: Path = Argument(..., metavar="SHAPES", help="A folder of shapes, or the one shape of a template."),
-    output: Path = options.output_option("FOLDER", "The output folder; made if needed."),
+    output: Path = output_option("FOLDER", "The output folder; made if needed."),
     how: PrepareOptions,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Make a template, and shapes to learn from.
 
@@ -95,8 +90,7 @@ def prepare(
         found = {"align": made.align, "scale": how.scale, "landmarks": made.landmarks}
     template, registered, picture = made.template, len(made.shapes), output / "nodes.png"
     compose_shapes([(template, None)]).render(picture)
-    for note in made.notes:
-        console.say(note)
+    console.say(*made.notes)
     console.say(
         f"wrote {output}: a template of {template.shape.V} vertices and {template.K} nodes"
         + (f", {registered} registered shapes" if registered else "")
@@ -117,10 +111,9 @@ class TrainOptions:
     template: str = Option(
         "human-T", metavar="NAME", help="A bundled template (human-T, human-A, human-I), or a bundle's file."
     )
-    shapes: Path | None = Option(
-        None,
-        metavar="FOLDER",
-        help="Learn from a folder that `meshmatch prepare` made, with its template. Default: generated human bodies "
+    shapes: Path | None = optional(
+        "FOLDER",
+        "Learn from a folder that `meshmatch prepare` made, with its template. Default: generated human bodies "
         "(needs the extra `train`).",
     )
     unsupervised: bool = Option(
@@ -136,9 +129,7 @@ class TrainOptions:
         help="How a deformation is represented: by moving least squares or radial basis functions of nodes, or by a "
         "network at every point, which is slow (--refine nodes then refines its code).",
     )
-    start: str | None = Option(
-        None, metavar="MODEL", help="Begin with the weights of a trained model of the same template and preset."
-    )
+    start: str | None = optional("MODEL", "Begin with the weights of a trained model of the same template and preset.")
     rate: float | None = Option(None, min=0.0, help="Learning rate; default: the preset's.")
     blend: float | None = Option(
         None,
@@ -153,33 +144,29 @@ class TrainOptions:
         help="How firmly two fits hold a common stretch of the template; written on the card. 1 suits bodies; 0.05 "
         "what differs more from shape to shape, such as organs.",
     )
-    name: str | None = Option(None, metavar="NAME", help="The model's name; default: the folder's.")
+    name: str | None = optional("NAME", "The model's name; default: the folder's.")
     category: str | None = Option(None, help="What it matches; default: human, or the name of the folder of shapes.")
     licence: str = Option("unstated", help="Terms of use of the weights; written on the card.")
     steps: int | None = Option(None, min=1, help="Training steps; default: the preset's.")
     minutes: float | None = Option(None, min=0.0, help="Stop after so many minutes; the same command goes on later.")
     identities: int = Option(4096, min=1, help="How many different bodies are generated.")
-    poses: Path | None = Option(
-        None, metavar="FILE", help="Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md)."
-    )
+    poses: Path | None = optional("FILE", "Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md).")
     pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
     bf16: bool | None = Option(None, "--bf16/--no-bf16", help="bfloat16 arithmetic; default: the preset's choice.")
     workers: int | None = Option(None, min=0, help="Processes that draw batches; default: the preset's.")
-    threads: options.Threads = 1
-    seed: options.Seed = 0
-    picture: Path | None = Option(
-        None, metavar="FILE", help="Draw the losses of this run over its steps: .png, .svg or .pdf."
-    )
+    threads: Threads = 1
+    seed: Seed = 0
+    picture: Path | None = optional("FILE", "Draw the losses of this run over its steps: .png, .svg or .pdf.")
     fresh: bool = Option(False, "--fresh", help="Start anew instead of going on from the folder's checkpoint.")
 
 
-@options.grouped
+@grouped
 def train(
     *,
-    output: Path = options.output_option("FOLDER", "The model folder; also holds the checkpoint."),
+    output: Path = output_option("FOLDER", "The model folder; also holds the checkpoint."),
     how: TrainOptions,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Train a model.
 
@@ -194,7 +181,10 @@ def train(
         from meshmatch.training.recipes import recipe_for
 
     set_threads(how.threads)
-    check_chart(how.picture)
+    if how.picture is not None:
+        from meshmatch.render.charts import check_chart
+
+        check_chart(how.picture)
     make_folder(output)
     check_writable(how.picture)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks

@@ -6,7 +6,7 @@ from typing import Literal
 from typer import Option
 
 import meshmatch
-from meshmatch.cli.options import RuleOptions, RunOptions, grouped, output_option
+from meshmatch.cli.options import RuleOptions, RunOptions, grouped, optional, output_option
 from meshmatch.cli.transfer_options import MapOptions, MapOptionsWithPairs, Picture, Source, Target, Transfer
 from meshmatch.errors import InputError, OptionError
 
@@ -25,8 +25,8 @@ def transfer_color(
     maps: MapOptions,
     rules: RuleOptions,
     run: RunOptions,
-    values: Path | None = Option(
-        None, metavar="FILE", help="Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colours."
+    values: Path | None = optional(
+        "FILE", "Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colours."
     ),
     directions: bool = Option(
         False,
@@ -133,9 +133,7 @@ def transfer_weights(
     output: Path = output_option("FILE", "Skin weights of TGT: .npz .json."),
     maps: MapOptions,
     run: RunOptions,
-    weights: Path | None = Option(
-        None, metavar="FILE", help="Skin weights of SRC: .npz .json .glb. Default: the skin in SRC."
-    ),
+    weights: Path | None = optional("FILE", "Skin weights of SRC: .npz .json .glb. Default: the skin in SRC."),
     influences: int = Option(4, min=1, help="Maximum number of joints per vertex."),
     fill: bool = Option(False, "--fill", help="Replace weights of low confidence by those of their neighbours."),
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for weights to be trusted."),

@@ -12,8 +12,7 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import words
-from meshmatch.cli.options import PAIRS_HELP, PairOptions, RunOptions
-from meshmatch.cli.output_paths import check_outputs
+from meshmatch.cli.options import PAIRS_HELP, PairOptions, RunOptions, check_outputs
 from meshmatch.cli.words import Console, Json, print_json
 from meshmatch.errors import OptionError
 from meshmatch.models.registry import locate_model

@@ -7,7 +7,7 @@ from typing import Literal
 from typer import Option
 
 import meshmatch
-from meshmatch.cli.options import RuleOptions, RunOptions, grouped, output_option
+from meshmatch.cli.options import RuleOptions, RunOptions, grouped, optional, output_option
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
 from meshmatch.cli.words import Console, Json
 from meshmatch.errors import OptionError
@@ -20,9 +20,7 @@ _WORTH_SAYING = 0.002  # of the surface
 class TextureOptions:
     """What is baked, and how."""
 
-    image: Path | None = Option(
-        None, metavar="FILE", help="Image for the texture coordinates of SRC, instead of its own."
-    )
+    image: Path | None = optional("FILE", "Image for the texture coordinates of SRC, instead of its own.")
     uv: Literal["auto", "keep", "new"] = Option(
         "auto", help="Texture coordinates of TGT. auto: reuse valid ones; keep: reuse or fail; new: unwrap."
     )

@@ -34,10 +34,11 @@ class Console:
     quiet: bool = False
     _open: list[tuple[rich.console.Console, ProgressCallback]] = field(default_factory=list)
 
-    def say(self, text: str) -> None:
-        """A line about what was done."""
+    def say(self, *lines: str) -> None:
+        """What was done."""
         if not self.quiet:
-            self._line("", text)
+            for text in lines:
+                self._line("", text)
 
     def warn(self, text: str) -> None:
         """A line that nobody should miss."""
@@ -161,8 +162,7 @@ def tell_verdict(console: Console, verdict: str, reasons: Sequence[str], what: s
     if verdict == "poor":
         console.warn(f"{what} is poor: {why(reasons)}")
     elif verdict != "good":
-        for reason in reasons:
-            console.say(f"note: {reason}")
+        console.say(*(f"note: {reason}" for reason in reasons))
 
 
 def why(reasons: Sequence[str]) -> str:
@@ -177,8 +177,7 @@ def fit_words(fit: meshmatch.Fit) -> str:
 
 def tell_match(console: Console, result: meshmatch.MatchResult, names: Sequence[str]) -> None:
     """What was repaired, and how both shapes were fitted."""
-    for note in result.notes:
-        console.say(note)
+    console.say(*result.notes)
     for name, fit in zip(names, (result.source_fit, result.target_fit), strict=True):
         console.say(f"{name}: {fit_words(fit)}")
 

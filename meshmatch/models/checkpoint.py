@@ -51,7 +51,10 @@ def save_weights(state: Mapping[str, Any], path: str | Path, *, storage: str = "
         if storage == "float32" or not (name.endswith("weight") and floating and array.ndim > 1):
             arrays[name] = array
         elif storage == "int8" and array.ndim == 2 and array.shape[1] >= _SHORT_ROW:
-            arrays[name], arrays[name + SCALE] = _quantised(array)
+            scale = np.abs(array).max(axis=1) / np.float32(127.0)
+            scale = np.where(scale > 0, scale, np.float32(1))  # a row of zeros stays one
+            arrays[name] = np.clip(np.round(array / scale[:, None]), -127, 127).astype(np.int8)
+            arrays[name + SCALE] = scale
         else:
             with np.errstate(over="ignore"):
                 half = array.astype(np.float16)
@@ -106,13 +109,6 @@ def _check(path: Path, held: Mapping[str, TensorInfo], expected: Mapping[str, tu
         fits = scaled and len(shape) == 2 and held[name + SCALE] == TensorInfo("F32", (shape[0],))
         if (held[name].dtype == "I8" or scaled) and not (held[name].dtype == "I8" and fits):
             raise _mismatch(path, f"the scale of {name} is missing or does not fit it")
-
-
-def _quantised(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(R, C) float32 -> (R, C) int8, (R,) float32."""
-    scale = np.abs(matrix).max(axis=1) / np.float32(127.0)
-    scale = np.where(scale > 0, scale, np.float32(1))  # a row of zeros stays one
-    return np.clip(np.round(matrix / scale[:, None]), -127, 127).astype(np.int8), scale
 
 
 def _mismatch(path: Path, reason: str) -> ModelError:

@@ -109,13 +109,8 @@ def find_model(name: str | Path) -> tuple[Path, ModelCard]:
 def load_model(name: str | Path = "human") -> TrainedModel:
     """Load a model by its registry name or folder.
 
-    Raises
-    ------
-    ModelError
-        Unknown name, damaged files, a kernel that is not known here, weights that are not those of the card's network,
-        or a template that is not the one the model was trained with.
-    TemplateError
-        The template's file is damaged.
+    `ModelError` for an unknown name, damaged files, a kernel that is not known here, weights that are not those of the
+    card's network, or a template that is not the one the model was trained with; `TemplateError` if its file is damaged.
     """
     from meshmatch.models.trained import trained_model  # torch
 

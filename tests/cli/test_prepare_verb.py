@@ -78,7 +78,7 @@ def test_one_shape_becomes_a_template(
 
 def test_the_nodes_are_drawn(run: Run, two: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
-    monkeypatch.setattr("meshmatch.render.layout.HEIGHT", 240)
+    monkeypatch.setattr("meshmatch.render.picture.HEIGHT", 240)
     made(run("prepare", two[0], "-o", tmp_path / "out", *FEW, "--json"))
     with Image.open(tmp_path / "out" / "nodes.png") as drawn:
         assert min(drawn.size) > 100
