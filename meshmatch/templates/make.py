@@ -167,12 +167,9 @@ def _complete(
         if not len(fresh):
             fresh = np.arange(min(8, len(extra)))
         nodes = np.concatenate([nodes, extra[fresh]])
-    some = ", ".join(str(int(index)) for index in bad[:5])
-    raise TemplateError(
-        f"{len(bad)} vertices have fewer than four non-coplanar nodes within {config.radius:g} (vertices {some}"
-        + (", ...)" if len(bad) > 5 else ")"),
-        "use more nodes, a larger radius or another strategy",
-    )
+    some = ", ".join(str(index) for index in bad[:5].tolist()) + (", ..." if len(bad) > 5 else "")
+    problem = f"{len(bad)} vertices have fewer than four non-coplanar nodes within {config.radius:g} (vertices {some})"
+    raise TemplateError(problem, "use more nodes, a larger radius or another strategy")
 
 
 def _allowed(

@@ -201,7 +201,6 @@ def largest_weights(weights: csr_array, limit: int) -> csr_array:
     order = np.lexsort((weights.indices, -weights.data, rows))
     rank = np.arange(len(order)) - weights.indptr[rows[order]]
     order = order[(rank < limit) & (weights.data[order] > 0)]
-    kept = csr_array((weights.data[order], (rows[order], weights.indices[order])), shape=weights.shape)
-    total = np.bincount(rows[order], weights.data[order], weights.shape[0])
-    kept.data /= total[np.repeat(np.arange(kept.shape[0]), np.diff(kept.indptr))]
-    return kept
+    rows, data = rows[order], weights.data[order]
+    data = data / np.bincount(rows, data, weights.shape[0])[rows]
+    return csr_array((data, (rows, weights.indices[order])), shape=weights.shape)

@@ -1,14 +1,6 @@
-"""Labels of vertices or faces, from files and to files. A label is a whole number or a word.
+"""Labels of vertices or faces, from files and to files: "Data on a shape" in docs/formats.md says how.
 
-=====  =======================================================================================
-.npy   (N,) int64, or text
-.txt   a label a line
-.csv   ``vertex,label`` or ``face,label``, a row each
-.json  ``{"on": "vertices", "labels": [...]}``
-.ply   the shape with a property ``label`` on vertices or faces and a colour each (written only)
-=====  =======================================================================================
-
-JSON may also be a bare list, or name the parts: ``{"left hand": [17, 18, ...], ...}``.
+A label is a whole number or a word. Files of shapes with a label, .ply, are written only.
 """
 
 from __future__ import annotations
@@ -113,11 +105,9 @@ def _labels(name: str, values: Sequence[Any], shape: Shape, on: str | None) -> L
         problem = f"{name} has {len(values)} labels, and {owner} as many vertices as faces"
         raise OptionError(problem, "say which with --on vertices or --on faces")
     if not fits:
-        raise InputError(
-            f"{name} has {len(values)} labels, but {owner} has {shape.V} vertices and {shape.F} faces"
-            + (f": they cannot be of its {on}" if on else ""),
-            _HINT,
-        )
+        asked = f": they cannot be of its {on}" if on else ""
+        problem = f"{name} has {len(values)} labels, but {owner} has {shape.V} vertices and {shape.F} faces{asked}"
+        raise InputError(problem, _HINT)
     cells: list[Any] = [_whole(value) for value in values]
     if any(cell is None and raw not in (None, "") and raw == raw for cell, raw in zip(cells, values, strict=True)):
         cells = [_word(name, raw) for raw in values]

@@ -1,13 +1,5 @@
-"""Landmarks, named points on a shape: pushed forward along a map, read from files and written.
-
-=====  =======================================================================================
-.csv   a row each: name,vertex,x,y,z,face,w0,w1,w2,confidence
-.json  ``{"landmarks": [{"name": ..., "vertex": ..., "position": [...], ...}, ...]}``
-.pp    MeshLab's picked points: names and positions
-=====  =======================================================================================
-
-Read is whatever says where a landmark is: a vertex; or a face with weights; or a position, which then stands for
-the nearest point of the surface. Also a plain list of vertices, .txt or .npy.
+"""Landmarks, named points on a shape: pushed forward along a map, read from files and written: "Data on a shape" in
+docs/formats.md says how.
 """
 
 from __future__ import annotations
@@ -35,7 +27,6 @@ from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, know
 _ELSEWHERE = 0.25
 LANDMARK_SUFFIXES = (".csv", ".json", ".pp")
 check_landmarks_suffix = partial(table_files.check_suffix, suffixes=LANDMARK_SUFFIXES, what="landmarks")
-_COLUMNS = ("name", "vertex", "x", "y", "z", "face", "w0", "w1", "w2", "confidence")
 _PLACES = ({"vertex"}, {"x", "y", "z"}, {"face", "w0", "w1", "w2"})
 # One as a file has it: name; vertex, face and barycentric, or position. What is missing may be left out.
 _Record = dict[str, Any]
@@ -159,18 +150,15 @@ def load_landmarks(path: str | Path, shape: Shape) -> tuple[Landmarks, float]:
     `InputError` if there is none, or one is not on `shape`.
     """
     readers = {".csv": _read_csv, ".json": _read_json, ".pp": _read_pp, ".txt": _read_vertices, ".npy": _read_vertices}
-
-    def on_shape(path: Path) -> tuple[Landmarks, float]:
-        records = readers[path.suffix.lower()](path)
-        if not records:
-            raise InputError("it holds no landmark")
-        return _on_shape([_named_place(record, k) for k, record in enumerate(records)], shape)
-
-    return table_files.read_by_suffix(path, dict.fromkeys(readers, on_shape), "landmarks", _HINT)
+    on_shape = dict.fromkeys(readers, lambda path: _on_shape(readers[path.suffix.lower()](path), shape))
+    return table_files.read_by_suffix(path, on_shape, "landmarks", _HINT)
 
 
-def _on_shape(entries: Sequence[tuple[str, str, Any]], shape: Shape) -> tuple[Landmarks, float]:
-    """Landmarks in the order of the entries; and the largest distance of a position from the surface."""
+def _on_shape(records: list[_Record], shape: Shape) -> tuple[Landmarks, float]:
+    """Landmarks in the order of the records; and the largest distance of a position from the surface."""
+    if not records:
+        raise InputError("it holds no landmark")
+    entries = [_named_place(record, k) for k, record in enumerate(records)]
     parts: list[Landmarks] = []
     rows: list[int] = []
     largest = 0.0
@@ -292,7 +280,7 @@ def save_landmarks(path: Path, landmarks: Landmarks) -> None:
     rows = list(zip(landmarks.names, *(column.tolist() for column in columns), sure, strict=True))
     if suffix == ".csv":
         cells = ([name, vertex, *xyz, face, *weights, trust] for name, vertex, xyz, face, weights, trust in rows)
-        table_files.write_rows(path, _COLUMNS, cells)
+        table_files.write_rows(path, ["name", "vertex", "x", "y", "z", "face", "w0", "w1", "w2", "confidence"], cells)
     elif suffix == ".json":
         keys = ("name", "vertex", "position", "face", "barycentric", "confidence")
         records = [dict(zip(keys, row, strict=True)) for row in rows]

@@ -1,26 +1,6 @@
-"""Numbers, colours and skin weights of each vertex, from files and to files.
+"""Numbers, colours and skin weights of each vertex, from files and to files: "Data on a shape" in docs/formats.md.
 
-Numbers are
-
-=====  ========================================================================
-.npy   (V,) or (V, D) float64
-.csv   a row per vertex: the vertex, then a column per number, with their names
-.ply   the shape, with a property per number (written only)
-=====  ========================================================================
-
-Colours go into shape files: .ply, .obj, .off, .glb. They are mixed as light; a `Shape` has them as screens show them
-(sRGB), whatever its file has.
-
-Skin weights are in .npz and .json with the same names, also read from the skins of glb and gltf:
-
-=======  =========================================================================================
-format   ``meshmatch skin weights 1``
-names    (J,) text: the joints (bones)
-joints   (V, N) int32: joints of each vertex, by their place in `names`; the heaviest first
-weights  (V, N) float32: how much of each; a row sums to 1, unused places hold joint 0 and weight 0
-=======  =========================================================================================
-
-N is the most that any vertex has. Also read: `weights` (V, J) without `joints`, one column for each joint.
+Colours are mixed as light; a `Shape` has them as screens show them (sRGB), whatever its file has.
 """
 
 from __future__ import annotations
