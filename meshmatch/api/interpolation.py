@@ -30,10 +30,8 @@ from meshmatch.threads import thread_limit
 
 Mesh = Literal["source", "template"]
 Place = Literal["auto", "files", "source"]
-EARLIEST, LATEST = -1.0, 2.0
-"""Times between which a sequence may run: the source is at 0, the target at 1."""
-FORMATS = ("ply", "obj", "off", "glb")
-"""Of the files in a folder."""
+EARLIEST, LATEST = -1.0, 2.0  # times between which a sequence may run
+FORMATS = ("ply", "obj", "off", "glb")  # of the files in a folder
 _HAIR = 1e-9
 _ALIKE = 1.5  # sizes of files in one unit differ by less
 
@@ -69,10 +67,7 @@ class InterpolationOptions:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One shape of a sequence: the source at time 0, the target at 1.
-
-    ``rotation`` (3, 3) leads into a frame with the template's axes, for pictures.
-    """
+    """A shape of a sequence, at 0 the source, at 1 the target; ``rotation`` (3, 3) leads to the axes of the template."""
 
     time: float
     shape: Shape
@@ -179,10 +174,8 @@ def _steps(
 
 
 def save_folder(path: str | Path, result: Interpolation, kind: str = "ply") -> list[str]:
-    """Write each shape of a sequence into a new folder, and a list of them: ``frame-000.ply`` ..., ``frames.json``; the
-    names of the shapes' files, in order.
-
-    `OptionError` for a format that is none of `FORMATS`; `OutputError` where the folder holds something, or cannot be
+    """Write each shape of a sequence into a new folder, ``frame-000.ply`` ..., and a list of them, ``frames.json``; the
+    names of the files in order. `OptionError` for another format; `OutputError` where the folder is not empty, or cannot be
     written.
     """
     if kind not in FORMATS:

@@ -26,7 +26,8 @@ from meshmatch.render.compose import (
 )
 from meshmatch.render.facing import facing, facing_alike
 from meshmatch.render.picture import Look, check_picture
-from meshmatch.render.viewer import PageReport, share_look, write_page
+from meshmatch.render.viewer.looks import share_look
+from meshmatch.render.viewer.page import PageReport, write_page
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
 from meshmatch.shapes.shape import Shape
@@ -168,11 +169,9 @@ def _rotations(
     """How the shapes stand: as they were fitted, if well; else the source as the user or its format says."""
     if maps.match is not None and maps.forward.verdict != "poor":
         # The frame of a fit follows the trunk; what stands is to stay on its ground.
-        first, second = maps.match.rotations
-        return (
-            facing_alike(maps.source, maps.source.verts, maps.source.verts @ first.T),
-            facing_alike(maps.target, maps.target.verts, maps.target.verts @ second.T),
-        )
+        pairs = zip((maps.source, maps.target), maps.match.rotations, strict=True)
+        first, second = (facing_alike(shape, shape.verts, shape.verts @ turn.T) for shape, turn in pairs)
+        return first, second
     if up is not None or front is not None:
         return facing(maps.source, up, front), None
     if isinstance(source, str | Path) and Path(source).suffix.lower() in (".glb", ".gltf"):

@@ -14,7 +14,6 @@ from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.appearance import Appearance, vertex_colors_alone
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.formats import Textured
-from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance, load_coordinates, save_textured
 from meshmatch.threads import thread_limit
 from meshmatch.transfer import bake
@@ -69,7 +68,18 @@ def transfer_texture(
         raise OptionError(f"invalid uv {uv!r}", f"choose one of {', '.join(get_args(Keep))}")
     mesh = as_shape(target, "target")
     own = load_coordinates(target, mesh) if uv != "new" and isinstance(target, str | Path) else None
-    shape, look = _look_of(source, image, look)
+    shape = as_shape(source, "source")
+    if look is None:
+        if isinstance(source, str | Path):
+            look = load_appearance(source, shape, image)
+        elif image is not None:
+            hint = "give the source as a path"
+            raise OptionError("an image needs the texture coordinates of the source's file", hint)
+        elif shape.colors is None:
+            hint = "give the source as a path if its file has a texture, or give look"
+            raise InputError(f"{shape.name or 'the source'} has neither a texture nor colours", hint)
+        else:
+            look = vertex_colors_alone(shape)
     began = time.monotonic()
     with thread_limit(1):
         atlas = atlas_of(mesh, own, options.size, options.padding, uv)
@@ -80,19 +90,3 @@ def transfer_texture(
     with thread_limit(1):
         baked = bake.transfer_texture(shape, look, mesh, maps.backward, atlas, options, report)
     return TexturedResult(baked.mesh, baked, atlas, maps, time.monotonic() - began)
-
-
-def _look_of(source: ShapeLike, image: str | Path | None, look: Appearance | None) -> tuple[Shape, Appearance]:
-    shape = as_shape(source, "source")
-    if look is not None:
-        return shape, look
-    if isinstance(source, str | Path):
-        return shape, load_appearance(source, shape, image)
-    if image is not None:
-        raise OptionError("an image needs the texture coordinates of the source's file", "give the source as a path")
-    if shape.colors is None:
-        raise InputError(
-            f"{shape.name or 'the source'} has neither a texture nor colours",
-            "give the source as a path if its file has a texture, or give look",
-        )
-    return shape, vertex_colors_alone(shape)

@@ -262,7 +262,7 @@ def view(
     Corresponding points have one colour; point at one shape and see the place on the other. The page is a single file
     for any recent browser and needs no network. With --map, --up and --front give the orientation of SOURCE.
     """
-    from meshmatch.render.viewer import check_page
+    from meshmatch.render.viewer.assembly import check_page
 
     check_page(output)
     transfer = Transfer(source, target, output, maps, run)

@@ -89,10 +89,7 @@ def compose_shapes(
 def compose_match(
     source: Shape, target: Shape, vertex_map: VertexMap, rotations: Rotations = (None, None), look: Look = Look()
 ) -> Composition:
-    """The source colored by position and the target in the colors that the map transfers to it; grey: unmatched.
-
-    `InputError` where the map does not belong to these shapes.
-    """
+    """The source colored by position, the target as the map transfers that; grey: unmatched. `InputError`: a foreign map."""
     turns = same_side(source, target, vertex_map, rotations, look.up, look.front)
     here = position_colors(source, turns[0])
     there = matched_colors(here, vertex_map, invert_map(vertex_map, source, target), source)
@@ -144,9 +141,8 @@ def compose_errors(
 
 
 def _painted_points(shape: Shape, vertices: Int[Ints, " N"], values: Float[Floats, " N"], scale: Scale) -> Panel:
-    """A shape with numbers at some of its vertices: interpolated where these lie close together, else drawn as balls.
-
-    In between, a vertex takes the weighted mean of its nearest known ones; one far from all has no value.
+    """A shape with numbers at some of its vertices, drawn as balls. Where these lie close together, the others take the
+    weighted mean of the nearest instead; one far from all has no value.
     """
     own, row, count = np.unique(vertices, return_inverse=True, return_counts=True)
     means = np.bincount(row, values) / count
@@ -190,7 +186,6 @@ def compose_values(
     limits: tuple[float, float] | None = None,
 ) -> Composition:
     """Shapes colored by a number per vertex on one scale, or in given colors: three or four numbers in 0..1 per vertex.
-
     `InputError` where they are neither of these, `OptionError` for ``title`` or ``limits`` with colors.
     """
     tables = [table[:, 0] if table.ndim == 2 and table.shape[1] == 1 else table for table in values]

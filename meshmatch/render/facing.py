@@ -54,9 +54,8 @@ def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Rot
 
 
 def upright(rotation: Rotation) -> Rotation:
-    """The rotation with its up direction snapped to an axis of the file, if it lies near one.
-
-    The frame of a fit follows the torso, which may lean; files nearly always have an axis that points up.
+    """The rotation with its up direction snapped to an axis of the file, if it lies near one: the frame of a fit follows
+    the torso, which may lean; files nearly always have an axis that points up.
     """
     axis = int(np.abs(rotation[1]).argmax())
     upward = np.sign(rotation[1, axis]) * np.eye(3)[axis]
@@ -92,9 +91,8 @@ def facing_matched(source: Shape, target: Shape, vertex_map: VertexMap, rotation
 
 
 def facing_alike(shape: Shape, points: Points, seen: Points) -> Rotation:
-    """Rotation that shows a shape from the side from which another one is seen; if it stands by itself, upright.
-
-    ``points`` are of this shape, in its file's frame; ``seen`` the same of the other one, y up and z to the viewer.
+    """Rotation that shows a shape from the side from which another one is seen; if it stands by itself, upright. ``points``
+    are of this shape, in its file's frame; ``seen`` the same of the other one, y up and z to the viewer.
     """
     a, b = points - points.mean(axis=0), seen - seen.mean(axis=0)
     left, sizes, right = np.linalg.svd(b.T @ a)

@@ -178,9 +178,8 @@ class Page:
 def lay_out(
     boxes: list[Float[Floats, "2 2"]], named: bool, legend: Legend | None, size: tuple[int, int] | None
 ) -> Page:
-    """Place figures on a page; their boxes (left, bottom; right, top) are as they are seen, the foot at 0.
-
-    `OptionError` where the size leaves no room for the shapes above names and legend.
+    """Place figures on a page by their boxes (left, bottom; right, top) as they are seen, the foot at 0; `OptionError` where
+    the size leaves no room for the shapes above names and legend.
     """
     seen = np.stack(boxes)
     shorter = min(size[1], 1.6 * size[0]) if size else HEIGHT
@@ -205,10 +204,7 @@ def lay_out(
 
 
 def _row(boxes: Float[Floats, "N 2 2"], aspect: float) -> tuple[Float[Floats, " N"], Float[Floats, "2 2"]]:
-    """Figures beside each other: x of each one's foot, and the box of all.
-
-    ``aspect`` is width over height to fill, by wider gaps; 0 for the narrowest row.
-    """
+    """x of each one's foot, and the box of all; wider gaps fill an ``aspect``, width over height: 0 is the narrowest row."""
     widths = boxes[:, 1, 0] - boxes[:, 0, 0]
     bottom, top = boxes[:, 0, 1].min(), boxes[:, 1, 1].max()
     gap = _GAP * max(1.0, float(np.median(widths)))

@@ -70,10 +70,7 @@ _SKY_SET, _SKY_FAR = _sky_directions()
 
 
 def visibility(scene: Scene, hits: Hits, rows: Rows, row: Rows, column: Rows) -> Shares:
-    """Shares of the key lamp and of the sky that reach ``rows`` of the hits.
-
-    ``row`` and ``column`` of their pixels select the subset of the directions that each uses.
-    """
+    """Shares of the key lamp and of the sky that reach ``rows`` of the hits; their pixels select subsets of directions."""
     result = np.empty((len(rows), 2), np.float32)
     ground = hits.face[rows] == -2
     side = np.where(ground, GROUND_BLOCK, BLOCK)

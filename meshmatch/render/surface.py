@@ -104,9 +104,8 @@ class TexturePaint:
 
 
 def _solid(material: Material, image: Float[Floats32, " N"], factor: Float[Floats32, " N"]) -> Bool[Bools, " N"]:
-    """Whether there is anything, by the alpha of the image and of its factor.
-
-    Half-transparent glass is drawn as if it were solid; what an image cuts out, such as hair from its card, is not.
+    """Whether there is anything, by the alpha of the image and of its factor: half-transparent glass is drawn as if it were
+    solid, what an image cuts out, such as hair from its card, is not.
     """
     if material.alpha == "opaque":
         return np.ones(len(image), bool)
@@ -184,10 +183,8 @@ def _ball(subdivisions: int) -> tuple[Float[Floats, "V 3"], Int[Ints, "F 3"]]:
     verts = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
     for _ in range(subdivisions):
-        corners = verts[faces]
-        middles = (corners + np.roll(corners, -1, axis=1)) / 2
-        a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-        ab, bc, ca = middles[:, 0], middles[:, 1], middles[:, 2]
+        a, b, c = np.moveaxis(verts[faces], 1, 0)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
         soup = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
         verts, inverse = np.unique(soup.round(12), axis=0, return_inverse=True)
         faces = inverse.reshape(-1, 3)

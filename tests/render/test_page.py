@@ -17,9 +17,10 @@ from meshmatch.errors import InputError, OptionError, OutputError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.facing import facing_alike
 from meshmatch.render.scales import position_colors
-from meshmatch.render.viewer import Looks, write_page
 from meshmatch.render.viewer.assembly import pack, small_integers
 from meshmatch.render.viewer.drawn import draw, relative_size, upright
+from meshmatch.render.viewer.looks import Looks
+from meshmatch.render.viewer.page import write_page
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.colors import UNKNOWN
 from meshmatch.shapes.shape import Shape

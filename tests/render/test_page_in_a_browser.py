@@ -13,7 +13,8 @@ import pytest
 from PIL import Image
 
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.render.viewer import Looks, write_page
+from meshmatch.render.viewer.looks import Looks
+from meshmatch.render.viewer.page import write_page
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
 from tests.render.browser import PHONE, Opened, browser, opened
