@@ -19,8 +19,7 @@ from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import WAYS, Blend, Deviation, Way
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.maps.surface import Surface
-from meshmatch.maps.template_footpoints import SurfaceBinding, in_core_frame
+from meshmatch.maps.footpoints import Surface, SurfaceBinding, in_core_frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
 from meshmatch.progress import ProgressCallback

@@ -29,7 +29,7 @@ from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.surface import Surface
+from meshmatch.maps.footpoints import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import find_model
 from meshmatch.shapes.decimate import decimate

@@ -40,7 +40,7 @@ from meshmatch.experiments.category import Maps, Shapes
 from meshmatch.experiments.sets import Pair, load_folder
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.triangles import vertex_normals
-from meshmatch.maps.surface import Surface
+from meshmatch.maps.footpoints import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import make_folder
 from meshmatch.render.picture import Look

@@ -32,7 +32,7 @@ from meshmatch.errors import ModelError
 from meshmatch.experiments import runner
 from meshmatch.fitting.initial_frames import standing_grid
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.surface import Surface
+from meshmatch.maps.footpoints import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.checkpoint import load_weights, save_weights
 from meshmatch.models.registry import CARD, TEMPLATE, WEIGHTS, read_card

@@ -21,7 +21,7 @@ from meshmatch.experiments import runner
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.evaluate import CM_PER_UNIT
-from meshmatch.maps.template_footpoints import template_footpoints
+from meshmatch.maps.footpoints import template_footpoints
 from meshmatch.outputs import make_folder
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes

@@ -18,8 +18,14 @@ from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.triangles import blend, triangle_areas, unit, vertex_areas, vertex_normals
-from meshmatch.maps.surface import RESTING_WEIGHT, Footpoints, Surface
-from meshmatch.maps.template_footpoints import closest_footpoints, in_core_frame, template_footpoints
+from meshmatch.maps.footpoints import (
+    RESTING_WEIGHT,
+    Footpoints,
+    Surface,
+    closest_footpoints,
+    in_core_frame,
+    template_footpoints,
+)
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape

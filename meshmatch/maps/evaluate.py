@@ -110,9 +110,8 @@ def distortion(
 ) -> float:
     """Mean change of the distance between two points under a map, in units of sqrt(area).
 
-    Compares ``samples`` random source vertices pairwise; both shapes in units of their own sqrt(area). 0 for
-    an isometry; a random map between two bodies has about 0.45. It needs no truth, and sees no left-right
-    flip.
+    Compares ``samples`` random source vertices pairwise; both shapes in units of their own sqrt(area). 0 for an
+    isometry; a random map between two bodies has about 0.45. It needs no truth, and sees no left-right flip.
     """
     index = np.asarray(index)
     chosen = rng.choice(source.V, size=min(samples, source.V), replace=False)

@@ -227,9 +227,8 @@ class VertexMap:
     def compose(self, other: VertexMap) -> VertexMap:
         """This map, then `other`: from this source to the other's target.
 
-        The point of a vertex is where `other` puts the vertex ``index[i]``; the confidence is the lower of
-        the two, the verdict the worse. `InputError` if `other` is no map, or does not start on the shape where this one
-        ends.
+        The point of a vertex is where `other` puts the vertex ``index[i]``; the confidence is the lower of the two, the
+        verdict the worse. `InputError` if `other` is no map, or does not start on the shape where this one ends.
         """
         check_map(other)
         counts = {self.target_vertices, other.source_vertices} - {UNKNOWN}

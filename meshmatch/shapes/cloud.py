@@ -18,13 +18,12 @@ LARGEST = 20_000
 def local_areas(points: Float[Floats, "V 3"]) -> Float[Floats, " V"]:
     """Area that each point stands for, squared units.
 
-    Among points scattered with density n over a surface, the disc that just holds a point's k nearest others
-    has an area of k / n on average; so pi (r_1^2 + ... + r_k^2) / (1 + ... + k) is an unbiased estimate of 1
-    / n, the area per point. (r_k alone would not do: around the vertices of an even mesh the distances come
-    in steps.) Noise makes r larger, by a nearly constant amount once r is well above it: where neighbourhoods
-    are not flat, k grows to half a per cent of the points, and only the growth of r^2 from k / 3 to k counts.
-    Where limbs are thinner than the neighbourhood the result is some per cent low (measured on bodies: -10 to
-    +8 % of area).
+    Among points scattered with density n over a surface, the disc that just holds a point's k nearest others has an
+    area of k / n on average; so pi (r_1^2 + ... + r_k^2) / (1 + ... + k) is an unbiased estimate of 1 / n, the area per
+    point. (r_k alone would not do: around the vertices of an even mesh the distances come in steps.) Noise makes r
+    larger, by a nearly constant amount once r is well above it: where neighbourhoods are not flat, k grows to half a
+    per cent of the points, and only the growth of r^2 from k / 3 to k counts. Where limbs are thinner than the
+    neighbourhood the result is some per cent low (measured on bodies: -10 to +8 % of area).
     """
     if len(points) < 4:
         return np.zeros(len(points))
@@ -46,9 +45,8 @@ def local_areas(points: Float[Floats, "V 3"]) -> Float[Floats, " V"]:
 def estimate_normals(points: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
     """Unit normals: where the neighbourhood is thinnest.
 
-    Signs are made to agree between neighbours (Hoppe et al. 1992, section 3.3), then each connected part is
-    turned to face away from its own center; for an open or very noisy cloud that can be wrong, so treat the
-    sign with care.
+    Signs are made to agree between neighbours (Hoppe et al. 1992, section 3.3), then each connected part is turned to
+    face away from its own center; for an open or very noisy cloud that can be wrong, so treat the sign with care.
     """
     if len(points) < 4:
         return np.zeros((len(points), 3))

@@ -39,10 +39,9 @@ _HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object 
 def load_shape(path: str | Path) -> Shape:
     """Read a mesh or a point cloud as it is: all vertices, in file order, in the file's frame and unit.
 
-    A vertex whose position is not a number is kept in its place and marked in `Shape.invalid`; its `verts`
-    row is then the centroid of the others. The scene of a glb or gltf is one shape: its meshes one after the
-    other, each where the scene puts it. An stl has no shared vertices: every corner of every triangle is a
-    vertex, 3 F of them.
+    A vertex whose position is not a number is kept in its place and marked in `Shape.invalid`; its `verts` row is then
+    the centroid of the others. The scene of a glb or gltf is one shape: its meshes one after the other, each where the
+    scene puts it. An stl has no shared vertices: every corner of every triangle is a vertex, 3 F of them.
 
     `InputError`: the file is missing, empty, cut short, of an unknown kind, or holds no usable vertex.
     """

@@ -52,15 +52,14 @@ class Repaired:
 def repair(shape: Shape) -> Repaired:
     """Drop what is broken, merge what is double, and say so.
 
-    In this order: vertices without a position and the faces that touch them; vertices at exactly the same
-    position are merged if they lie on an open edge (texture seams of obj and glTF files, every corner of an
-    stl; two layers that merely touch stay apart); faces without area; faces that occur twice (both of them,
-    where they are a flap of no volume on a closed surface); outlier parts (see
-    `meshmatch.shapes.faces.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the
-    shape is made of small parts, and only those far from the rest are outliers); vertices that no face uses.
-    Then faces are turned so that neighbours agree and the shape is not inside out. Open and non-manifold
-    edges are counted, not mended. Of a cloud: points without a position, double ones, and outliers far from all
-    others.
+    In this order: vertices without a position and the faces that touch them; vertices at exactly the same position are
+    merged if they lie on an open edge (texture seams of obj and glTF files, every corner of an stl; two layers that
+    merely touch stay apart); faces without area; faces that occur twice (both of them, where they are a flap of no
+    volume on a closed surface); outlier parts (see `meshmatch.shapes.faces.OUTLIER_SHARE`; unless together they are
+    more than a tenth of the surface: then the shape is made of small parts, and only those far from the rest are
+    outliers); vertices that no face uses. Then faces are turned so that neighbours agree and the shape is not inside
+    out. Open and non-manifold edges are counted, not mended. Of a cloud: points without a position, double ones, and
+    outliers far from all others.
 
     `InputError` if nothing is left: no face of a mesh has any area.
     """

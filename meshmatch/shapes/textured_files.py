@@ -29,9 +29,8 @@ def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
     obj: its mtl with Kd, map_Kd, d and map_d, beside it. Everything else: vertex colours.
 
     `shape` is what `load_shape` made of the same file; `image` a picture that takes the place of those that the file
-    names, or that it fails to name.
-    `InputError`: an image or material file is missing, damaged, too large, or outside the file's folder; there are no
-    texture coordinates for `image`; or the file has no look at all.
+    names, or that it fails to name. `InputError`: an image or material file is missing, damaged, too large, or outside
+    the file's folder; there are no texture coordinates for `image`; or the file has no look at all.
     """
     found = find_appearance(path, shape, image)
     if found is None:

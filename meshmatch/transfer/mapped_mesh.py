@@ -5,7 +5,7 @@ the inverse of a map. Where several parts of the image pass by, the most trustwo
 with confidence, near, and never a triangle that the map has pulled apart.
 
 The search is exact for triangles of any size, which an image needs: a map stretches some and shrinks others, and
-leaves vertices without a triangle. `meshmatch.maps.surface` says how other searches differ.
+leaves vertices without a triangle. `meshmatch.maps.footpoints` says how other searches differ.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import closest_on_triangles, interpolate, squared_lengths, unit
-from meshmatch.maps.surface import Footpoints
-from meshmatch.maps.template_footpoints import reassign_islands
+from meshmatch.maps.footpoints import Footpoints, reassign_islands
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.shapes.shape import Shape
 

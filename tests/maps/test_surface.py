@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from meshmatch.maps.surface import Surface
+from meshmatch.maps.footpoints import Surface
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
 from tests.maps.solids import grid

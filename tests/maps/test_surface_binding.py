@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.frames import Frame
-from meshmatch.maps.template_footpoints import SurfaceBinding
+from meshmatch.maps.footpoints import SurfaceBinding
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere

@@ -5,7 +5,7 @@ import pytest
 
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.frames import Frame
-from meshmatch.maps.template_footpoints import (
+from meshmatch.maps.footpoints import (
     neighbour_medians,
     neighbours,
     small_islands,

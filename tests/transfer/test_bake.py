@@ -8,7 +8,7 @@ import pytest
 
 from meshmatch.errors import OptionError
 from meshmatch.geometry.triangles import closest_on_triangles
-from meshmatch.maps.surface import Surface
+from meshmatch.maps.footpoints import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.colors import bytes_of, to_linear, to_srgb

@@ -1,9 +1,8 @@
 """glTF 2.0, binary (glb) and text (gltf): the triangles and points of a scene, where the scene puts them.
 
-Specification: Khronos glTF 2.0. A skinned mesh stands as its joints stand in the file (sections 3.7.3 and
-5.28), so that it fits whatever hangs from the same joints. Animations and morph targets are ignored; materials
-and weights are read by `meshmatch.shapes.formats.gltf_attributes`, files written by
-`meshmatch.shapes.formats.gltf_out`.
+Specification: Khronos glTF 2.0. A skinned mesh stands as its joints stand in the file (sections 3.7.3 and 5.28), so
+that it fits whatever hangs from the same joints. Animations and morph targets are ignored; materials and weights are
+read by `meshmatch.shapes.formats.gltf_attributes`, files written by `meshmatch.shapes.formats.gltf_out`.
 """
 
 from __future__ import annotations
