@@ -29,17 +29,14 @@ _loading = threading.Lock()
 
 def as_model(model: TrainedModel | str | Path) -> TrainedModel:
     """A model, loaded once if it is given by its name or folder (and again if its files have changed since).
-
     `ModelError` where there is none of this name, its files are damaged, or it is something else.
     """
     if not isinstance(model, str | Path):
         from meshmatch.models.trained import TrainedModel
 
         if not isinstance(model, TrainedModel):
-            raise ModelError(
-                f"a model cannot be made of {type(model).__name__}",
-                "give its name, its folder, or what load_model returned",
-            )
+            hint = "give its name, its folder, or what load_model returned"
+            raise ModelError(f"a model cannot be made of {type(model).__name__}", hint)
         return model
     from meshmatch.models.registry import WEIGHTS, locate_model
 
@@ -76,9 +73,8 @@ def validated(shape: Shape) -> Repaired:
     if not fixed.area > 0:
         raise InputError(f"{name} has no surface area", "are all its points the same, or on a line?")
     if clean.far_parts:
-        raise InputError(
-            f"{name} contains {clean.far_parts + 1} large parts far apart", "save each object in a file of its own"
-        )
+        many = f"{name} contains {clean.far_parts + 1} large parts far apart"
+        raise InputError(many, "save each object in a file of its own")
     return clean
 
 
@@ -94,6 +90,5 @@ def checked_threads(threads: int | None) -> int:
 def check_config(config: object) -> None:
     """Refuse what is no `FitConfig` (`OptionError`)."""
     if not isinstance(config, FitConfig):
-        raise OptionError(
-            f"a config is a FitConfig, not {type(config).__name__}", 'such as meshmatch.FitConfig(up="y")'
-        )
+        hint = 'such as meshmatch.FitConfig(up="y")'
+        raise OptionError(f"a config is a FitConfig, not {type(config).__name__}", hint)

@@ -93,10 +93,8 @@ class Matcher:
         with thread_limit(1):
             for fit in (source, target):
                 if not isinstance(fit, Fit):
-                    raise OptionError(
-                        f"a map is made from fits, not from {type(fit).__name__}",
-                        "fit each shape with Matcher.fit; or call match with the shapes themselves",
-                    )
+                    hint = "fit each shape with Matcher.fit; or call match with the shapes themselves"
+                    raise OptionError(f"a map is made from fits, not from {type(fit).__name__}", hint)
             fits = self._agreed((source, target)) if agree else (source, target)
             return map_of_fits(fits, (source, target), self.threads)
 
@@ -188,10 +186,8 @@ class Matcher:
     ) -> tuple[Fit, Fit]:
         for fit in fits:
             if fit.template_hash != self.model.template.hash:
-                raise OptionError(
-                    f"this fit is of another template ({fit.template_hash}, not {self.model.template.hash})",
-                    f"fit the shape with the model {self.model.card.name}",
-                )
+                wrong = f"this fit is of another template ({fit.template_hash}, not {self.model.template.hash})"
+                raise OptionError(wrong, f"fit the shape with the model {self.model.card.name}")
         config = config or replace(self.config, seed=fits[0].seed)
         shapes = [shape_of(fit).shape for fit in fits]
         first, second = agreed_fits(self.model, shapes, list(fits), config, known)

@@ -85,15 +85,13 @@ class MapPair:
             return invert_map(self.forward, self.source, self.target, self.threads)
 
 
-def map_of_fits(fits: tuple[Fit, Fit], before_agreement: tuple[Fit, Fit], threads: int = 1) -> VertexMap:
-    """The map from the shape of the first fit to that of the second.
-
-    `OptionError` where the fits are of different templates, or do not know their shapes.
+def map_of_fits(fits: tuple[Fit, Fit], before: tuple[Fit, Fit], threads: int) -> VertexMap:
+    """The map from the shape of the first fit to that of the second. `OptionError` where the fits are of different
+    templates, or do not know their shapes.
     """
     source, target = fits
-    return build_map(
-        shape_of(source), source, shape_of(target), target, workers=threads, before_agreement=before_agreement
-    )
+    shapes = shape_of(source), shape_of(target)
+    return build_map(shapes[0], source, shapes[1], target, workers=threads, before_agreement=before)
 
 
 def shape_of(fit: Fit) -> Repaired:

@@ -56,10 +56,8 @@ def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> Ma
 
         matcher = Matcher() if found is None else found
         if not isinstance(matcher, Matcher):
-            raise InputError(
-                f"{type(match).__name__} is not a map",
-                "pass a MatchResult, a VertexMap, the path of a map, a Matcher, or nothing to match the shapes",
-            )
+            hint = "pass a MatchResult, a VertexMap, the path of a map, a Matcher, or nothing to match the shapes"
+            raise InputError(f"{type(match).__name__} is not a map", hint)
         found = matcher.match(source, target)
     if isinstance(found, VertexMap):
         return MapPair(source, target, found.for_shapes(source, target, label))

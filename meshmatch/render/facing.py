@@ -31,9 +31,8 @@ _TORSO = 0.2  # half width of the chest without arms
 
 
 def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Rotation:
-    """Rotation into y up, z front, by named axes of the file; what is not named is guessed.
-
-    `OptionError` for an axis other than x, y, z, -x, -y, -z, or the same axis twice.
+    """Rotation into y up, z front, by named axes of the file; what is not named is guessed. `OptionError` for an axis
+    other than x, y, z, -x, -y, -z, or the same axis twice.
     """
     axes = {name: axis.lstrip("+").lower() for name, axis in (("up", up), ("front", front)) if axis is not None}
     for name, axis in axes.items():

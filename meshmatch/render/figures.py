@@ -79,9 +79,8 @@ def rotation_about_x(degrees: float) -> Float[Floats, "3 3"]:
 
 
 def build_figure(panel: Panel, up: str | None, front: str | None, turn: float, tilt: float) -> Figure:
-    """The surfaces of a panel as they are seen (`Look` has the parameters).
-
-    `OptionError` for an invalid axis, or colors of the wrong shape.
+    """The surfaces of a panel as they are seen (`Look` has the parameters). `OptionError` for an invalid axis, or
+    colors of the wrong shape.
     """
     shape = panel.shape
     towards = facing(shape, up, front) if panel.rotation is None else np.asarray(panel.rotation, np.float64)

@@ -196,9 +196,8 @@ def _fine(
     chosen: Rows,
     places: Float[Floats, "R 2"],
 ) -> tuple[Vectors, Float[Floats32, " N"]]:
-    """Light times alpha, and alpha, of chosen pixels of a band, each the mean over places in it.
-
-    Visibility is that of the pixels around, where they lie on the same surface.
+    """Light times alpha, and alpha, of chosen pixels of a band, each the mean over places in it. Visibility is that of
+    the pixels around, where they lie on the same surface.
     """
     shape = (len(hits.face) // viewport.width, viewport.width)
     row, column = np.divmod(np.repeat(chosen, len(places)), shape[1])

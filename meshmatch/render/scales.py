@@ -68,9 +68,8 @@ class Scale:
 
     @classmethod
     def of(cls, values: ArrayLike, title: str = "", limits: tuple[float, float] | None = None) -> Scale:
-        """A scale for these numbers: round ends, from 0 if they are not negative and reach down to it.
-
-        A few numbers far above the others do not count; the legend then says that there are some.
+        """A scale for these numbers: round ends, from 0 if they are not negative and reach down to it. A few numbers
+        far above the others do not count; the legend then says that there are some.
         """
         numbers = np.asarray(values, dtype=np.float64).ravel()
         finite = numbers[np.isfinite(numbers)]

@@ -64,9 +64,8 @@ def pack(arrays: Mapping[str, NDArray[Any]]) -> tuple[list[dict[str, Any]], str]
 def write_html(
     path: Path, name: str, scripts: Sequence[str], words: dict[str, Any], arrays: Mapping[str, NDArray[Any]], title: str
 ) -> int:
-    """Write a page of ``name``.html, ``name``.css, scripts, words and arrays; how many bytes it has.
-
-    Every part is put in once, in one pass: a name cannot pose as a part. `OutputError` where it cannot be written.
+    """Write a page of ``name``.html, ``name``.css, scripts, words and arrays; how many bytes it has. Every part is put
+    in once, in one pass: a name cannot pose as a part. `OutputError` where it cannot be written.
     """
     table, packed = pack(arrays)
     # JSON that stays inside a script element, whatever its strings say.

@@ -66,10 +66,9 @@ def share_look(
     coordinates: tuple[Floats | None, Floats | None] = (None, None),
     workers: int = 1,
 ) -> Looks | None:
-    """The source's look on both shapes; the target's if the source has none; None if neither has one.
-
-    ``own`` is what source and target have in their files, and ``coordinates`` (F, 3, 2) the texture coordinates there,
-    which are baked to where they serve. The maps are from source to target, and from target to source.
+    """The source's look on both shapes; the target's if the source has none; None if neither has one. ``own`` is what
+    source and target have in their files, and ``coordinates`` (F, 3, 2) the texture coordinates there, which are baked
+    to where they serve. The maps are from source to target, and from target to source.
     """
     source, target = shapes
     first, second = own
@@ -109,11 +108,10 @@ def dress(look: Appearance, shape: Shape, part: Drawn) -> tuple[Arrays, dict[str
 
 
 def _skin(look: Appearance, part: Drawn) -> tuple[Arrays, dict[str, Any]]:
-    """A textured surface as the page has it.
-
-    Arrays: ``vertex`` (S,) the row of the shape that is drawn, ``uv`` (S, 2), ``face`` (M, 3) of these S, by material;
-    ``paint`` (S, 3) where vertex colours are to be multiplied; ``image0``, ``image1``...: bytes of files. Words:
-    ``groups``, which faces have which material, and ``images``, the kinds of the files.
+    """A textured surface as the page has it. Arrays: ``vertex`` (S,) the row of the shape that is drawn, ``uv`` (S, 2),
+    ``face`` (M, 3) of these S, by material; ``paint`` (S, 3) where vertex colours are to be multiplied; ``image0``,
+    ``image1``...: bytes of files. Words: ``groups``, which faces have which material, and ``images``, the kinds of the
+    files.
     """
     material = look.material[part.file_face]
     order = np.argsort(material, kind="stable")
