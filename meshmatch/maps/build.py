@@ -63,20 +63,16 @@ def build_map(
     the two fits are of different templates.
     """
     if source_fit.template_hash != target_fit.template_hash:
-        raise OptionError(
-            f"the fits use different templates ({source_fit.template_hash}, {target_fit.template_hash})",
-            "fit both shapes with the same model",
-        )
+        both = f"{source_fit.template_hash}, {target_fit.template_hash}"
+        raise OptionError(f"the fits use different templates ({both})", "fit both shapes with the same model")
     foot, resting = template_footpoints(source.shape, source_fit, workers)
     on_source, distance = foot, foot.distance
     moved = foot.values(source_fit.faces, target_fit.points)
     if is_noisy(source.shape):
         on_source = closest_footpoints(source.shape, source_fit, workers)
         distance = on_source.distance
-        points = in_core_frame(source.shape, source_fit)[0]
-        (moved, resting), _ = expectation(
-            points, source_fit, noise_level(distance), [target_fit.points, source_fit.resting]
-        )
+        points, places = in_core_frame(source.shape, source_fit)[0], [target_fit.points, source_fit.resting]
+        (moved, resting), _ = expectation(points, source_fit, noise_level(distance), places)
     normals = vertex_normals(target_fit.points, target_fit.faces)
     facing = unit(on_source.values(source_fit.faces, normals))
     found = _points_of_target(target.shape, target_fit, moved, facing, resting, workers)
@@ -90,11 +86,8 @@ def build_map(
     verdict = max(source_fit.verdict, target_fit.verdict, key=_VERDICTS.index)
     if verdict == "poor":
         confidence *= _POOR
-    reasons = tuple(
-        f"{side.shape.name}: {reason}"
-        for side, fit in ((source, source_fit), (target, target_fit))
-        for reason in fit.reasons
-    )
+    sides = (source, source_fit), (target, target_fit)
+    reasons = tuple(f"{side.shape.name}: {reason}" for side, fit in sides for reason in fit.reasons)
     original = source.original_to_repaired
     index, face, weights = _in_original(target, found)
     return VertexMap.between(

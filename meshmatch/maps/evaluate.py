@@ -63,8 +63,7 @@ class Errors:
     def curve(self, thresholds: ArrayLike) -> Floats:
         """Share (0..1) of the points with an error of at most each threshold, in units of sqrt(area)."""
         ordered = np.sort(self.values.astype(np.float64))
-        shares: Floats = np.searchsorted(ordered, np.asarray(thresholds), side="right") / len(ordered)
-        return shares
+        return np.asarray(np.searchsorted(ordered, np.asarray(thresholds), side="right") / len(ordered))
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
-from meshmatch.maps import table_files
+from meshmatch.maps import MAP_SUFFIXES, table_files
 from meshmatch.maps.mat_file import read_mat
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap, check_map
 from meshmatch.outputs import replace_on_success
@@ -34,6 +35,7 @@ _WORDS = ("source", "target", "verdict", "source_hash", "target_hash")
 _COUNTS = ("source_vertices", "target_vertices")
 _KNOWN = (*_ARRAYS, *_WORDS, *_COUNTS, "reasons")
 _FORMAT = "meshmatch map 1"
+check_suffix = partial(table_files.check_suffix, suffixes=MAP_SUFFIXES, what="maps")
 
 
 def save_map(path: str | Path, vertex_map: VertexMap) -> None:
@@ -46,11 +48,6 @@ def save_map(path: str | Path, vertex_map: VertexMap) -> None:
     write = _FORMATS[check_suffix(path)][0]
     with replace_on_success(path) as temporary:
         write(temporary, vertex_map)
-
-
-def check_suffix(path: str | Path) -> str:
-    """The suffix in small letters, if maps have it; `OptionError` otherwise. Ask before long work."""
-    return table_files.check_suffix(path, _FORMATS, "maps")
 
 
 def load_map(path: str | Path, source: ShapeLike | None = None, target: ShapeLike | None = None) -> VertexMap:
@@ -123,10 +120,8 @@ def _read_csv(path: Path) -> dict[str, Any]:
     column = {name: table[:, k] for k, name in enumerate(names)}
     if "source_vertex" in column:
         table_files.check_numbered(column["source_vertex"])
-    record = {
-        "index": column["target_vertex"],
-        **{name: column[name] for name in names if name in ("face", "confidence")},
-    }
+    record = {name: column[name] for name in names if name in ("face", "confidence")}
+    record["index"] = column["target_vertex"]
     if {"w0", "w1", "w2"} <= set(names):
         record["barycentric"] = np.column_stack([column[name] for name in ("w0", "w1", "w2")])
     return record

@@ -115,10 +115,7 @@ def short_floats(values: np.ndarray) -> list[Any]:
 
 
 def load_pairs(path: str | Path) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
-    """Read pairs: vertices of the source, and the same N points on the target.
-
-    `InputError` if the file is missing or empty, or is not a table of two columns of vertices.
-    """
+    """Read pairs: vertices of the source, and the same N points on the target; `InputError` as `load_points`."""
     first, second = _table(Path(path), 2, _PAIRS).T.copy()
     return first, second
 

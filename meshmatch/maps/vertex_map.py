@@ -263,10 +263,8 @@ class VertexMap:
 def check_map(found: object) -> None:
     """Refuse what is no `VertexMap` (`InputError`)."""
     if not isinstance(found, VertexMap):
-        raise InputError(
-            f"{type(found).__name__} is not a map",
-            "pass a VertexMap: a MatchResult has one as .map, and VertexMap.between makes one of an index",
-        )
+        hint = "pass a VertexMap: a MatchResult has one as .map, and VertexMap.between makes one of an index"
+        raise InputError(f"{type(found).__name__} is not a map", hint)
 
 
 def check_faces(face: Int[Ints, " V_source"], target_faces: int, label: str) -> None:

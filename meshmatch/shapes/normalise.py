@@ -53,8 +53,7 @@ def unit_sphere_frame(shape: Shape) -> Frame:
     `InputError` if all vertices lie in one point.
     """
     center = _centroid(shape) if shape.area > 0 else shape.bounds.mean(axis=0)
-    valid = shape.verts if shape.invalid is None else shape.verts[~shape.invalid]
-    radius = float(np.sqrt(((valid - center) ** 2).sum(axis=1).max()))
+    radius = float(np.sqrt(np.nanmax(((shape.verts_or_nan - center) ** 2).sum(axis=1))))
     if not radius > 0:
         raise InputError(f"{shape.name or 'the shape'} has no size", "all its vertices lie in one point")
     return Frame(radius, np.eye(3), center)

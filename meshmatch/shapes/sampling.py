@@ -11,7 +11,7 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.geometry.triangles import interpolate
+from meshmatch.geometry.triangles import dot, interpolate, triangle_vectors
 from meshmatch.shapes.shape import Shape
 
 _NEIGHBOURS = 16
@@ -125,8 +125,7 @@ def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Int
     if 3 * len(faces) < len(points):
         rough = f"{cloud.name or 'the cloud'} is too rough for a template: its points lie on no surface"
         raise InputError(rough, "give a cleaner or denser cloud, or a mesh, with --template")
-    a, b, c = (points[faces[:, i]] for i in range(3))
-    outwards = (np.cross(b - a, c - a) * normals[faces].sum(1)).sum(1)
+    outwards = dot(triangle_vectors(points, faces), normals[faces].sum(1))
     faces[outwards < 0] = faces[outwards < 0][:, ::-1]
     used, renumbered = np.unique(faces, return_inverse=True)
     return chosen[used], renumbered.reshape(-1, 3)

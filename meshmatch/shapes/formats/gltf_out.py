@@ -36,7 +36,7 @@ def write(path: Path, shape: Shape) -> None:
         attributes["NORMAL"] = smooth_normals(shape.verts, shape.faces)
     if shape.colors is not None:
         attributes["COLOR_0"] = np.concatenate([to_linear(shape.colors[:, :3]), shape.colors[:, 3:]], axis=1)
-    _write(path, shape.name, attributes, shape.faces)
+    _write(path, shape.name, attributes, shape.faces, {}, b"")
 
 
 def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
@@ -65,14 +65,7 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
     _write(path, name, attributes, faces, look, png)
 
 
-def _write(
-    path: Path,
-    name: str,
-    attributes: dict[str, Floats],
-    faces: Ints,
-    look: dict[str, Any] | None = None,
-    png: bytes = b"",
-) -> None:
+def _write(path: Path, name: str, attributes: dict[str, Floats], faces: Ints, look: dict[str, Any], png: bytes) -> None:
     """Arrays and an image one after the other, each at a multiple of four bytes, behind what describes them."""
     arrays: list[NDArray[Any]] = [values.astype("<f4") for values in attributes.values()]
     primitive: dict[str, Any] = {"attributes": {key: k for k, key in enumerate(attributes)}, "mode": _POINTS}
@@ -99,7 +92,7 @@ def _write(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": name}],
         "meshes": [{"primitives": [primitive], "name": name}],
-        **(look or {}),
+        **look,
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": starts[-1]}],

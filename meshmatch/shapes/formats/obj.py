@@ -50,9 +50,8 @@ def entries_and_faces(name: str, data: bytes, word: bytes) -> tuple[bytes, Ints,
 
     Faces of the old spelling ``fo`` come last.
     """
-    (text, listed), (faces, lines), (old, old_lines) = formats.lines_of(
-        formats.without_comments(data), word, b"f", b"fo"
-    )
+    data = formats.without_comments(data)
+    (text, listed), (faces, lines), (old, old_lines) = formats.lines_of(data, word, b"f", b"fo")
     if len(old_lines):
         faces, lines = faces + b"\n" + old, np.concatenate([lines, old_lines])
     sizes = words_per_line(faces)

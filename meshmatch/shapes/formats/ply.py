@@ -6,7 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ _TYPES = {
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 _END = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:\r\n|[\r\n]|\Z)")
 _CHANNELS = ("red", "green", "blue", "alpha")
+Columns: TypeAlias = Mapping[str, NDArray[Any]]
+_NONE: Columns = MappingProxyType({})
 _NUMBERS = ("x", "y", "z", *_CHANNELS, "r", "g", "b", "a")
 
 
@@ -72,11 +75,7 @@ def read(path: Path, data: bytes) -> Raw:
 
 
 def write(
-    path: Path,
-    shape: Shape,
-    vertex: Mapping[str, NDArray[Any]] | None = None,
-    face: Mapping[str, NDArray[Any]] | None = None,
-    comments: Sequence[str] = (),
+    path: Path, shape: Shape, vertex: Columns = _NONE, face: Columns = _NONE, comments: Sequence[str] = ()
 ) -> None:
     """Binary little-endian; positions as float where that loses nothing, else double; `comments` go into the header.
 
@@ -93,11 +92,11 @@ def write(
     table: dict[str, NDArray[Any]] = dict(zip("xyz", shape.verts_or_nan.T, strict=True))
     if shape.colors is not None:
         table |= zip(_CHANNELS, np.rint(np.clip(shape.colors.T, 0, 1) * 255).astype(np.uint8), strict=True)
-    body = _rows(table | dict(vertex or {}), shape.V, [(axis, kind) for axis in "xyz"], header)
+    body = _rows(table | dict(vertex), shape.V, [(axis, kind) for axis in "xyz"], header)
     if not shape.is_cloud:
         header += [f"element face {shape.F}", "property list uchar int vertex_indices"]
         lists = {"n": np.full(shape.F, 3), "corners": shape.faces}
-        body += _rows(lists | dict(face or {}), shape.F, [("n", "u1"), ("corners", "<i4", (3,))], header)
+        body += _rows(lists | dict(face), shape.F, [("n", "u1"), ("corners", "<i4", (3,))], header)
     path.write_bytes("\n".join([*header, "end_header\n"]).encode() + body)
 
 
