@@ -6,10 +6,9 @@ import typer
 from typer.core import TyperGroup
 
 from meshmatch import __version__
-from meshmatch.cli.evaluate import evaluate
 from meshmatch.cli.info import info
 from meshmatch.cli.interpolate import interpolate
-from meshmatch.cli.match import match, register
+from meshmatch.cli.match import evaluate, match, register
 from meshmatch.cli.models import models
 from meshmatch.cli.picture import picture, view
 from meshmatch.cli.train import prepare, train

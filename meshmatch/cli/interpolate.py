@@ -14,9 +14,6 @@ from meshmatch.errors import OptionError
 from meshmatch.models.registry import locate_model
 from meshmatch.outputs import folder_on_success, replace_on_success
 
-Met = dict[float, str]
-"""Names of the shapes that are passed, by their times."""
-
 
 @dataclass(frozen=True)
 class SequenceOptions:
@@ -83,6 +80,7 @@ def interpolate(
             )  # fmt: skip
         for file, fit in zip(files, result.fits, strict=True):
             words.refuse_poor(run.strict, fit.verdict, (f"{file.name}: {words.why(fit.reasons)}",))
+        # Names of the shapes that are passed, by their times.
         met = dict(zip(result.times, [file.name for file in files], strict=True))
         if sequence.plot is not None:
             _plot(sequence.plot, result, met)
@@ -102,7 +100,7 @@ def interpolate(
         print_json({"output": output, "plot": sequence.plot} | _record(result, files) | chosen | how.record)
 
 
-def _draw_strip(path: Path, result: "meshmatch.Interpolation", met: Met) -> None:
+def _draw_strip(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) -> None:
     """All shapes in a row, each with its time, or the name of the shape that is passed then."""
     from meshmatch.render.figures import Panel
     from meshmatch.render.picture import render_shapes
@@ -112,7 +110,7 @@ def _draw_strip(path: Path, result: "meshmatch.Interpolation", met: Met) -> None
     render_shapes([Panel(step.shape, label=label, rotation=step.rotation) for step, label in pairs], path)
 
 
-def _write_page(path: Path, result: "meshmatch.Interpolation", met: Met) -> None:
+def _write_page(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) -> None:
     """In one frame, that of the first shape: what moves in the files moves on the page."""
     from meshmatch.render.viewer.page import write_motion
 
@@ -125,7 +123,7 @@ def _write_page(path: Path, result: "meshmatch.Interpolation", met: Met) -> None
 _WRITERS = {".png": _draw_strip, ".html": _write_page, ".htm": _write_page}
 
 
-def _plot(path: Path, result: "meshmatch.Interpolation", met: Met) -> None:
+def _plot(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) -> None:
     from meshmatch.render.charts import draw_lines
 
     times = [step.time for step in result.steps]

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 Subject: TypeAlias = "tuple[meshmatch.Shape | Template, Appearance | None]"
 """What was named, with its textures or colors if it has any."""
-View = Literal["quarter", "front", "left", "right", "back", "above"]
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,9 @@ class PictureOptions:
 class LookOptions:
     """How it is shown."""
 
-    view: View = Option("quarter", help="The side that is shown.")
+    view: Literal["quarter", "front", "left", "right", "back", "above"] = Option(
+        "quarter", help="The side that is shown."
+    )
     up: options.Axis | None = Option(None, help="The files' axis that points up. Guessed if not given.")
     front: options.Axis | None = Option(None, help="The files' axis that the shapes face. Guessed if not given.")
     size: str | None = options.optional("WxH", "Width and height in pixels, such as 1200x800. Fitted if not given.")

@@ -16,6 +16,7 @@ from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss
 from meshmatch.training.scans import ScanConfig
 
 Preset = Literal["default", "paper"]
+_CHAMFER = ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4)  # the paper's weights for segmentation transfer
 
 
 @dataclass(frozen=True)
@@ -79,14 +80,12 @@ def small_data() -> Recipe:
 def clouds() -> Recipe:
     """For shapes without correspondence: the network for small data, the paper's weights for segmentation transfer."""
     small = small_data()
-    loss = ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4)
-    return replace(small, train=replace(small.train, loss=loss), storage="float16")
+    return replace(small, train=replace(small.train, loss=_CHAMFER), storage="float16")
 
 
 def paper_clouds() -> Recipe:
     """The paper's network and weights for shapes without correspondence."""
-    loss = ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4)
-    train = TrainConfig(steps=4000, shapes=8, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=loss, workers=0)
+    train = TrainConfig(steps=4000, shapes=8, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=_CHAMFER, workers=0)
     scan = ScanConfig(points=1024, noise=0.0, scale=0.0)
     return Recipe(PAPER, train, scan, "cubic", storage="float16")
 

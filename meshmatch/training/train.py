@@ -43,7 +43,7 @@ class CardFacts:
     folder) begin the training.
     """
 
-    name: str = ""  # of the output folder
+    name: str = ""  # the output folder's
     category: str = ""  # the name of the folder of shapes; "human" for bodies
     data: str = ""  # a sentence about the shapes
     licence: str = "unstated"
@@ -115,9 +115,8 @@ def _source(shapes: Path, template: Template, recipe: Recipe) -> tuple[Source | 
         source = (deformed_source if recipe.deform else registered_source)(verts)
         return source, f"{len(verts)} registered shapes of {name}"
     samples = read_samples(shapes, template)
-    known = len(samples.template_landmarks)
-    words = f"{len(samples.points)} shapes of {name}, without correspondence"
-    return samples, words + (f" and {known} known points" if known else "")
+    known = f" and {len(samples.template_landmarks)} known points" if len(samples.template_landmarks) else ""
+    return samples, f"{len(samples.points)} shapes of {name}, without correspondence{known}"
 
 
 def train_model(
