@@ -33,6 +33,7 @@ def match(
     target matched to vertex i of the source; vertices are counted from 0, in the order of the files.
     """
     from meshmatch.maps.files import check_suffix
+    from meshmatch.maps.vertex_map import DIRECTION
 
     how.check()
     check_suffix(output)
@@ -59,7 +60,10 @@ def match(
     if picture is not None:
         console.say(f"drew {picture}: corresponding points in one colour")
     if run.json:
-        print_json({"output": output, "picture": picture} | words.match_record(result, names) | how.record)
+        fits = [words.fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)]
+        about = {"direction": DIRECTION, "confidence_mean": float(found.confidence.mean()), "notes": result.notes}
+        about |= {"fits": fits, "seconds": round(result.seconds, 3)}
+        print_json({"output": output, "picture": picture} | words.map_record(found, names) | about | how.record)
 
 
 @grouped

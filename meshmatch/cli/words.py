@@ -192,13 +192,3 @@ def map_record(found: meshmatch.VertexMap, names: Sequence[str]) -> Json:
     """A map for --json."""
     sizes = {"source_vertices": found.source_vertices, "target_vertices": found.target_vertices}
     return {"source": names[0], "target": names[1]} | sizes | {"verdict": found.verdict, "reasons": found.reasons}
-
-
-def match_record(result: meshmatch.MatchResult, names: Sequence[str]) -> Json:
-    """A match for --json."""
-    from meshmatch.maps.vertex_map import DIRECTION
-
-    confidence = float(result.map.confidence.mean())
-    fits = [fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)]
-    about = {"direction": DIRECTION, "confidence_mean": confidence, "notes": result.notes, "fits": fits}
-    return map_record(result.map, names) | about | {"seconds": round(result.seconds, 3)}

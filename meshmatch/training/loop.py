@@ -210,11 +210,14 @@ class Trainer:
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
         self.optimiser.step()
         self.step += 1
+        self._update_average()
+        return terms
+
+    def _update_average(self) -> None:
         # A young average follows quickly, an old one slowly.
         keep = min(self.config.average, (1 + self.step) / (10 + self.step))
         names, values = zip(*self.model.named_parameters(), strict=True)
         torch._foreach_lerp_([self.average[n] for n in names], [v.detach() for v in values], 1 - keep)
-        return terms
 
     def _any(self, stop: bool) -> bool:
         """Whether any process says so: one that stopped alone would leave the others waiting for its gradients."""
