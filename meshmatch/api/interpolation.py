@@ -55,10 +55,9 @@ class InterpolationOptions:
 
     def __post_init__(self) -> None:
         if not EARLIEST <= self.start < self.stop <= LATEST:
-            raise OptionError(
-                f"a sequence cannot run from {self.start:g} to {self.stop:g}",
-                f"the source is at 0 and the target at 1; times go from {EARLIEST:g} to {LATEST:g}, the earlier first",
-            )
+            times = f"times go from {EARLIEST:g} to {LATEST:g}, the earlier first"
+            hint = f"the source is at 0 and the target at 1; {times}"
+            raise OptionError(f"a sequence cannot run from {self.start:g} to {self.stop:g}", hint)
         for name, choices in {"mesh": get_args(Mesh), "way": WAYS, "place": get_args(Place)}.items():
             if getattr(self, name) not in choices:
                 raise OptionError(f"invalid {name} {getattr(self, name)!r}", f"choose one of {', '.join(choices)}")

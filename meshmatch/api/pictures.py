@@ -112,10 +112,8 @@ def _composed(
             raise OptionError(f"a fit is of one shape, not of {len(shapes)}", "make a picture for each")
         own = None if fit.repaired is None else fit.repaired.original
         if own is not None and own.hash != shapes[0].hash:
-            raise InputError(
-                f"the fit is of {own.name or 'another shape'}, not of {shapes[0].name or 'this one'}",
-                "draw the shape that was fitted",
-            )
+            what = f"the fit is of {own.name or 'another shape'}, not of {shapes[0].name or 'this one'}"
+            raise InputError(what, "draw the shape that was fitted")
         return compose_fit(shapes[0], fit.shape, fit.frame.rotation)
     looks = [_read_look(source, shape)[0] for source, shape in zip(given, shapes, strict=True)]
     return compose_shapes(list(zip(shapes, looks, strict=True)))

@@ -165,9 +165,8 @@ def evaluate(
                 raise InputError(f"the truth must be numbers of vertices, not {numbers.dtype}", hint)
             known.append(numbers.astype(np.int64))
         if known[0].ndim != 1 or known[0].shape != known[1].shape:
-            raise InputError(
-                f"the truth has {known[0].shape} vertices of the source and {known[1].shape} of the target",
-                "give one target vertex for every source vertex, or a pair of lists of the same length",
-            )
+            what = f"the truth has {known[0].shape} vertices of the source and {known[1].shape} of the target"
+            hint = "give one target vertex for every source vertex, or a pair of lists of the same length"
+            raise InputError(what, hint)
     with thread_limit(1):
         return evaluate_map(vertex_map, source, target, *known, rng=np.random.default_rng(seed))

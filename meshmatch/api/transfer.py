@@ -87,10 +87,8 @@ def transfer_values(
     source = as_shape(source, "source")
     numbers = as_numbers(values, "values")
     if numbers.ndim not in (1, 2) or len(numbers) != source.V:
-        raise InputError(
-            f"values must be an array of ({source.V},) or ({source.V}, D), not {numbers.shape}",
-            "one row for each vertex of the source",
-        )
+        hint = "one row for each vertex of the source"
+        raise InputError(f"values must be an array of ({source.V},) or ({source.V}, D), not {numbers.shape}", hint)
     blank = None if rule.blank is None else as_numbers(rule.blank, "blank")
     if blank is not None and blank.shape not in ((), (1,), numbers.shape[1:]):
         raise OptionError(f"blank has {blank.shape} numbers and the values {numbers.shape[1:]}", "give one number")
@@ -251,10 +249,8 @@ def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape) -> 
         return at_vertices(source, places)
     if places.ndim == 2 and places.shape[1] == 3 and places.dtype.kind in "iuf":
         return at_points(source, places.astype(np.float64))[0]
-    raise InputError(
-        f"landmarks cannot be an array of {places.shape} {places.dtype}",
-        "give vertices (N,) as integers, or positions (N, 3)",
-    )
+    hint = "give vertices (N,) as integers, or positions (N, 3)"
+    raise InputError(f"landmarks cannot be an array of {places.shape} {places.dtype}", hint)
 
 
 def _confidence(maps: MapPair) -> Float[Floats, " V"]:

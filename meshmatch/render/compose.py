@@ -197,10 +197,8 @@ def compose_values(
     for shape, table in zip(shapes, tables, strict=True):
         columns = 1 if table.ndim == 1 else table.shape[1]
         if columns not in (3, 4) or not ((table >= 0) & (table <= 1)).all():
-            raise InputError(
-                f"{shape.name}: {columns} numbers per vertex are neither a scale nor colors",
-                "give one number per vertex, or red, green and blue in 0..1",
-            )
+            hint = "give one number per vertex, or red, green and blue in 0..1"
+            raise InputError(f"{shape.name}: {columns} numbers per vertex are neither a scale nor colors", hint)
     if title or limits is not None:
         raise OptionError("colors have no scale", "leave out the title and the range")
     return Composition(_painted(shapes, tables), caption="the colors of a file")

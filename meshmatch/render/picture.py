@@ -69,10 +69,8 @@ class Look:
         if min(self.size) < 16:
             raise OptionError(f"a picture of {width} x {height} pixels shows nothing", "the minimum is 16 x 16")
         if max(self.size) > MAX_SIDE or width * height > MAX_PIXELS:
-            raise OptionError(
-                f"a picture of {width} x {height} pixels is too large",
-                f"at most {MAX_SIDE} pixels per side and {MAX_PIXELS // 1_000_000} million in total",
-            )
+            hint = f"at most {MAX_SIDE} pixels per side and {MAX_PIXELS // 1_000_000} million in total"
+            raise OptionError(f"a picture of {width} x {height} pixels is too large", hint)
 
 
 def background_color(background: str) -> Ink | None:
