@@ -26,7 +26,7 @@ from meshmatch.maps.footpoints import (
     in_core_frame,
     template_footpoints,
 )
-from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.maps.vertex_map import VERDICTS, VertexMap
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 
@@ -41,7 +41,6 @@ _ROUGH = 0.5  # from this `Shape.roughness` on, noise is larger than the templat
 _SAMPLES = 48  # of the template that share a point
 _NOISE_RANGE = 0.006, 0.03  # units of sqrt(area)
 _CHUNK = 8192  # points at a time
-_VERDICTS = ("good", "fair", "poor")
 
 
 def build_map(
@@ -83,7 +82,7 @@ def build_map(
         for fit, before in zip((source_fit, target_fit), before_agreement, strict=True):
             stretched += np.linalg.norm(foot.values(fit.faces, fit.points - before.points), axis=1)
         confidence *= np.exp(-np.square(stretched / _AGREEMENT_SCALE))
-    verdict = max(source_fit.verdict, target_fit.verdict, key=_VERDICTS.index)
+    verdict = max(source_fit.verdict, target_fit.verdict, key=VERDICTS.index)
     if verdict == "poor":
         confidence *= _POOR
     sides = (source, source_fit), (target, target_fit)
@@ -187,7 +186,6 @@ def most_likely_points(
     tree = cKDTree(np.column_stack([mean, RESTING_WEIGHT * resting_mean, np.sqrt(variance)]))
     query = np.column_stack([moved, RESTING_WEIGHT * resting, np.zeros(len(moved))])
     vertex = tree.query(query, workers=workers)[1].astype(np.int64)
-    weights = np.zeros((len(moved), 3))
-    weights[:, 0] = 1.0
+    weights = np.tile([1.0, 0.0, 0.0], (len(moved), 1))
     distance = np.linalg.norm(moved - points[vertex], axis=1)
     return Footpoints(vertex, np.full(len(moved), -1, np.int64), weights, distance)

@@ -68,10 +68,9 @@ class Errors:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How much of a target a map reaches: little where many source vertices share few of the target's.
+    """How much of a target a map reaches: shares (0..1) of its vertices that are hit, and of the area around them.
 
-    Shares (0..1) of the target's vertices that are hit, and of the area that belongs to them. A source with fewer
-    vertices than the target cannot reach all: `vertices` is at most V_source / V_target.
+    A source with fewer vertices than the target cannot reach all: `vertices` is at most V_source / V_target.
     """
 
     vertices: float

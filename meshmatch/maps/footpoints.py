@@ -113,7 +113,7 @@ class Surface:
         N = len(points)
         vertex = np.empty(N, np.int64)
         face = np.full(N, -1, np.int64)
-        weights = np.zeros((N, 3))
+        weights = np.tile([1.0, 0.0, 0.0], (N, 1))
         distance = np.empty(N)
 
         def answer(low: int) -> None:
@@ -127,8 +127,6 @@ class Surface:
 
         with ThreadPoolExecutor(workers) as pool:
             list(pool.map(answer, range(0, N, _CHUNK)))
-        if not len(self.faces):
-            weights[:, 0] = 1.0
         return Footpoints(vertex, face, weights, distance)
 
     def _on_faces(self, points: Floats, vertex: Ints) -> tuple[Ints, Floats, Floats]:

@@ -110,8 +110,7 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
 def short_floats(values: np.ndarray) -> list[Any]:
     """float32 numbers as the floats with the fewest digits that read back as the same float32."""
-    short: list[Any] = values.astype(np.float32).astype(np.str_).astype(np.float64).tolist()
-    return short
+    return list(values.astype(np.float32).astype(np.str_).astype(np.float64).tolist())
 
 
 def load_pairs(path: str | Path) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:

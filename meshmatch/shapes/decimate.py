@@ -74,11 +74,7 @@ def _fast(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
 
 
 def _by_pymeshlab(verts: Floats, faces: Ints, target: int) -> tuple[Floats, Ints]:
-    """With planar quadrics: well-shaped triangles, topology kept.
-
-    Its filters sit in plugins. Without Debian's libopengl0 some of them are silently missing; without libgl1 the
-    import fails.
-    """
+    """Well-shaped triangles, topology kept. Without Debian's libopengl0 some filters are silently missing."""
     try:
         import pymeshlab
     except ModuleNotFoundError as error:
