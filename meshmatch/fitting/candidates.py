@@ -48,11 +48,11 @@ STAGE = "fitting as a part"
 SHARES = (1.0, 0.8, 0.62, 0.48, 0.36)
 _MIN_SHARE = 0.2  # that a shape is taken to show
 _WIDE_SHARES = (0.8, 0.48)  # for which a wide search tries all frames
-_ROUGH = 1024  # samples by which frames are ranked
+_ROUGH = 768  # samples by which frames are ranked
 # Candidates of each share that are fitted with care, in a narrow and in a wide search.
-_CAREFUL, _CAREFUL_IF_WIDE = 6, 8
+_CAREFUL, _CAREFUL_IF_WIDE = 5, 5
 # Candidates that are completed and fitted again: so many once, of these so many twice, and so many three times.
-_COMPLETED = (14, 7, 4)
+_COMPLETED = (10, 5, 3)
 _VARIED = 2  # candidates of which variants are sought
 _COARSE = 2048
 _MAX_ADDED = 3  # points that complete the samples, for each of them, at most
@@ -137,7 +137,7 @@ def fit_part(task: FitTask, refine: Refine) -> Registration:
     found = _search(task, refine, wide=False)
     if judge_registration(found, partial=True)[0] != "poor":
         return found
-    config = replace(task.config, copies=2 * task.config.copies, hypotheses=4 * task.config.hypotheses)
+    config = replace(task.config, copies=2 * task.config.copies, hypotheses=2 * task.config.hypotheses)
     again = _search(replace(task, config=config), refine, wide=True)
     return min(found, again, key=lambda each: each.candidate.cost)
 

@@ -131,7 +131,7 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
         asked.clear()
         best = candidates.fit_part(task, REFINEMENTS["none"].part)
         found[verdict] = best.candidate.cost
-        assert asked == ({(48, 2, False)} if verdict == "fair" else {(48, 2, False), (96, 8, True)})
+        assert asked == ({(48, 2, False)} if verdict == "fair" else {(48, 2, False), (96, 4, True)})
     assert found["poor"] <= found["fair"]
     assert (found["poor"] < found["fair"]) or not wide_is_better
 
