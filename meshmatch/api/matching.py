@@ -190,7 +190,7 @@ class Matcher:
                 raise OptionError(wrong, f"fit the shape with the model {self.model.card.name}")
         config = config or replace(self.config, seed=fits[0].seed)
         shapes = [shape_of(fit).shape for fit in fits]
-        first, second = agreed_fits(self.model, shapes, list(fits), config, known)
+        first, second = agreed_fits(self.model, shapes, list(fits), config, known, threads=self.threads)
         return first, second
 
 

@@ -10,6 +10,7 @@ decides.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,6 +57,7 @@ def agreed_fits(
     config: FitConfig | None = None,
     landmarks: Sequence[Landmarks] | None = None,
     how: AgreeConfig | None = None,
+    threads: int = 1,
 ) -> list[Fit]:
     """Let the fits of several repaired shapes agree on how the template stretches; by default as the card says how much.
 
@@ -71,8 +73,9 @@ def agreed_fits(
     if how is None:
         how = AgreeConfig()
         how = replace(how, strain=how.strain * model.card.stiffness)
-    members = []
-    for number, (shape, fit) in enumerate(zip(shapes, fits, strict=True)):
+
+    def member(number: int) -> Member:
+        shape, fit = shapes[number], fits[number]
         known = None if landmarks is None else landmarks[number]
         local = None if known is None else (known[0], fit.frame.apply(known[1]))
         own = config.for_noise(shape.roughness)
@@ -80,9 +83,13 @@ def agreed_fits(
         points = fit.frame.apply(frame.undo(samples.points))
         normals = samples.normals @ frame.rotation @ fit.frame.rotation.T
         samples = replace(samples, points=points, normals=normals).facing(system.surface(fit.vectors))
-        members.append(Member(samples, fit.vectors, how.for_noise(shape.roughness), local, fit.partial))
+        return Member(samples, fit.vectors, how.for_noise(shape.roughness), local, fit.partial)
+
+    with ThreadPoolExecutor(threads) as pool:
+        members = list(pool.map(member, range(len(fits))))
+    refined = agree(system, members, config.nodes, threads)
     agreed = []
-    for shape, fit, vectors in zip(shapes, fits, agree(system, members, config.nodes), strict=True):
+    for shape, fit, vectors in zip(shapes, fits, refined, strict=True):
         points = system.moved(vectors)
         distance = vertex_distance(points, fit.frame.apply(shape.verts))
         agreed.append(replace(fit, vectors=vectors, points=points, vertex_distance=distance))
@@ -100,25 +107,30 @@ class Member:
     partial: bool = False  # the shape shows a part only
 
 
-def agree(system: NodeSystem, members: Sequence[Member], nodes: NodeRefineConfig) -> list[Float[Floats, "K 3"]]:
-    """Refine the fits of several shapes together: better node vectors for each.
+def agree(
+    system: NodeSystem, members: Sequence[Member], nodes: NodeRefineConfig, threads: int = 1
+) -> list[Float[Floats, "K 3"]]:
+    """Refine the fits of several shapes together, so many beside each other: better node vectors for each.
 
     ``nodes`` says how pairs of points are found and weighed, where a member's own configuration does not.
     """
+
+    def step(member: Member, vectors: Floats, F: Floats, common: Floats) -> Floats:
+        config = member.config
+        share, points = config.point_share, config.back_points
+        pairing = replace(nodes, point_share=share, back_points=points, shared=config.shared)
+        terms = pair_terms(system, member.samples, vectors, config.scale, pairing, member.partial)
+        if member.landmarks is not None:
+            add_landmarks(terms, member.landmarks, nodes.landmark_weight)
+        targets = nearest_rotations(F, common) @ common
+        return system.solve(*terms, config.strain / len(F), targets, nodes.damping / system.K, vectors)
+
     refined = [member.vectors for member in members]
-    for _ in range(members[0].config.steps):
-        gradients = [system.deformation_gradient(vectors) for vectors in refined]
-        common = mean_stretch(gradients)
-        for number, (member, F) in enumerate(zip(members, gradients, strict=True)):
-            config, vectors = member.config, refined[number]
-            share, points = config.point_share, config.back_points
-            pairing = replace(nodes, point_share=share, back_points=points, shared=config.shared)
-            terms = pair_terms(system, member.samples, vectors, config.scale, pairing, member.partial)
-            if member.landmarks is not None:
-                add_landmarks(terms, member.landmarks, nodes.landmark_weight)
-            targets = nearest_rotations(F, common) @ common
-            damping = nodes.damping / system.K
-            refined[number] = system.solve(*terms, config.strain / len(F), targets, damping, vectors)
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in range(members[0].config.steps):
+            gradients = [system.deformation_gradient(vectors) for vectors in refined]
+            common = [mean_stretch(gradients)] * len(members)
+            refined = list(pool.map(step, members, refined, gradients, common))
     return refined
 
 

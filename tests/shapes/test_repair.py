@@ -364,9 +364,9 @@ def test_same_rows_against_the_slow_way() -> None:
 
 
 def test_same_rows_survives_a_collision(monkeypatch: pytest.MonkeyPatch) -> None:
-    from meshmatch.geometry import topology
+    from meshmatch.geometry import triangles
 
-    monkeypatch.setattr(topology, "_hash", lambda rows: np.zeros(len(rows), np.uint64))
+    monkeypatch.setattr(triangles, "_hash", lambda rows: np.zeros(len(rows), np.uint64))
     rows = np.array([[2, 0, 0], [1, 0, 0], [2, 0, 0], [1, 0, 0]])
     np.testing.assert_array_equal(same_rows(rows), [0, 1, 0, 1])
 
