@@ -47,13 +47,13 @@ STAGE = "fitting as a part"
 # Shares of the surface that a part may show, and all that follows, were set by hand.
 SHARES = (1.0, 0.8, 0.62, 0.48, 0.36)
 _MIN_SHARE = 0.2  # that a shape is taken to show
-_WIDE_SHARES = (0.8, 0.48)  # for which a wide search tries all frames
+_WIDE_SHARES = (0.62,)  # for which a wide search tries all frames
 _ROUGH = 768  # samples by which frames are ranked
 # Candidates of each share that are fitted with care, in a narrow and in a wide search.
 _CAREFUL, _CAREFUL_IF_WIDE = 5, 5
 # Candidates that are completed and fitted again: so many once, of these so many twice, and so many three times.
 _COMPLETED = (10, 5, 3)
-_VARIED = 2  # candidates of which variants are sought
+_VARIED = 1  # candidates of which variants are sought
 _COARSE = 2048
 _MAX_ADDED = 3  # points that complete the samples, for each of them, at most
 

@@ -41,7 +41,7 @@ _POOL = 24  # among how many of the best those that are unlike each other are lo
 # One whose score is so many times the best one's after a few steps never caught up: on 78 bodies of SCAPE, FAUST and
 # SHREC'19 the order changed within 1.004.
 _BEHIND = 1.05
-_PART_FINALISTS = 5  # interpretations of a part that get a few steps each
+_PART_FINALISTS = 4  # interpretations of a part that get a few steps each
 _SCREENED_SAMPLES = 4096  # enough to tell interpretations apart
 
 

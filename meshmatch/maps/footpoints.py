@@ -243,8 +243,9 @@ def small_islands(
     continuous = ~is_discontinuous(edge_lengths(image, edges), length)
     if continuous.all():
         return np.zeros(V, bool)
-    kept = edges[continuous]
-    graph = csr_matrix((np.ones(len(kept)), (kept[:, 0], kept[:, 1])), (V, V))
+    start, end = edges[continuous].astype(np.int32).T
+    graph = csr_matrix((np.ones(len(start), np.int8), (start, end)), (V, V))
+    del start, end
     piece = connected_components(graph, directed=False)[1]
     return np.asarray((np.bincount(piece, areas) < _MAINLAND * areas.sum())[piece])
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -45,6 +45,7 @@ class Objective(ABC):
     of a scan.
     """
 
+    needs_correspondence: ClassVar[bool] = True  # shapes must be registered
     reconstruction: float = 1.0
     volume: float = 5e-3
     arap: float = 1e-2
@@ -138,6 +139,7 @@ class SurfacePoints(LossPoints):
 class ChamferLoss(Objective):
     """The template is pulled to the nearest points of a shape, and they to it; ``landmarks`` weighs known points."""
 
+    needs_correspondence: ClassVar[bool] = False
     landmarks: float = 1.0
 
     def __call__(self, model: Deformer, batch: CloudBatch, points: SurfacePoints, generator: torch.Generator) -> Terms:

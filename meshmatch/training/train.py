@@ -27,7 +27,7 @@ from meshmatch.training import setup
 from meshmatch.training.bodies import Bodies, human_source
 from meshmatch.training.datasets import Source, deformed_source, registered_source
 from meshmatch.training.loop import StepReport, Trainer
-from meshmatch.training.losses import CorrespondenceLoss, held_out_error
+from meshmatch.training.losses import held_out_error
 from meshmatch.training.recipes import Recipe, recipe_for
 
 CHECKPOINT = Path("checkpoint", "last.safetensors")  # in the model folder
@@ -110,7 +110,7 @@ def train(
 def _source(shapes: Path, template: Template, recipe: Recipe) -> tuple[Source | ShapeSamples, str]:
     """The shapes of a prepared folder as a recipe needs them, and a few words about them."""
     name = shapes.resolve().name
-    if isinstance(recipe.train.loss, CorrespondenceLoss):
+    if recipe.train.loss.needs_correspondence:
         verts = torch.from_numpy(read_registered(shapes, template))
         source = (deformed_source if recipe.deform else registered_source)(verts)
         return source, f"{len(verts)} registered shapes of {name}"
