@@ -131,7 +131,7 @@ class Matcher:
 
     def _configs(self, config: FitConfig | Sequence[FitConfig] | None, count: int) -> list[FitConfig]:
         config = self.config if config is None else config
-        configs = [config] * count if isinstance(config, FitConfig) else list(config)
+        configs = list(config) if isinstance(config, Sequence) else [config] * count
         if len(configs) != count:
             raise OptionError(f"{count} shapes need one FitConfig, or {count} of them, not {len(configs)}")
         for each in configs:
