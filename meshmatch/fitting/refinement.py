@@ -38,8 +38,8 @@ _SHARE, _FAR = 0.02, 0.1
 # Interpretations closer than that are the same, and of these so many at most are averaged.
 _NEAR, _MAX_AVERAGED = 0.05, 8
 _POOL = 24  # among how many of the best those that are unlike each other are looked for
-# One whose score is so many times the best one's after a few steps never caught up: on 78 bodies of SCAPE, FAUST and
-# SHREC'19 the order changed within 1.004.
+# One whose score is so many times the best one's after a few steps is left: on 78 bodies of SCAPE, FAUST and SHREC'19 the
+# best after a few steps was the best at the end.
 _BEHIND = 1.05
 _PART_FINALISTS = 4  # interpretations of a part that get a few steps each
 _SCREENED_SAMPLES = 4096  # enough to tell interpretations apart
