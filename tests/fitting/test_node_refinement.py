@@ -62,6 +62,16 @@ def test_the_nearest_rotation_is_the_one_that_was_applied() -> None:
     assert np.allclose(anything @ anything.transpose(0, 2, 1), np.eye(3))
 
 
+def test_nearest_rotations_are_those_of_singular_values() -> None:
+    F, start = np.random.default_rng(0).normal(size=(2, 200, 3, 3))  # half of them turned inside out
+    F[0], F[1, 0] = 0, F[1, 1]  # no rotation is nearest to nothing; a plane has one
+    U, _, Vh = np.linalg.svd(F @ start.transpose(0, 2, 1))
+    U[:, :, 2] *= np.linalg.det(U @ Vh)[:, None]
+    found = nearest_rotations(F, start)
+    assert np.allclose(found[1:], (U @ Vh)[1:])
+    assert np.allclose(found @ found.transpose(0, 2, 1), np.eye(3)) and np.allclose(np.linalg.det(found), 1)
+
+
 def test_pairs_are_those_of_a_plain_loop(system: NodeSystem) -> None:
     scan = scan_of(Shape(1.1 * system.verts + 0.02, system.faces), 60)
     config = replace(CONFIG, back_points=20)
