@@ -159,6 +159,9 @@ class FitOptions:
         help="Treat shapes as partial scans (--partial) or as complete (--whole). Default: detect.",
     )
     seed: Seed = 0
+    device: str = Option(
+        "cpu", metavar="NAME", help="Where the network is evaluated: cpu, or cuda (needs meshmatch[train])."
+    )
 
     @property
     def axes(self) -> tuple[tuple[Axis | None, Axis | None], ...]:
@@ -175,7 +178,7 @@ class FitOptions:
         from meshmatch.fitting.fit_config import FitConfig
 
         partial: Literal["auto", "yes", "no"] = "auto" if self.partial is None else "yes" if self.partial else "no"
-        plain = FitConfig(refine=self.refine, seed=self.seed, partial=partial)
+        plain = FitConfig(refine=self.refine, seed=self.seed, partial=partial, device=self.device)
         return tuple(replace(plain, up=up, front=front) for up, front in self.axes)
 
     @property

@@ -17,8 +17,8 @@ from torch import Tensor
 from meshmatch.arrays import Float
 from meshmatch.errors import TemplateError
 from meshmatch.experiments.ablation_views import BASE, Run
-from meshmatch.models.inference import NetworkConfig
 from meshmatch.models.layers import BasisEncoder, PointEncoder
+from meshmatch.models.network import NetworkConfig
 from meshmatch.templates.make import NodeConfig, Strategy, choose_nodes
 from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import Template, read_template

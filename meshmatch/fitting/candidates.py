@@ -144,7 +144,9 @@ def fit_part(task: FitTask, refine: Refine) -> Registration:
 
 def _search(task: FitTask, refine: Refine, wide: bool) -> Registration:
     """The best fit of a part from some orientations; each search draws the same random numbers."""
-    task = replace(task, predictor=Predictor.of(task.model, np.random.default_rng(task.config.seed)))
+    task = replace(
+        task, predictor=Predictor.of(task.model, np.random.default_rng(task.config.seed), task.config.device)
+    )
     progress = task.progress.stage(STAGE)
     candidates = _careful(task, wide, progress.between(0.0, 0.4))
     for number, count in enumerate(_COMPLETED):

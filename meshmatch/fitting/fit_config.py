@@ -98,6 +98,8 @@ class FitConfig:
     variants, tilt : further interpretations of the best of these: predictions from frames tilted at random, by about so
         many degrees
     finalists, screening : so many interpretations get so many node steps before the best one gets them all
+    device : where the network is evaluated and codes are searched: "cpu", or one of torch's, such as "cuda" (needs the
+        extra ``train``)
     nodes, latent : how node vectors, or codes, are refined
 
     `OptionError` for an unknown refinement, axis or word for ``partial``; up and front along the same axis; or a count
@@ -118,6 +120,7 @@ class FitConfig:
     tilt: float = 15.0
     finalists: int = 4
     screening: int = 4
+    device: str = "cpu"
     nodes: NodeRefineConfig = field(default_factory=NodeRefineConfig)
     latent: LatentRefineConfig = field(default_factory=LatentRefineConfig)
 

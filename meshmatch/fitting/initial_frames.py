@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from meshmatch.arrays import Float, Floats
 from meshmatch.fitting.fit_config import FitConfig, axis_of
 from meshmatch.geometry.frames import Frame, RigidPose
-from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.models.inference import Network, quick_tree
+from meshmatch.geometry.oriented import OrientedPoints, quick_tree
+from meshmatch.models.network import Network
 from meshmatch.models.trained import TrainedModel, once_per_model
 from meshmatch.shapes.normalise import ALIGNS, align
 from meshmatch.shapes.shape import Shape
@@ -45,7 +45,7 @@ def frames_to_try(model: TrainedModel, samples: OrientedPoints, config: FitConfi
         frames = standing_grid(samples.points.mean(0))
     elif frames is None:
         points = samples.points[:_VOTERS]
-        frames = with_flips(propose(model.inference, points, config.copies, config.hypotheses, config.seed))
+        frames = with_flips(propose(model.on(config.device), points, config.copies, config.hypotheses, config.seed))
     up, front = _axes(config)
     if up is None and front is None:
         return frames

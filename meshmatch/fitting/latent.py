@@ -11,7 +11,7 @@ from meshmatch.fields.field import Field, PointField, arap_energy, volume_energy
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.fit_config import LatentRefineConfig
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.models.trained import TrainedModel, once_per_model
+from meshmatch.models.trained import TrainedModel, once_per_model, torch_network
 from meshmatch.progress import Progress
 from meshmatch.shapes.sampling import farthest_points
 
@@ -19,17 +19,22 @@ from meshmatch.shapes.sampling import farthest_points
 class PaperEnergy:
     """The paper's energy of what a decoder answers: Chamfer distance to points drawn from samples, volume, rigidity.
 
-    Samples are in the core frame.
+    Samples are in the core frame. It is computed on one of torch's devices.
     """
 
     def __init__(
-        self, model: TrainedModel, samples: OrientedPoints, config: LatentRefineConfig, rng: np.random.Generator
+        self,
+        model: TrainedModel,
+        samples: OrientedPoints,
+        config: LatentRefineConfig,
+        rng: np.random.Generator,
+        device: str = "cpu",
     ) -> None:
-        self.config = config
+        self.config, self.network = config, torch_network(model, device)
         drawn = samples.drawn(config.points, rng)
-        self.points = torch.from_numpy(drawn).float()
+        self.points = torch.from_numpy(drawn).float().to(device)
         self._tree = cKDTree(drawn)
-        self._template = _on_template(model, min(config.points, model.template.shape.V))
+        self._template = _on_template(model, min(config.points, model.template.shape.V), device)
 
     def __call__(self, vectors: torch.Tensor) -> torch.Tensor:
         """Energy (a scalar tensor) of rows (1, R, 3), such as node vectors, in the core frame."""
@@ -44,7 +49,7 @@ class PaperEnergy:
     def value(self, vectors: Float[Floats, "K 3"]) -> float:
         """The same of an array."""
         with torch.no_grad():
-            return float(self(torch.from_numpy(vectors).float()[None]))
+            return float(self(torch.from_numpy(vectors).float()[None].to(self.points.device)))
 
 
 def refine_code(
@@ -54,6 +59,7 @@ def refine_code(
     rng: np.random.Generator,
     progress: Progress | None = None,
     start: Float[Floats, "K 3"] | None = None,
+    device: str = "cpu",
 ) -> Float[Floats, "K 3"]:
     """Node vectors of the code that fits samples (core frame) best, found by Adam.
 
@@ -61,11 +67,11 @@ def refine_code(
     own answer, or from given node vectors. What the encoder's code does not say of them (the learned corrections, where
     the model has them) stays as a constant offset.
     """
-    energy_of = PaperEnergy(model, samples, config, rng)
-    network = model.network
+    energy_of = PaperEnergy(model, samples, config, rng, device)
+    network = energy_of.network
     with torch.no_grad():
         code = network.encoder(network.encoder.features(energy_of.points[None]))
-        first = network(energy_of.points[None]) if start is None else torch.from_numpy(start).float()[None]
+        first = network(energy_of.points[None]) if start is None else torch.from_numpy(start).float()[None].to(device)
         offset = first - network.decoder(code)
     code = code.detach().clone().requires_grad_(True)
     optimiser = torch.optim.Adam([code], lr=config.rate)
@@ -81,22 +87,25 @@ def refine_code(
         if progress is not None and (step % 20 == 0 or step == config.steps - 1):
             progress((step + 1) / config.steps)
     assert best_vectors is not None
-    return best_vectors.double().numpy()
+    return best_vectors.double().cpu().numpy()
 
 
 @once_per_model
-def _on_template(model: TrainedModel, P: int) -> tuple[torch.Tensor, PointField]:
+def _on_template(model: TrainedModel, P: int, device: str) -> tuple[torch.Tensor, PointField]:
     """Template points (P, 3) and the field there."""
     verts = model.template.shape.verts
     verts = verts[farthest_points(verts, P)]
+    at = torch.from_numpy(verts).float().to(device)
+    if not model.has_nodes:
+        return at, torch_network(model, device).pointwise_field(verts).to(device)
     field = model.field(verts)
-    in_torch: PointField = Field.of(field) if isinstance(field, ShapeFunctions) else field
-    return torch.from_numpy(verts).float(), in_torch.for_descent()
+    assert isinstance(field, ShapeFunctions)
+    return at, Field.of(field).to(device).for_descent()
 
 
 def _chamfer(moved: torch.Tensor, points: torch.Tensor, tree: cKDTree) -> torch.Tensor:
     """Mean squared nearest distances both ways; neighbours from trees, gradients through the distances."""
-    here = moved.detach().numpy()
+    here = moved.detach().cpu().numpy()
     forward = torch.from_numpy(tree.query(here)[1])
-    back = torch.from_numpy(cKDTree(here).query(points.numpy())[1])
+    back = torch.from_numpy(cKDTree(here).query(points.cpu().numpy())[1])
     return (moved - points[forward]).square().sum(1).mean() + (moved[back] - points).square().sum(1).mean()

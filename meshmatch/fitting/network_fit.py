@@ -21,7 +21,7 @@ from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, with_normals
-from meshmatch.models.inference import Network
+from meshmatch.models.network import Network
 from meshmatch.models.trained import TrainedModel, once_per_model
 
 # How many points the network sees of tilted copies, in turn: thin samples tip it either way where it is in doubt.
@@ -120,9 +120,9 @@ class Predictor:
     rng: np.random.Generator
 
     @classmethod
-    def of(cls, model: TrainedModel, rng: np.random.Generator) -> Predictor:
+    def of(cls, model: TrainedModel, rng: np.random.Generator, device: str = "cpu") -> Predictor:
         """The predictor of a trained model."""
-        return cls(model.inference, node_system(model), model.template.core, mirror_of(model), rng)
+        return cls(model.on(device), node_system(model), model.template.core, mirror_of(model), rng)
 
     def fit_all(
         self,

@@ -70,7 +70,8 @@ def _search_code(task: FitTask, candidates: list[Candidate]) -> Candidate:
     local = task.samples.to_local(best.pose)
     facing = local.facing(task.system.surface(best.vectors))
     progress = task.progress.stage("refinement")
-    vectors = refine_code(task.model, facing, task.config.latent, task.predictor.rng, progress)
+    config = task.config
+    vectors = refine_code(task.model, facing, config.latent, task.predictor.rng, progress, device=config.device)
     return Candidate(best.pose, vectors, two_way_residual(task.system, local, vectors))
 
 

@@ -54,7 +54,7 @@ class FitTask:
         rng = np.random.default_rng(config.seed)
         clean = without_outliers(shape)
         frame, samples = take_samples(clean, config.samples, rng, scan_frame(model, clean))
-        predictor = Predictor.of(model, rng)
+        predictor = Predictor.of(model, rng, config.device)
         progress = progress or Progress()
         return cls(model, config, predictor, shape, clean.roughness, frame, samples, landmarks, progress)
 

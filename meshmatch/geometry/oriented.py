@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Bool, Bools, Float, Floats
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
 from meshmatch.geometry.frames import Frame, RigidPose
 
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area). Set by hand.
@@ -92,3 +92,8 @@ def with_normals(
 ) -> Float[Floats, "P 6"]:
     """Six-dimensional positions in which surfaces back to back are apart."""
     return np.concatenate([points, weight * normals], 1)
+
+
+def quick_tree(points: Float[Floats32, "P D"]) -> cKDTree:
+    """A tree that is asked a few times only: built quickly rather than balanced."""
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)

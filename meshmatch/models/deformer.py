@@ -25,7 +25,7 @@ from meshmatch.fields.field import (
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models import layers
-from meshmatch.models.inference import NetworkConfig
+from meshmatch.models.network import NetworkConfig
 
 
 def rotation_from_six(six: Float[torch.Tensor, "B 6"]) -> Float[torch.Tensor, "B 3 3"]:
@@ -138,7 +138,7 @@ class Deformer(nn.Module):
             vectors = self.correct(vectors, points)
         return vectors
 
-    # The same questions in arrays, as `models.inference.Network` has them: for fields that torch alone can evaluate.
+    # The same questions in arrays, as `models.network.Network` has them: for fields that torch alone can evaluate.
 
     @property
     def align_basis(self) -> Float[Floats32, "M 3"]:
@@ -180,7 +180,7 @@ def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
 
 
 def with_weights(config: NetworkConfig, K: int, weights: Mapping[str, np.ndarray]) -> Deformer:
-    """A network for K nodes with given weights (`models.inference.weight_shapes`), in evaluation mode."""
+    """A network for K nodes with given weights (`models.network.weight_shapes`), in evaluation mode."""
     network = blank_deformer(config, K)
     # copies: weights that training changes are no one else's
     network.load_state_dict({name: torch.from_numpy(np.array(w)) for name, w in weights.items()}, assign=True)

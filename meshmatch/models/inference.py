@@ -1,103 +1,63 @@
-"""What a network is made of; what fitting asks of it (`Network`, on whatever device), and NumPy's answers (`NodeNetwork`).
+"""Where a network is evaluated: in NumPy for matching (`NodeNetwork`), or in torch, for pointwise fields and on a GPU.
 
 The layers are few, dense and small: their weights are read from memory once for a batch, so that twenty clouds cost about
-as much as four. `models.deformer` is the same network for training; a test holds both to the same answers.
+as much as four. `models.deformer` is the same network in torch; a test holds both to the same answers.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from itertools import pairwise
-from typing import Literal, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import erf
 
 from meshmatch.arrays import Float, Floats, Floats32
-from meshmatch.errors import ModelError
-from meshmatch.fields.shape_functions import FIELDS, FieldName
+from meshmatch.errors import OptionError, needs
+from meshmatch.fields.shape_functions import has_nodes
+from meshmatch.geometry.oriented import quick_tree
+from meshmatch.models.checkpoint import load_weights
+from meshmatch.models.network import POINT_SIZES, Network, NetworkConfig, weight_shapes
+
+if TYPE_CHECKING:
+    from meshmatch.models.deformer import Deformer
 
 _EPSILON = np.float32(1e-5)  # of layer and batch norms, as in torch
-_POINT_SIZES = (126, 128, 256, 512, 1024)  # of the layers of `models.layers.PointEncoder`
-_MAX = {
-    "code": 4096, "width": 8192, "depth": 64, "basis": 8192,
-    "align_basis": 8192, "align_width": 8192, "corrections": 64, "correct_width": 8192,
-}  # fmt: skip
 
 
-@dataclass(frozen=True)
-class NetworkConfig:
-    """Sizes and choices of a deformer; saved in the model card (cards without ``field`` have moving least squares).
+def load_network(path: str | Path, config: NetworkConfig, K: int) -> Network:
+    """A network for K nodes with the weights of a file, in evaluation mode. A pointwise one needs torch.
 
-    The defaults were chosen on generated bodies (docs/results.md, ablations).
-
-    A pointwise field has a decoder of its own, whatever ``decoder`` says.
+    `ModelError` if the file is damaged, or holds the weights of another network.
     """
+    if has_nodes(config.field):
+        return NodeNetwork(config, load_weights(path, weight_shapes(config, K)))
+    with needs("torch", "train"):
+        from meshmatch.models.deformer import blank_deformer, with_weights
 
-    encoder: Literal["basis", "point"] = "basis"
-    decoder: Literal["flat", "node"] = "flat"
-    code: int = 512
-    width: int = 768
-    depth: int = 2
-    basis: int = 768
-    align_basis: int = 512
-    align_width: int = 512
-    corrections: int = 3
-    correct_width: int = 640
-    field: FieldName = "mls"
-
-    def __post_init__(self) -> None:
-        # A card may come from anywhere: bound what building the network allocates.
-        if self.encoder not in ("basis", "point") or self.decoder not in ("flat", "node"):
-            raise ModelError(f"unknown network: encoder {self.encoder!r}, decoder {self.decoder!r}", "update meshmatch")
-        if self.field not in FIELDS:
-            raise ModelError(f"unknown field {self.field!r}, only {', '.join(FIELDS)}", "update meshmatch")
-        for name, limit in _MAX.items():
-            value = getattr(self, name)
-            if type(value) is not int or not 0 <= value <= limit:
-                raise ModelError(f"network option {name} must be an integer from 0 to {limit}, not {value!r}")
-
-    @staticmethod
-    def from_dict(values: dict) -> NetworkConfig:
-        known = NetworkConfig.__dataclass_fields__
-        unknown = sorted(set(values) - set(known))
-        if unknown:
-            raise ModelError(f"unknown network options: {', '.join(unknown)}", "update meshmatch")
-        return NetworkConfig(**values)
-
-    def to_dict(self) -> dict:
-        return asdict(self)
+    expected = {key: tuple(value.shape) for key, value in blank_deformer(config, K).state_dict().items()}
+    return with_weights(config, K, load_weights(path, expected))
 
 
-PAPER = NetworkConfig(encoder="point", decoder="node", width=1024, align_basis=0, corrections=0)
+def in_torch(network: Network, K: int, device: str = "cpu") -> Deformer:
+    """A network for K nodes as torch has it, on one of torch's devices such as "cuda"; `OptionError` if it is not there."""
+    with needs("torch", "train"):
+        import torch
 
+        from meshmatch.models.deformer import Deformer, with_weights
 
-class Network(Protocol):
-    """What fitting asks of a network; rows are node vectors, or a code where the field is pointwise."""
-
-    @property
-    def config(self) -> NetworkConfig: ...
-
-    @property
-    def align_basis(self) -> Float[Floats32, "M 3"]:
-        """Basis points of the aligner."""
-
-    def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B R 3"]:
-        """Rows for several clouds, of any number of points each, in their core frames."""
-
-    def read_frames(self, offsets: Float[Floats32, "B M 3"]) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
-        """Rotations R and centers t of the core, scan = R core + t, from offsets of basis points to nearest points."""
-
-    def encode(self, cloud: Float[Floats, "P 3"]) -> Float[Floats, " D"]:
-        """The code of a cloud in its core frame."""
-
-    def decode(self, code: Float[Floats, " D"]) -> Float[Floats, "R 3"]:
-        """The rows of a code, without corrections."""
-
-    def rotate_rows(self, rows: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
-        """Rows of the deformation whose moved points (rows) are those of ``rows`` times ``turn``."""
+    if isinstance(network, NodeNetwork):
+        network = with_weights(network.config, K, network.weights)
+    assert isinstance(network, Deformer)
+    try:
+        return copy.deepcopy(network).to(torch.device(device)) if device != "cpu" else network
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise OptionError(
+            f"device {device!r} cannot be used: {str(error).splitlines()[0]}", "write cpu, or cuda"
+        ) from error
 
 
 class NodeNetwork:
@@ -146,7 +106,7 @@ class NodeNetwork:
         angle = np.float32(2 * np.pi) * cloud[:, None, :] * frequencies[:, None]
         x = np.concatenate([np.sin(angle), np.cos(angle)], -1).reshape(len(cloud), -1)
         x /= np.float32(np.sqrt(3 * len(frequencies)))
-        for layer in range(0, 3 * len(_POINT_SIZES) - 3, 3):
+        for layer in range(0, 3 * len(POINT_SIZES) - 3, 3):
             x = np.maximum(x, 0) if layer else x
             x = self._batch_norm(f"encoder.points.{layer + 1}", self._linear(f"encoder.points.{layer}", x))
         return self._linear("encoder.head.3", np.maximum(self._linear("encoder.head.0", x.max(0)), 0))
@@ -202,60 +162,6 @@ class NodeNetwork:
         return self._linear(f"{name}.{last}", _gelu(self._layer_norm(f"{name}.{last - 2}", x)))
 
 
-def weight_shapes(config: NetworkConfig, K: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of the weights and buffers of a network with K nodes, by name; not for pointwise fields."""
-    found: dict[str, tuple[int, ...]] = {"nodes": (K, 3), "anchors": (K, 3), "anchor_phi": (K, K)}
-
-    def linear(name: str, inputs: int, outputs: int, *rest: int) -> None:
-        found.update({f"{name}.weight": (outputs, inputs, *rest), f"{name}.bias": (outputs,)})
-
-    def norm(name: str, width: int) -> None:
-        found.update({f"{name}.weight": (width,), f"{name}.bias": (width,)})
-
-    def batch_norm(name: str, width: int) -> None:
-        norm(name, width)
-        found.update({f"{name}.running_mean": (width,), f"{name}.running_var": (width,)})
-        found[f"{name}.num_batches_tracked"] = ()
-
-    def residual_mlp(name: str, inputs: int, width: int, depth: int, outputs: int) -> None:
-        linear(f"{name}.0", inputs, width)
-        for block in range(1, depth + 1):
-            norm(f"{name}.{block}.norm", width)
-            linear(f"{name}.{block}.widen", width, width)
-            linear(f"{name}.{block}.narrow", width, width)
-        norm(f"{name}.{depth + 1}", width)
-        linear(f"{name}.{depth + 3}", width, outputs)
-
-    code, width = config.code, config.width
-    if config.encoder == "basis":
-        found["encoder.basis"] = (config.basis, 3)
-        residual_mlp("encoder.network", 3 * config.basis, width, config.depth, code)
-    else:
-        found["encoder.frequencies"] = (21,)
-        for number, (inputs, outputs) in enumerate(pairwise(_POINT_SIZES)):
-            linear(f"encoder.points.{3 * number}", inputs, outputs, 1)
-            batch_norm(f"encoder.points.{3 * number + 1}", outputs)
-        linear("encoder.head.0", 1024, 1024)
-        linear("encoder.head.3", 1024, code)
-    if config.decoder == "flat":
-        residual_mlp("decoder.network", code, width, 1, 3 * K)
-    else:
-        found["decoder.nodes"] = (K, 3)
-        linear("decoder.from_code", code, width)
-        found["decoder.from_node.weight"] = (width, 3)
-        batch_norm("decoder.network.0", width)
-        for layer, inputs in ((2, width), (5, width // 2)):
-            linear(f"decoder.network.{layer}", inputs, inputs // 2)
-            batch_norm(f"decoder.network.{layer + 1}", inputs // 2)
-        linear("decoder.network.8", width // 4, 3)
-    if config.align_basis:
-        found["aligner.basis"] = (config.align_basis, 3)
-        residual_mlp("aligner.network", 3 * config.align_basis, config.align_width, 2, 9)
-    if config.corrections:
-        residual_mlp("corrector", 10 * K, config.correct_width, 1, 3 * K)
-    return found
-
-
 def rotation_from_six(six: Float[Floats, "B 6"]) -> Float[Floats, "B 3 3"]:
     """Rotations by Gram-Schmidt on two predicted columns (Zhou et al., CVPR 2019)."""
     a, b = six[:, :3], six[:, 3:]
@@ -263,11 +169,6 @@ def rotation_from_six(six: Float[Floats, "B 6"]) -> Float[Floats, "B 3 3"]:
     b = b - (a * b).sum(-1, keepdims=True) * a
     b = b / np.maximum(np.linalg.norm(b, axis=-1, keepdims=True), 1e-12)
     return np.stack([a, b, np.cross(a, b)], -1)
-
-
-def quick_tree(points: Float[Floats32, "P D"]) -> cKDTree:
-    """A tree that is asked a few times only: built quickly rather than balanced."""
-    return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def _gelu(x: Floats32) -> Floats32:

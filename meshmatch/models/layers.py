@@ -16,7 +16,7 @@ from torch import nn
 
 from meshmatch.arrays import Float, Int
 from meshmatch.fields.field import pack
-from meshmatch.models.inference import quick_tree
+from meshmatch.geometry.oriented import quick_tree
 
 
 def nearest_index(

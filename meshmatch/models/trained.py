@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.errors import ModelError, needs
+from meshmatch.errors import ModelError
 from meshmatch.fields.shape_functions import ShapeFunctions, has_nodes, shape_functions
 from meshmatch.geometry.kernels import KERNELS
 from meshmatch.models.card import ModelCard
-from meshmatch.models.checkpoint import load_weights
-from meshmatch.models.inference import Network, NetworkConfig, NodeNetwork, weight_shapes
+from meshmatch.models.inference import NodeNetwork, in_torch, load_network
+from meshmatch.models.network import Network, NetworkConfig
 from meshmatch.templates.template import Template, load_template
 
 if TYPE_CHECKING:
@@ -66,6 +66,10 @@ class TrainedModel:
         """The network in torch, in evaluation mode, on the CPU; needs the extra ``train``."""
         return torch_network(self)
 
+    def on(self, device: str) -> Network:
+        """What fits ask: in arrays on "cpu", in torch on its other devices (`OptionError` if that is not there)."""
+        return self.inference if device == "cpu" else torch_network(self, device)
+
     @property
     def has_nodes(self) -> bool:
         """Whether its fits are node vectors, which can be solved for; a pointwise model has codes alone."""
@@ -92,29 +96,9 @@ def once_per_model(
 
 
 @once_per_model
-def torch_network(model: TrainedModel) -> Deformer:
-    """The network of a model whose inference is in arrays, as torch has it."""
-    with needs("torch", "train"):
-        from meshmatch.models.deformer import Deformer, with_weights
-
-    if isinstance(model.inference, Deformer):  # pointwise
-        return model.inference
-    assert isinstance(model.inference, NodeNetwork)
-    return with_weights(model.inference.config, model.template.K, model.inference.weights)
-
-
-def load_network(path: str | Path, config: NetworkConfig, K: int) -> Network:
-    """A network for K nodes with the weights of a file, in evaluation mode. A pointwise one needs torch.
-
-    `ModelError` if the file is damaged, or holds the weights of another network.
-    """
-    if has_nodes(config.field):
-        return NodeNetwork(config, load_weights(path, weight_shapes(config, K)))
-    with needs("torch", "train"):
-        from meshmatch.models.deformer import blank_deformer, with_weights
-
-    expected = {key: tuple(value.shape) for key, value in blank_deformer(config, K).state_dict().items()}
-    return with_weights(config, K, load_weights(path, expected))
+def torch_network(model: TrainedModel, device: str = "cpu") -> Deformer:
+    """The network of a model as torch has it, see `meshmatch.models.inference.in_torch`."""
+    return in_torch(model.inference, model.template.K, device)
 
 
 def trained_model(card: ModelCard, template_file: Path, weights_file: Path) -> TrainedModel:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from meshmatch.errors import OptionError
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.checkpoint import Storage
-from meshmatch.models.inference import PAPER, NetworkConfig
+from meshmatch.models.network import PAPER, NetworkConfig
 from meshmatch.templates.prepared_folder import frame_of, is_registered
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss

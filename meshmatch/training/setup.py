@@ -15,7 +15,7 @@ from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.deformer import Deformer
-from meshmatch.models.inference import NetworkConfig
+from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import Template

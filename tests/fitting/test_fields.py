@@ -22,7 +22,7 @@ from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.nodes import refine_nodes
 from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.models.inference import NetworkConfig
+from meshmatch.models.network import NetworkConfig
 from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape

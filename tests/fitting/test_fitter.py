@@ -51,6 +51,20 @@ def fits(model: TrainedModel, egg: Shape) -> dict[Refine, Fit]:
 
 
 @pytest.mark.parametrize("refine", REFINEMENTS)
+def test_torch_on_a_device_fits_as_numpy_does(
+    model: TrainedModel, egg: Shape, fits: dict[Refine, Fit], refine: Refine
+) -> None:
+    there = Fitter(model, replace(QUICK, refine=refine, device="cpu:0")).fit(egg)
+    assert np.allclose(there.points, fits[refine].points, atol=2e-4)
+
+
+@pytest.mark.parametrize("device", ["abacus", "cuda:4096", ""])
+def test_a_device_that_is_not_there_is_said(model: TrainedModel, egg: Shape, device: str) -> None:
+    with pytest.raises(OptionError, match="device"):
+        Fitter(model, replace(QUICK, device=device)).fit(egg)
+
+
+@pytest.mark.parametrize("refine", REFINEMENTS)
 def test_a_fit_is_whole(model: TrainedModel, egg: Shape, fits: dict[Refine, Fit], refine: Refine) -> None:
     fit = fits[refine]
     K, V = model.template.K, model.template.shape.V

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.initial_frames import aligned_frames, scan_frame
-from meshmatch.models.inference import NetworkConfig
+from meshmatch.models.network import NetworkConfig
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import template_radius

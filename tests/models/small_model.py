@@ -10,7 +10,7 @@ import torch
 from meshmatch.models.card import ModelCard, write_card
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import blank_deformer
-from meshmatch.models.inference import NetworkConfig
+from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, save_template
 

@@ -13,7 +13,7 @@ from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import Deformer, blank_deformer, rotation_from_six, with_weights
-from meshmatch.models.inference import PAPER, NetworkConfig, NodeNetwork, weight_shapes
+from meshmatch.models.inference import NodeNetwork, load_network
 from meshmatch.models.layers import (
     BasisEncoder,
     FlatDecoder,
@@ -24,8 +24,9 @@ from meshmatch.models.layers import (
     residual_mlp,
     two_way_offsets,
 )
+from meshmatch.models.network import PAPER, NetworkConfig, weight_shapes
 from meshmatch.models.registry import built_in_folder, load_model
-from meshmatch.models.trained import TrainedModel, load_network
+from meshmatch.models.trained import TrainedModel
 from meshmatch.training.setup import build_deformer
 from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, bent_eggs, egg_template
 

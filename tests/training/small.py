@@ -5,7 +5,7 @@ import torch
 
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.deformer import Deformer
-from meshmatch.models.inference import NetworkConfig
+from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
 from meshmatch.templates.template import Template

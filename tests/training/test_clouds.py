@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from meshmatch.models.inference import NetworkConfig
+from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.prepared_folder import ShapeSamples

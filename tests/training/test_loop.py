@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 
 from meshmatch.errors import ModelError, OptionError, OutputError
 from meshmatch.models.deformer import Deformer
-from meshmatch.models.inference import NetworkConfig
+from meshmatch.models.network import NetworkConfig
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import Batch, BatchDataset
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer, learning_rate

@@ -1,0 +1,145 @@
+"""What a network is made of (`NetworkConfig`, the shapes of its weights), and what fitting asks of it (`Network`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Literal, Protocol
+
+from meshmatch.arrays import Float, Floats, Floats32
+from meshmatch.errors import ModelError
+from meshmatch.fields.shape_functions import FIELDS, FieldName
+
+POINT_SIZES = (126, 128, 256, 512, 1024)  # of the layers of `models.layers.PointEncoder`
+_MAX = {
+    "code": 4096, "width": 8192, "depth": 64, "basis": 8192,
+    "align_basis": 8192, "align_width": 8192, "corrections": 64, "correct_width": 8192,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes and choices of a deformer; saved in the model card (cards without ``field`` have moving least squares).
+
+    The defaults were chosen on generated bodies (docs/results.md, ablations).
+
+    A pointwise field has a decoder of its own, whatever ``decoder`` says.
+    """
+
+    encoder: Literal["basis", "point"] = "basis"
+    decoder: Literal["flat", "node"] = "flat"
+    code: int = 512
+    width: int = 768
+    depth: int = 2
+    basis: int = 768
+    align_basis: int = 512
+    align_width: int = 512
+    corrections: int = 3
+    correct_width: int = 640
+    field: FieldName = "mls"
+
+    def __post_init__(self) -> None:
+        # A card may come from anywhere: bound what building the network allocates.
+        if self.encoder not in ("basis", "point") or self.decoder not in ("flat", "node"):
+            raise ModelError(f"unknown network: encoder {self.encoder!r}, decoder {self.decoder!r}", "update meshmatch")
+        if self.field not in FIELDS:
+            raise ModelError(f"unknown field {self.field!r}, only {', '.join(FIELDS)}", "update meshmatch")
+        for name, limit in _MAX.items():
+            value = getattr(self, name)
+            if type(value) is not int or not 0 <= value <= limit:
+                raise ModelError(f"network option {name} must be an integer from 0 to {limit}, not {value!r}")
+
+    @staticmethod
+    def from_dict(values: dict) -> NetworkConfig:
+        known = NetworkConfig.__dataclass_fields__
+        unknown = sorted(set(values) - set(known))
+        if unknown:
+            raise ModelError(f"unknown network options: {', '.join(unknown)}", "update meshmatch")
+        return NetworkConfig(**values)
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+
+PAPER = NetworkConfig(encoder="point", decoder="node", width=1024, align_basis=0, corrections=0)
+
+
+class Network(Protocol):
+    """What fitting asks of a network; rows are node vectors, or a code where the field is pointwise."""
+
+    @property
+    def config(self) -> NetworkConfig: ...
+
+    @property
+    def align_basis(self) -> Float[Floats32, "M 3"]:
+        """Basis points of the aligner."""
+
+    def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B R 3"]:
+        """Rows for several clouds, of any number of points each, in their core frames."""
+
+    def read_frames(self, offsets: Float[Floats32, "B M 3"]) -> tuple[Float[Floats, "B 3 3"], Float[Floats, "B 3"]]:
+        """Rotations R and centers t of the core, scan = R core + t, from offsets of basis points to nearest points."""
+
+    def encode(self, cloud: Float[Floats, "P 3"]) -> Float[Floats, " D"]:
+        """The code of a cloud in its core frame."""
+
+    def decode(self, code: Float[Floats, " D"]) -> Float[Floats, "R 3"]:
+        """The rows of a code, without corrections."""
+
+    def rotate_rows(self, rows: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
+        """Rows of the deformation whose moved points (rows) are those of ``rows`` times ``turn``."""
+
+
+def weight_shapes(config: NetworkConfig, K: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the weights and buffers of a network with K nodes, by name; not for pointwise fields."""
+    found: dict[str, tuple[int, ...]] = {"nodes": (K, 3), "anchors": (K, 3), "anchor_phi": (K, K)}
+
+    def linear(name: str, inputs: int, outputs: int, *rest: int) -> None:
+        found.update({f"{name}.weight": (outputs, inputs, *rest), f"{name}.bias": (outputs,)})
+
+    def norm(name: str, width: int) -> None:
+        found.update({f"{name}.weight": (width,), f"{name}.bias": (width,)})
+
+    def batch_norm(name: str, width: int) -> None:
+        norm(name, width)
+        found.update({f"{name}.running_mean": (width,), f"{name}.running_var": (width,)})
+        found[f"{name}.num_batches_tracked"] = ()
+
+    def residual_mlp(name: str, inputs: int, width: int, depth: int, outputs: int) -> None:
+        linear(f"{name}.0", inputs, width)
+        for block in range(1, depth + 1):
+            norm(f"{name}.{block}.norm", width)
+            linear(f"{name}.{block}.widen", width, width)
+            linear(f"{name}.{block}.narrow", width, width)
+        norm(f"{name}.{depth + 1}", width)
+        linear(f"{name}.{depth + 3}", width, outputs)
+
+    code, width = config.code, config.width
+    if config.encoder == "basis":
+        found["encoder.basis"] = (config.basis, 3)
+        residual_mlp("encoder.network", 3 * config.basis, width, config.depth, code)
+    else:
+        found["encoder.frequencies"] = (21,)
+        for number, (inputs, outputs) in enumerate(pairwise(POINT_SIZES)):
+            linear(f"encoder.points.{3 * number}", inputs, outputs, 1)
+            batch_norm(f"encoder.points.{3 * number + 1}", outputs)
+        linear("encoder.head.0", 1024, 1024)
+        linear("encoder.head.3", 1024, code)
+    if config.decoder == "flat":
+        residual_mlp("decoder.network", code, width, 1, 3 * K)
+    else:
+        found["decoder.nodes"] = (K, 3)
+        linear("decoder.from_code", code, width)
+        found["decoder.from_node.weight"] = (width, 3)
+        batch_norm("decoder.network.0", width)
+        for layer, inputs in ((2, width), (5, width // 2)):
+            linear(f"decoder.network.{layer}", inputs, inputs // 2)
+            batch_norm(f"decoder.network.{layer + 1}", inputs // 2)
+        linear("decoder.network.8", width // 4, 3)
+    if config.align_basis:
+        found["aligner.basis"] = (config.align_basis, 3)
+        residual_mlp("aligner.network", 3 * config.align_basis, config.align_width, 2, 9)
+    if config.corrections:
+        residual_mlp("corrector", 10 * K, config.correct_width, 1, 3 * K)
+    return found
