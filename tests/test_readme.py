@@ -102,8 +102,8 @@ def test_every_verb_is_shown_on_some_page() -> None:
 
 
 def test_a_call_that_the_program_would_refuse_is_noticed() -> None:
-    (call,) = calls("```bash\nmeshmatch match a.ply b.ply \\\n  -o m.npy --colour red  # no\n```\n")
-    with pytest.raises(TyperException, match="--colour"):
+    (call,) = calls("```bash\nmeshmatch match a.ply b.ply \\\n  -o m.npy --color red  # no\n```\n")
+    with pytest.raises(TyperException, match="--color"):
         parse(call)
     with pytest.raises(TyperException, match="'w' is not one of"):
         parse(["match", "a.ply", "b.ply", "-o", "m.npy", "--up", "w"])

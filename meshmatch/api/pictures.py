@@ -51,8 +51,8 @@ def picture(
 
     ``shapes`` are each as in `match`, those given as files with their textures; or what one of the functions of
     `meshmatch.render.compose` returned, such as the errors of a map. With the ``match`` or map of two shapes
-    corresponding points have one colour. ``values`` are for each shape a number per vertex (V,), shown as a color map, or
-    colours (V, 3 or 4) in 0..1; ``labels`` for each shape one per vertex or face. With the ``fit`` of the one shape its
+    corresponding points have one color. ``values`` are for each shape a number per vertex (V,), shown as a color map, or
+    colors (V, 3 or 4) in 0..1; ``labels`` for each shape one per vertex or face. With the ``fit`` of the one shape its
     template is drawn over it, with its distance as a color map. ``look`` is size, background, axes and side; ``names``
     are written below the shapes.
 
@@ -100,7 +100,7 @@ def _composed(
             what = f"values of {shape.name or 'the shape'}"
             tables.append(table := as_numbers(numbers, what))
             if table.ndim not in (1, 2) or len(table) != shape.V:
-                hint = "one number or one colour for each vertex, and one array for each shape"
+                hint = "one number or one color for each vertex, and one array for each shape"
                 raise InputError(f"{what} must be an array of ({shape.V},), not {table.shape}", hint)
         return compose_values(shapes, tables)
     if labels is not None:

@@ -105,7 +105,7 @@ def shape_of(fit: Fit) -> Repaired:
 class ConfidenceRule:
     """What to do where the map is not to be trusted: below a confidence of ``minimum`` (0..1).
 
-    ``fill`` replaces values by what their neighbours have; ``blank`` by a number, one number for each column, a colour
+    ``fill`` replaces values by what their neighbours have; ``blank`` by a number, one number for each column, a color
     (sRGB, 0..1), or a label. By default they are kept. `OptionError` for both, or a minimum outside 0..1.
     """
 

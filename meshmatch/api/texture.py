@@ -58,10 +58,10 @@ def transfer_texture(
     See `find_maps` for the shapes and the match; textures and texture coordinates are read where the shapes are files.
     ``image`` is a picture for the source's texture coordinates, instead of those that its file names. ``uv``: reuse the
     target's texture coordinates if they are valid ("auto"); reuse them or fail ("keep"); or unwrap the target anew
-    ("new"). ``look`` is of the source, where it is not a file; else its vertex colours are baked. See `Matcher` for
+    ("new"). ``look`` is of the source, where it is not a file; else its vertex colors are baked. See `Matcher` for
     ``progress``.
 
-    `MeshmatchError`: the source has neither a texture nor colours, the target is a point cloud, its texture
+    `MeshmatchError`: the source has neither a texture nor colors, the target is a point cloud, its texture
     coordinates are to be kept and are not valid; or as `meshmatch.match`.
     """
     if uv not in get_args(Keep):
@@ -77,7 +77,7 @@ def transfer_texture(
             raise OptionError("an image needs the texture coordinates of the source's file", hint)
         elif shape.colors is None:
             hint = "give the source as a path if its file has a texture, or give look"
-            raise InputError(f"{shape.name or 'the source'} has neither a texture nor colours", hint)
+            raise InputError(f"{shape.name or 'the source'} has neither a texture nor colors", hint)
         else:
             look = vertex_colors_alone(shape)
     began = time.monotonic()

@@ -1,4 +1,4 @@
-"""Attributes from one shape to another: values, colours, labels, skin weights and landmarks; the maps they follow.
+"""Attributes from one shape to another: values, colors, labels, skin weights and landmarks; the maps they follow.
 
 Shapes and ``match`` are as in `find_maps`. `ConfidenceRule` says what is done where the map is not to be trusted.
 """
@@ -111,13 +111,13 @@ def transfer_colors(
     colors: ArrayLike | Appearance | None = None,
     rule: ConfidenceRule = ConfidenceRule(),
 ) -> Transferred[Floats]:
-    """Vertex colours of the source on the target's vertices, mixed as light: ``data`` is (V_target, 4), red, green, blue
+    """Vertex colors of the source on the target's vertices, mixed as light: ``data`` is (V_target, 4), red, green, blue
     (sRGB) and alpha in 0..1.
 
     ``colors`` (V_source, 3 or 4) in 0..1 (sRGB) are other ones than those of the source's file; an `Appearance` is
     sampled with its textures.
 
-    `MeshmatchError`: the source has no vertex colours; or as `find_maps`.
+    `MeshmatchError`: the source has no vertex colors; or as `find_maps`.
     """
     source = as_shape(source, "source")
     given = None if isinstance(colors, Appearance) else light_of(source, colors)

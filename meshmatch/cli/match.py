@@ -25,7 +25,7 @@ def match(
     output: Path = output_option("MAP", "The map; its suffix chooses the format: .npy .npz .csv .txt .mat .json."),
     how: PairOptions,
     run: RunOptions,
-    picture: Path | None = optional("PNG", "Draw both shapes, corresponding points in one colour."),
+    picture: Path | None = optional("PNG", "Draw both shapes, corresponding points in one color."),
 ) -> None:
     """Match every vertex of one shape to another.
 
@@ -58,7 +58,7 @@ def match(
         f"its vertex of {names[1]} ({result.seconds:.1f} s)"
     )
     if picture is not None:
-        console.say(f"drew {picture}: corresponding points in one colour")
+        console.say(f"drew {picture}: corresponding points in one color")
     if run.json:
         fits = [words.fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)]
         about = {"direction": DIRECTION, "confidence_mean": float(found.confidence.mean()), "notes": result.notes}
@@ -76,7 +76,7 @@ def register(
     how: FitOptions,
     run: RunOptions,
     dense: bool = Option(False, "--dense", help="Write the template in its full resolution."),
-    picture: Path | None = optional("PNG", "Draw the template over the shape, coloured by distance."),
+    picture: Path | None = optional("PNG", "Draw the template over the shape, colored by distance."),
 ) -> None:
     """Fit the model's template to one shape.
 

@@ -28,13 +28,13 @@ Subject: TypeAlias = "tuple[meshmatch.Shape | Template, Appearance | None]"
 class PictureOptions:
     """What is shown."""
 
-    map: Path | None = options.optional("MAP", "Of two shapes, SOURCE TARGET, a map: matched places in one colour.")
+    map: Path | None = options.optional("MAP", "Of two shapes, SOURCE TARGET, a map: matched places in one color.")
     confidence: bool = Option(False, "--confidence", help="With --map: its confidence, as a color map.")
     truth: options.Truth = None
     points: options.Points = None
     unit: options.ErrorUnit = Option("cm", help="Of errors: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100.")
     values: list[Path] | None = options.optional(
-        "FILE", "A number per vertex, as a color map (.npy .csv); or three, as a colour. Once for each shape."
+        "FILE", "A number per vertex, as a color map (.npy .csv); or three, as a color. Once for each shape."
     )
     title: str | None = options.optional("TEXT", "What the numbers of --values are, with their unit.")
     range: tuple[float, float] | None = options.optional(
@@ -52,7 +52,7 @@ class PictureOptions:
         "laid on it now. The distance is drawn as a color map.",
     )
     image: Path | None = options.optional("FILE", "A texture for a shape whose file names none, or another one.")
-    plain: bool = Option(False, "--plain", help="Without textures, colours and nodes.")
+    plain: bool = Option(False, "--plain", help="Without textures, colors and nodes.")
     seed: options.Seed = 0
 
     @property
@@ -101,7 +101,7 @@ class LookOptions:
     up: options.Axis | None = Option(None, help="The files' axis that points up. Guessed if not given.")
     front: options.Axis | None = Option(None, help="The files' axis that the shapes face. Guessed if not given.")
     size: str | None = options.optional("WxH", "Width and height in pixels, such as 1200x800. Fitted if not given.")
-    background: str = Option("white", metavar="COLOR", help="white, dark, transparent, or a colour such as #e8f0f8.")
+    background: str = Option("white", metavar="COLOR", help="white, dark, transparent, or a color such as #e8f0f8.")
     ground: bool = Option(True, "--ground/--no-ground", help="Whether shadows fall.")
 
     def look(self) -> "Look":
@@ -138,7 +138,7 @@ def picture(
 ) -> None:
     """Draw shapes, and what is known about them.
 
-    A PNG without a GPU, a display or OpenGL. Textures and colours of the files are shown where there are any.
+    A PNG without a GPU, a display or OpenGL. Textures and colors of the files are shown where there are any.
     """
     shown.check(len(shapes))
     if name and len(name) != len(shapes):
@@ -260,7 +260,7 @@ def view(
 ) -> None:
     """Make a page that shows two shapes and the map between them.
 
-    Corresponding points have one colour; point at one shape and see the place on the other. The page is a single file
+    Corresponding points have one color; point at one shape and see the place on the other. The page is a single file
     for any recent browser and needs no network. With --map, --up and --front give the orientation of SOURCE.
     """
     from meshmatch.render.viewer.assembly import check_page

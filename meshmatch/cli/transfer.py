@@ -1,4 +1,4 @@
-"""The verbs that transfer what vertices, faces or points have: colours, labels, skin weights, landmarks."""
+"""The verbs that transfer what vertices, faces or points have: colors, labels, skin weights, landmarks."""
 
 from pathlib import Path
 from typing import Literal
@@ -20,13 +20,13 @@ def transfer_color(
     source: Source,
     target: Target,
     output: Path = output_option(
-        "FILE", "TGT with colours: .ply .glb .obj .off, or the colours alone: .npy .csv. With --values: .npy .csv .ply."
+        "FILE", "TGT with colors: .ply .glb .obj .off, or the colors alone: .npy .csv. With --values: .npy .csv .ply."
     ),
     maps: MapOptions,
     rules: RuleOptions,
     run: RunOptions,
     values: Path | None = optional(
-        "FILE", "Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colours."
+        "FILE", "Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colors."
     ),
     directions: bool = Option(
         False,
@@ -35,10 +35,10 @@ def transfer_color(
     ),
     picture: Picture = None,
 ) -> None:
-    """Transfer vertex colours, or other numbers per vertex.
+    """Transfer vertex colors, or other numbers per vertex.
 
     They are interpolated within the faces of SRC. The VALUE of --blank is a number, one number for each column
-    (1,0,0), or a colour (#ff0000).
+    (1,0,0), or a color (#ff0000).
     """
     from meshmatch.transfer import vertex_files
 
@@ -59,7 +59,7 @@ def transfer_color(
             result = meshmatch.transfer_values(a, b, given.numbers, transfer, directions=directions, rule=rule)
             vertex_files.save_values(temporary, vertex_files.Values(result.data, given.names), b)
     low = transfer.tell_low(result.low, rule.minimum)
-    what = "colours" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
+    what = "colors" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
     transfer.console.say(f"wrote {output}: {what} for the {b.V} vertices of {transfer.names[1]}")
     if picture is not None:
         from meshmatch.render.compose import compose_light, compose_values

@@ -29,8 +29,7 @@ class TextureOptions:
     padding: int = Option(
         8,
         metavar="TEXELS",
-        help="Distance between new charts. Colours are continued past their edges; with 0 they are not, and seams "
-        "show.",
+        help="Distance between new charts. Colors are continued past their edges; with 0 they are not, and seams show.",
     )
 
 
@@ -42,7 +41,7 @@ def transfer_texture(
     output: Path = output_option(
         "FILE",
         "TGT with its texture: .glb, or .obj (with an .mtl and a .png of the same name). As .ply or .off, "
-        "and for a point cloud, it gets vertex colours instead.",
+        "and for a point cloud, it gets vertex colors instead.",
     ),
     texture: TextureOptions,
     maps: MapOptions,
@@ -52,8 +51,8 @@ def transfer_texture(
 ) -> None:
     """Transfer the texture of one shape to another.
 
-    Every texel takes the colour of its place on SRC: from its materials and their images, or from its vertex colours.
-    The VALUE of --blank is a colour such as #808080, or 0 for a hole. The first vertices of a written glb are those of
+    Every texel takes the color of its place on SRC: from its materials and their images, or from its vertex colors.
+    The VALUE of --blank is a color such as #808080, or 0 for a hole. The first vertices of a written glb are those of
     TGT in their order, and copies at texture seams follow; an obj has exactly the vertices and faces of TGT.
     """
     from meshmatch.shapes import textured_files
@@ -71,7 +70,7 @@ def transfer_texture(
     painted = b.is_cloud or output.suffix.lower() in _COLORS
     if painted and uv == "keep":
         hint = "leave out --uv keep" if b.is_cloud else "end the output in .glb or .obj for a texture"
-        raise OptionError(f"{b.name} gets vertex colours, which need no texture coordinates", hint)
+        raise OptionError(f"{b.name} gets vertex colors, which need no texture coordinates", hint)
     files = [output] if painted else textured_files.files_of(output)
     with transfer.outputs(image, files) as temporary:
         look = textured_files.load_appearance(source, a, image)
@@ -86,7 +85,7 @@ def transfer_texture(
                 )
             textured_files.write_textured(output, temporary, made.mesh, made.baked.image)
             record, pair = _tell_baked(transfer.console, made, rule, size), made.maps
-    what = "with vertex colours" if painted else f"with a texture of {size} x {size}"
+    what = "with vertex colors" if painted else f"with a texture of {size} x {size}"
     transfer.console.say(f"wrote {' '.join(str(file) for file in files)}: {transfer.names[1]} {what}")
     if picture is not None:
         from meshmatch.render.compose import compose_shapes
@@ -108,7 +107,7 @@ def _tell_baked(
         became = "filled in from around" if rule.fill else "kept as it is" if rule.blank is None else "left blank"
         console.say(f"{100 * baked.low:.1f} % of the surface has less confidence than {rule.minimum:g}: {became}")
     if baked.torn > _WORTH_SAYING:
-        console.say(f"note: the map is discontinuous on {100 * baked.torn:.1f} % of the surface; colours are cut there")
+        console.say(f"note: the map is discontinuous on {100 * baked.torn:.1f} % of the surface; colors are cut there")
     whose = "its own texture coordinates" if atlas.own else "new texture coordinates"
     console.say(f"{whose}: {100 * baked.used:.0f} % of the texture lies on the surface ({made.seconds:.1f} s)")
     uv = {"size": size, "uv": "own" if atlas.own else "new", "uv_note": atlas.note, "used": baked.used}

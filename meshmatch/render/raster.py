@@ -30,7 +30,7 @@ def _lattice(count: int, step: int) -> Float[Floats, "count 2"]:
     return (np.stack([np.arange(count), (step * np.arange(count)) % count], axis=1) + 0.5) / count - 0.5
 
 
-_RIM, _INNER = _lattice(16, 7), _lattice(8, 3)  # where an outline runs through a pixel; where colours meet
+_RIM, _INNER = _lattice(16, 7), _lattice(8, 3)  # where an outline runs through a pixel; where colors meet
 
 
 @dataclass(frozen=True)

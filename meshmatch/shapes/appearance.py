@@ -1,4 +1,4 @@
-"""How a file says that its surface looks: texture coordinates, materials with their images, vertex colours.
+"""How a file says that its surface looks: texture coordinates, materials with their images, vertex colors.
 
 It stands beside `Shape` and not in it: appearance belongs to the file, geometry to the shape, and few verbs ask
 for it. Faces and vertices are those of `load_shape`, in the same order.
@@ -35,9 +35,9 @@ _DAMAGE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error,
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The base colour of some faces: an image times a factor.
+    """The base color of some faces: an image times a factor.
 
-    `image` (H, W, 4) has sRGB colours and plain alpha; its top row begins at v = 0. `factor` is linear red, green, blue,
+    `image` (H, W, 4) has sRGB colors and plain alpha; its top row begins at v = 0. `factor` is linear red, green, blue,
     and alpha. `wrap` says what u and v outside 0..1 mean, `nearest` that the file wants texels as squares, not blended.
     Alpha is ignored ("opaque"), compared with `cutoff` ("mask"), or a share ("blend").
     """
@@ -57,7 +57,7 @@ class Appearance:
 
     There is at least one material; each face has one. `uv` are the texture coordinates of each corner: u to the right,
     v *down*, as in glTF, with the transforms that the file asks for; zeros where a material has no image. `colors` are
-    linear colour and alpha of each vertex, to be multiplied.
+    linear color and alpha of each vertex, to be multiplied.
 
     `InputError` for a coordinate that is not finite or absurdly large on a face with an image.
     """
@@ -82,13 +82,13 @@ class Appearance:
 
     @property
     def plain(self) -> bool:
-        """True if there is nothing to see: no image, no vertex colours, one colour all over."""
+        """True if there is nothing to see: no image, no vertex colors, one color all over."""
         factors = {self.materials[k].factor for k in np.unique(self.material).tolist()}
         return not self.textured and self.colors is None and len(factors) <= 1
 
 
 def vertex_colors_alone(shape: Shape) -> Appearance:
-    """The look of a shape that has its vertex colours and nothing else (sRGB, as ply, obj and off hold them)."""
+    """The look of a shape that has its vertex colors and nothing else (sRGB, as ply, obj and off hold them)."""
     colors = None
     if shape.colors is not None:
         colors = np.concatenate([to_linear(shape.colors[:, :3]), shape.colors[:, 3:]], axis=1)
@@ -99,7 +99,7 @@ def vertex_colors_alone(shape: Shape) -> Appearance:
 def no_coordinates(name: str) -> InputError:
     """The error for a picture that nothing says how to lay on."""
     what = f"{name} has no texture coordinates: an image cannot be laid on it"
-    return InputError(what, "unwrap it, or leave out --image and use its vertex colours")
+    return InputError(what, "unwrap it, or leave out --image and use its vertex colors")
 
 
 class ImageReader:

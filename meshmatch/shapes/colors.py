@@ -1,6 +1,6 @@
-"""Colours: as files write them (sRGB), the light that they stand for, in which averages are taken, and those of labels.
+"""Colors: as files write them (sRGB), the light that they stand for, in which averages are taken, and those of labels.
 
-IEC 61966-2-1. Half black and half white seen from afar is 188 of 255, not 128: so colours are mixed as light.
+IEC 61966-2-1. Half black and half white seen from afar is 188 of 255, not 128: so colors are mixed as light.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ _STEPS = 1 << 14  # of the table of `bytes_of`
 
 
 def to_linear(srgb: ArrayLike) -> Float[Floats, ...]:
-    """Light of a colour in 0..1 as files and screens write it."""
+    """Light of a color in 0..1 as files and screens write it."""
     srgb = np.asarray(srgb, np.float64)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.0) + 0.055) / 1.055) ** 2.4)
 
 
 def to_srgb(linear: ArrayLike) -> Float[Floats, ...]:
-    """A colour in 0..1 as files and screens write it, of an amount of light; the inverse of `to_linear`."""
+    """A color in 0..1 as files and screens write it, of an amount of light; the inverse of `to_linear`."""
     light = np.clip(np.asarray(linear, np.float64), 0.0, 1.0)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
@@ -53,12 +53,12 @@ _LIGHT_OF_CUBES = np.array(
 
 
 def oklab_to_linear(lab: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
-    """Light of colours in Oklab, where equal steps look equal (Ottosson 2020)."""
+    """Light of colors in Oklab, where equal steps look equal (Ottosson 2020)."""
     return np.asarray((lab @ _ROOTS_OF_OKLAB) ** 3 @ _LIGHT_OF_CUBES)
 
 
 def label_colors(labels: ArrayLike) -> Float[Floats, "N 3"]:
-    """Written colours of labels (N,): the same for the same label always, and neighbours far apart."""
+    """Written colors of labels (N,): the same for the same label always, and neighbours far apart."""
     number = np.asarray(labels, dtype=np.int64)
     # Hue by the golden angle; three rings of lightness, so that many labels stay apart.
     hue = np.radians(28.0 + 137.50776 * (number % 1000))

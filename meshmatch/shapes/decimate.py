@@ -25,7 +25,7 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
 
     A mesh that has no more is returned as it is. A closed mesh comes out closed, if need be with more triangles than
     asked for; if no way to do that is found, with as few open and non-manifold edges as possible. Non-manifold input is
-    taken as it is. Vertices that no face uses are dropped; colours are those of the nearest original vertex.
+    taken as it is. Vertices that no face uses are dropped; colors are those of the nearest original vertex.
 
     `faces` is at least 4; borders and closedness can keep it from getting there. Quality "meshlab" (by pymeshlab) takes
     ten times as long, and makes well-shaped triangles where the surface is flat. `InputError`: the shape is a cloud.

@@ -68,7 +68,7 @@ def save_shape(path: str | Path, shape: ShapeLike) -> None:
     """Write a shape, in the format that the suffix names. The file appears whole or not at all.
 
     ply, obj, off, xyz and npy keep every bit of the positions; stl and glb hold 32-bit floats, and stl no
-    shared vertices. Colours go into ply, obj, off and glb. An invalid vertex is written as nan where the
+    shared vertices. Colors go into ply, obj, off and glb. An invalid vertex is written as nan where the
     format allows (all but stl and glb, which take its stand-in).
 
     `OptionError`: the suffix is not one that can be written, or holds no clouds (stl) or no faces (xyz, npy).
@@ -100,7 +100,7 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
     """The shape that is meant: a `Shape` as it is, a file read, everything else copied.
 
     Of an object, ``vertices`` are taken and, unless it is a cloud, ``faces`` (trimesh) or ``triangles`` (Open3D); and
-    vertex colours of a `trimesh.Trimesh`. `name` is for messages, where the source has none of its own.
+    vertex colors of a `trimesh.Trimesh`. `name` is for messages, where the source has none of its own.
     `InputError`: the file cannot be read, or the source is none of these.
     """
     if isinstance(source, Shape):

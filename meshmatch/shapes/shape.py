@@ -208,7 +208,7 @@ class Shape:
     def to_trimesh(self) -> Trimesh:
         """The shape as a `trimesh.Trimesh`, vertices and faces in the same order; a cloud as one without faces.
 
-        Invalid vertices keep their stand-in positions; colours become 8-bit vertex colours.
+        Invalid vertices keep their stand-in positions; colors become 8-bit vertex colors.
         """
         from trimesh import Trimesh
 

@@ -1,4 +1,4 @@
-"""Appearances from files: materials and images of glb, gltf and obj, vertex colours of all others; and textured meshes
+"""Appearances from files: materials and images of glb, gltf and obj, vertex colors of all others; and textured meshes
 to files: one glb, or an obj with its mtl and png. All of these appear whole, or none does.
 """
 
@@ -25,8 +25,8 @@ TEXTURED_SUFFIXES = (".glb", ".obj")
 def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = None) -> Appearance:
     """What a file says about the look of its surface.
 
-    glb and gltf: materials with base colour image and factor, samplers, texture transforms, vertex colours.
-    obj: its mtl with Kd, map_Kd, d and map_d, beside it. Everything else: vertex colours.
+    glb and gltf: materials with base color image and factor, samplers, texture transforms, vertex colors.
+    obj: its mtl with Kd, map_Kd, d and map_d, beside it. Everything else: vertex colors.
 
     `shape` is what `load_shape` made of the same file; `image` a picture that takes the place of those that the file
     names, or that it fails to name. `InputError`: an image or material file is missing, damaged, too large, or outside
@@ -34,7 +34,7 @@ def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
     """
     found = find_appearance(path, shape, image)
     if found is None:
-        nothing = f"{Path(path).name} has no texture and no vertex colours: there is nothing to transfer"
+        nothing = f"{Path(path).name} has no texture and no vertex colors: there is nothing to transfer"
         hint = "name a picture for its texture coordinates with --image, or export it with its materials"
         raise InputError(nothing, hint)
     return found
@@ -80,7 +80,7 @@ def files_of(path: Path) -> list[Path]:
 def check_textured(path: Path, colored: tuple[str, ...] = ()) -> None:
     """Refuse a suffix that holds no texture (`OptionError`), nor is one of those `colored` by vertex."""
     if path.suffix.lower() not in (*TEXTURED_SUFFIXES, *colored):
-        hint = f", or in {' or '.join(colored)} for vertex colours" if colored else ""
+        hint = f", or in {' or '.join(colored)} for vertex colors" if colored else ""
         unknown = f"{path.name}: cannot write a texture as {path.suffix or '(no suffix)'}"
         raise OptionError(unknown, f"end the name in {' or '.join(TEXTURED_SUFFIXES)}{hint}")
 

@@ -1,8 +1,8 @@
-"""Baking: for every texel of the target's atlas the colour of its place on the source.
+"""Baking: for every texel of the target's atlas the color of its place on the source.
 
 A texel is a point of a triangle of the target. The map says where the triangle's corners lie on the source; the
 point between these images slides onto the source (`meshmatch.transfer.surface_walk`), and the face that it ends on says
-its texture coordinates: they are never interpolated across the source's seams. Colours are averaged as light.
+its texture coordinates: they are never interpolated across the source's seams. Colors are averaged as light.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class BakeOptions:
 
     A texel that covers a seam or much detail of the source is seen at ``samples x samples`` points, others at one.
     ``padding`` texels lie between charts of a new atlas; 0 also leaves the texels past the seams empty. Texels of less
-    than ``min_confidence`` can get the colours of their neighbours in the atlas (``fill``), or one colour, sRGB and alpha
+    than ``min_confidence`` can get the colors of their neighbours in the atlas (``fill``), or one color, sRGB and alpha
     in 0..1 (``blank``). `OptionError` for sizes that are out of range, and choices that contradict each other.
     """
 
@@ -116,7 +116,7 @@ def transfer_texture(
 
 
 def colors_of_vertices(source: Shape, look: Appearance, target: Shape, back: VertexMap) -> Floats:
-    """(V_tgt, 4) linear colours and alpha of a target's vertices or points, as wide as the gaps between them."""
+    """(V_tgt, 4) linear colors and alpha of a target's vertices or points, as wide as the gaps between them."""
     walker, sampler = _arranged(source, look)
     points, start = images_of(walker, back)
     place, weights, _ = walker.closest(points.T.astype(np.float32, order="C"), start.astype(np.int32))
@@ -162,7 +162,7 @@ def _painted(
             narrow = locator.reach.take(face) / np.float32(options.samples)
             seen = sampler.colors(place, held, sampler.footprint(place, narrow))
             plain += seen[:3]
-            seen[:3] *= seen[3]  # transparent samples do not count for the colour
+            seen[:3] *= seen[3]  # transparent samples do not count for the color
             total += seen
         share = total[3]
         total[:3] = np.where(share > 0, total[:3] / np.where(share > 0, share, 1), plain / len(steps))
@@ -200,7 +200,7 @@ def _fill_and_blank(image: Pixels, painted: Bools, low: Bools, options: BakeOpti
     if options.blank is not None:
         red, green, blue, share = np.round(255 * np.array(options.blank)).astype(np.uint8).tolist()
         pixels[low, 3] = share
-        if share:  # what is transparent keeps the colours around it, for the filters of viewers
+        if share:  # what is transparent keeps the colors around it, for the filters of viewers
             pixels[low, :3] = (red, green, blue)
         if share < 255 and low.any() and alpha == "opaque":
             return "blend" if share else "mask"

@@ -1,4 +1,4 @@
-"""Closest points on the surface that colours are taken from, by walking over it.
+"""Closest points on the surface that colors are taken from, by walking over it.
 
 A search begins at a known face, and goes from face to face over shared edges. So it never changes to another sheet that
 merely passes by, and neighbouring points end at neighbouring places, which a search in a tree does not grant.

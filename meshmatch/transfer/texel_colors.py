@@ -1,5 +1,5 @@
-"""Where on the source the texels of the target's atlas lie, and the colour of any point of the source: from its
-materials, images and vertex colours.
+"""Where on the source the texels of the target's atlas lie, and the color of any point of the source: from its
+materials, images and vertex colors.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class MaterialSampler:
 
     The walker is of the same file; lengths are in its unit. For a cloud, whose points are its faces, the look has a
     material for each point. `alpha` and `cutoff` say what the alpha of `colors` means; faces over whose edges the
-    colours go on without a seam have one number in `chart` (F,).
+    colors go on without a seam have one number in `chart` (F,).
     """
 
     def __init__(self, look: Appearance, walker: SurfaceWalker) -> None:
@@ -64,7 +64,7 @@ class MaterialSampler:
         return reach * self._density.take(face)
 
     def colors(self, face: NDArray[np.integer], weights: Floats32, footprint: Floats32) -> Floats32:
-        """Linear colours and alpha (4, N) on faces (N,) at weights (3, N), as wide as `footprint` (N,) texels."""
+        """Linear colors and alpha (4, N) on faces (N,) at weights (3, N), as wide as `footprint` (N,) texels."""
         if len(self.materials) == 1:
             return self._of_one(0, face, weights, footprint)
         out = np.ones((4, len(face)), np.float32)

@@ -1,7 +1,7 @@
 """Images texel by texel: which triangle of an atlas lies on each, and what they are in ever smaller sizes.
 
 A pyramid is made of known texels alone. Every texel of a smaller level is the mean, in light, of those known among its
-four; texels that nobody painted then take the colour of the next smaller level. So a mip level that a viewer makes of a
+four; texels that nobody painted then take the color of the next smaller level. So a mip level that a viewer makes of a
 filled image never shows a background: each of its texels that touches a chart is the mean of chart texels.
 """
 
@@ -167,7 +167,7 @@ class Pyramid:
         else:
             weight *= alpha / np.float32(255)
         levels = fill(pixels, weight)
-        if material.alpha != "opaque":  # colours are made up, not the holes between them
+        if material.alpha != "opaque":  # colors are made up, not the holes between them
             pixels[..., 3] = alpha
             means, share = alpha.astype(np.float32)[..., None], np.ones(alpha.shape, np.float32)
             for level in levels[1:]:
@@ -180,7 +180,7 @@ class Pyramid:
         self.wrap, self.nearest = material.wrap, material.nearest
 
     def look(self, u: Floats32, v: Floats32, footprint: Floats32) -> Floats32:
-        """Linear colours and alpha (4, N) at (N,), (N,), as wide as `footprint` (N,) texels of the largest level."""
+        """Linear colors and alpha (4, N) at (N,), (N,), as wide as `footprint` (N,) texels of the largest level."""
         level = np.log2(np.maximum(footprint, np.float32(1.0)))
         level = np.minimum(level, np.float32(len(self.starts) - 1))
         whole = level.astype(np.int32)

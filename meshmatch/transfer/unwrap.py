@@ -50,7 +50,7 @@ def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Ke
     name = shape.name or "the target"
     if shape.is_cloud:
         problem = f"{name} is a point cloud, which has no surface for a texture"
-        raise OptionError(problem, "its points can have colours: end the output in .ply")
+        raise OptionError(problem, "its points can have colors: end the output in .ply")
     if not (shape.face_areas > 0).any():
         raise InputError(f"{name} has no triangle with an area", "is it a mesh?")
     words, note = f"{name} has no texture coordinates to keep", ""

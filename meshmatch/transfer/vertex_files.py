@@ -1,6 +1,6 @@
-"""Numbers, colours and skin weights of each vertex, from files and to files: "Data on a shape" in docs/formats.md.
+"""Numbers, colors and skin weights of each vertex, from files and to files: "Data on a shape" in docs/formats.md.
 
-Colours are mixed as light; a `Shape` has them as screens show them (sRGB), whatever its file has.
+Colors are mixed as light; a `Shape` has them as screens show them (sRGB), whatever its file has.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from meshmatch.shapes.shape import Shape
 VALUE_SUFFIXES = (".npy", ".csv", ".ply")
 _COLOR_SUFFIXES = (".ply", ".glb", ".obj", ".off", ".npy", ".csv")
 check_values_suffix = partial(table_files.check_suffix, suffixes=VALUE_SUFFIXES, what="values")
-check_color_suffix = partial(table_files.check_suffix, suffixes=_COLOR_SUFFIXES, what="vertex colours")
+check_color_suffix = partial(table_files.check_suffix, suffixes=_COLOR_SUFFIXES, what="vertex colors")
 _HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy or .csv"
 # Properties that a ply has already.
 _RESERVED = {"x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a"}
@@ -130,42 +130,42 @@ def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:
 
 
 def light_of(shape: Shape, colors: ArrayLike | None = None) -> Float[Floats, "V 4"]:
-    """Light of the vertices of a shape, from its own colours (`InputError` if it has none) or from others (V, 3 or 4)
+    """Light of the vertices of a shape, from its own colors (`InputError` if it has none) or from others (V, 3 or 4)
     as screens show them.
     """
     if colors is None:
         if shape.colors is None:
-            problem = f"{shape.name or 'the source'} has no vertex colours"
+            problem = f"{shape.name or 'the source'} has no vertex colors"
             raise InputError(problem, "give numbers with --values, or transfer its texture: meshmatch transfer-texture")
         return light(shape.colors)
     table = checked_colors(np.asarray(colors, np.float64))
     if len(table) != shape.V or table.ndim != 2:
-        raise InputError(f"colours must be an array of ({shape.V}, 3 or 4), not {table.shape}")
+        raise InputError(f"colors must be an array of ({shape.V}, 3 or 4), not {table.shape}")
     return light(np.column_stack([table, np.ones(len(table))])[:, :4])
 
 
 def checked_colors(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
-    """The same colours; `OptionError` where they are not 3 or 4 numbers within 0..1."""
+    """The same colors; `OptionError` where they are not 3 or 4 numbers within 0..1."""
     if colors.ndim == 0 or colors.shape[-1] not in (3, 4) or not ((colors >= 0) & (colors <= 1)).all():
         raise OptionError(
-            "a colour has 3 or 4 numbers within 0..1: red, green, blue and alpha", "such as 0.5,0.5,0.5 or #808080"
+            "a color has 3 or 4 numbers within 0..1: red, green, blue and alpha", "such as 0.5,0.5,0.5 or #808080"
         )
     return colors
 
 
 def light(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
-    """Light of colours (..., 3 or 4) as screens show them; alpha is left as it is."""
+    """Light of colors (..., 3 or 4) as screens show them; alpha is left as it is."""
     return np.concatenate([to_linear(colors[..., :3]), colors[..., 3:]], axis=-1)
 
 
 def seen(amounts: Float[Floats, "V 4"]) -> Float[Floats, "V 4"]:
-    """Colours as screens show them (sRGB, 0..1) of light; nan is black."""
+    """Colors as screens show them (sRGB, 0..1) of light; nan is black."""
     amounts = np.clip(np.nan_to_num(amounts), 0.0, 1.0)
     return np.concatenate([to_srgb(amounts[:, :3]), amounts[:, 3:]], axis=1)
 
 
 def parse_color(text: str | None) -> tuple[float, float, float, float] | None:
-    """The colour and alpha (sRGB, 0..1) that a text such as #808080 means; `OptionError` if it means none."""
+    """The color and alpha (sRGB, 0..1) that a text such as #808080 means; `OptionError` if it means none."""
     if text is None:
         return None
     red, green, blue, alpha = checked_colors(parse_blank(text, 4)).tolist()
@@ -173,7 +173,7 @@ def parse_color(text: str | None) -> tuple[float, float, float, float] | None:
 
 
 def save_colors(path: Path, shape: Shape, colors: Float[Floats, "V 4"]) -> None:
-    """Write `shape` with vertex colours as screens show them; or the colours alone."""
+    """Write `shape` with vertex colors as screens show them; or the colors alone."""
     if check_color_suffix(path) in (".npy", ".csv"):
         save_values(path, Values(colors, ("red", "green", "blue", "alpha")), shape)
     else:

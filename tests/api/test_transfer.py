@@ -145,9 +145,9 @@ def test_what_does_not_belong_to_the_source(
         getattr(meshmatch, call)(source, target, *words, found)
 
 
-def test_colours_that_are_not_there(pair: tuple[Shape, Shape, VertexMap]) -> None:
+def test_colors_that_are_not_there(pair: tuple[Shape, Shape, VertexMap]) -> None:
     source, target, found = pair
-    with pytest.raises(InputError, match="has no vertex colours"):
+    with pytest.raises(InputError, match="has no vertex colors"):
         meshmatch.transfer_colors(source, target, found)
     with pytest.raises(OptionError, match="3 or 4 numbers within"):
         meshmatch.transfer_colors(source, target, found, colors=np.full((source.V, 3), 2.0))
@@ -228,7 +228,7 @@ def test_blanks_that_do_not_fit(pair: tuple[Shape, Shape, VertexMap]) -> None:
 
 def test_textures_that_cannot_be_baked(pair: tuple[Shape, Shape, VertexMap]) -> None:
     source, target, found = pair
-    with pytest.raises(InputError, match="neither a texture nor colours"):
+    with pytest.raises(InputError, match="neither a texture nor colors"):
         meshmatch.transfer_texture(source, target, found)
     with pytest.raises(OptionError, match="invalid uv"):
         meshmatch.transfer_texture(source, target, found, uv="bogus")  # type: ignore[arg-type]

@@ -188,7 +188,7 @@ def test_match_draws_a_picture(run: Run, two: tuple[Path, Path], stub: FakeMatch
     with Image.open(picture) as image:
         pixels = np.asarray(image)
         assert image.size[0] > 1.3 * image.size[1]  # side by side
-    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 1000  # and in colours
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 1000  # and in colors
     assert output.exists()
 
 

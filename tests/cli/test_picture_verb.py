@@ -129,7 +129,7 @@ def test_numbers_become_heat_on_one_scale(run: Run, two: tuple[Path, Path], draw
     assert drawn.look.legend == Scale(-1, 2, "error (mm)", beyond=(False, True))
 
 
-def test_three_numbers_are_a_colour(run: Run, two: tuple[Path, Path], drawn: Drawn) -> None:
+def test_three_numbers_are_a_color(run: Run, two: tuple[Path, Path], drawn: Drawn) -> None:
     colors = np.random.default_rng(0).random((V, 3))
     np.save(two[0].with_name("c.npy"), colors)
     assert run("picture", two[0], "--values", two[0].with_name("c.npy"), "-o", two[0].with_name("o.png")).status == 0
@@ -137,7 +137,7 @@ def test_three_numbers_are_a_colour(run: Run, two: tuple[Path, Path], drawn: Dra
     assert drawn.look.legend is None
 
 
-def test_a_label_has_one_colour_on_all_shapes(run: Run, two: tuple[Path, Path], drawn: Drawn) -> None:
+def test_a_label_has_one_color_on_all_shapes(run: Run, two: tuple[Path, Path], drawn: Drawn) -> None:
     here, there, out = two[0].with_name("l.txt"), two[0].with_name("f.json"), two[0].with_name("out.png")
     here.write_text("\n".join(["head"] * 600 + ["arm"] * 42))
     faces = load_shape(two[1]).F
@@ -170,11 +170,11 @@ def test_what_labels_belong_to_can_be_said(run: Run, two: tuple[Path, Path], dra
     assert drawn.panels[0].face_colors is None
 
 
-def test_a_map_as_colours(run: Run, turned_map: tuple[Path, Path, Path], drawn: Drawn) -> None:
+def test_a_map_as_colors(run: Run, turned_map: tuple[Path, Path, Path], drawn: Drawn) -> None:
     found, a, c = turned_map
     answer = run("picture", a, c, "--map", found, "-o", a.with_name("o.png"))
     assert answer.status == 0, answer.err
-    assert "matched places in one colour" in answer.err
+    assert "matched places in one color" in answer.err
     one, other = drawn.panels
     assert np.asarray(other.colors)[np.load(a.with_name("truth.npy"))] == pytest.approx(np.asarray(one.colors))
     assert [one.label, other.label] == ["a.ply", "c.ply"]

@@ -42,7 +42,7 @@ SHARED: list[tuple[tuple[str, ...], dict[str, Any], dict[str, Any]]] = [
 
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sphere: Shape, torus: Shape) -> Path:
-    """Two coloured shapes, and everything that verbs want beside them."""
+    """Two colored shapes, and everything that verbs want beside them."""
     monkeypatch.chdir(tmp_path)
     for name, shape in (("a.ply", sphere), ("b.ply", torus)):
         save_shape(name, Shape(shape.verts, shape.faces, name, np.full((shape.V, 4), 0.5)))

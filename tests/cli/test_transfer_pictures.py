@@ -53,7 +53,7 @@ def test_a_picture_of_both_shapes(run: Run, pair: Path, verb: str) -> None:  # n
     assert json.loads(well(run(*call(verb, "--json"))).out)["picture"] is None
 
 
-def test_colours_and_numbers(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811
+def test_colors_and_numbers(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811
     well(run(*call("transfer-color", "--picture", "p.png")))
     a, b = load_shape("a.ply"), load_shape("b.ply")
     assert a.colors is not None
@@ -102,7 +102,7 @@ def test_weights_show_the_heaviest_joint(run: Run, pair: Path, drawn: Drawn) -> 
     assert found[z < -0.1] == pytest.approx(label_colors(np.ones((z < -0.1).sum(), int)))
 
 
-def test_landmarks_are_balls_of_one_colour(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811
+def test_landmarks_are_balls_of_one_color(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811
     well(run(*call("transfer-landmarks", "--picture", "p.png")))
     a = load_shape("a.ply")
     for panel in drawn.panels:

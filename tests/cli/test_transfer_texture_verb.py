@@ -29,7 +29,7 @@ SMALL = ("--size", "64", "--padding", "2", "--threads", "1")
 
 
 def picture(size: int = 32) -> np.ndarray:
-    """Slow waves: close by, colours are nearly the same."""
+    """Slow waves: close by, colors are nearly the same."""
     y, x = np.mgrid[:size, :size] / size
     image = np.full((size, size, 4), 255, np.uint8)
     image[..., :3] = np.round(127 + 100 * np.stack([np.sin(5 * x), np.sin(4 * y), np.cos(5 * x * y)], -1))
@@ -193,7 +193,7 @@ def test_doubt_is_kept_filled_or_left_blank(run: Run, pair: Path) -> None:
     assert record["low_confidence_share"] == 0
 
 
-def test_clouds_and_ply_get_vertex_colours(run: Run, pair: Path) -> None:
+def test_clouds_and_ply_get_vertex_colors(run: Run, pair: Path) -> None:
     b = load_shape("b.ply")
     np.save("b.npy", b.verts)
     cloud = load_shape("b.npy")
@@ -204,7 +204,7 @@ def test_clouds_and_ply_get_vertex_colours(run: Run, pair: Path) -> None:
         found = load_shape(out)
         assert found.colors is not None and found.V == b.V
         assert found.is_cloud == (target == "b.npy")
-        assert "with vertex colours" in answer.err
+        assert "with vertex colors" in answer.err
         assert json.loads(answer.out)["files"] == [out]
     assert not Path("cloud.mtl").exists()
     assert np.ptp(found.colors[:, :3]) > 0.5
@@ -216,7 +216,7 @@ def test_clouds_and_ply_get_vertex_colours(run: Run, pair: Path) -> None:
     assert np.median(off) < 20
 
 
-def test_doubt_about_vertex_colours(run: Run, pair: Path) -> None:
+def test_doubt_about_vertex_colors(run: Run, pair: Path) -> None:
     sure = np.where(load_shape("a.glb").verts[:, 2] > 0.3, 0.0, 1.0).astype(np.float32)
     save_map("doubt.npz", replace(load_map("ab.npz"), confidence=sure))
     record = json.loads(well(run(*call("--json", "--blank", "1,0,0", map="doubt.npz", out="out.ply"))).out)
@@ -291,7 +291,7 @@ def wild_coordinates() -> None:
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (plain_source, "a.glb has no texture and no vertex colours: there is nothing to transfer"),
+        (plain_source, "a.glb has no texture and no vertex colors: there is nothing to transfer"),
         (damaged_source, "a.glb"),
         (damaged_image, "damaged image"),
         (wild_coordinates, "texture coordinates of 1 faces are out of range"),
@@ -318,7 +318,7 @@ def test_a_missing_image_beside_an_obj(run: Run, pair: Path, no_fit: None) -> No
         (("--samples", "0"), "1 to 8 samples"),
         (("--padding", "33"), "padding of 33 texels"),
         (("--blank", "purple"), "--blank purple"),
-        (("--blank", "2,0,0"), "a colour has 3 or 4 numbers within 0..1"),
+        (("--blank", "2,0,0"), "a color has 3 or 4 numbers within 0..1"),
         (("--blank", "0", "--fill"), "contradict each other"),
         (("--up", "y", "--front", "y"), "lie along one axis"),
         (("--image", "gone.png"), "there is no file gone.png"),
@@ -369,7 +369,7 @@ def test_a_companion_that_cannot_be_written_stops_all(run: Run, pair: Path, no_f
 def test_clouds_have_no_surface(run: Run, pair: Path, no_fit: None) -> None:
     np.save("b.npy", load_shape("b.ply").verts)
     answer = run(*call("--uv", "keep", target="b.npy", out="out.ply", map=None))
-    refused(answer, "b.npy gets vertex colours", pair, {path.name for path in pair.iterdir()})
+    refused(answer, "b.npy gets vertex colors", pair, {path.name for path in pair.iterdir()})
     answer = run(*call("--uv", "keep", out="out.ply", map=None))
     refused(answer, "end the output in .glb or .obj", pair, {path.name for path in pair.iterdir()})
 

@@ -74,7 +74,7 @@ def refused(answer: Answer, words: str, folder: Path, before: set[str]) -> None:
 
 
 @pytest.mark.parametrize("out", ["out.ply", "out.glb", "out.obj", "out.off", "out.npy", "out.csv"])
-def test_colours_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
+def test_colors_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
     answer = well(run(*call("transfer-color", out=out)))
     a, b = load_shape("a.ply"), load_shape("b.ply")
     assert a.colors is not None
@@ -90,7 +90,7 @@ def test_colours_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
         found = np.array(shape.colors)
     assert np.abs(found[: a.V, :3] - a.colors[:, :3]).max() < 0.51 / 255
     assert np.abs(found[:, :3] - (b.verts / 2 + 0.5)).max() < 0.05
-    assert f"wrote {out}: colours for the {b.V} vertices of b.ply" in answer.err
+    assert f"wrote {out}: colors for the {b.V} vertices of b.ply" in answer.err
     assert "used the map ab.npz from a.ply to b.ply" in answer.err
 
 
@@ -150,7 +150,7 @@ def test_blank_values(run: Run, pair: Path, doubtful: np.ndarray) -> None:
     assert f"({found.sum()} of 642)" in answer.err and "left blank" in answer.err
 
 
-def test_blank_colours(run: Run, pair: Path, doubtful: np.ndarray) -> None:
+def test_blank_colors(run: Run, pair: Path, doubtful: np.ndarray) -> None:
     well(run(*call("transfer-color", "--blank", "#804020")))
     colors = load_shape("out.ply").colors
     assert colors is not None
@@ -442,8 +442,8 @@ def nothing(folder: Path) -> None:
 
 
 WRONG: dict[str, tuple[list[str | Path], Callable[[Path], object], str]] = {
-    "no colours": (call("transfer-color"), plain, "a.ply has no vertex colours"),
-    "colours as stl": (call("transfer-color", out="c.stl"), nothing, "'.stl' is not a format for vertex colours"),
+    "no colors": (call("transfer-color"), plain, "a.ply has no vertex colors"),
+    "colors as stl": (call("transfer-color", out="c.stl"), nothing, "'.stl' is not a format for vertex colors"),
     "values as glb": (
         call("transfer-color", "--values", "values.npy", out="c.glb"),
         nothing,
@@ -454,12 +454,8 @@ WRONG: dict[str, tuple[list[str | Path], Callable[[Path], object], str]] = {
         short("values.npy"),
         "9 rows, but a.ply has 162",
     ),
-    "blank colours": (call("transfer-color", "--blank", "red"), nothing, "--blank red: 4 numbers are needed"),
-    "colours out of range": (
-        call("transfer-color", "--blank", "2"),
-        nothing,
-        "a colour has 3 or 4 numbers within 0..1",
-    ),
+    "blank colors": (call("transfer-color", "--blank", "red"), nothing, "--blank red: 4 numbers are needed"),
+    "colors out of range": (call("transfer-color", "--blank", "2"), nothing, "a color has 3 or 4 numbers within 0..1"),
     "both": (call("transfer-color", "--blank", "0", "--fill"), nothing, "contradict each other"),
     "short labels": (
         call("transfer-labels"),

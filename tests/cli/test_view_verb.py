@@ -169,14 +169,14 @@ def test_a_texture_is_worn_by_both(run: Run, known: tuple[Path, Path, Path], sph
     assert words_of(page)["look"] == {"kind": "texture", "side": "target"}
 
 
-def test_colours_of_both_shapes(run: Run, known: tuple[Path, Path, Path], sphere: Shape) -> None:
+def test_colors_of_both_shapes(run: Run, known: tuple[Path, Path, Path], sphere: Shape) -> None:
     colored, page = known[0].with_name("colored.ply"), known[0].with_name("page.html")
     colors = np.concatenate([np.abs(sphere.verts), np.ones((sphere.V, 1))], axis=1)
     save_shape(colored, Shape(sphere.verts, sphere.faces, "colored", colors))
     save_map(known[2], VertexMap.identity(sphere))
     assert run("view", colored, colored, "--map", known[2], "-o", page).status == 0
     words = words_of(page)
-    assert (words["look"], words["own"]) == ({"kind": "colours", "side": "source"}, True)
+    assert (words["look"], words["own"]) == ({"kind": "colors", "side": "source"}, True)
 
 
 def test_a_texture_that_is_missing_is_said_and_the_rest_shown(

@@ -29,7 +29,7 @@ def test_the_nearest_map_of_a_finer_copy_is_exact(sphere: Shape) -> None:
     np.testing.assert_allclose(nearest_map(fine, sphere).points(sphere), back.points(sphere), atol=1e-9)
 
 
-def test_colours_at_points_of_a_square() -> None:
+def test_colors_at_points_of_a_square() -> None:
     square = Shape(CORNERS, FACES)
     look = Appearance((Material(image=quarters(16)),), np.zeros(2, np.int64), UV[FACES])
     found = colors_at(square, look, np.array([[0.25, 0.75, 0], [0.75, 0.75, 0.3], [0.25, 0.25, 0]]))

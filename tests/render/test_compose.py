@@ -46,13 +46,13 @@ def scale_of(shown: Composition) -> Scale:
     return shown.legend
 
 
-def test_identity_brings_every_colour_to_its_place(cube: Shape) -> None:
+def test_identity_brings_every_color_to_its_place(cube: Shape) -> None:
     colors = position_colors(cube)
     carried = carried_colors(colors, VertexMap.identity(cube), cube, cube)
     assert np.allclose(carried, colors)
 
 
-def test_colours_go_from_source_to_target(sphere: Shape) -> None:
+def test_colors_go_from_source_to_target(sphere: Shape) -> None:
     order = np.random.default_rng(0).permutation(sphere.V)
     place = np.argsort(order)
     shuffled = Shape(sphere.verts[order], place[sphere.faces], "shuffled")

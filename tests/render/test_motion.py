@@ -55,7 +55,7 @@ def test_every_frame_is_in_the_page(tmp_path: Path, make_sphere: Callable[[int],
     assert again.read_bytes() == path.read_bytes()
 
 
-def test_own_colours_and_a_cloud(tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
+def test_own_colors_and_a_cloud(tmp_path: Path, make_sphere: Callable[[int], Shape]) -> None:
     ball = make_sphere(1)
     path = tmp_path / "a.html"
     write_motion(path, grown(ball, 1, 2, colors=True), (0, 1), rotation=np.eye(3))

@@ -366,7 +366,7 @@ def image(height: int = 8, width: int = 16) -> np.ndarray:
 
 
 def look_of(shape: Shape, pixels: np.ndarray | None, **material: Any) -> Appearance:
-    """Half the faces wear an image by x and z, the others one colour."""
+    """Half the faces wear an image by x and z, the others one color."""
     low = shape.bounds[0]
     uv = ((shape.verts - low) / np.ptp(shape.verts, axis=0))[:, [0, 2]][shape.faces]
     which = (np.arange(shape.F) % 2).astype(np.int64)
@@ -430,12 +430,12 @@ def test_alpha_is_kept_where_it_counts(tmp_path: Path, cube: Shape) -> None:
     assert not page.words["own"]
 
 
-def test_vertex_colours_are_painted(tmp_path: Path, cube: Shape) -> None:
+def test_vertex_colors_are_painted(tmp_path: Path, cube: Shape) -> None:
     light = np.linspace(0, 1, 32).reshape(8, 4)
     look = Appearance((Material(),), np.zeros(12, np.int64), np.zeros((12, 3, 2)), light)
     twice = Pair(cube, cube, VertexMap.identity(cube), VertexMap.identity(cube))
     page = page_of(tmp_path / "page.html", twice, looks=Looks("source", (look, look)))
-    assert page.words["look"] == {"kind": "colours", "side": "source"}
+    assert page.words["look"] == {"kind": "colors", "side": "source"}
     assert page.words["source"]["look"] is None
     paint = page.arrays["source.look.paint"].reshape(8, 3) / 255
     linear = np.where(paint <= 0.04045, paint / 12.92, ((paint + 0.055) / 1.055) ** 2.4)

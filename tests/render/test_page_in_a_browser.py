@@ -160,7 +160,7 @@ def test_views_that_are_not_linked_turn_alone(running: Any, file: Path) -> None:
         assert view.place("target", 5)["x"] == pytest.approx(before[1]["x"], abs=0.01)
 
 
-def test_colours_and_wireframe_change_what_is_drawn(running: Any, file: Path, tmp_path: Path) -> None:
+def test_colors_and_wireframe_change_what_is_drawn(running: Any, file: Path, tmp_path: Path) -> None:
     with opened(running, file) as view:
         names = [label.inner_text() for label in view.page.locator("#modes label").all()]
         assert names == ["Matches", "Texture", "Original", "Confidence", "Plain"]

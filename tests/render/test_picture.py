@@ -202,7 +202,7 @@ def test_a_cloud_and_points_are_balls(tmp_path: Path) -> None:
 
 
 def test_the_look_of_a_cloud_is_its_light(tmp_path: Path) -> None:
-    """Appearance holds light, a shape's own colours are as written: a file of either kind looks the same."""
+    """Appearance holds light, a shape's own colors are as written: a file of either kind looks the same."""
     points = box((1, 1, 0.5)).verts
     colors = np.tile([0.5, 0.25, 0.75, 1.0], (8, 1))
     cloud = Shape(points, np.zeros((0, 3), int), "dots", colors)
@@ -271,7 +271,7 @@ def test_what_lies_far_away_makes_the_rest_small_and_nothing_worse(tmp_path: Pat
         assert something(draw(tmp_path, (both, None), look=Look(size=(64, 64)))).any() == seen
 
 
-def test_colours_that_are_no_numbers_are_black(tmp_path: Path) -> None:
+def test_colors_that_are_no_numbers_are_black(tmp_path: Path) -> None:
     shape = box((1, 1, 1))
     colors = np.full((8, 3), np.nan)
     assert draw(tmp_path, (shape, colors))[48, 48].max() < 40

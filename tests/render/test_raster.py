@@ -175,7 +175,7 @@ def test_a_disc_lies_across_its_normal() -> None:
     assert image.alpha[:, 65:].sum() < 3  # seen from its edge
 
 
-def test_the_nearest_corner_gives_a_sharp_colour() -> None:
+def test_the_nearest_corner_gives_a_sharp_color() -> None:
     triangle = np.array([[-0.3, -0.3, 0], [0.3, -0.3, 0], [0, 0.3, 0]])
     paint = VertexPaint(np.eye(3), np.array([[0, 1, 2]]), sharp=True)
     weights = np.array([[0.5, 0.3, 0.2], [0.1, 0.2, 0.7], [0.3, 0.4, 0.3]])

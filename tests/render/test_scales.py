@@ -1,4 +1,4 @@
-"""Numbers and labels as colours."""
+"""Numbers and labels as colors."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_heat_gets_darker_all_the_way() -> None:
     assert backwards == pytest.approx(scale.colors(np.linspace(1, 0, 50)))
 
 
-def test_both_signs_have_a_colour_and_0_has_none() -> None:
+def test_both_signs_have_a_color_and_0_has_none() -> None:
     scale = Scale(-2, 2)
     below, middle, above = scale.colors([-2.0, 0.0, 2.0])
     assert below[2] > below[0] + 0.1
@@ -87,7 +87,7 @@ def test_nice_steps(span: float, step: float) -> None:
     assert nice_step(span, 5) == pytest.approx(step)
 
 
-def test_a_label_has_one_colour_whoever_else_is_there() -> None:
+def test_a_label_has_one_color_whoever_else_is_there() -> None:
     colors = label_colors(np.arange(17))
     assert np.array_equal(label_colors([3, 16]), colors[[3, 16]])
     apart = np.linalg.norm(colors[:, None] - colors[None], axis=2) + np.eye(17)

@@ -91,17 +91,17 @@ def test_nothing_to_wear(pair: Pair) -> None:
     assert share_look((pair.source, pair.target), (None, None), pair.there, pair.back) is None
 
 
-def test_colours_of_vertices_are_carried_as_such(pair: Pair) -> None:
+def test_colors_of_vertices_are_carried_as_such(pair: Pair) -> None:
     looks = share_look((pair.source, pair.target), (colored(pair.source), None), pair.there, pair.back)
     assert looks is not None
-    assert looks.words["look"] == {"kind": "colours", "side": "source"}
+    assert looks.words["look"] == {"kind": "colors", "side": "source"}
     assert not looks.worn[1].textured
     seen = vertex_paint(looks.worn[1], pair.target)[:, 0]
     assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.01
 
 
 @pytest.mark.parametrize("why", ["cloud", "fine"])
-def test_where_nothing_can_be_baked_vertices_have_colours(
+def test_where_nothing_can_be_baked_vertices_have_colors(
     pair: Pair, textured: Appearance, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "MOST_FACES", 100 if why == "fine" else 10**6)
@@ -116,7 +116,7 @@ def test_where_nothing_can_be_baked_vertices_have_colours(
     assert np.abs(seen - height(pair.source)[pair.back.index]).max() < 0.05
 
 
-def test_the_colours_of_a_cloud_are_carried(pair: Pair) -> None:
+def test_the_colors_of_a_cloud_are_carried(pair: Pair) -> None:
     cloud = Shape(pair.source.verts, np.empty((0, 3), np.int64), "cloud")
     there = VertexMap.between(cloud, pair.target, pair.there.index)
     back = VertexMap.between(pair.target, cloud, pair.back.index)

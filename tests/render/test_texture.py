@@ -47,7 +47,7 @@ def test_a_wide_footprint_takes_the_mean_in_light() -> None:
     assert found[:, :3] == pytest.approx(np.tile(QUARTERS.mean(axis=0), (4, 1)), abs=0.02)
 
 
-def test_factor_and_vertex_colours_multiply() -> None:
+def test_factor_and_vertex_colors_multiply() -> None:
     colors = np.tile([0.5, 1.0, 1.0, 1.0], (4, 1))
     found = paint(look(Material(image=quarters(64), factor=(0.5, 0.25, 1.0, 1.0)), colors=colors))
     assert found[:, :3] == pytest.approx(QUARTERS * [0.25, 0.25, 1.0], abs=1e-6)

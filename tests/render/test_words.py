@@ -69,7 +69,7 @@ def bar(scale: Scale, size: tuple[int, int] = (400, 100)) -> tuple[np.ndarray, l
     return np.asarray(image), written
 
 
-def test_a_bar_has_the_colours_of_its_numbers_above_them() -> None:
+def test_a_bar_has_the_colors_of_its_numbers_above_them() -> None:
     scale = Scale(0, 5, "error (cm)")
     pixels, written = bar(scale)
     assert written[0] == ("error (cm)", 200)
@@ -79,9 +79,9 @@ def test_a_bar_has_the_colours_of_its_numbers_above_them() -> None:
     row = next(r for r in range(100) if np.ptp(pixels[r, 120:280], axis=1).max() > 100) + 5
     for value, x in zip((1, 2, 3, 4), places[1:5], strict=True):
         assert pixels[row, round(x)] / 255 == pytest.approx(scale.colors([value])[0], abs=0.02)
-    coloured = np.flatnonzero((pixels[row] < 250).any(axis=1))
-    assert coloured[0] == pytest.approx(places[0], abs=4)
-    assert coloured[-1] == pytest.approx(places[-1], abs=4)
+    colored = np.flatnonzero((pixels[row] < 250).any(axis=1))
+    assert colored[0] == pytest.approx(places[0], abs=4)
+    assert colored[-1] == pytest.approx(places[-1], abs=4)
 
 
 def test_numbers_without_room_are_left_out() -> None:

@@ -29,7 +29,7 @@ def one_material(**texture: Any) -> list[dict[str, Any]]:
 # Light
 
 
-def test_light_and_colour_are_inverses_and_match_the_standard() -> None:
+def test_light_and_color_are_inverses_and_match_the_standard() -> None:
     values = np.linspace(0, 1, 1001)
     np.testing.assert_allclose(to_srgb(to_linear(values)), values, atol=1e-12)
     assert to_linear(0.5) == pytest.approx(0.21404, abs=1e-5)  # IEC 61966-2-1
@@ -148,7 +148,7 @@ def test_specular_glossiness_and_webp(tmp_path: Path) -> None:
     assert found.image is not None and found.image.shape == (16, 16, 4)
 
 
-def test_vertex_colours_of_gltf_are_light_already(tmp_path: Path) -> None:
+def test_vertex_colors_of_gltf_are_light_already(tmp_path: Path) -> None:
     write_gltf(tmp_path / "a.glb", primitives=[{"colors": np.full((4, 3), 0.25)}, {}])
     colors = look(tmp_path / "a.glb").colors
     assert colors is not None
@@ -243,7 +243,7 @@ def test_an_obj_without_mtl_takes_the_image_that_is_named(tmp_path: Path) -> Non
     np.testing.assert_array_equal(found.uv, UV[FACES])
 
 
-def test_vertex_colours_where_nothing_else_is(tmp_path: Path) -> None:
+def test_vertex_colors_where_nothing_else_is(tmp_path: Path) -> None:
     colors = np.array([[1, 0, 0, 1], [0, 1, 0, 1], [0.5, 0.5, 0.5, 1], [0, 0, 0, 1]])
     for suffix in ("ply", "obj", "off"):
         save_shape(tmp_path / f"a.{suffix}", Shape(CORNERS, FACES, "a", colors))
@@ -252,7 +252,7 @@ def test_vertex_colours_where_nothing_else_is(tmp_path: Path) -> None:
         assert found.colors[2, 0] == pytest.approx(to_linear(0.5), abs=0.01)  # ply: 8 bits
 
 
-def test_vertex_colours_save_an_obj_whose_mtl_was_lost(tmp_path: Path) -> None:
+def test_vertex_colors_save_an_obj_whose_mtl_was_lost(tmp_path: Path) -> None:
     text = "mtllib lost.mtl\n" + "".join(f"v {x} {y} {z} 1 0 0\n" for x, y, z in CORNERS)
     (tmp_path / "a.obj").write_text(text + "f 1 2 3\nf 1 3 4\n")
     assert look(tmp_path / "a.obj").colors is not None
@@ -273,7 +273,7 @@ def test_no_look_at_all(tmp_path: Path, sphere: Shape) -> None:
     write_square_obj(tmp_path / "a.obj", mtl=None)
     write_gltf(tmp_path / "a.glb")
     for suffix in ("ply", "obj", "glb"):
-        assert "has no texture and no vertex colours" in refused(tmp_path / f"a.{suffix}").message
+        assert "has no texture and no vertex colors" in refused(tmp_path / f"a.{suffix}").message
 
 
 def test_a_missing_image_and_a_missing_mtl_are_named(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_open_and_non_manifold_and_unused_are_survived(torus: Shape) -> None:
     assert (np.diff(np.sort(small.faces, axis=1), axis=1) > 0).all()
 
 
-def test_colours_come_from_the_nearest_vertex(make_sphere: Callable[[int], Shape]) -> None:
+def test_colors_come_from_the_nearest_vertex(make_sphere: Callable[[int], Shape]) -> None:
     ball = make_sphere(3)
     colors = np.random.default_rng(0).random((ball.V, 4))
     small = decimate(Shape(ball.verts, ball.faces, colors=colors), 300)

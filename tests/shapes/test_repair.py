@@ -305,7 +305,7 @@ def test_one_triangle_is_a_shape() -> None:
     assert (done.shape.V, done.shape.F) == (3, 1)
 
 
-def test_colours_follow_their_vertices(sphere: Shape) -> None:
+def test_colors_follow_their_vertices(sphere: Shape) -> None:
     colors = np.random.default_rng(0).random((sphere.V + 1, 4))
     shape = Shape(np.vstack([[[9, 9, 9]], sphere.verts]), sphere.faces + 1, colors=colors)
     np.testing.assert_array_equal(repair(shape).shape.colors, colors[1:])

@@ -106,14 +106,14 @@ def test_ply_big_endian_with_wide_counts_and_unequal_lists(tmp_path: Path) -> No
     check(load(tmp_path, "b.ply", windows + body))
 
 
-def test_ply_colours_of_two_bytes(tmp_path: Path) -> None:
+def test_ply_colors_of_two_bytes(tmp_path: Path) -> None:
     channels = "".join(f"property ushort {c}\n" for c in ("red", "green", "blue"))
     head = HUGE.format("binary_little_endian", 1).replace("end_header\n", channels + "end_header\n")
     shape = load(tmp_path, "a.ply", head.encode() + struct.pack("<3f3H", 1, 2, 3, 65535, 13107, 0))
     np.testing.assert_allclose(shape.colors, [[1, 0.2, 0, 1]])
 
 
-def test_ply_colours_are_rounded_not_cut(tmp_path: Path, cube: Shape) -> None:
+def test_ply_colors_are_rounded_not_cut(tmp_path: Path, cube: Shape) -> None:
     save_shape(tmp_path / "a.ply", Shape(cube.verts, cube.faces, colors=np.full((8, 4), 0.999)))
     np.testing.assert_array_equal(load_shape(tmp_path / "a.ply").colors, 1.0)
 
@@ -133,7 +133,7 @@ def test_ply_triangle_strips_turn_every_second_one(tmp_path: Path) -> None:
     np.testing.assert_array_equal(shape.faces, [[0, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 0]])
 
 
-def test_ply_text_colours_follow_the_header_not_the_values(tmp_path: Path) -> None:
+def test_ply_text_colors_follow_the_header_not_the_values(tmp_path: Path) -> None:
     body = "0 0 0 0 1 1\n1 0 0 1 0 0\n0 1 0 0 0 1\n"
     head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {c}\n" for c in "xyz")
     bytes_ = head + "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n" + body
@@ -191,7 +191,7 @@ def test_obj_seams_split_nothing_and_unused_vertices_stay(tmp_path: Path) -> Non
     np.testing.assert_array_equal(shape.faces, [[1, 2, 3], [3, 2, 1]])
 
 
-def test_obj_colours(tmp_path: Path) -> None:
+def test_obj_colors(tmp_path: Path) -> None:
     shape = load(tmp_path, "a.obj", "v 0 0 0 1 0 0\nv 1 0 0 0 .5 0\nv 0 1 0 0 0 1\nf 1 2 3\n")
     np.testing.assert_allclose(shape.colors, [[1, 0, 0, 1], [0, 0.5, 0, 1], [0, 0, 1, 1]])
 
@@ -204,7 +204,7 @@ def test_off(tmp_path: Path, head: str) -> None:
     check(load(tmp_path, "a.off", head + rows))
 
 
-def test_off_with_colours_and_normals(tmp_path: Path) -> None:
+def test_off_with_colors_and_normals(tmp_path: Path) -> None:
     rows = "".join(f"{x} {y} {z} 0 0 1 255 0 51 255\n" for x, y, z in CORNERS)
     shape = load(tmp_path, "a.off", "CNOFF\n5 2 0\n" + rows + "4 0 1 2 3\n3 0 1 4\n")
     check(shape)
@@ -327,7 +327,7 @@ def test_gltf_skin_stands_as_its_joints_do(tmp_path: Path) -> None:
     np.testing.assert_allclose(shape.verts, TRIANGLE + np.array([[0, 0, 7], [0, 0, 9], [0, 0, 8]]), atol=1e-6)
 
 
-def test_gltf_colours_sparse_and_strided_data(tmp_path: Path) -> None:
+def test_gltf_colors_sparse_and_strided_data(tmp_path: Path) -> None:
     rows = np.zeros((3, 4), np.float32)
     rows[:, :3] = TRIANGLE
     document = {
@@ -354,8 +354,8 @@ def test_gltf_colours_sparse_and_strided_data(tmp_path: Path) -> None:
             },
         ],
     }
-    colours = np.array([[255, 0, 0, 255], [0, 51, 0, 255], [0, 0, 0, 0]], np.uint8)
-    parts = [rows, colours, np.array([2, 0, 0, 0], np.uint8), np.array([[4, 5, 6]], np.float32)]
+    colors = np.array([[255, 0, 0, 255], [0, 51, 0, 255], [0, 0, 0, 0]], np.uint8)
+    parts = [rows, colors, np.array([2, 0, 0, 0], np.uint8), np.array([[4, 5, 6]], np.float32)]
     shape = gltf(tmp_path, "a.glb", document, *parts)
     np.testing.assert_allclose(shape.verts, [*TRIANGLE, [0, 0, 0], [0, 0, 0], [4, 5, 6]])
     # a fifth of the light (linear in glTF) looks like 0.4845 (IEC 61966-2-1)
@@ -363,7 +363,7 @@ def test_gltf_colours_sparse_and_strided_data(tmp_path: Path) -> None:
     np.testing.assert_allclose(shape.colors, expected, atol=1e-6)
 
 
-def test_colours_of_a_glb_are_light(tmp_path: Path, cube: Shape) -> None:
+def test_colors_of_a_glb_are_light(tmp_path: Path, cube: Shape) -> None:
     """A middle grey (0.5 on a screen) is 0.214 of the light: in the file, to the eyes of another program, and back."""
     save_shape(tmp_path / "a.ply", Shape(cube.verts, cube.faces, "a", np.tile([0.5, 0.5, 0.5, 0.25], (8, 1))))
     save_shape(tmp_path / "a.glb", load_shape(tmp_path / "a.ply"))

@@ -94,7 +94,7 @@ def test_the_meaning_of_alpha_is_written(tmp_path: Path, alpha: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
-def test_trimesh_sees_the_same_colours(tmp_path: Path, ball: tuple[Textured, np.ndarray], suffix: str) -> None:
+def test_trimesh_sees_the_same_colors(tmp_path: Path, ball: tuple[Textured, np.ndarray], suffix: str) -> None:
     """The second implementation: its own reader, its own weights, its own look-up of the picture."""
     mesh, image = ball
     image[..., 3] = 255
@@ -134,7 +134,7 @@ def test_trimesh_sees_the_same_colours(tmp_path: Path, ball: tuple[Textured, np.
 
 
 def test_a_picture_without_holes_has_no_alpha_channel() -> None:
-    assert png_bytes(quarters())[25] == 2  # PNG's colour type: red, green, blue
+    assert png_bytes(quarters())[25] == 2  # PNG's color type: red, green, blue
     holes = quarters().copy()
     holes[0, 0, 3] = 0
     assert png_bytes(holes)[25] == 6

@@ -85,7 +85,7 @@ def test_two_triangles_with_several_threads_and_parts(sphere: Shape, monkeypatch
     np.testing.assert_array_equal(one.image, many.image)
 
 
-def test_one_colour_stays_one_colour_whatever_the_map(sphere: Shape, torus: Shape) -> None:
+def test_one_color_stays_one_color_whatever_the_map(sphere: Shape, torus: Shape) -> None:
     rng = np.random.default_rng(4)
     face, weights = rng.integers(0, sphere.F, torus.V), rng.dirichlet((1, 1, 1), torus.V)
     wild = VertexMap.between(torus, sphere, sphere.faces[face, 0], face=face, barycentric=weights)
@@ -98,7 +98,7 @@ def test_one_colour_stays_one_colour_whatever_the_map(sphere: Shape, torus: Shap
 
 
 def by_hand(source: Shape, look: Appearance, target: Shape, back: VertexMap, uv: np.ndarray, size: int) -> dict:
-    """Linear colours of the texels whose triangle's corners lie on one face or next to it, one by one."""
+    """Linear colors of the texels whose triangle's corners lie on one face or next to it, one by one."""
     image = look.materials[0].image
     assert image is not None
     places = source.verts[back.index]
@@ -216,7 +216,7 @@ def test_no_background_along_any_seam_at_any_mip_level(sphere: Shape, size: int)
 
 
 def test_both_sides_of_a_new_seam_show_the_same(sphere: Shape) -> None:
-    """A seam runs through a smooth picture: seen from both sides, its colours must agree."""
+    """A seam runs through a smooth picture: seen from both sides, its colors must agree."""
     y = sphere.verts
     colors = np.concatenate([0.5 + 0.4 * np.sin(4 * y), np.ones((sphere.V, 1))], axis=1)
     look = Appearance((Material(),), np.zeros(sphere.F, np.int64), np.zeros((sphere.F, 3, 2)), colors)
@@ -257,7 +257,7 @@ def test_coordinates_are_not_interpolated_across_the_sources_seams() -> None:
 # Materials
 
 
-def test_several_materials_with_images_factors_and_vertex_colours() -> None:
+def test_several_materials_with_images_factors_and_vertex_colors() -> None:
     red = np.full((4, 4, 4), (255, 0, 0, 255), np.uint8)
     materials = (Material("a", red, factor=(0.5, 1, 1, 1)), Material("b", factor=(0.0, 0.25, 1.0, 1.0)))
     colors = np.tile([1.0, 1.0, 0.5, 1.0], (4, 1))
@@ -326,7 +326,7 @@ def test_a_seam_of_the_source_is_smoothed_by_more_samples() -> None:
 # Alpha
 
 
-def test_alpha_is_kept_and_the_colour_of_holes_is_not() -> None:
+def test_alpha_is_kept_and_the_color_of_holes_is_not() -> None:
     image = np.zeros((32, 32, 4), np.uint8)
     image[...] = (255, 0, 255, 0)
     image[8:24, 8:24] = (0, 100, 200, 255)
@@ -389,7 +389,7 @@ def test_doubt_is_reported_and_kept_left_blank_or_filled() -> None:
     assert worn(SQUARE, look, SQUARE, doubtful(), OWN, replace(SMALL, min_confidence=0.0)).low == 0.0
 
 
-def test_filling_takes_the_colours_around() -> None:
+def test_filling_takes_the_colors_around() -> None:
     image = np.full((32, 32, 4), (0, 0, 255, 255), np.uint8)
     image[:12, 20:] = (255, 0, 0, 255)  # what is in doubt is red
     for padding in (0, 2):
@@ -443,7 +443,7 @@ def test_nothing_is_smeared_where_a_map_tears(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_texture_goes_on_up_to_the_cut() -> None:
-    """Beside a tear each side continues as it would have: no patch of one colour around a vertex."""
+    """Beside a tear each side continues as it would have: no patch of one color around a vertex."""
     source, _ = strips()
     target, back, uv = torn_case()
     x = np.mgrid[:64, :192][1]
@@ -461,7 +461,7 @@ def test_a_texture_goes_on_up_to_the_cut() -> None:
     assert before[-1] - before[0] >= 3  # it has not stopped
 
 
-# Clouds, colours, oddities
+# Clouds, colors, oddities
 
 
 def test_a_cloud_as_source(sphere: Shape) -> None:
@@ -478,7 +478,7 @@ def test_a_cloud_as_source(sphere: Shape) -> None:
     assert np.abs(seen - (middle + 1) / 2).max() < 0.12
 
 
-def test_points_get_colours(sphere: Shape) -> None:
+def test_points_get_colors(sphere: Shape) -> None:
     image = smooth(64)
     look = wearing(image, unwrapped(sphere, 64, 2))
     fine, _, back = split(sphere)

@@ -41,7 +41,7 @@ def test_write_then_read(tmp_path: Path, suffix: str, on: On, words: bool) -> No
 
 @pytest.mark.parametrize("on", ["vertices", "faces"])
 @pytest.mark.parametrize("words", [False, True])
-def test_a_ply_has_labels_and_colours(tmp_path: Path, on: On, words: bool) -> None:
+def test_a_ply_has_labels_and_colors(tmp_path: Path, on: On, words: bool) -> None:
     given = some(on, words)
     save_labels(tmp_path / "l.ply", given, SHAPE)
     shape = load_shape(tmp_path / "l.ply")

@@ -173,7 +173,7 @@ def test_vertices_without_weights_get_their_neighbours() -> None:
 
 
 def test_what_is_filled_in_lies_between_what_is_known_to_the_last_bit() -> None:
-    """Colours must stay within 0..1, and labels' shares too: the solver alone ends a rounding error beyond."""
+    """Colors must stay within 0..1, and labels' shares too: the solver alone ends a rounding error beyond."""
     sheet = grid(4, 40)
     for seed in range(8):
         rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Images in smaller sizes, and looking colours up in them."""
+"""Images in smaller sizes, and looking colors up in them."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from tests.shapes.painted import quarters
 
 
 def look(pyramid: Pyramid, u: float, v: float, footprint: float = 0.0) -> list[float]:
-    """Colour and alpha in 0..1 at one place, as a screen shows it."""
+    """Color and alpha in 0..1 at one place, as a screen shows it."""
     one = [np.array([x], np.float32) for x in (u, v, footprint)]
     found = pyramid.look(*one)[:, 0].astype(float)
     return [*to_srgb(found[:3]).tolist(), float(found[3])]
@@ -41,7 +41,7 @@ def test_an_unknown_texel_takes_the_mean_of_its_three_neighbours_as_light() -> N
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (7, 5), (1, 9), (1, 1)])
-def test_one_colour_stays_one_colour(shape: tuple[int, int]) -> None:
+def test_one_color_stays_one_color(shape: tuple[int, int]) -> None:
     pixels = np.zeros((*shape, 4), np.uint8)
     weight = (np.random.default_rng(0).random(shape) < 0.3).astype(np.float32)
     weight[0, 0] = 1
@@ -147,7 +147,7 @@ def test_alpha_counts_unless_the_material_is_opaque() -> None:
     assert look(Pyramid(Material(image=image)), 0.25, 0.5) == pytest.approx([1, 0, 0, 1], abs=1e-4)
     seen = Pyramid(Material(image=image, alpha="blend"))
     assert look(seen, 0.75, 0.5)[3] == pytest.approx(128 / 255)
-    # nobody sees the red: it must not colour its surroundings
+    # nobody sees the red: it must not color its surroundings
     np.testing.assert_allclose(look(seen, 0.25, 0.5), [0, 0, 1, 0], atol=1e-4)
     assert look(seen, 0.5, 0.5, 8.0)[3] == pytest.approx(64 / 255, abs=3e-3)
 

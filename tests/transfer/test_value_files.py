@@ -1,4 +1,4 @@
-"""Numbers of vertices, and vertex colours: written and read, and what files get wrong."""
+"""Numbers of vertices, and vertex colors: written and read, and what files get wrong."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -126,7 +126,7 @@ def painted() -> Shape:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".npy", ".csv"])
-def test_colours_are_written_as_they_were(tmp_path: Path, suffix: str) -> None:
+def test_colors_are_written_as_they_were(tmp_path: Path, suffix: str) -> None:
     shape = painted()
     path = tmp_path / f"c{suffix}"
     save_colors(path, shape, seen(light_of(shape)))
@@ -138,7 +138,7 @@ def test_colours_are_written_as_they_were(tmp_path: Path, suffix: str) -> None:
     assert np.abs(found[:, :channels] - shape.colors[:, :channels]).max() < 1e-9
 
 
-def test_gltf_holds_light_and_the_others_colours(tmp_path: Path) -> None:
+def test_gltf_holds_light_and_the_others_colors(tmp_path: Path) -> None:
     """Middle grey on a screen, 188 of 255, is half the light of white."""
     grey = np.full((SHAPE.V, 4), 0.5)
     grey[:, 3] = 1
@@ -155,13 +155,13 @@ def test_gltf_holds_light_and_the_others_colours(tmp_path: Path) -> None:
     assert np.abs(stored.visual.vertex_colors[:, :3] / 255 - 0.5).max() < 0.005
 
 
-def test_no_colours_is_told_with_what_to_do(tmp_path: Path) -> None:
+def test_no_colors_is_told_with_what_to_do(tmp_path: Path) -> None:
     save_shape(tmp_path / "a.ply", SHAPE)
-    with pytest.raises(InputError, match=r"a\.ply has no vertex colours") as told:
+    with pytest.raises(InputError, match=r"a\.ply has no vertex colors") as told:
         light_of(load_shape(tmp_path / "a.ply"))
     assert "--values" in told.value.hint
 
 
-def test_colours_have_their_suffixes(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match=r"c\.stl: '\.stl' is not a format for vertex colours"):
+def test_colors_have_their_suffixes(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"c\.stl: '\.stl' is not a format for vertex colors"):
         save_colors(tmp_path / "c.stl", SHAPE, np.ones((SHAPE.V, 4)))

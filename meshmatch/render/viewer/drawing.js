@@ -1,4 +1,4 @@
-// One shape as three.js draws it. Every colour scheme is an attribute that is there from the beginning; choosing one
+// One shape as three.js draws it. Every color scheme is an attribute that is there from the beginning; choosing one
 // sets a number.
 
 const MODES = { matches: 0, look: 1, own: 1, confidence: 2, plain: 3 };
@@ -73,7 +73,7 @@ function usualEdge(position, face) {
 
 class Drawing {
   // arrays of one side: position, normal, color, confidence, place, match, face; vertex, where rows are not the file's;
-  // look.* and own.*, its textures or colours. ramp: colours of confidence 0..1 in even steps.
+  // look.* and own.*, its textures or colors. ramp: colors of confidence 0..1 in even steps.
   constructor(words, arrays, ramp) {
     this.words = words;
     this.arrays = arrays;

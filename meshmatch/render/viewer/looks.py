@@ -26,7 +26,7 @@ Arrays = dict[str, NDArray[Any]]
 TEXELS = 1024
 """Width and height of a texture that is baked for a page."""
 MOST_FACES = 40_000
-"""A finer mesh wears colours of vertices: they show nearly as much, and it is unwrapped for a minute."""
+"""A finer mesh wears colors of vertices: they show nearly as much, and it is unwrapped for a minute."""
 LARGEST = 2048
 """Pixels along an image's longer side; a larger one is made smaller."""
 MOST_PIXELS = 3 * LARGEST**2
@@ -46,7 +46,7 @@ class Looks:
     def words(self) -> dict[str, Any]:
         """What the page's buttons and legend say."""
         textured = self.worn[self.side == "target"].textured
-        kind = "texture" if textured else "colours"
+        kind = "texture" if textured else "colors"
         return {"look": {"kind": kind, "side": self.side}, "own": self.own is not None}
 
     def of(self, k: int) -> list[tuple[str, Appearance]]:
@@ -82,7 +82,7 @@ def share_look(
 def _carried(
     look: Appearance, owner: Shape, wearer: Shape, back: VertexMap, coordinates: Floats | None, workers: int
 ) -> Appearance:
-    """A look of `owner` on `wearer`, by a map from `wearer` to `owner`: baked, or as colours of vertices."""
+    """A look of `owner` on `wearer`, by a map from `wearer` to `owner`: baked, or as colors of vertices."""
     material = np.zeros(wearer.F, np.int64)
     if look.textured and 0 < wearer.F <= MOST_FACES:
         choices = BakeOptions(size=TEXELS, padding=4, workers=workers)
@@ -100,7 +100,7 @@ def _carried(
 
 def dress(look: Appearance, shape: Shape, part: Drawn) -> tuple[Arrays, dict[str, Any] | None]:
     """Arrays and words of a look on what is drawn of a shape: a skin where there is an image and the triangles are the
-    file's own; else ``paint`` (N, 3), a colour for each vertex that is drawn, without words.
+    file's own; else ``paint`` (N, 3), a color for each vertex that is drawn, without words.
     """
     if len(part.file_face) and (look.textured or len(look.materials) > 1):
         return _skin(look, part)
@@ -109,7 +109,7 @@ def dress(look: Appearance, shape: Shape, part: Drawn) -> tuple[Arrays, dict[str
 
 def _skin(look: Appearance, part: Drawn) -> tuple[Arrays, dict[str, Any]]:
     """A textured surface as the page has it. Arrays: ``vertex`` (S,) the row of the shape that is drawn, ``uv`` (S, 2),
-    ``face`` (M, 3) of these S, by material; ``paint`` (S, 3) where vertex colours are to be multiplied; ``image0``,
+    ``face`` (M, 3) of these S, by material; ``paint`` (S, 3) where vertex colors are to be multiplied; ``image0``,
     ``image1``...: bytes of files. Words: ``groups``, which faces have which material, and ``images``, the kinds of the
     files.
     """
@@ -170,7 +170,7 @@ def _encoded(pixels: Pixels, shrink: float, opaque: bool) -> tuple[str, bytes]:
 
 
 def vertex_paint(look: Appearance, shape: Shape) -> Float[Floats, "V 3"]:
-    """The colour at each vertex as screens show it: of the last of its faces, at the nearest texel."""
+    """The color at each vertex as screens show it: of the last of its faces, at the nearest texel."""
     light = np.ones((shape.V, 3)) if look.colors is None else np.array(look.colors[:, :3])
     for k, material in enumerate(look.materials):
         face = np.flatnonzero(look.material == k)

@@ -144,7 +144,7 @@ function turn(event) {
 function prepare(arrays) {
   const canvas = $('canvas');
   renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
-  renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader writes colours as they are to appear
+  renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader writes colors as they are to appear
   camera = new THREE.PerspectiveCamera(VIEW.field, 1, 0.005, 50);
   scene = new THREE.Scene();
   geometry = new THREE.BufferGeometry();

@@ -49,7 +49,7 @@ def write_page(
 ) -> PageReport:
     """Write a page that shows two shapes side by side, and for each point of one its match on the other.
 
-    The source is coloured by position, the target by its colours carried along the map. The same input gives the same
+    The source is colored by position, the target by its colors carried along the map. The same input gives the same
     bytes. ``rotations`` are as `Frame.rotation` of a fit; the source's is guessed if not given, and the target's then
     follows from the map. ``names`` are shown instead of the shapes' own, and ``looks`` by a button.
 
@@ -128,7 +128,7 @@ def write_motion(
     """Write a page on which a shape goes through frames; how many bytes it has. The same input gives the same bytes.
 
     The ``frames`` are at least two shapes with the same vertices and faces, in one frame and unit, each with its time,
-    which increase; the first gives the colours. ``rotation`` leads from there into y up, z to the front. ``met`` are names
+    which increase; the first gives the colors. ``rotation`` leads from there into y up, z to the front. ``met`` are names
     to show at some of the times. Up to ``most`` vertices are drawn, and fewer where there are many frames.
 
     `OptionError` for a suffix that is no page's, and for other frames or times; `OutputError` where the file cannot be

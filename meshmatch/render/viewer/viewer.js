@@ -4,7 +4,7 @@ function prepare(arrays) {
   const canvas = $('canvas');
   renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
   renderer.autoClear = false;
-  renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader writes colours as they are to appear
+  renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader writes colors as they are to appear
   ((drawings = {}), (cameras = {}), (controls = {}));
   for (const side of SIDES) {
     const own = {};

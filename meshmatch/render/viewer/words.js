@@ -6,7 +6,7 @@ const within = (name) => `\u2068${name}\u2069`;
 // Parts of each legend: words, the scale, and what may be left out where there is little room.
 const SCALE = Symbol('scale');
 const LEGENDS = {
-  matches: () => ['One colour is one place', ': the source by position, the target through the map.'],
+  matches: () => ['One color is one place', ': the source by position, the target through the map.'],
   look: () => [
     `The ${words.look.kind} of ${within(words[words.look.side].name)}`,
     ', transferred by the map to the other.',
@@ -27,7 +27,7 @@ const LEGENDS = {
 
 function modes() {
   const found = [['matches', 'Matches']];
-  if (words.look) found.push(['look', words.look.kind === 'texture' ? 'Texture' : 'Colours']);
+  if (words.look) found.push(['look', words.look.kind === 'texture' ? 'Texture' : 'Colors']);
   if (words.own) found.push(['own', 'Original']);
   if (words.confidence) found.push(['confidence', 'Confidence']);
   return [...found, ['plain', 'Plain']];
@@ -138,7 +138,7 @@ function keys(event) {
   const typing = event.target instanceof HTMLInputElement && event.target.type !== 'radio';
   if (typing || $('help').open) return;
   const side = document.activeElement === view('target') ? 'target' : 'source';
-  const radio = event.target instanceof HTMLInputElement; // arrows choose among the colours there
+  const radio = event.target instanceof HTMLInputElement; // arrows choose among the colors there
   const list = modes(),
     key = event.key;
   if (/^[1-9]$/.test(key) && Number(key) <= list.length) setMode(list[Number(key) - 1][0]);

@@ -4,12 +4,12 @@ A map answers for every vertex of a file, so readers keep them all, in order, an
 promises. STL goes through trimesh. The other readers are our own, because of what trimesh 5.2 does (measured):
 
 - ply: text takes 1.4 s instead of 0.4 s for 164,000 vertices; importing trimesh takes 0.7 s, and ply is what
-  benchmarks and scans come in. Triangle strips become points, and 16-bit colours lose their upper byte.
+  benchmarks and scans come in. Triangle strips become points, and 16-bit colors lose their upper byte.
 - obj: a file with several materials becomes several meshes, each with all the vertices.
-- off: vertex colours are lost, and a face that is cut short vanishes without a word.
+- off: vertex colors are lost, and a face that is cut short vanishes without a word.
 - gltf: meshes come in another order than the scene's (`Rogue.glb`), skins are ignored, strips without indices fail.
 
-Its writers round: ply to 32 bits, off to ten digits and obj to eight behind the point (1e-20 becomes 0), colours of
+Its writers round: ply to 32 bits, off to ten digits and obj to eight behind the point (1e-20 becomes 0), colors of
 glb to 8 bits of linear light, too few for dark ones. Ours keep every bit of ply, off and obj positions.
 """
 
@@ -35,7 +35,7 @@ _SPACE[[9, 10, 11, 12, 13, 32]] = True
 
 @dataclass(frozen=True, eq=False)
 class Raw:
-    """What a file says, unchecked: positions, maybe NaN; faces; sRGB colours and alpha in 0..1."""
+    """What a file says, unchecked: positions, maybe NaN; faces; sRGB colors and alpha in 0..1."""
 
     verts: Float[Floats, "V 3"]
     faces: Int[Ints, "F 3"]
@@ -89,7 +89,7 @@ def indices(name: str, values: NDArray[Any]) -> Ints:
 
 
 def painted(channels: Float[Floats, "V C"]) -> Float[Floats, "V 4"]:
-    """Colours of 3 or 4 channels, which count to 255 if one is above 1, else to 1."""
+    """Colors of 3 or 4 channels, which count to 255 if one is above 1, else to 1."""
     channels = np.nan_to_num(channels)
     colors = np.ones((len(channels), 4))
     colors[:, : channels.shape[1]] = np.clip(channels / (255.0 if (channels > 1).any() else 1.0), 0.0, 1.0)

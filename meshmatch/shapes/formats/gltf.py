@@ -257,7 +257,7 @@ class Document:
 
 
 def joined_colors(colors: list[Float[Floats, "_ 4"] | None], counts: list[int]) -> Float[Floats, "V 4"] | None:
-    """Colours of primitives one after the other, white for those without; None if none has any."""
+    """Colors of primitives one after the other, white for those without; None if none has any."""
     if all(color is None for color in colors):
         return None
     return np.vstack([np.ones((n, 4)) if c is None else c for c, n in zip(colors, counts, strict=True)])

@@ -86,7 +86,7 @@ class _Look:
         return found
 
     def _base(self, number: int) -> tuple[dict[str, Any], dict[str, Any] | None, tuple[float, ...]]:
-        """A material, its base colour texture and its factor."""
+        """A material, its base color texture and its factor."""
         material = self.json["materials"][number] if number >= 0 else {}
         gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
         if gloss is not None and "pbrMetallicRoughness" not in material:

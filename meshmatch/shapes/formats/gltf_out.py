@@ -30,7 +30,7 @@ _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
 def write(path: Path, shape: Shape) -> None:
-    """A mesh or a cloud; 32-bit floats, 32-bit indices, linear vertex colours."""
+    """A mesh or a cloud; 32-bit floats, 32-bit indices, linear vertex colors."""
     attributes = {"POSITION": shape.verts}
     if not shape.is_cloud:
         attributes["NORMAL"] = smooth_normals(shape.verts, shape.faces)

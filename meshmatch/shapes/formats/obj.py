@@ -17,7 +17,7 @@ from meshmatch.shapes.shape import Shape
 
 
 def read(path: Path, data: bytes) -> Raw:
-    """One vertex per ``v`` line, in their order; with colours where six numbers are given."""
+    """One vertex per ``v`` line, in their order; with colors where six numbers are given."""
     name = path.name
     if b"\0" in data[:4096]:
         raise InputError(f"{name} is not an obj file: it is binary", formats.WRONG_SUFFIX)
@@ -101,7 +101,7 @@ def write_textured(path: Path, mesh: formats.Textured, mtl: str, material: str) 
 
 
 def write_material(path: Path, material: str, image: str, mesh: formats.Textured) -> None:
-    """The mtl: plain paint in the colours of the image. No options of maps: not every reader knows them."""
+    """The mtl: plain paint in the colors of the image. No options of maps: not every reader knows them."""
     paint = [f"newmtl {material}", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {image}"]
     _write(path, paint if mesh.alpha == "opaque" else [*paint, f"map_d {image}"])
 

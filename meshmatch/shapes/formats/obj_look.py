@@ -119,7 +119,7 @@ def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
 
 
 def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
-    """The materials of all mtl files that are named. A shape with vertex colours may miss them."""
+    """The materials of all mtl files that are named. A shape with vertex colors may miss them."""
     entries: dict[str, _Entry] = {}
     for name in names:
         whole = _beside(path.parent, name)
@@ -209,7 +209,7 @@ def _image(path: Path, name: str, entry: _Entry, reader: ImageReader, laid: bool
         return image
     other = decode(entry.alpha)
     if other.shape != image.shape:
-        what = f"{path.name}: the alpha image {entry.alpha.file} differs in size from the colour image"
-        raise InputError(what, "save both in one size, or the alpha within the colours' png")
+        what = f"{path.name}: the alpha image {entry.alpha.file} differs in size from the color image"
+        raise InputError(what, "save both in one size, or the alpha within the colors' png")
     channel = other[..., 0] if (other[..., 3] == 255).all() else other[..., 3]
     return np.concatenate([image[..., :3], channel[..., None]], axis=-1)

@@ -18,7 +18,7 @@ _HEADER = re.compile(rb"\s*((?:ST)?C?N?)OFF\b|\s*((?:ST)?C?N?)OFF(?=\d)")
 
 
 def read_off(path: Path, data: bytes) -> Raw:
-    """With or without colours and normals."""
+    """With or without colors and normals."""
     name = path.name
     text = formats.without_comments(data).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     header = _HEADER.match(text)
@@ -59,7 +59,7 @@ def read_off(path: Path, data: bytes) -> Raw:
 
 
 def write_off(path: Path, shape: Shape) -> None:
-    """Positions with every digit that they have; colours as COFF."""
+    """Positions with every digit that they have; colors as COFF."""
     verts = shape.verts_or_nan
     rows = verts if shape.colors is None else np.hstack([verts, shape.colors])
     lines = ["OFF" if shape.colors is None else "COFF", f"{shape.V} {shape.F} 0"]

@@ -45,7 +45,7 @@ class _Element:
 
 
 def read(path: Path, data: bytes) -> Raw:
-    """Vertices, faces (polygons or strips) and vertex colours."""
+    """Vertices, faces (polygons or strips) and vertex colors."""
     name = path.name
     order, elements, start = _header(name, data)
     known = [element.name for element in elements]
