@@ -18,6 +18,8 @@ from tests import array_annotations
 
 array_annotations.install(["meshmatch"])  # before any of its modules is loaded
 
+from meshmatch.fitting.fit import Fit  # noqa: E402
+from meshmatch.geometry.frames import Frame  # noqa: E402
 from meshmatch.shapes.shape import Shape  # noqa: E402
 
 
@@ -106,6 +108,14 @@ def torus() -> Shape:
     c, d = np.roll(b, -1, axis=1), np.roll(a, -1, axis=1)
     faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
     return Shape(verts, faces, "torus")
+
+
+def some_fit(points: np.ndarray, faces: np.ndarray, **about: Any) -> Fit:
+    """A good fit that nobody made: in the frame of its file, resting where it lies, unless `about` says otherwise."""
+    plain: dict[str, Any] = {"template_hash": "", "frame": Frame.identity(), "vectors": points, "resting": points}
+    plain |= {"residual": 0.0, "vertex_distance": np.zeros(1), "verdict": "good", "reasons": ()}
+    plain |= {"up": "+y", "front": "+z", "seconds": 0.0, "seed": 0}
+    return Fit(points=points, faces=faces, **(plain | about))
 
 
 def icosphere(splits: int) -> Shape:

@@ -141,5 +141,6 @@ def _array(file: IO[bytes], name: str, most: int) -> NDArray[Any]:
 def _not_arrays(path: Path, error: Exception) -> InputError:
     if "pickle" in str(error) or "Object arrays" in str(error):
         return InputError(f"{path.name} holds Python objects, which are not read", "save plain arrays in it")
-    unreadable = f"{path.name} does not hold arrays that can be read: {error}"
+    what = str(error).partition(": <ast.")[0]  # not where Python's parser has its node
+    unreadable = f"{path.name} does not hold arrays that can be read: {what}"
     return InputError(unreadable, "is it damaged, or of another format?")

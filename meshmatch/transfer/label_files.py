@@ -5,6 +5,7 @@ A label is a whole number or a word. Files of shapes with a label, .ply, are wri
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -52,10 +53,9 @@ class Labels:
         """The label that `text` names, of the kind that these are; `OptionError` if it cannot be one."""
         if self.are_words:
             return text
-        try:
-            return int(text)
-        except ValueError:
-            raise OptionError(f"--blank {text}: labels are whole numbers here", "such as --blank -1") from None
+        if (number := _whole(text)) is None:
+            raise OptionError(f"--blank {text}: labels are whole numbers here", "such as --blank -1")
+        return number
 
 
 def named(codes: Ints, given: Labels, on: On, blank: str | None) -> Labels:
@@ -119,8 +119,10 @@ def _labels(name: str, values: Sequence[Any], shape: Shape, on: str | None) -> L
 
 
 def _whole(value: Any) -> int | None:
-    """A whole number, also one written as text or with a decimal point."""
+    """A whole number, also one written as text, in plain digits, or with a decimal point."""
     try:
+        if isinstance(value, str) and not re.fullmatch(r"\s*[+-]?[0-9]+\s*", value):
+            return None
         if isinstance(value, str | int):
             return int(value)
         return int(value) if float(value) == int(value) else None

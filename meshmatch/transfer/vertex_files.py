@@ -113,13 +113,14 @@ def save_values(path: Path, values: Values, shape: Shape) -> None:
 
 def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:
     """What the user's text says: a number, one for each column, or #rrggbb; `OptionError` if it says none of these."""
+    numbers: list[float] = []
     try:
         if re.fullmatch("#[0-9a-fA-F]{6}", text):
             numbers = [byte / 255 for byte in bytes.fromhex(text[1:])]
-        else:
+        elif text.isascii() and "_" not in text:  # Python's numbers have other digits too
             numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
-        numbers = []
+        pass
     if len(numbers) == 3 and columns == 4:
         numbers.append(1.0)
     numbers *= columns if len(numbers) == 1 else 1

@@ -16,6 +16,7 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
+from tests.conftest import some_fit
 
 
 @pytest.fixture(autouse=True)
@@ -60,25 +61,9 @@ def two(tmp_path: Path, sphere: Shape, torus: Shape) -> tuple[Path, Path]:
 def fake_fit(shape: Shape, verdict: str = "good", reasons: tuple[str, ...] = (), **other: Any) -> Fit:
     """A fit that nobody made: of two triangles."""
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    rest: dict[str, Any] = {
-        "frame": Frame(2.0, np.eye(3), np.array([10.0, 0, 0])),
-        "up": "+y",
-        "front": "-z",
-        "residual": 0.0123,
-    }
-    return Fit(
-        template_hash="0" * 16,
-        points=corners,
-        vectors=np.zeros((4, 3)),
-        resting=corners,
-        faces=np.array([[0, 1, 2], [0, 2, 3]]),
-        vertex_distance=np.zeros(shape.V),
-        verdict=verdict,
-        reasons=reasons,
-        seconds=1.0,
-        seed=0,
-        **(rest | other),
-    )
+    rest: dict[str, Any] = {"frame": Frame(2.0, np.eye(3), np.array([10.0, 0, 0])), "front": "-z", "residual": 0.0123}
+    rest |= {"template_hash": "0" * 16, "vertex_distance": np.zeros(shape.V), "verdict": verdict, "reasons": reasons}
+    return some_fit(corners, np.array([[0, 1, 2], [0, 2, 3]]), seconds=1.0, **(rest | other))
 
 
 def nearest_map(source: Shape, target: Shape, **about: Any) -> VertexMap:

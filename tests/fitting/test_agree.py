@@ -17,6 +17,7 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
+from tests.conftest import some_fit
 from tests.fitting.eggs import egg_model
 
 TURNS = Rotation.random(4, random_state=np.random.default_rng(0)).as_matrix()
@@ -104,10 +105,9 @@ def test_landmarks_hold(system: NodeSystem, model: TrainedModel) -> None:
 
 
 def fit_of(system: NodeSystem, vectors: np.ndarray, verdict: str = "good") -> Fit:
-    points = system.moved(vectors)
-    frame = Frame(2.0, TURNS[1], np.array([1.0, 2.0, 3.0]))
-    none = np.zeros(len(points))
-    return Fit("egg", frame, points, vectors, system.verts, system.faces, 0.02, none, verdict, (), "+y", "+z", 0.0, 0)
+    about = {"frame": Frame(2.0, TURNS[1], np.array([1.0, 2.0, 3.0])), "verdict": verdict, "residual": 0.02}
+    points, none = system.moved(vectors), np.zeros(len(system.verts))
+    return some_fit(points, system.faces, vectors=vectors, resting=system.verts, vertex_distance=none, **about)
 
 
 def test_fits_agree_in_their_own_frames(system: NodeSystem, model: TrainedModel) -> None:

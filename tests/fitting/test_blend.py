@@ -16,6 +16,7 @@ from meshmatch.fitting.system import node_system
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
+from tests.conftest import some_fit
 from tests.fitting.eggs import egg_model
 
 HALF = np.array([0.5, 0.5])
@@ -43,22 +44,8 @@ def bent(model: TrainedModel, degrees: float, grow: float = 1.0) -> np.ndarray:
 
 def fit_of(model: TrainedModel, vectors: np.ndarray, frame: Frame | None = None) -> Fit:
     system = node_system(model)
-    return Fit(
-        template_hash=model.template.hash,
-        frame=frame or Frame.identity(),
-        points=system.moved(vectors),
-        vectors=vectors,
-        resting=system.verts,
-        faces=system.faces,
-        residual=0.01,
-        vertex_distance=np.zeros(3),
-        verdict="good",
-        reasons=(),
-        up="+y",
-        front="+z",
-        seconds=0.0,
-        seed=0,
-    )
+    about = {"template_hash": model.template.hash, "frame": frame or Frame.identity()}
+    return some_fit(system.moved(vectors), system.faces, vectors=vectors, resting=system.verts, **about)
 
 
 @pytest.fixture(scope="module")

@@ -6,21 +6,17 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.fit import Fit
-from meshmatch.geometry.frames import Frame
 from meshmatch.maps.build import build_map
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
+from tests.conftest import some_fit
 from tests.maps.solids import bumpy_sphere
 from tests.transfer.known import brute_force
 
 
 def lying_on(shape: Shape) -> Fit:
     """A fit that is exactly its shape."""
-    none = np.zeros(shape.V)
-    return Fit(
-        "", Frame.identity(), shape.verts, shape.verts, shape.verts, shape.faces, 0.0, none, "good", (), "+y", "+z",
-        0.0, 0,
-    )  # fmt: skip
+    return some_fit(shape.verts, shape.faces)
 
 
 def test_where_a_fit_moved_it_is_not_believed() -> None:

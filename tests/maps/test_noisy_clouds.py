@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.fit import Fit
-from meshmatch.geometry.frames import Frame
 from meshmatch.maps import build
 from meshmatch.maps.build import expectation, is_noisy, most_likely_points, noise_level
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
+from tests.conftest import some_fit
 
 NO_FACES = np.empty((0, 3), np.int64)
 
@@ -23,9 +23,7 @@ def plate(side: int = 21, height: float = 0.0) -> Fit:
     a = np.arange(side * side).reshape(side, side)
     p, q, r, t = (c.reshape(-1) for c in (a[:-1, :-1], a[1:, :-1], a[1:, 1:], a[:-1, 1:]))
     faces = np.concatenate([np.stack([p, q, r], 1), np.stack([p, r, t], 1)])
-    return Fit(
-        "", Frame.identity(), points, points, points, faces, 0.0, np.zeros(1), "good", (), "+y", "+z", 0.0, 0
-    )  # fmt: skip
+    return some_fit(points, faces)
 
 
 def test_the_noise_is_that_of_the_distances_whatever_a_few_strays_do() -> None:

@@ -9,7 +9,7 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.maps.footpoints import SurfaceBinding
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
-from tests.conftest import icosphere
+from tests.conftest import icosphere, some_fit
 
 TURN = Rotation.from_euler("xyz", [20, 50, -30], degrees=True).as_matrix()
 FRAME = Frame(2.5, TURN, np.array([7.0, -1, 4]))
@@ -18,22 +18,7 @@ FRAME = Frame(2.5, TURN, np.array([7.0, -1, 4]))
 def ball_fit(rider: Shape) -> Fit:
     """The unit sphere as the template, laid near a shape."""
     ball = icosphere(2)
-    return Fit(
-        template_hash="0" * 16,
-        frame=FRAME,
-        points=np.array(ball.verts),
-        vectors=np.zeros((4, 3)),
-        resting=np.array(ball.verts),
-        faces=np.array(ball.faces),
-        residual=0.01,
-        vertex_distance=np.zeros(rider.V),
-        verdict="good",
-        reasons=(),
-        up="+y",
-        front="+z",
-        seconds=0.0,
-        seed=0,
-    )
+    return some_fit(np.array(ball.verts), np.array(ball.faces), frame=FRAME, vertex_distance=np.zeros(rider.V))
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.fit import Fit
-from meshmatch.geometry.frames import Frame
 from meshmatch.maps.footpoints import (
     neighbour_medians,
     neighbours,
@@ -13,6 +12,7 @@ from meshmatch.maps.footpoints import (
     template_footpoints,
 )
 from meshmatch.shapes.shape import Shape
+from tests.conftest import some_fit
 
 # A chain of ten vertices, one apart; where they belong is where they are.
 CHAIN = np.stack([np.arange(9), np.arange(1, 10)], 1)
@@ -70,9 +70,7 @@ def plates(gap: float) -> Fit:
     points = np.concatenate([low, low + np.array([0, 0, gap])])
     resting = np.concatenate([low, low + np.array([0, 0, 1.0])])
     faces = np.concatenate([half, half + len(low)])
-    return Fit(
-        "", Frame.identity(), points, points, resting, faces, 0.0, np.zeros(1), "good", (), "+y", "+z", 0.0, 0
-    )  # fmt: skip
+    return some_fit(points, faces, resting=resting)
 
 
 def test_points_that_noise_carries_across_return() -> None:

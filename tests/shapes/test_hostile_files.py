@@ -2,6 +2,8 @@
 
 import base64
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +107,23 @@ def test_obj_with_texture_coordinates_that_are_no_numbers(tmp_path: Path) -> Non
 def test_npy_headers(tmp_path: Path, header: bytes, words: str) -> None:
     content = b"\x93NUMPY\x01\x00" + len(header + b"\n").to_bytes(2, "little") + header + b"\n"
     refused(tmp_path / "a.npy", content, words)
+
+
+def test_npy_headers_do_not_say_where_the_parser_has_its_nodes(tmp_path: Path) -> None:
+    content = b"\x93NUMPY\x01\x00" + bytes([60, 0]) + b"{'descr': f(), 'fortran_order': x}".ljust(59) + b"\n"
+    refused(tmp_path / "a.npy", content, "can be read: malformed node or string on line 1$")
+
+
+def test_damaged_stl_says_nothing_else(tmp_path: Path) -> None:
+    lines = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+    text = f"solid x\n{lines}{lines}endsolid x\n"
+    for number, old in enumerate(("normal 0 0 1", "normal 0 0 1\nouter", "vertex 1 0 0")):
+        (tmp_path / f"{number}.stl").write_text(text.replace(old, old.replace("0", "?", 1)))
+    code = "import sys; from meshmatch.cli import main; sys.exit(main(sys.argv[1:]))"
+    for path in sorted(tmp_path.iterdir()):
+        told = subprocess.run([sys.executable, "-c", code, "info", path], capture_output=True, text=True)
+        assert "Traceback" not in told.stderr
+        assert told.stderr.count("\n") == (2 if told.returncode else 0)
 
 
 @pytest.mark.parametrize("code", [0x110000, 0xD800])

@@ -127,6 +127,8 @@ def test_whole_numbers_written_as_others_are_numbers(tmp_path: Path) -> None:
     assert load_labels(tmp_path / "a.npy", SHAPE).names == (0, 1)
     np.save(tmp_path / "b.npy", np.arange(SHAPE.V) % 2 == 0)
     assert load_labels(tmp_path / "b.npy", SHAPE).names == (0, 1)
+    assert labels_of(np.resize([" 7", "+1"], SHAPE.V), SHAPE).names == (1, 7)
+    assert labels_of(np.resize(["٣", "1_0"], SHAPE.V), SHAPE).names == ("1_0", "٣")  # digits for Python, words here
 
 
 def test_missing_labels_are_none(tmp_path: Path) -> None:
@@ -202,8 +204,9 @@ def test_blank_has_the_kind_of_the_labels() -> None:
     assert cells(named(codes, numbers, "vertices", "17")) == [-4, 17, 17]
     assert cells(named(codes, words, "vertices", None)) == ["left hand", "", "Fuß"]
     assert cells(named(codes, words, "vertices", "99")) == ["left hand", "99", "Fuß"]
-    with pytest.raises(OptionError, match="--blank none: labels are whole numbers"):
-        named(codes, numbers, "vertices", "none")
+    for text in ("none", "٣", "1_0"):
+        with pytest.raises(OptionError, match=f"--blank {text}: labels are whole numbers"):
+            named(codes, numbers, "vertices", text)
 
 
 def test_a_suffix_that_cannot_hold_labels_is_refused(tmp_path: Path) -> None:

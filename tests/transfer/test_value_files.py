@@ -107,7 +107,18 @@ def test_what_stands_for_nothing(text: str, columns: int, expected: list[float])
 
 @pytest.mark.parametrize(
     ("text", "columns"),
-    [("red", 3), ("#ff00", 3), ("#gg0000", 3), ("#٣٣٣٣٣٣", 3), ("#+f+f+f", 3), ("1,2", 3), ("", 1), ("#ff0000", 1)],
+    [
+        ("red", 3),
+        ("#ff00", 3),
+        ("#gg0000", 3),
+        ("#٣٣٣٣٣٣", 3),
+        ("#+f+f+f", 3),
+        ("1,2", 3),
+        ("", 1),
+        ("#ff0000", 1),
+        ("٣", 1),
+        ("1_0", 1),
+    ],
 )
 def test_what_cannot_stand_for_nothing(text: str, columns: int) -> None:
     with pytest.raises(OptionError, match="needed"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from io import BytesIO
 from pathlib import Path
@@ -72,6 +73,7 @@ def read_stl(path: Path, data: bytes) -> Raw:
     """Every corner of a triangle is a vertex of its own, in the file's order; several solids one after the other."""
     from trimesh.exchange.stl import load_stl  # 0.7 s to import: only where it is needed
 
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())  # or it prints tracebacks of damaged files
     try:
         found = load_stl(BytesIO(data))
         solids = found["geometry"].values() if "geometry" in found else [found]
