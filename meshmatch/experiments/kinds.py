@@ -1,0 +1,147 @@
+"""The animals of the benchmark through a model that has never seen one of them.
+
+Cats, dogs, cows, horses and hippos, each fitted once and turned every way; then every ordered pair is matched as `match`
+does it (--agree all lets the fits of all shapes agree once, instead of those of every pair), and every landmark counts.
+The error is the distance along the target between the matched and the true point, in units of sqrt(area), times 100;
+"off" is the share of points beyond 10. `euclid` is the straight distance, as in meshmatch.experiments.animals. Beside it
+how far the verdicts tell the truth: the worse one of the two fits, and the error of the pair.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from typer import Option
+
+from meshmatch.api.inputs import validated
+from meshmatch.api.matching import Matcher
+from meshmatch.arrays import Ints
+from meshmatch.experiments import runner
+from meshmatch.experiments.animals import TRUTH, animal_errors, kind_of
+from meshmatch.experiments.category import Shapes, ordered_pairs
+from meshmatch.experiments.scores import TruthDistances
+from meshmatch.experiments.sets import Pair, load_folder
+from meshmatch.fitting.agree import agreed_fits
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.maps.build import build_map
+from meshmatch.maps.vertex_map import VertexMap
+
+OFF = 0.1
+"""In units of sqrt(area): a point further off is lost."""
+VERDICTS = ("good", "fair", "poor")
+_COLUMNS = {"pairs": "pairs:d", "mean": "mean_x100:.2f", "median": "median_x100:.2f", "off": "off:.1%"}
+_HORSES = ("muybridge", "ferrari", "horse")  # names of files that do not say it themselves
+
+Agree = Literal["pairs", "all", "no"]
+
+
+def species(name: str) -> str:
+    """What kind of animal a file's name says it is."""
+    return "horse" if any(sign in name.lower() for sign in _HORSES) else kind_of(name)
+
+
+def maps_of(matcher: Matcher, fits: Mapping[str, Fit], pairs: Sequence[Pair], agree: Agree) -> dict[Pair, VertexMap]:
+    """Maps of pairs through their fits, which agree first: those of each pair, or all of them at once."""
+    clean = {name: validated(fit.repaired.original) for name, fit in fits.items() if fit.repaired is not None}
+
+    def agreed(names: Sequence[str]) -> dict[str, Fit]:
+        own = [fits[name] for name in names]
+        if agree == "no":
+            return dict(zip(names, own, strict=True))
+        shapes = [clean[name].shape for name in names]
+        return dict(zip(names, agreed_fits(matcher.model, shapes, own, matcher.config), strict=True))
+
+    together = agreed(list(fits)) if agree == "all" else {}
+    found = {}
+    for a, b in runner.track(sorted({(min(pair), max(pair)) for pair in pairs}), "mapping"):
+        both = together or agreed([a, b])
+        for pair in {(a, b), (b, a)} & set(pairs):
+            source, target = pair
+            before = fits[source], fits[target]
+            found[pair] = build_map(clean[source], both[source], clean[target], both[target], before_agreement=before)
+    return found
+
+
+def rows_of(errors: Mapping[Pair, np.ndarray], group: Any) -> list[dict[str, Any]]:
+    """A row for every group of pairs, with the mean over pairs of their means, medians and shares beyond `OFF`."""
+    groups: dict[str, list[np.ndarray]] = defaultdict(list)
+    for pair, values in errors.items():
+        groups[group(pair)].append(values)
+    return [
+        {
+            "of": name,
+            "pairs": len(each),
+            "mean_x100": round(100 * float(np.mean([values.mean() for values in each])), 4),
+            "median_x100": round(100 * float(np.median([values.mean() for values in each])), 4),
+            "off": round(float(np.mean([(values > OFF).mean() for values in each])), 4),
+        }
+        for name, each in sorted(groups.items())
+    ]
+
+
+def geodesic_errors(
+    shapes: Shapes, truth: Mapping[str, Ints], maps: Mapping[Pair, VertexMap], cache: Path | None
+) -> dict[Pair, np.ndarray]:
+    """Distances along the target at every landmark of every pair, in units of sqrt(area)."""
+    found: dict[Pair, np.ndarray] = {}
+    for target in runner.track(sorted({b for _, b in maps}), "measuring"):
+        mine = [pair for pair in maps if pair[1] == target]
+        distances = TruthDistances(shapes[target], truth[target], cache)
+        values = distances.errors([maps[pair].index[truth[pair[0]]] for pair in mine])
+        found |= dict(zip(mine, values, strict=True))
+    return found
+
+
+@runner.command
+def main(
+    data: runner.Data = runner.DATA,
+    model: runner.Model = "quadruped",
+    agree: Annotated[Agree, Option(help="which fits agree before they are composed")] = "pairs",
+    limit_pairs: runner.LimitPairs = None,
+    limit_shapes: Annotated[int | None, Option(min=2, help="animals, evenly spread")] = None,
+    cache: runner.Cache = None,
+    threads: runner.Threads = 1,
+    seed: runner.Seed = 0,
+) -> runner.Report:
+    shapes, truth = load_folder(data / "animal", TRUTH)
+    shapes = {name: shapes[name] for name in runner.spread(list(shapes), limit_shapes)}
+    matcher = Matcher(model, FitConfig(seed=seed), threads)
+    began = time.perf_counter()
+    fits = {name: matcher.fit(shape) for name, shape in runner.track(list(shapes.items()), "fitting")}
+    fitted = time.perf_counter() - began
+    pairs = ordered_pairs(shapes, limit_pairs)
+    maps = maps_of(matcher, fits, pairs, agree)
+    mapped = time.perf_counter() - began - fitted
+    errors = geodesic_errors(shapes, truth, maps, cache)
+    verdicts = {name: fit.verdict for name, fit in fits.items()}
+    worse = {pair: max((verdicts[name] for name in pair), key=VERDICTS.index) for pair in maps}
+    whole = rows_of(errors, lambda _: "all")[0] | {"euclid": animal_errors(shapes, truth, maps)["mean_x100"]}
+    kinds = rows_of(errors, lambda pair: f"{species(pair[0])} to {species(pair[1])}")
+    judged = rows_of(errors, worse.__getitem__)
+    each = [
+        row
+        for name in shapes
+        for row in rows_of({pair: values for pair, values in errors.items() if name in pair}, lambda _, name=name: name)
+    ]
+    for row in each:  # all pairs of one animal, in both directions
+        row["verdict"] = verdicts[row["of"]]
+    title = "error x 100 / sqrt(area)"
+    tables = [
+        runner.table(f"Animals with {matcher.model.card.name}: {title}", [*kinds, whole], {"of": "of", **_COLUMNS}),
+        runner.table(f"By the worse verdict: {title}", judged, {"verdict": "of", **_COLUMNS}),
+        runner.table(f"By animal: {title}", each, {"animal": "of", "verdict": "verdict", **_COLUMNS}),
+    ]
+    record: dict[str, Any] = {"all": whole, "kinds": kinds, "judged": judged, "animals": each}
+    record |= {"fit_seconds": round(fitted / len(fits), 2), "map_seconds": round(mapped / len(maps), 2)}
+    return runner.Report(record, tables)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

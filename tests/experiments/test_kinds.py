@@ -1,0 +1,47 @@
+"""Errors of animals by kind, by verdict and by animal: by hand, and bumpy balls with a model of a body."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.experiments import kinds
+from meshmatch.experiments.sets import Pair
+from tests.experiments.small_bench import build
+
+
+def test_animals_by_their_names() -> None:
+    names = ("muybridge_014_01", "fox-05", "lion3", "cow_alph", "hippo5", "timthumb")
+    assert [kinds.species(name) for name in names] == ["horse", "dog", "cat", "cow", "hippo", "other"]
+
+
+def test_rows_by_hand() -> None:
+    near, far = np.array([0.01, 0.03, 0.05, 0.2]), np.array([0.0, 0.0, 0.0, 0.04])
+    errors: dict[Pair, np.ndarray] = {("a", "b"): near, ("b", "a"): far, ("a", "c"): far}
+    rows = kinds.rows_of(errors, lambda pair: "a" if pair[0] == "a" else "rest")
+    assert [row["of"] for row in rows] == ["a", "rest"]
+    assert rows[0] == {"of": "a", "pairs": 2, "mean_x100": 4.125, "median_x100": 4.125, "off": 0.125}
+    assert rows[1]["mean_x100"] == 1.0
+
+
+@pytest.mark.parametrize("agree", ["pairs", "all", "no"])
+def test_every_pair_counts(agree: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    build(tmp_path)
+    (tmp_path / "faust").rename(tmp_path / "animal")
+    words = ["--data", str(tmp_path), "--model", "human", "--agree", agree, "--cache", str(tmp_path / "cache")]
+    assert kinds.main(words) == 0
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert record["all"]["pairs"] == 6
+    assert sum(row["pairs"] for row in record["judged"]) == 6
+    assert {row["of"]: row["pairs"] for row in record["animals"]} == dict.fromkeys(
+        ("tr_reg_000", "tr_reg_001", "tr_reg_010"), 4
+    )
+    means = [row["mean_x100"] for row in record["animals"]]
+    assert record["all"]["mean_x100"] == pytest.approx(np.mean(means), abs=1e-3)
+    assert 0 < record["all"]["euclid"] <= record["all"]["mean_x100"]
+
+
+def test_without_data_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert kinds.main(["--data", str(tmp_path)]) == 1
+    assert "no shapes" in capsys.readouterr().err
