@@ -62,6 +62,7 @@ OWNERS = {
         ),
         "experiments",
     },
+    "skimage": {"experiments"},
     "threadpoolctl": {"threads"},
     "torch": {"arrays", "fields", "models", "training", "fitting", "experiments"},
     "trimesh": {"shapes", "fitting", "experiments"},
@@ -73,6 +74,7 @@ DISTRIBUTIONS = {
     "fast_simplification": "fast-simplification",
     "pyFM": "pyfmaps",
     "robust_laplacian": "robust-laplacian",
+    "skimage": "scikit-image",
 }
 EXTRAS = ("meshlab", "train", "bench", "plots")  # what the package imports only where it is installed
 HEAVY = {"torch", "trimesh", "pymeshlab", "scipy", "safetensors", "matplotlib", "jaxtyping"}

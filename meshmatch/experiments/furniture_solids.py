@@ -168,7 +168,7 @@ class Assembly:
         grid = np.clip(grid, -rim, rim)
         grid[grid == 0] = 1e-9  # a surface through a grid point would make triangles without area
         verts, faces, _, _ = marching_cubes(grid, 0.0, spacing=(step,) * 3, allow_degenerate=False)
-        return Shape(verts.astype(np.float64) + origin, faces[:, ::-1].astype(np.int64), self.kind)
+        return Shape(verts.astype(np.float64) + origin, faces.astype(np.int64), self.kind)
 
     @cached_property
     def surface(self) -> Shape:
