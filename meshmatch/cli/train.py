@@ -108,8 +108,10 @@ def prepare(
 class TrainOptions:
     """What is learned, and how."""
 
-    template: str = Option(
-        "human-T", metavar="NAME", help="A bundled template (human-T, human-A, human-I), or a bundle's file."
+    template: str | None = optional(
+        "NAME",
+        "A bundled template (human-T, human-A, human-I, human-T-300), or a bundle's file. Default: human-T; of the "
+        "preset paper human-T-300, which has its 300 nodes.",
     )
     shapes: Path | None = optional(
         "FOLDER",
@@ -131,6 +133,8 @@ class TrainOptions:
     )
     start: str | None = optional("MODEL", "Begin with the weights of a trained model of the same template and preset.")
     rate: float | None = Option(None, min=0.0, help="Learning rate; default: the preset's.")
+    volume: float | None = Option(None, min=0.0, metavar="WEIGHT", help="Weight of volume: the paper's l2.")
+    arap: float | None = Option(None, min=0.0, metavar="WEIGHT", help="Weight of rigidity: the paper's l3.")
     blend: float | None = Option(
         None,
         metavar="WEIGHT",
@@ -178,7 +182,7 @@ def train(
         from meshmatch.training import train as training
         from meshmatch.training.bodies import Bodies
         from meshmatch.training.pose_files import load_poses
-        from meshmatch.training.recipes import recipe_for
+        from meshmatch.training.recipes import PAPER_TEMPLATE, recipe_for
 
     set_threads(how.threads)
     if how.picture is not None:
@@ -189,11 +193,12 @@ def train(
     check_writable(how.picture)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
     console = Console(quiet or not first)
-    settings = ("field", "blend", "rate", "steps", "minutes", "bf16", "workers", "threads", "seed")
+    settings = ("field", "volume", "arap", "blend", "rate", "steps", "minutes", "bf16", "workers", "threads", "seed")
     recipe = recipe_for(how.shapes, how.preset, how.unsupervised)
     recipe = recipe.changed(**{name: getattr(how, name) for name in settings})
     known = None if how.poses is None else load_poses(how.poses, how.pose_share)
-    bodies = Bodies(how.template, how.identities, known) if how.shapes is None or known is not None else None
+    template = how.template or (PAPER_TEMPLATE if how.preset == "paper" else "human-T")
+    bodies = Bodies(template, how.identities, known) if how.shapes is None or known is not None else None
     facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, how.start)
     if not how.fresh and (output / training.CHECKPOINT).is_file():
         console.say(f"going on from the checkpoint in {output}; --fresh starts anew")

@@ -99,7 +99,7 @@ class Setting:
             threads=self.threads,
             seed=run.seed,
         )
-        return Recipe(network, train, replace(chosen.scan, upright=False), run.kernel)
+        return Recipe(network, train, replace(chosen.scan, upright=False, sphere=False), run.kernel)
 
     @property
     def strained(self) -> int:

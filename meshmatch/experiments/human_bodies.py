@@ -9,7 +9,7 @@ import torch
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import NodeConfig, make_template
+from meshmatch.templates.make import NodeConfig, choose_nodes, make_template
 from meshmatch.templates.template import Template
 from meshmatch.training.bodies import human_source, joint_rotations, pose_limbs
 from meshmatch.training.limbs import Limbs, Still
@@ -87,6 +87,17 @@ def human_template(rig: Rig, pose: str, config: NodeConfig, low: tuple[Int[Ints,
         standing_body(rig, pose), f"human-{pose}", config, labels=labels, label_names=names, core=core, low=low
     )
     return replace(made, pose=pose, source=SOURCE, licence=LICENCE)
+
+
+def with_paper_nodes(template: Template) -> Template:
+    """A human template with the paper's 300 nodes, chosen by body parts; each has a radius of a fifth of the diameter of
+    the sphere around the template's bounding box's middle, as the captions of its tables say. Named after their number.
+    """
+    verts = template.shape.verts
+    middle = 0.5 * (verts.min(0) + verts.max(0))
+    radius = round(0.2 * 2 * float(np.linalg.norm(verts - middle, axis=1).max()), 2)
+    nodes = choose_nodes(template.shape, NodeConfig("parts", 300, radius), template.labels)
+    return replace(template, name=f"{template.name}-{len(nodes)}", nodes=nodes, radius=radius)
 
 
 def unseen_bodies(template: Template, count: int, trained: int = 0, seed: int = 0) -> Float[Floats, "N V 3"]:

@@ -14,6 +14,7 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel, once_per_model, torch_network
 from meshmatch.progress import Progress
 from meshmatch.shapes.sampling import farthest_points
+from meshmatch.templates.template import template_radius
 
 
 class PaperEnergy:
@@ -31,6 +32,9 @@ class PaperEnergy:
         device: str = "cpu",
     ) -> None:
         self.config, self.network = config, torch_network(model, device)
+        # The paper's weights are of lengths in the unit sphere, which models that scale by it share.
+        sphere = template_radius(model.template) if model.card.frame["scale"] == "sphere" else 1.0
+        self._chamfer_weight = config.chamfer / sphere**2
         drawn = samples.drawn(config.points, rng)
         self.points = torch.from_numpy(drawn).float().to(device)
         self._tree = cKDTree(drawn)
@@ -40,7 +44,7 @@ class PaperEnergy:
         """Energy (a scalar tensor) of rows (1, R, 3), such as node vectors, in the core frame."""
         verts, field = self._template
         moved = verts + field.displacement(vectors)[0]
-        chamfer = self.config.chamfer * _chamfer(moved, self.points, self._tree)
+        chamfer = self._chamfer_weight * _chamfer(moved, self.points, self._tree)
         if not self.config.volume and not self.config.arap:
             return chamfer
         F = field.deformation_gradient(vectors)[0]

@@ -103,9 +103,9 @@ class NodeNetwork:
 
     def _encode_points(self, cloud: Float[Floats32, "P 3"]) -> Float[Floats32, " D"]:
         frequencies = self.weights["encoder.frequencies"]
-        angle = np.float32(2 * np.pi) * cloud[:, None, :] * frequencies[:, None]
-        x = np.concatenate([np.sin(angle), np.cos(angle)], -1).reshape(len(cloud), -1)
-        x /= np.float32(np.sqrt(3 * len(frequencies)))
+        angle = np.float32(2 * np.pi) * cloud @ frequencies.T
+        x = np.concatenate([np.sin(angle), np.cos(angle)], -1)
+        x /= np.float32(np.sqrt(len(frequencies)))
         for layer in range(0, 3 * len(POINT_SIZES) - 3, 3):
             x = np.maximum(x, 0) if layer else x
             x = self._batch_norm(f"encoder.points.{layer + 1}", self._linear(f"encoder.points.{layer}", x))

@@ -11,7 +11,7 @@ from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.errors import ModelError
 from meshmatch.fields.shape_functions import FIELDS, FieldName
 
-POINT_SIZES = (126, 128, 256, 512, 1024)  # of the layers of `models.layers.PointEncoder`
+POINT_SIZES = (128, 128, 256, 512, 1024)  # of the layers of `models.layers.PointEncoder`
 _MAX = {
     "code": 4096, "width": 8192, "depth": 64, "basis": 8192,
     "align_basis": 8192, "align_width": 8192, "corrections": 64, "correct_width": 8192,
@@ -120,7 +120,7 @@ def weight_shapes(config: NetworkConfig, K: int) -> dict[str, tuple[int, ...]]:
         found["encoder.basis"] = (config.basis, 3)
         residual_mlp("encoder.network", 3 * config.basis, width, config.depth, code)
     else:
-        found["encoder.frequencies"] = (21,)
+        found["encoder.frequencies"] = (POINT_SIZES[0] // 2, 3)
         for number, (inputs, outputs) in enumerate(pairwise(POINT_SIZES)):
             linear(f"encoder.points.{3 * number}", inputs, outputs, 1)
             batch_norm(f"encoder.points.{3 * number + 1}", outputs)

@@ -34,7 +34,8 @@ STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 # Of the diameter along the surface: how far apart what one node moves may be. Where parts lie so close that a vertex
 # is left without nodes, the next share is tried. Set by hand.
 _GEODESIC_SHARES = (0.2, 0.3, 0.45, 1.0)
-_FUNCTIONS = 12  # eigenvectors that tell clusters apart
+_FUNCTIONS = 4  # eigenvectors that tell clusters apart, as in the paper
+_MAX_PAIRED = 8000  # vertices, evenly spread, whose pairs the geodesic rule looks at
 
 
 @dataclass(frozen=True)
@@ -135,15 +136,14 @@ def choose_nodes(
     """
     if config.strategy == "parts" and labels is None and not shape.is_cloud:
         raise OptionError("node strategy 'parts' needs part labels", "use --strategy spectral or geodesic")
-    rng = np.random.default_rng(config.seed)
-    samples = sample_surface(shape, 30 * config.K, rng)
-    if noisy:
-        candidates = samples.points + config.depth * rng.standard_normal(samples.points.shape)
-    else:
-        candidates = samples.points - samples.normals * rng.uniform(0, config.depth, (len(samples.points), 1))
+    samples, candidates = _candidates(shape, config, noisy)
     failure: TemplateError | None = None
     for allowed in _allowed(shape, config, candidates, labels, samples):
-        chosen = candidates[allowed] if allowed.any() else candidates
+        chosen = candidates[allowed]
+        if len(chosen) < 4:
+            problem = f"strategy {config.strategy!r} rejects all nodes: each moves vertices that do not belong together"
+            failure = TemplateError(problem, "use a smaller radius or another strategy")
+            continue
         nodes = chosen[farthest_points(chosen, min(config.K, len(chosen)))]
         try:
             return _complete(shape, config, nodes, chosen)
@@ -151,6 +151,21 @@ def choose_nodes(
             failure = error
     assert failure is not None
     raise failure
+
+
+def rejected_share(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None) -> float:
+    """Share (0..1) of the candidates that a strategy rejects, before it becomes milder where vertices go without."""
+    samples, candidates = _candidates(shape, config, noisy=False)
+    return float(1 - next(_allowed(shape, config, candidates, labels, samples)).mean())
+
+
+def _candidates(shape: Shape, config: NodeConfig, noisy: bool) -> tuple[Samples, Float[Floats, "N 3"]]:
+    """Samples of the surface, and where nodes may be: below them, or around them."""
+    rng = np.random.default_rng(config.seed)
+    samples = sample_surface(shape, 30 * config.K, rng)
+    if noisy:
+        return samples, samples.points + config.depth * rng.standard_normal(samples.points.shape)
+    return samples, samples.points - samples.normals * rng.uniform(0, config.depth, (len(samples.points), 1))
 
 
 def _complete(
@@ -188,7 +203,7 @@ def _allowed(
         yield _parts_allowed(shape, labels, touched, own)
     elif config.strategy == "geodesic":
         for share in _GEODESIC_SHARES:
-            yield _geodesic_allowed(shape, touched, own, share)
+            yield _geodesic_allowed(shape, config.radius, candidates, share)
     else:
         clusters = config.clusters
         while True:
@@ -208,14 +223,23 @@ def _parts_allowed(shape: Shape, parts: Int[Ints, " V"], touched: list, own: Int
     return np.array([joined[parts[at], np.unique(parts[hits])].all() for at, hits in zip(own, touched, strict=True)])
 
 
-def _geodesic_allowed(shape: Shape, touched: list, own: Int[Ints, " N"], share: float) -> Bool[Bools, " N"]:
-    """Drop candidates that touch surface further than a share of the diameter along the surface."""
+def _geodesic_allowed(shape: Shape, radius: float, candidates: Float[Floats, "N 3"], share: float) -> Bool[Bools, " N"]:
+    """Drop candidates that touch two vertices further apart than a share of the diameter, both along the surface."""
     graph = edge_graph(shape)
-    far = dijkstra(graph, indices=farthest_points(shape.verts, 40))
-    diameter = far[np.isfinite(far)].max()
-    owners, place = np.unique(own, return_inverse=True)
-    distance = dijkstra(graph, indices=owners, limit=share * diameter)
-    return np.array([np.isfinite(distance[at, hits]).all() for at, hits in zip(place, touched, strict=True)])
+    some = farthest_points(shape.verts, min(shape.V, _MAX_PAIRED))
+    far = dijkstra(graph, indices=some[:40])
+    limit = share * far[np.isfinite(far)].max()
+    near = np.concatenate(
+        [
+            np.isfinite(dijkstra(graph, indices=some[start : start + 200], limit=limit)[:, some])
+            for start in range(0, len(some), 200)
+        ]
+    )
+    touched = cKDTree(shape.verts[some]).query_ball_point(candidates, radius)
+    # A few of the vertices tell most candidates apart before all pairs are looked at.
+    return np.array(
+        [near[np.ix_(hits[:: len(hits) // 8 + 1], hits)].all() and near[np.ix_(hits, hits)].all() for hits in touched]
+    )
 
 
 def edge_graph(shape: Shape) -> coo_matrix:

@@ -136,7 +136,7 @@ def load_template(path: str | Path) -> Template:
 
 
 def read_template(name: str | Path) -> Template:
-    """A template by file, or one of the built-in ones by name (human-T, human-A, human-I); `TemplateError` as above."""
+    """A template by file, or a built-in one by name (human-T, human-A, human-I, human-T-300); `TemplateError` as above."""
     path = Path(name)
     if path.is_file():
         return load_template(path)

@@ -74,7 +74,7 @@ class BatchDataset(torch.utils.data.Dataset):
     """Item s is the batch of training step s.
 
     ``template_core`` are the template's vertices of the core, ``core`` their indices; ``loss_points`` the indices of
-    supervised vertices. Each drawn shape is scanned ``scans_per_shape`` times.
+    supervised vertices. Each drawn shape is scanned ``scans_per_shape`` times, and scaled to ``radius`` or to area 1.
     """
 
     source: Source
@@ -89,6 +89,7 @@ class BatchDataset(torch.utils.data.Dataset):
     scans_per_shape: int = 2
     seed: int = 0
     length: int = 1
+    radius: float | None = None
 
     def __len__(self) -> int:
         return self.length
@@ -100,6 +101,8 @@ class BatchDataset(torch.utils.data.Dataset):
         scale = verts.flatten(1).std(1)[:, None, None]
         verts = bump(verts / scale * 0.3, self.scan.bumps, generator)
         verts, areas = normalise(verts, self.faces)
+        if self.radius is not None:
+            verts = verts * (self.radius / verts.norm(dim=-1).amax(1))[:, None, None]
         verts, areas = (table.repeat_interleave(self.scans_per_shape, 0) for table in (verts, areas))
         B = len(verts)
         verts = verts * (1 + self.scan.scale * torch.randn(B, 1, 1, generator=generator).clamp(-2, 2))

@@ -36,7 +36,9 @@ class TrainConfig:
     warm_up: int = 200
     decay: float = 0.4
     weight_decay: float = 0.01
-    average: float = 0.999
+    average: float = 0.999  # how much of the averaged weights a step keeps; 0: the last weights are the model's
+    momentum: float = 0.99  # of squared gradients: the second beta of Adam
+    clip: float | None = 1.0  # largest norm of a gradient
     minutes: float | None = None
     checkpoint_minutes: float = 3.0
     workers: int = 1
@@ -97,7 +99,11 @@ class Trainer:
         self.points = points.to(self.device)
         self.average = {n: p.detach().clone() for n, p in model.named_parameters()}
         self.optimiser = torch.optim.AdamW(
-            model.parameters(), lr=config.rate, betas=(0.9, 0.99), weight_decay=config.weight_decay, fused=True
+            model.parameters(),
+            lr=config.rate,
+            betas=(0.9, config.momentum),
+            weight_decay=config.weight_decay,
+            fused=True,
         )
         self.step, self.seconds = 0, 0.0
 
@@ -207,7 +213,8 @@ class Trainer:
                 if parameter.grad is not None:
                     dist.all_reduce(parameter.grad)
                     parameter.grad /= self.world
-        torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
+        if config.clip is not None:
+            torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.clip)
         self.optimiser.step()
         self.step += 1
         self._update_average()

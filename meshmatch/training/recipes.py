@@ -16,6 +16,11 @@ from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss
 from meshmatch.training.scans import ScanConfig
 
 Preset = Literal["default", "paper"]
+PAPER_TEMPLATE = "human-T-300"
+"""The bundled template with the paper's 300 nodes, each with a radius of a fifth of the diameter."""
+_PLAIN_ADAM: dict[str, Any] = {
+    "warm_up": 0, "decay": 0.0, "weight_decay": 0.0, "average": 0.0, "momentum": 0.999, "clip": None,
+}  # fmt: skip
 _CHAMFER = ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4)  # the paper's weights for segmentation transfer
 
 
@@ -35,13 +40,15 @@ class Recipe:
     storage: Storage = "int8"
 
     def changed(self, **settings: Any) -> Recipe:
-        """Another recipe: fields of `TrainConfig`, ``field`` of the network or ``blend`` of the loss; None changes nothing.
+        """Another recipe: fields of `TrainConfig`, ``field`` of the network, ``volume``, ``arap`` and ``blend`` of the loss;
+        None changes nothing.
 
         `OptionError` if a setting is unknown or out of range.
         """
         wanted = {name: value for name, value in settings.items() if value is not None}
         network = replace(self.network, field=wanted.pop("field", self.network.field))
-        loss = replace(self.train.loss, blend=wanted.pop("blend", self.train.loss.blend))
+        weights = {name: wanted.pop(name) for name in ("volume", "arap", "blend") & wanted.keys()}
+        loss = replace(self.train.loss, **weights)
         known = {each.name for each in fields(TrainConfig)}
         if unknown := sorted(wanted.keys() - known):
             raise OptionError(f"unknown training setting {unknown[0]!r}", f"choose from {', '.join(sorted(known))}")
@@ -55,13 +62,24 @@ def default() -> Recipe:
 
 
 def paper() -> Recipe:
-    """The NeurIPS 2022 paper's: point encoder, node decoder, squared loss with its weights, its kernel, batch and rate.
+    """The NeurIPS 2022 paper's: point encoder, node decoder, squared loss with its weights, its kernel, batch and rate, and
+    Adam as it is.
 
-    Scans are 3,000 clean points turned about the vertical axis; 75,000 steps are its 1,200 epochs of 1,000 shapes.
+    Scans are 3,000 clean points in the unit sphere, turned about the vertical axis; 75,000 steps are its 1,200 epochs of
+    1,000 shapes. Its 300 nodes are those of the template `PAPER_TEMPLATE`.
     """
-    train = TrainConfig(steps=75_000, shapes=16, scans_per_shape=1, decay=0.0, weight_decay=0.0)
+    train = TrainConfig(steps=75_000, shapes=16, scans_per_shape=1, **_PLAIN_ADAM)
     scan = ScanConfig(
-        3000, noise=0.0, holes=0.0, outliers=0.0, partial=0.0, density=0.0, bumps=0.0, scale=0.0, upright=True
+        3000,
+        noise=0.0,
+        holes=0.0,
+        outliers=0.0,
+        partial=0.0,
+        density=0.0,
+        bumps=0.0,
+        scale=0.0,
+        upright=True,
+        sphere=True,
     )
     return Recipe(PAPER, train, scan, "cubic")
 
@@ -85,7 +103,7 @@ def clouds() -> Recipe:
 
 def paper_clouds() -> Recipe:
     """The paper's network and weights for shapes without correspondence."""
-    train = TrainConfig(steps=4000, shapes=8, scans_per_shape=1, decay=0.0, weight_decay=0.0, loss=_CHAMFER, workers=0)
+    train = TrainConfig(steps=4000, shapes=8, scans_per_shape=1, loss=_CHAMFER, workers=0, **_PLAIN_ADAM)
     scan = ScanConfig(points=1024, noise=0.0, scale=0.0)
     return Recipe(PAPER, train, scan, "cubic", storage="float16")
 

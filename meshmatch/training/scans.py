@@ -18,6 +18,7 @@ class ScanConfig:
     ``holes``, ``outliers``, ``partial`` are shares of the scans: with holes; with up to 10 % outliers; seen
     from one side or cut by a plane. ``upright``: scans stand in the category's own axes, centred, turned about
     the vertical only (the paper); otherwise roughly in the core frame, where an aligner puts them.
+    ``sphere``: shapes are scaled to the template's radius around its centroid (the paper) instead of to area 1.
     """
 
     points: int = 2048
@@ -29,6 +30,7 @@ class ScanConfig:
     bumps: float = 0.004
     scale: float = 0.04
     upright: bool = False
+    sphere: bool = False
 
 
 def surface_area(

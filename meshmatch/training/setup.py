@@ -18,7 +18,7 @@ from meshmatch.models.deformer import Deformer
 from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.prepared_folder import ShapeSamples
-from meshmatch.templates.template import Template
+from meshmatch.templates.template import Template, template_radius
 from meshmatch.training.datasets import Augmentation, BatchDataset, CloudDataset, Source, build_lattice
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import LossPoints, SurfacePoints
@@ -98,7 +98,7 @@ def build_dataset(
     faces, supervised = torch.from_numpy(np.array(template.shape.faces)), torch.from_numpy(loss_vertices(template))
     encoder = None if model is None else deepcopy(model.encoder).cpu()
     aligner = None if model is None or model.aligner is None else deepcopy(model.aligner).cpu()
-    settings = scan, shapes, scans_per_shape, seed, length
+    settings = scan, shapes, scans_per_shape, seed, length, template_radius(template) if scan.sphere else None
     return BatchDataset(source, faces, verts[core], core, supervised, encoder, aligner, *settings)
 
 

@@ -22,7 +22,7 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.templates.prepared_folder import ShapeSamples, frame_of, read_registered, read_samples
-from meshmatch.templates.template import Template, read_template, save_template
+from meshmatch.templates.template import Template, read_template, save_template, template_radius
 from meshmatch.training import setup
 from meshmatch.training.bodies import Bodies, human_source
 from meshmatch.training.datasets import Source, deformed_source, registered_source
@@ -137,6 +137,12 @@ def train_model(
     checkpoint = output / CHECKPOINT
     make_folder(checkpoint.parent)
     config, kernel = recipe.train, recipe.kernel
+    if recipe.scan.sphere:  # lengths of the paper are in the unit sphere
+        config = replace(
+            config,
+            loss=replace(config.loss, reconstruction=config.loss.reconstruction / template_radius(template) ** 2),
+        )
+        facts = replace(facts, frame=facts.frame or {"orientation": "searched", "scale": "sphere"})
     points: Any
     data: Any = source
     if isinstance(source, ShapeSamples):

@@ -135,12 +135,14 @@ def test_a_batch_of_one_equals_one_of_a_batch(networks: dict[str, Deformer], con
 def test_the_positional_encoding_lies_on_a_sphere() -> None:
     encoder = PointEncoder(8)
     features = encoder.features(clouds())
-    assert features.shape == (3, 60, 6 * 21)
+    assert features.shape == (3, 60, 128)
     assert torch.allclose(features.norm(dim=-1), torch.ones(3, 60), atol=1e-5)
-    at_zero = encoder.features(torch.zeros(1, 1, 3))[0, 0] * 63**0.5
-    assert torch.allclose(at_zero.sort()[0], torch.tensor([0.0] * 63 + [1.0] * 63), atol=1e-6)
-    low, high = float(encoder.frequencies[0]), float(encoder.frequencies[-1])
-    assert (low, high) == pytest.approx((0.5, 4.0))
+    at_zero = encoder.features(torch.zeros(1, 1, 3))[0, 0] * 8
+    assert torch.allclose(at_zero, torch.tensor([0.0] * 64 + [1.0] * 64), atol=1e-6)
+    wave = encoder.frequencies[5]
+    there = encoder.features((wave / wave.square().sum() / 4)[None, None])[0, 0] * 8  # a quarter of its period along
+    assert there[5] == pytest.approx(1.0)
+    assert there[64 + 5] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_basis_features_are_offsets() -> None:

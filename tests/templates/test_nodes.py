@@ -15,6 +15,7 @@ from meshmatch.templates.make import (
     choose_nodes,
     edge_graph,
     farthest_points_any,
+    rejected_share,
     spectral_clusters,
 )
 from meshmatch.templates.template import Template, load_template
@@ -120,6 +121,24 @@ def test_geodesic_rejection_keeps_a_node_off_the_other_plate() -> None:
 
     assert touching_both("uniform") > 10
     assert touching_both("geodesic") == 0
+
+
+def test_the_geodesic_rule_is_about_pairs_by_hand() -> None:
+    """A strip of length 10: a node in its middle reaches 1.5 both ways, so a pair 3 apart, though nothing 2 from itself."""
+    x = np.linspace(0, 10, 101)
+    verts = np.stack([np.repeat(x, 2), np.tile([0.0, 0.05], 101), np.zeros(202)], 1)
+    a = np.arange(0, 200, 2)
+    faces = np.concatenate([np.stack([a, a + 1, a + 2], 1), np.stack([a + 1, a + 3, a + 2], 1)])
+    strip = Shape(verts, faces, "strip")
+    shares = [rejected_share(strip, NodeConfig("geodesic", 60, radius, depth=0.0)) for radius in (0.9, 1.5)]
+    assert shares[0] == 0.0  # pairs up to 1.8 apart, of the 2 that are allowed
+    assert shares[1] > 0.8  # all but those at the ends, which reach one way
+
+
+def test_what_rules_reject(ring: Shape) -> None:
+    assert rejected_share(ring, NodeConfig("uniform", 60, 0.2)) == 0.0
+    labels = (ring.verts[:, 0] > 0).astype(int)
+    assert rejected_share(ring, NodeConfig("parts", 60, 0.2), labels) == 0.0  # both border on each other
 
 
 def test_a_rejection_that_leaves_nothing_becomes_milder_or_names_the_vertices(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from meshmatch.cli import main
+from meshmatch.experiments.human_bodies import with_paper_nodes
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit_config import FitConfig
@@ -18,7 +20,9 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
+from meshmatch.templates.template import read_template, template_radius
 from meshmatch.training import recipes
+from meshmatch.training.setup import build_dataset
 from tests.training.small import POINTS, egg_template
 
 QUICK = FitConfig(samples=1000, coarse_samples=300)
@@ -73,7 +77,44 @@ def test_the_model_has_the_papers_choices(loaded: TrainedModel) -> None:
     assert card.field["kernel"] == "cubic"
     assert (card.network["encoder"], card.network["decoder"]) == ("point", "node")
     assert card.recipe["scan"]["upright"] is True
+    assert card.frame == {"orientation": "searched", "scale": "sphere"}
     assert loaded.network.aligner is None
+
+
+def test_the_papers_numbers() -> None:
+    """Table 1, and what the text says of training."""
+    chosen = recipes.paper()
+    loss, train = chosen.train.loss, chosen.train
+    assert (loss.reconstruction, loss.volume, loss.arap, loss.blend) == (1.0, 5e-3, 1e-2, 5e-3)
+    assert (train.rate, train.shapes, train.scans_per_shape, train.steps) == (1e-3, 16, 1, 75_000)
+    assert (train.warm_up, train.decay, train.weight_decay, train.average, train.clip) == (0, 0.0, 0.0, 0.0, None)
+    assert (chosen.scan.points, chosen.scan.sphere, chosen.kernel) == (3000, True, "cubic")
+    config = recipes.paper_clouds().train.loss  # table 2
+    assert (config.reconstruction, config.volume, config.arap, config.blend) == (1.0, 1e-4, 1e-3, 1e-4)
+    template = read_template(recipes.PAPER_TEMPLATE)
+    assert template.K == 300
+    middle = 0.5 * (template.shape.verts.min(0) + template.shape.verts.max(0))
+    diameter = 2 * np.linalg.norm(template.shape.verts - middle, axis=1).max()
+    assert template.radius == pytest.approx(0.2 * diameter, abs=0.006)
+    made = with_paper_nodes(read_template("human-T"))
+    assert (made.name, made.hash) == (template.name, template.hash)
+
+
+def test_shapes_to_learn_from_have_the_templates_radius() -> None:
+    template = egg_template()
+    stretched = torch.from_numpy(template.shape.verts * [1.0, 2.0, 0.7]).float()
+    scan = replace(recipes.paper().scan, points=50, upright=True)
+    for sphere in (True, False):
+        data = build_dataset(
+            template, lambda n, _: stretched.expand(n, -1, -1), None, replace(scan, sphere=sphere), 2, 1, 0
+        )
+        far = data[0].targets.norm(dim=-1).amax(1)
+        assert (abs(far - template_radius(template)).max() < 0.05) == sphere
+
+
+def test_weights_of_losses_can_be_set() -> None:
+    loss = recipes.paper().changed(volume=0.5, arap=0.25, blend=0.125).train.loss
+    assert (loss.volume, loss.arap, loss.blend) == (0.5, 0.25, 0.125)
 
 
 def test_its_fits_are_moved_with_the_papers_kernel(loaded: TrainedModel, eggs: Path) -> None:
