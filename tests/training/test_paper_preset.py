@@ -103,7 +103,7 @@ def test_the_papers_numbers() -> None:
 def test_shapes_to_learn_from_have_the_templates_radius() -> None:
     template = egg_template()
     stretched = torch.from_numpy(template.shape.verts * [1.0, 2.0, 0.7]).float()
-    scan = replace(recipes.paper().scan, points=50, upright=True)
+    scan = recipes.paper().scan
     for sphere in (True, False):
         data = build_dataset(
             template, lambda n, _: stretched.expand(n, -1, -1), None, replace(scan, sphere=sphere), 2, 1, 0
