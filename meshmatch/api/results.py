@@ -11,8 +11,8 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Float, Floats, Ints
-from meshmatch.errors import InputError, OptionError
+from meshmatch.arrays import Float, Floats
+from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
 from meshmatch.maps.evaluate import Evaluation, evaluate_map
@@ -156,17 +156,6 @@ def evaluate(
         found = load_map(found, source, target)
     vertex_map = found.map if isinstance(found, MatchResult) else found
     check_map(vertex_map)
-    known: list[Ints] = []
-    if truth is not None:
-        pair = truth if isinstance(truth, tuple) and len(truth) == 2 else (np.arange(source.V), truth)
-        for numbers in map(np.asarray, pair):
-            if numbers.dtype.kind not in "iu":
-                hint = "integers, counted from 0"
-                raise InputError(f"the truth must be numbers of vertices, not {numbers.dtype}", hint)
-            known.append(numbers.astype(np.int64))
-        if known[0].ndim != 1 or known[0].shape != known[1].shape:
-            what = f"the truth has {known[0].shape} vertices of the source and {known[1].shape} of the target"
-            hint = "give one target vertex for every source vertex, or a pair of lists of the same length"
-            raise InputError(what, hint)
+    known = truth if isinstance(truth, tuple) and len(truth) == 2 else (None, truth)
     with thread_limit(1):
         return evaluate_map(vertex_map, source, target, *known, rng=np.random.default_rng(seed))

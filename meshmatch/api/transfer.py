@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from meshmatch.api.results import ConfidenceRule, MapPair, MatchResult, Transferred
-from meshmatch.arrays import Float, Floats, as_numbers
+from meshmatch.arrays import Floats, as_numbers
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance
+from meshmatch.shapes.colors import light, seen
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
@@ -27,13 +28,14 @@ from meshmatch.transfer.bake import colors_of_vertices
 from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, named
 from meshmatch.transfer.landmarks import Landmarks, at_points, at_vertices, load_landmarks, push_landmarks
 from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels, replace_low_values, replace_low_weights
-from meshmatch.transfer.vertex_files import SkinWeights, checked_colors, light, light_of, load_weights, seen, weights_of
+from meshmatch.transfer.vertex_files import SkinWeights, checked_colors, light_of, load_weights, weights_of
 
 if TYPE_CHECKING:
     from meshmatch.api.matching import Matcher
 
-MapMaker: TypeAlias = Callable[[Shape, Shape], "MatchResult | MapPair"]
-MapLike: TypeAlias = "MatchResult | MapPair | VertexMap | str | Path | Matcher | MapMaker | None"
+MapLike: TypeAlias = (
+    "MatchResult | MapPair | VertexMap | str | Path | Matcher | Callable[[Shape, Shape], MatchResult | MapPair] | None"
+)
 """What a transfer follows: a match or a map from source to target, its file, or who makes it when all else is
 checked: a `Matcher`, or a function of both shapes."""
 
@@ -98,7 +100,7 @@ def transfer_values(
             found = pull_directions(maps.backward, maps.source, maps.target, numbers)
         else:
             found = pull_values(maps.backward, numbers)
-        confidence = _confidence(maps)
+        confidence = maps.backward.confidence.astype(np.float64)
         found, low = replace_low_values(found, confidence < rule.minimum, maps.target, blank, rule.fill)
     return Transferred(found, confidence, low, maps)
 
@@ -132,7 +134,7 @@ def transfer_colors(
         else:
             assert isinstance(colors, Appearance)
             found = colors_of_vertices(maps.source, colors, maps.target, maps.backward)
-        confidence = _confidence(maps)
+        confidence = maps.backward.confidence.astype(np.float64)
         found, low = replace_low_values(found, confidence < rule.minimum, maps.target, blank, rule.fill)
     return Transferred(seen(found), confidence, low, maps)
 
@@ -170,7 +172,7 @@ def transfer_labels(
     maps = find_maps(source, target, match)
     back, of_face = maps.backward, given.on == "faces"
     with thread_limit(1):
-        confidence = _confidence(maps)
+        confidence = maps.backward.confidence.astype(np.float64)
         if kind == "faces":
             found = pull_face_labels(back, source, target, given.codes, of_face, maps.threads)
             confidence = confidence[target.faces].mean(axis=1)
@@ -208,7 +210,7 @@ def transfer_weights(
         given = weights if isinstance(weights, SkinWeights) else weights_of(weights, source)
     maps = find_maps(source, target, match)
     with thread_limit(1):
-        confidence = _confidence(maps)
+        confidence = maps.backward.confidence.astype(np.float64)
         found = pull_weights(maps.backward, given.matrix, influences)
         found, low = replace_low_weights(found, confidence < rule.minimum, maps.target, rule.fill, influences)
     return Transferred(SkinWeights(found, given.names), confidence, low, maps)
@@ -251,7 +253,3 @@ def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape) -> 
         return at_points(source, places.astype(np.float64))[0]
     hint = "give vertices (N,) as integers, or positions (N, 3)"
     raise InputError(f"landmarks cannot be an array of {places.shape} {places.dtype}", hint)
-
-
-def _confidence(maps: MapPair) -> Float[Floats, " V"]:
-    return maps.backward.confidence.astype(np.float64)

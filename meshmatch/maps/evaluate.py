@@ -83,13 +83,17 @@ def map_errors(
     """Errors at known points: is ``index[source_points[n]]`` the vertex ``target_points[n]``?
 
     `index` (V_source,) is the map; both kinds of points (N,) are vertices, `geodesics` those of the target.
-    `InputError` if the lists differ in length or name a vertex that is not there.
+    `InputError` if the lists are no integers, differ in length, or name a vertex that is not there.
     """
     index, a, b = (np.asarray(ids) for ids in (index, source_points, target_points))
+    for ids in (a, b):
+        if ids.dtype.kind not in "iu":
+            raise InputError(f"the truth must be numbers of vertices, not {ids.dtype}", "integers, counted from 0")
     if a.shape != b.shape or a.ndim != 1 or not a.size:
-        raise InputError(f"the truth needs one target point for each source point, not {a.shape} and {b.shape}")
+        hint = "give one target vertex for every source vertex, or a pair of lists of the same length"
+        raise InputError(f"the truth has {a.shape} vertices of the source and {b.shape} of the target", hint)
     for ids, size, side in ((a, len(index), "source"), (b, geodesics.V, "target")):
-        if ids.dtype.kind not in "iu" or ids.min() < 0 or ids.max() >= size:
+        if ids.min() < 0 or ids.max() >= size:
             raise InputError(f"the truth names points that are not among the {size} vertices of the {side}")
     return Errors(geodesics.between(index[a], b).astype(np.float32))
 

@@ -17,7 +17,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.geometry.triangles import same_rows, vertex_normals
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.texels import Pyramid
+from meshmatch.transfer.texels import pyramids_of
 
 AnyFloats = NDArray[np.floating[Any]]
 Rows = Int[Ints, " N"]
@@ -67,17 +67,8 @@ class TexturePaint:
     def __init__(self, look: Appearance, shape: Shape, scale: float) -> None:
         self._look, self._faces = look, shape.faces
         self._colors = None if look.colors is None else np.nan_to_num(look.colors).astype(np.float32)
-        self._pyramids: dict[int, Pyramid] = {}
-        shared: dict[tuple[int, tuple[str, str], bool, bool], Pyramid] = {}
-        texels = np.zeros(len(look.materials))
-        for number in np.unique(look.material).tolist():
-            material = look.materials[number]
-            if material.image is not None:
-                texels[number] = material.image.shape[0] * material.image.shape[1]
-                key = (id(material.image), material.wrap, material.nearest, material.alpha == "opaque")
-                if key not in shared:
-                    shared[key] = Pyramid(material)
-                self._pyramids[number] = shared[key]
+        self._pyramids = pyramids_of(look)
+        texels = np.array([0.0 if m.image is None else m.image[..., 0].size for m in look.materials])
         # Texels per unit of length on each face: a pixel averages as many as it is wide.
         a, b = look.uv[:, 1] - look.uv[:, 0], look.uv[:, 2] - look.uv[:, 0]
         flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])

@@ -18,7 +18,7 @@ from PIL import Image
 
 from meshmatch.arrays import Float, Floats, Int, Ints, UInts8
 from meshmatch.errors import InputError
-from meshmatch.shapes.colors import to_linear
+from meshmatch.shapes.colors import light
 from meshmatch.shapes.shape import Shape
 
 Pixels = UInts8
@@ -89,9 +89,7 @@ class Appearance:
 
 def vertex_colors_alone(shape: Shape) -> Appearance:
     """The look of a shape that has its vertex colors and nothing else (sRGB, as ply, obj and off hold them)."""
-    colors = None
-    if shape.colors is not None:
-        colors = np.concatenate([to_linear(shape.colors[:, :3]), shape.colors[:, 3:]], axis=1)
+    colors = None if shape.colors is None else light(shape.colors)
     alpha: Alpha = "blend" if colors is not None and (colors[:, 3] < 1).any() else "opaque"
     return Appearance((Material(alpha=alpha),), np.zeros(shape.F, np.int64), np.zeros((shape.F, 3, 2)), colors)
 

@@ -27,6 +27,17 @@ def to_srgb(linear: ArrayLike) -> Float[Floats, ...]:
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
+def light(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
+    """Light of colors (..., 3 or 4) as screens show them; alpha is left as it is."""
+    return np.concatenate([to_linear(colors[..., :3]), colors[..., 3:]], axis=-1)
+
+
+def seen(amounts: Float[Floats, "V 4"]) -> Float[Floats, "V 4"]:
+    """Colors as screens show them (sRGB, 0..1) of light; nan is black."""
+    amounts = np.clip(np.nan_to_num(amounts), 0.0, 1.0)
+    return np.concatenate([to_srgb(amounts[:, :3]), amounts[:, 3:]], axis=1)
+
+
 LINEAR_OF_BYTE: Floats32 = to_linear(np.arange(256) / 255.0).astype(np.float32)
 """(256,) light of each byte of an image."""
 

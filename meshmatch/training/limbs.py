@@ -34,22 +34,6 @@ class Draw:
         return torch.stack(options)[pick, torch.arange(self.B)]
 
 
-class Still(Draw):
-    """Draws nothing: every value is its mean, so a template stands exactly as asked."""
-
-    def __init__(self, B: int) -> None:
-        super().__init__(B, torch.Generator())
-
-    def normal(self, mean: float, deviation: float) -> torch.Tensor:
-        return torch.full((self.B,), float(mean))
-
-    def uniform(self, low: float, high: float) -> torch.Tensor:
-        return torch.full((self.B,), 0.5 * (low + high))
-
-    def normal3(self, deviation: float) -> torch.Tensor:
-        return torch.zeros(self.B, 3)
-
-
 @dataclass(frozen=True)
 class Limbs:
     """Clinical angles in degrees, each (B,), of one side of the body."""

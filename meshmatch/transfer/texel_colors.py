@@ -16,7 +16,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Alpha, Appearance, Material
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.surface_walk import SurfaceWalker, duals, weighted
-from meshmatch.transfer.texels import MOST_ROWS, Pyramid, rows_of, texels_in, wrapped
+from meshmatch.transfer.texels import MOST_ROWS, pyramids_of, rows_of, texels_in, wrapped
 
 # The map is discontinuous on a triangle if an edge of its image is this many times as long as usual, and a little
 # more (sqrt(area)). Set by hand, as in `mapped_mesh`.
@@ -38,8 +38,8 @@ class MaterialSampler:
         self._material = look.material
         self._faces = walker.faces
         self._colors = None if look.colors is None else list(look.colors.T.astype(np.float32, order="C"))
-        used = np.unique(look.material).tolist()
-        self.alpha, self.cutoff, self._hard = _meaning([self.materials[k] for k in used])
+        used = [self.materials[k] for k in np.unique(look.material).tolist()]
+        self.alpha, self.cutoff, self._hard = _meaning(used)
         pictured = np.array([m.image is not None for m in self.materials])[look.material]
         uv = _folded(look.uv)
         held = np.array(["clamp" in m.wrap for m in self.materials])[look.material]
@@ -47,17 +47,7 @@ class MaterialSampler:
         self._uv = [list(uv[:, :, k].T.astype(np.float32, order="C")) for k in range(2)]
         self.chart = _charts(walker, look, pictured)
         self._density = _densities(walker, self.materials, look.material, look.uv)
-        # One pyramid for each material with an image; materials that share all of it share the pyramid.
-        self._pyramids: dict[int, Pyramid] = {}
-        made: dict[tuple[object, ...], Pyramid] = {}
-        keys = [(id(m.image), m.wrap, m.nearest, m.alpha == "opaque") for m in self.materials]
-        for number in used:
-            material, key = self.materials[number], keys[number]
-            if material.image is not None:
-                if key not in made:
-                    alike = np.array([other == key for other in keys])
-                    made[key] = Pyramid(material, known_texels(material, look.uv[alike[look.material]]))
-                self._pyramids[number] = made[key]
+        self._pyramids = pyramids_of(look, known_texels)
 
     def footprint(self, face: NDArray[np.integer], reach: Floats32) -> Floats32:
         """How many texels of its image a step of `reach` (N,) covers on faces (N,)."""

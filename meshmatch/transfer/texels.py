@@ -8,13 +8,13 @@ filled image never shows a background: each of its texels that touches a chart i
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32
-from meshmatch.shapes.appearance import Material, Pixels, Wrap
+from meshmatch.shapes.appearance import Appearance, Material, Pixels, Wrap
 from meshmatch.shapes.colors import LINEAR_OF_BYTE, bytes_of
 
 _AT_ONCE = 1 << 21  # texels
@@ -214,6 +214,24 @@ class Pyramid:
             a, b, c, d = (_light(texel, k) for texel in corners)
             out[k] = _mixed(_mixed(a, b, across), _mixed(c, d, across), down)
         return out
+
+
+def pyramids_of(
+    look: Appearance, known: Callable[[Material, Floats], Bools | None] = lambda material, uv: None
+) -> dict[int, Pyramid]:
+    """By the number of each material that has an image and a face; those that share all of an image share its pyramid.
+
+    ``known`` texels (H, W) of a material are asked for with the coordinates (F, 3, 2) of all faces that share it.
+    """
+    keys = [(id(m.image), m.wrap, m.nearest, m.alpha == "opaque") for m in look.materials]
+    used = [k for k in np.unique(look.material).tolist() if look.materials[k].image is not None]
+    made: dict[tuple[object, ...], Pyramid] = {}
+    for number in used:
+        if keys[number] not in made:
+            alike = np.array([key == keys[number] for key in keys])[look.material]
+            material = look.materials[number]
+            made[keys[number]] = Pyramid(material, known(material, look.uv[alike]))
+    return {number: made[keys[number]] for number in used}
 
 
 def _light(texels: NDArray[np.uint32], channel: int) -> Floats32:

@@ -20,7 +20,7 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.colors import to_linear, to_srgb
+from meshmatch.shapes.colors import light
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.input_files import read_npy, read_npz
 from meshmatch.shapes.shape import Shape
@@ -152,17 +152,6 @@ def checked_colors(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
             "a color has 3 or 4 numbers within 0..1: red, green, blue and alpha", "such as 0.5,0.5,0.5 or #808080"
         )
     return colors
-
-
-def light(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
-    """Light of colors (..., 3 or 4) as screens show them; alpha is left as it is."""
-    return np.concatenate([to_linear(colors[..., :3]), colors[..., 3:]], axis=-1)
-
-
-def seen(amounts: Float[Floats, "V 4"]) -> Float[Floats, "V 4"]:
-    """Colors as screens show them (sRGB, 0..1) of light; nan is black."""
-    amounts = np.clip(np.nan_to_num(amounts), 0.0, 1.0)
-    return np.concatenate([to_srgb(amounts[:, :3]), amounts[:, 3:]], axis=1)
 
 
 def parse_color(text: str | None) -> tuple[float, float, float, float] | None:

@@ -8,9 +8,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import OptionError
-from meshmatch.experiments.human_bodies import body_parts, human_template, standing_body, still_pose
+from meshmatch.experiments.human_bodies import Still, body_parts, human_template, standing_body, still_pose
 from meshmatch.training.bodies import draw_identities, sample_bodies, sample_free_pose, sample_pose
-from meshmatch.training.limbs import FOLDED, Draw, Still, draw_arms, draw_limbs, mirrored, with_legs
+from meshmatch.training.limbs import FOLDED, Draw, draw_arms, draw_limbs, mirrored, with_legs
 from meshmatch.training.rig import Rig, build_rig, forward_kinematics, load_rig, penetration, save_rig, skin
 from meshmatch.training.rotations import rotation_between, rotation_from_vector
 from tests.training.stick import stick_figure

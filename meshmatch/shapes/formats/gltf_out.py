@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import dot, same_rows, vertex_normals
-from meshmatch.shapes.colors import to_linear
+from meshmatch.shapes.colors import light
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
 
@@ -35,7 +35,7 @@ def write(path: Path, shape: Shape) -> None:
     if not shape.is_cloud:
         attributes["NORMAL"] = smooth_normals(shape.verts, shape.faces)
     if shape.colors is not None:
-        attributes["COLOR_0"] = np.concatenate([to_linear(shape.colors[:, :3]), shape.colors[:, 3:]], axis=1)
+        attributes["COLOR_0"] = light(shape.colors)
     _write(path, shape.name, attributes, shape.faces, {}, b"")
 
 
