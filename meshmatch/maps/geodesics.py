@@ -108,10 +108,8 @@ class GeodesicDistances:
         self.unit = float(np.sqrt(shape.area)) if unit is None else float(unit)
         if not self.unit > 0:
             raise InputError(f"{shape.name or 'the shape'} has no surface area")
-        faces = shape.faces
-        if shape.invalid is not None:  # its position is a stand-in: a path over it would cut through the body
-            faces = faces[~shape.invalid[faces].any(axis=1)]
-        self.graph = surface_graph(shape.verts, faces)
+        # An invalid vertex has a stand-in for a position: a path over it would cut through the body.
+        self.graph = surface_graph(shape.verts, shape.faces[shape.valid_faces])
 
     @property
     def V(self) -> int:

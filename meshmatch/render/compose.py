@@ -175,8 +175,7 @@ def compose_fit(
 
 def distances(shape: Shape, fitted: Shape) -> Float[Floats, " V"]:
     """Distance of each vertex of a shape to the surface of another; nan where it has no position."""
-    found = MappedMesh.of(fitted).query(shape.verts).distance
-    return found if shape.invalid is None else np.where(shape.invalid, np.nan, found)
+    return np.where(shape.valid, MappedMesh.of(fitted).query(shape.verts).distance, np.nan)
 
 
 def compose_values(

@@ -83,7 +83,7 @@ def same_side(
 
 def facing_matched(source: Shape, target: Shape, vertex_map: VertexMap, rotation: Rotation) -> Rotation:
     """Rotation that shows the target from the side from which ``rotation`` shows the source; that if nothing tells."""
-    known = np.ones(source.V, bool) if source.invalid is None else ~source.invalid
+    known = source.valid
     if not known.any():
         return rotation
     return facing_alike(target, vertex_map.points(target)[known], source.verts[known] @ rotation.T)
@@ -112,7 +112,7 @@ def _standing(upward: Direction, ahead: Direction) -> Rotation:
 def _samples(shape: Shape) -> tuple[Points, Float[Floats, " N"]]:
     """Points all over the surface, centered, in units of sqrt(area), and the share of the area around each."""
     if shape.is_cloud:
-        points = shape.verts if shape.invalid is None else shape.verts[~shape.invalid]
+        points = shape.verts[shape.valid]
         weights = np.ones(len(points))
     else:
         points, weights = shape.verts[shape.faces].mean(axis=1), shape.face_areas

@@ -118,16 +118,9 @@ def build_figure(panel: Panel, up: str | None, front: str | None, turn: float, t
 def _seen_vertices(shape: Shape) -> surface.Rows:
     """Neither those without a position nor those that no face uses; at least one."""
     if shape.is_cloud:
-        return np.arange(shape.V) if shape.invalid is None else np.flatnonzero(~shape.invalid)
-    used = surface.corners_of(shape.faces[_valid_faces(shape)])
+        return np.flatnonzero(shape.valid)
+    used = surface.corners_of(shape.faces[shape.valid_faces])
     return used if len(used) else np.zeros(1, np.int64)
-
-
-def _valid_faces(shape: Shape) -> surface.Rows:
-    """Indices of the faces whose corners all have a position."""
-    if shape.invalid is None:
-        return np.arange(shape.F)
-    return np.flatnonzero(~shape.invalid[shape.faces].any(axis=1))
 
 
 def _paint(panel: Panel, scale: float) -> surface.Paint:
@@ -148,7 +141,7 @@ def _skin(
 ) -> surface.Surface:
     """A shape with its vertices as they are seen; the rotation turns its normals."""
     if not shape.is_cloud:
-        valid = _valid_faces(shape)
+        valid = np.flatnonzero(shape.valid_faces)
         if not len(valid):  # embree needs a triangle even for an empty scene
             return surface.mesh_surface(verts[:1], np.zeros((1, 3), np.int64), surface.face_paint(np.ones((1, 3))))
         return surface.mesh_surface(verts, shape.faces, paint, None if len(valid) == shape.F else valid)

@@ -64,7 +64,7 @@ def repair(shape: Shape) -> Repaired:
     `InputError` if nothing is left: no face of a mesh has any area.
     """
     notes: list[str] = []
-    valid = np.ones(shape.V, bool) if shape.invalid is None else ~shape.invalid
+    valid = shape.valid
     if not valid.any():
         raise InputError(f"{shape.name or 'the shape'}: no vertex has a position (all NaN)", "export it again")
     _note(notes, shape.V - int(valid.sum()), "vertex", "without a position (NaN) dropped")

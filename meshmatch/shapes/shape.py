@@ -124,12 +124,22 @@ class Shape:
         """True if there are no faces."""
         return len(self.faces) == 0
 
+    @property
+    def valid(self) -> Bool[Bools, " V"]:
+        """True for a vertex that has a position."""
+        return np.ones(self.V, bool) if self.invalid is None else ~self.invalid
+
+    @property
+    def valid_faces(self) -> Bool[Bools, " F"]:
+        """True for a face whose corners all have a position."""
+        return np.asarray(self.valid[self.faces].all(axis=1))
+
     @cached_property
     def face_vectors(self) -> Floats:
         """(F, 3) normal of each face, twice its area long; 0 where a corner is invalid."""
         vectors = triangle_vectors(self.verts, self.faces)
         if self.invalid is not None:
-            vectors[self.invalid[self.faces].any(axis=1)] = 0.0
+            vectors[~self.valid_faces] = 0.0
         return vectors
 
     @cached_property

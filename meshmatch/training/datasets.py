@@ -30,6 +30,9 @@ from meshmatch.training.scans import (
     yaw_rotations,
 )
 
+DEFORM = 0.08
+"""Standard deviation of the vectors of a coarse lattice, whose field deforms a shape smoothly, units of sqrt(area)."""
+_PLAIN = 0.25  # of the shapes are not deformed; this and `DEFORM` are set by hand
 _SIDE = 4  # nodes of the lattice along each axis; this and the reach are set by hand
 _REACH = 1.9  # of a lattice node, in spacings
 _MAX_POINTS = 400_000  # for which a lattice is kept ready; with more shapes there is no need to deform them
@@ -128,24 +131,6 @@ class BatchDataset(torch.utils.data.Dataset):
         return Batch(in_core, targets, features, self.aligner.features(turned), anywhere @ R, center)
 
 
-@dataclass(frozen=True)
-class Augmentation:
-    """How much shapes are deformed from one drawing to the next; set by hand.
-
-    deform : standard deviation, in units of sqrt(surface area), of the vectors of a coarse lattice of nodes, whose field
-    deforms a shape smoothly; every shape draws how much of it. plain : share of the shapes that are not deformed.
-    """
-
-    deform: float = 0.08
-    plain: float = 0.25
-
-    def vectors(self, B: int, L: int, generator: torch.Generator) -> Float[Tensor, "B L 3"]:
-        """Vectors of the lattice's nodes for a batch of shapes."""
-        size = self.deform * torch.rand(B, 1, 1, generator=generator)
-        size = size * (torch.rand(B, 1, 1, generator=generator) >= self.plain)
-        return size * torch.randn(B, L, 3, generator=generator)
-
-
 @dataclass(frozen=True, eq=False)
 class Lattice:
     """A coarse field on every sample of N shapes, its gradient there, and the field on their landmarks."""
@@ -186,14 +171,20 @@ def _lattice_field(points: Float[Floats, "N 3"]) -> Field:
     return Field.of(build_field(points, lattice, _REACH * float(ticks[1] - ticks[0]), "smooth"))
 
 
-def deformed_source(shapes: Float[Tensor, "N V 3"], augmentation: Augmentation | None = None) -> Source:
+def lattice_vectors(deform: float, B: int, L: int, generator: torch.Generator) -> Float[Tensor, "B L 3"]:
+    """Vectors of a lattice's nodes for a batch of shapes; every shape draws how much of the deformation it gets."""
+    size = deform * torch.rand(B, 1, 1, generator=generator)
+    size = size * (torch.rand(B, 1, 1, generator=generator) >= _PLAIN)
+    return size * torch.randn(B, L, 3, generator=generator)
+
+
+def deformed_source(shapes: Float[Tensor, "N V 3"], deform: float = DEFORM) -> Source:
     """Registered shapes, drawn with replacement and smoothly deformed; all stand alike, in any unit.
 
     So many that no change is needed (see `build_lattice`) are drawn as they are.
     """
-    augmentation = augmentation or Augmentation()
     N, V, _ = shapes.shape
-    if N * V > _MAX_POINTS or augmentation.deform <= 0:
+    if N * V > _MAX_POINTS or deform <= 0:
         return registered_source(shapes)
     shapes = shapes - shapes.mean(1, keepdim=True)
     shapes = 0.3 * shapes / shapes.flatten(1).std(1)[:, None, None]  # about area 1
@@ -201,7 +192,7 @@ def deformed_source(shapes: Float[Tensor, "N V 3"], augmentation: Augmentation |
 
     def draw(count: int, generator: torch.Generator) -> Tensor:
         which = torch.randint(N, (count,), generator=generator)
-        return shapes[which] + phi[which] @ augmentation.vectors(count, phi.shape[2], generator)
+        return shapes[which] + phi[which] @ lattice_vectors(deform, count, phi.shape[2], generator)
 
     return draw
 
@@ -216,10 +207,10 @@ class CloudDataset(torch.utils.data.Dataset):
     lattice: Lattice | None
     encoder: BasisEncoder | PointEncoder | None
     scan: ScanConfig
-    augmentation: Augmentation
     shapes: int = 8
     seed: int = 0
     length: int = 1
+    deform: float = DEFORM
 
     def __len__(self) -> int:
         return self.length
@@ -236,8 +227,8 @@ class CloudDataset(torch.utils.data.Dataset):
         rows = which[:, None]
         points, normals, known = self.points[rows, pick], self.normals[rows, pick], self.landmarks[which]
         B = len(which)
-        if self.lattice is not None and self.augmentation.deform > 0:
-            vectors = self.augmentation.vectors(B, self.lattice.phi.shape[2], generator)
+        if self.lattice is not None and self.deform > 0:
+            vectors = lattice_vectors(self.deform, B, self.lattice.phi.shape[2], generator)
             points = points + self.lattice.phi[rows, pick] @ vectors
             known = known + self.lattice.landmark_phi[which] @ vectors
             slopes = self.lattice.gradient[rows, pick] @ vectors[:, None]  # B P k a: d u_a / d x_k

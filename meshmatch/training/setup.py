@@ -19,7 +19,7 @@ from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import Template, template_radius
-from meshmatch.training.datasets import Augmentation, BatchDataset, CloudDataset, Source, build_lattice
+from meshmatch.training.datasets import BatchDataset, CloudDataset, Source, build_lattice
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import LossPoints, SurfacePoints
 from meshmatch.training.scans import ScanConfig
@@ -112,7 +112,7 @@ def build_loss_points(template: Template, kernel: Kernel, model: Deformer, strai
 def build_cloud_dataset(samples: ShapeSamples, config: TrainConfig, scan: ScanConfig) -> CloudDataset:
     """Batches of a folder's samples, as yet without an encoder."""
     points, normals, known = map(torch.from_numpy, (samples.points, samples.normals, samples.landmarks))
-    settings = scan, Augmentation(), config.shapes, config.seed, config.steps
+    settings = scan, config.shapes, config.seed, config.steps
     return CloudDataset(points, normals, known, build_lattice(samples), None, *settings)
 
 

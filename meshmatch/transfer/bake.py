@@ -97,7 +97,7 @@ def transfer_texture(
     walker, sampler = _arranged(source, look)
     uv = atlas.uv
     if target.invalid is not None:  # faces with a corner that has no position
-        valid = ~target.invalid[target.faces].any(axis=1)
+        valid = target.valid_faces
         target, uv = Shape(target.verts, target.faces[valid], target.name), uv[valid]
     locator = TexelLocator(walker, target, back, uv * options.size)
     inside = faces_on(uv * options.size, options.size)[0]

@@ -65,11 +65,8 @@ class MappedMesh:
         self.unit = length_of(target)
         found = corners_of(target.faces, source_to_target.face, source_to_target.index)
         self.normals = unit(interpolate(known_normals(target), found, source_to_target.barycentric))
-        kept = np.flatnonzero(~discontinuous_faces(source_to_target, source, target))
-        lone = np.ones(source.V, bool)
-        if source.invalid is not None:  # their places are stand-ins
-            kept = kept[~source.invalid[source.faces[kept]].any(axis=1)]
-            lone &= ~source.invalid
+        kept = np.flatnonzero(~discontinuous_faces(source_to_target, source, target) & source.valid_faces)
+        lone = source.valid
         lone[source.faces[kept].ravel()] = False
         self._source_unit = length_of(source)
         self._source = source.verts / self._source_unit
@@ -242,9 +239,7 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
             lambda rows, near: image.query(target.verts[rows], normals[rows], workers, near * source_length),
             _ROUNDS,
         )
-    sure = np.clip(found.confidence, 0.0, 1.0)
-    if target.invalid is not None:
-        sure[target.invalid] = 0.0
+    sure = np.where(target.valid, np.clip(found.confidence, 0.0, 1.0), 0.0)
     rest: dict[str, Any] = {"face": found.face, "barycentric": found.barycentric, "confidence": sure}
     return VertexMap.between(target, source, found.vertex, verdict=checked.verdict, reasons=checked.reasons, **rest)
 
@@ -257,9 +252,7 @@ def _meeting_vertices(found: VertexMap, source: Shape, V: int) -> tuple[Int[Ints
     rows = np.flatnonzero(found.on_vertex)
     at = found.index[rows]
     np.maximum.at(highest, at, found.confidence[rows])
-    trusted = found.confidence[rows] >= _MEETING * highest[at]
-    if source.invalid is not None:
-        trusted &= ~source.invalid[rows]
+    trusted = (found.confidence[rows] >= _MEETING * highest[at]) & source.valid[rows]
     rows, at = rows[trusted], at[trusted]
     count = np.bincount(at, minlength=V)
     sums = np.stack([np.bincount(at, source.verts[rows, k], V) for k in range(3)], axis=1)

@@ -37,7 +37,7 @@ class SurfaceWalker:
         self._opposite = list(np.ascontiguousarray(self.opposite.T))
         self.face_of_vertex = np.full(shape.V, -1, np.int64)  # a face at each vertex; -1 where there is none
         self.face_of_vertex[shape.faces[::-1].ravel()] = np.repeat(np.arange(shape.F - 1, -1, -1), 3)
-        self._unfit = self._flat if shape.invalid is None else self._flat | shape.invalid[shape.faces].any(axis=1)
+        self._unfit = self._flat | ~shape.valid_faces
         self._tree: cKDTree | None = None
 
     def closest(self, points: Floats32, face: Ints32) -> tuple[Ints32, Floats32, Floats32]:
@@ -119,7 +119,7 @@ class PointWalker(SurfaceWalker):
     """
 
     def __init__(self, shape: Shape) -> None:
-        valid = np.arange(shape.V) if shape.invalid is None else np.flatnonzero(~shape.invalid)
+        valid = np.flatnonzero(shape.valid)
         near = cKDTree(shape.verts[valid]).query(shape.verts, min(3, len(valid)))[1].reshape(shape.V, -1)
         faces = np.concatenate([valid[near], valid[near[:, -1:]].repeat(3 - near.shape[1], axis=1)], axis=1)
         super().__init__(Shape(shape.verts, faces, shape.name, invalid=shape.invalid))

@@ -199,9 +199,7 @@ class TexelLocator:
         )
         self._size = length.max(axis=1).astype(np.float32)
         scale = float(np.median(length.ravel() / np.maximum(own_length.ravel(), 1e-300)))
-        self.discontinuous = np.asarray((length > _STRETCH * scale * own_length + _SLACK).any(axis=1))
-        if target.invalid is not None:
-            self.discontinuous |= target.invalid[target.faces].any(axis=1)
+        self.discontinuous = (length > _STRETCH * scale * own_length + _SLACK).any(axis=1) | ~target.valid_faces
         if self.discontinuous.any():
             self._jacobian = _jacobians(target, held, ~self.discontinuous)
             bend = (scale * own_length.max(axis=1) / np.maximum(self._size, 1e-12)).astype(np.float32)

@@ -11,7 +11,8 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import Template
-from meshmatch.training.datasets import Augmentation, CloudDataset, build_lattice, deformed_normals, deformed_source
+from meshmatch.training import datasets
+from meshmatch.training.datasets import CloudDataset, build_lattice, deformed_normals, deformed_source
 from meshmatch.training.loop import TrainConfig, Trainer
 from meshmatch.training.losses import ChamferLoss, chamfer, held_out_error, robust
 from meshmatch.training.recipes import Recipe
@@ -98,9 +99,7 @@ def test_batches_are_functions_of_seed_and_step(data: CloudDataset) -> None:
 
 
 def test_every_shape_is_drawn_before_one_comes_again(eggs: ShapeSamples, data: CloudDataset) -> None:
-    still = replace(
-        data, augmentation=Augmentation(deform=0.0), scan=ScanConfig(points=202, noise=0, scale=0), shapes=3
-    )
+    still = replace(data, deform=0.0, scan=ScanConfig(points=202, noise=0, scale=0), shapes=3)
     heights = sorted(float(each[:, 1].max() - each[:, 1].min()) for each in still[0].points)
     true = sorted(float(np.ptp(each[:, 1])) for each in eggs.points)
     assert np.allclose(heights, true, atol=0.15)
@@ -122,7 +121,7 @@ def test_known_points_move_with_their_shape(eggs: ShapeSamples, data: CloudDatas
 
 
 def test_a_warp_changes_shapes_and_many_shapes_have_none(eggs: ShapeSamples, data: CloudDataset) -> None:
-    calm = replace(data, augmentation=Augmentation(deform=0.0))
+    calm = replace(data, deform=0.0)
     assert (data[0].points - calm[0].points).abs().max() > 0.01
     many = replace(eggs, points=np.zeros((400, 1024, 3), np.float32))
     assert build_lattice(many) is None
@@ -186,11 +185,14 @@ def test_it_learns(eggs: ShapeSamples, template: Template, data: CloudDataset) -
     assert held_out_error(model, held_out, points) < 0.9 * before
 
 
-def test_few_registered_shapes_are_deformed_at_every_drawing(template: Template) -> None:
+def test_few_registered_shapes_are_deformed_at_every_drawing(
+    template: Template, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(datasets, "_PLAIN", 0.5)
     verts = torch.from_numpy(np.array(template.shape.verts)).float()
     shapes = torch.stack([verts, verts * torch.tensor([1.0, 1.2, 1.0])])
     generator = torch.Generator().manual_seed(0)
-    drawn = deformed_source(100 + 20 * shapes, Augmentation(deform=0.1, plain=0.5))(64, generator)
+    drawn = deformed_source(100 + 20 * shapes, deform=0.1)(64, generator)
     centred = shapes - shapes.mean(1, keepdim=True)
     own = 0.3 * centred / centred.flatten(1).std(1)[:, None, None]
     apart = (drawn[:, None] - own[None]).norm(dim=-1).mean(-1).min(1).values
@@ -201,5 +203,5 @@ def test_few_registered_shapes_are_deformed_at_every_drawing(template: Template)
     moved = drawn[int(apart.argmax())] - own[0]
     step = (moved[ends[:, 0]] - moved[ends[:, 1]]).norm(dim=1).mean()
     assert float(step) < 0.5 * float(moved.norm(dim=1).mean())
-    plain = deformed_source(shapes, Augmentation(deform=0.0))(3, generator)
+    plain = deformed_source(shapes, deform=0.0)(3, generator)
     assert any(torch.allclose(plain[0], each) for each in centred)

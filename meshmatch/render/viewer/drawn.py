@@ -58,7 +58,7 @@ class Drawn:
 
 def draw(shape: Shape, most: int = MOST) -> Drawn:
     """What to draw of a shape: no vertex without a position, and of more than `most` a coarser surface."""
-    valid = np.ones(shape.V, bool) if shape.invalid is None else ~shape.invalid
+    valid = shape.valid
     if not valid.any():  # nothing but stand-ins: still a page
         valid[:] = True
     sound = np.flatnonzero(valid[shape.faces].all(axis=1))
