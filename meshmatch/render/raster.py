@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
-from meshmatch.render.scene import Hits, Scene, Vectors
-from meshmatch.render.shading import BLOCK, GROUND_BLOCK, Shares, shade, shadow, visibility
+from meshmatch.render.scene import BLOCK, GROUND_BLOCK, Hits, Scene, Shares, Vectors, shade, shadow, visibility
 from meshmatch.render.surface import Rows
 
 BAND = 100_000

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from meshmatch.render import raster, shading
+from meshmatch.render import raster
 from meshmatch.render.figures import rotation_about_x
 from meshmatch.render.raster import Layer, Viewport, composite, draw
-from meshmatch.render.scene import Ground, Scene
+from meshmatch.render.scene import Ground, Scene, visibility
 from meshmatch.render.surface import Surface, VertexPaint, balls, discs, face_paint, mesh_surface
 
 WINDOW = Viewport(90, 70, -0.45, 0.35, 0.01)
@@ -120,10 +120,10 @@ def test_light_that_nothing_blocks_is_whole_and_a_lid_takes_it() -> None:
     x = np.array([0.0, 0.1])
     hits = open_floor.look(x, x, 0.01)
     rows = np.arange(2)
-    assert (shading.visibility(open_floor, hits, rows, rows, rows) == 1).all()
+    assert (visibility(open_floor, hits, rows, rows, rows) == 1).all()
     lid = square(8.0, 0.02)
     covered = Scene([square(0.8), Surface(lid.verts, lid.faces, lid.normals, lid.paint)])
-    seen = shading.visibility(covered, hits, rows, rows, rows)
+    seen = visibility(covered, hits, rows, rows, rows)
     assert (seen[:, 0] == 0).all()
     assert (seen[:, 1] < 0.35).all()  # some rays end before the lid: what is near counts most
 
