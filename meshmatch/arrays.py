@@ -1,21 +1,34 @@
 """Array types in one dialect: ``Float[Floats, "V 3"]`` is a float64 array of V rows and 3 columns.
 
 The shape is jaxtyping's (https://docs.kidger.site/jaxtyping); a type checker sees the array type alone. Modules that
-use it begin with ``from __future__ import annotations``, so that annotations cost nothing when they are loaded.
+use it begin with ``from __future__ import annotations``, so that annotations cost nothing when they are loaded; and
+jaxtyping is not loaded for them either, unless it was before, as tests do.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import sys
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool as Bool
-from jaxtyping import Float as Float
-from jaxtyping import Int as Int
-from jaxtyping import UInt8 as UInt8
 from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.errors import InputError
+
+if TYPE_CHECKING or "jaxtyping" in sys.modules:
+    from jaxtyping import Bool as Bool
+    from jaxtyping import Float as Float
+    from jaxtyping import Int as Int
+    from jaxtyping import UInt8 as UInt8
+else:
+
+    class Bool:
+        """The array type alone."""
+
+        def __class_getitem__(cls, what: tuple[Any, str]) -> Any:
+            return what[0]
+
+    Float = Int = UInt8 = Bool
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

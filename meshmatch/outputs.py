@@ -1,7 +1,6 @@
 """Output files and folders appear whole or not at all."""
 
 import os
-import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -58,7 +57,7 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
     if not folder.is_dir():
         raise OutputError(f"cannot write {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}")
     # A name has 255 bytes at most, and a letter up to 4 of them.
-    temporary = folder / f".{path.stem[:40]}.{secrets.token_hex(4)}{path.suffix}"
+    temporary = folder / f".{path.stem[:40]}.{os.urandom(4).hex()}{path.suffix}"
     try:
         temporary.touch(exist_ok=False)  # tells now, not after minutes of work
         mode = temporary.stat().st_mode  # some writers make files that only their owner may read
@@ -94,7 +93,7 @@ def folder_on_success(path: str | Path) -> Iterator[Path]:
         raise OutputError(f"the folder {path} is not empty", "choose a new one, or empty it first")
     if not folder.is_dir():
         raise OutputError(f"cannot make {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}")
-    temporary = folder / f".{path.name[:40]}.{secrets.token_hex(4)}"
+    temporary = folder / f".{path.name[:40]}.{os.urandom(4).hex()}"
     try:
         temporary.mkdir()
     except OSError as error:

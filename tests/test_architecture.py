@@ -336,5 +336,11 @@ def test_what_needs_no_network_loads_no_torch() -> None:
     none(found & {"torch", "matplotlib", "trimesh", "pymeshlab"})
 
 
+def test_a_match_loads_no_tools_of_other_libraries() -> None:
+    """Annotations need no jaxtyping when they run, and SciPy's star import of NumPy none of NumPy's tools."""
+    none(loaded_by("import meshmatch.api.matching") & {"jaxtyping", "unittest", "torch"})
+    assert loaded_by("import meshmatch.geometry, numpy; numpy.testing.assert_equal(1, 1)") >= {"unittest"}
+
+
 def test_the_interpreter_test_sees_a_heavy_import() -> None:
     assert "scipy" in loaded_by("import meshmatch.maps.geodesics")

@@ -6,9 +6,7 @@ Listing models loads neither NumPy nor torch.
 
 from __future__ import annotations
 
-import hashlib
 import os
-import secrets
 import shutil
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -91,6 +89,8 @@ def find_model(name: str | Path) -> tuple[Path, ModelCard]:
 
     `ModelError` if there is no such model, or it is damaged.
     """
+    import hashlib
+
     folder = locate_model(name)
     card = read_card(folder / CARD)
     for part in (TEMPLATE, WEIGHTS):
@@ -154,7 +154,7 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
     taken = ModelError(f"there is a model called {card.name} already", hint)
     if target.exists() and not replace:
         raise taken
-    temporary = user_folder() / f".{card.name}.{secrets.token_hex(4)}"
+    temporary = user_folder() / f".{card.name}.{os.urandom(4).hex()}"
     replaced = user_folder() / f".{card.name}{_REPLACED}"
     try:
         temporary.mkdir(parents=True)
@@ -189,7 +189,7 @@ def remove_model(name: str) -> None:
         if folder.is_symlink():
             folder.unlink()
             return
-        grave = folder.with_name(f".{name}.{secrets.token_hex(4)}")
+        grave = folder.with_name(f".{name}.{os.urandom(4).hex()}")
         os.rename(folder, grave)  # it loses its name at once, so that a half-removed model is never found
         shutil.rmtree(grave)
     except OSError as error:
