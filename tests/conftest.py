@@ -113,7 +113,7 @@ def torus() -> Shape:
 def some_fit(points: np.ndarray, faces: np.ndarray, **about: Any) -> Fit:
     """A good fit that nobody made: in the frame of its file, resting where it lies, unless `about` says otherwise."""
     plain: dict[str, Any] = {"template_hash": "", "frame": Frame.identity(), "vectors": points, "resting": points}
-    plain |= {"residual": 0.0, "vertex_distance": np.zeros(1), "verdict": "good", "reasons": ()}
+    plain |= {"residual": 0.0, "verts": points, "verdict": "good", "reasons": ()}
     plain |= {"up": "+y", "front": "+z", "seconds": 0.0, "seed": 0}
     return Fit(points=points, faces=faces, **(plain | about))
 

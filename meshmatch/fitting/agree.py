@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.fitting.fit import Fit, vertex_distance
+from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig, NodeRefineConfig, geometric_between
 from meshmatch.fitting.nodes import add_landmarks, nearest_rotations, pair_terms
 from meshmatch.fitting.system import NodeSystem, node_system
@@ -88,12 +88,9 @@ def agreed_fits(
     with ThreadPoolExecutor(threads) as pool:
         members = list(pool.map(member, range(len(fits))))
     refined = agree(system, members, config.nodes, threads)
-    agreed = []
-    for shape, fit, vectors in zip(shapes, fits, refined, strict=True):
-        points = system.moved(vectors)
-        distance = vertex_distance(points, fit.frame.apply(shape.verts))
-        agreed.append(replace(fit, vectors=vectors, points=points, vertex_distance=distance))
-    return agreed
+    return [
+        replace(fit, vectors=vectors, points=system.moved(vectors)) for fit, vectors in zip(fits, refined, strict=True)
+    ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -52,7 +53,7 @@ class Fit:
     resting : (V, 3) the same vertices on the resting template, template frame
     faces : (F, 3) the template's triangles
     residual : mean distance, normals included, between template and shape, both ways, in units of sqrt(area)
-    vertex_distance : (N,) distance of every vertex of the shape to the nearest template vertex, same unit
+    verts : (N, 3) vertices of the shape, in the frame and unit of its file
     verdict, reasons : "good", "fair" or "poor", and why it is not good
     up, front : the axes of the file that the fit took for up and front, such as "+y" and "-z"
     seconds, seed : how long the fit took, and with which random numbers
@@ -68,7 +69,7 @@ class Fit:
     resting: Float[Floats, "V 3"]
     faces: Int[Ints, "F 3"]
     residual: float
-    vertex_distance: Float[Floats, " N"]
+    verts: Float[Floats, "N 3"]
     verdict: Verdict
     reasons: tuple[Reason, ...]
     up: str
@@ -78,6 +79,11 @@ class Fit:
     partial: bool = False
     repaired: Repaired | None = None
     notes: tuple[str, ...] = ()
+
+    @cached_property
+    def vertex_distance(self) -> Floats:
+        """(N,) distance of every vertex of the shape to the nearest template vertex, in units of sqrt(area)."""
+        return np.asarray(cKDTree(self.points).query(self.frame.apply(self.verts))[0])
 
     @property
     def points_in_file(self) -> Float[Floats, "V 3"]:
@@ -100,11 +106,6 @@ class Fit:
                 f"the fit is of another template ({self.template_hash}, not {expected})",
                 "use the model that made the fit",
             )
-
-
-def vertex_distance(points: Float[Floats, "V 3"], verts: Float[Floats, "N 3"]) -> Float[Floats, " N"]:
-    """Distance of each vertex of a shape to the nearest template vertex, both in the core frame."""
-    return np.asarray(cKDTree(points).query(verts)[0])
 
 
 def axis_name(direction: Float[Floats, " 3"]) -> str:

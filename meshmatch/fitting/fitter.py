@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
 from meshmatch.fitting.candidates import fit_part, fit_whole
-from meshmatch.fitting.fit import Fit, axis_name, vertex_distance
+from meshmatch.fitting.fit import Fit, axis_name
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.nodes import Landmarks
 from meshmatch.fitting.refinement import REFINEMENTS, Refinement
@@ -94,7 +94,7 @@ def _as_fit(found: Registration, partial: bool, began: float) -> Fit:
         resting=task.system.verts,
         faces=task.system.faces,
         residual=found.candidate.residual,
-        vertex_distance=vertex_distance(points, frame.apply(task.shape.verts)),
+        verts=task.shape.verts,
         verdict=verdict,
         reasons=reasons,
         up=axis_name(frame.rotation[1]),
@@ -107,7 +107,7 @@ def _as_fit(found: Registration, partial: bool, began: float) -> Fit:
 
 def boundary_length(shape: Shape) -> float:
     """Length of the edges with one face, in the unit of the file."""
-    ends = shape.verts[shape.edges.vertices[shape.edges.sizes == 1]]  # N 2 3
+    ends = shape.verts[shape.edges.open]  # N 2 3
     return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum())
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Ints32
 
 # Neighbours are discontinuous if their images are further apart than this (sqrt(area)) plus so many times their own
 # distance. Set by hand.
@@ -166,55 +166,59 @@ def face_parts(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " F"]:
 class Edges:
     """The edges of faces, sorted once for several questions."""
 
-    # Twice the number of each edge of each face, plus 1 if the face runs from the smaller vertex to the larger.
-    ordered: Int[Ints, " F_times_3"]
-    begins: NDArray[np.int32]  # (E,) where each edge begins in `ordered`: half the memory of int64
+    vertices: Int[Ints32, "E 2"]  # the two vertices of each edge, the smaller first; sorted
+    begins: NDArray[np.int32]  # (E,) where each edge begins in the sorted `directed_edges`
     sizes: NDArray[np.int32]  # (E,) and how many faces it has
-    stride: int  # the number of the edge between vertices i < j is i * stride + j
+    disagreeing: Bool[Bools, " pairs"]  # for each edge of exactly two faces: do both run along it the same way?
 
     @property
-    def vertices(self) -> Int[Ints, "E 2"]:
-        """(E, 2) the two vertices of each edge, the smaller first; sorted."""
-        return np.stack(np.divmod(self.ordered[self.begins] >> 1, self.stride), axis=1)
+    def open(self) -> Int[Ints32, "N 2"]:
+        """Vertices of the edges that have one face."""
+        return self.vertices[self.sizes == 1]
 
     @property
     def counts(self) -> tuple[int, int]:
         """How many edges have one face (open), and how many have more than two (non-manifold)."""
         return int((self.sizes == 1).sum()), int((self.sizes > 2).sum())
 
-    @property
-    def disagreeing(self) -> Bool[Bools, " pairs"]:
-        """For each edge of exactly two faces: do both run along it the same way?"""
-        two = self.begins[self.sizes == 2]
-        return np.asarray(self.ordered[two] == self.ordered[two + 1])
-
 
 def edges_of(faces: Int[Ints, "F 3"]) -> Edges:
-    """Sort the edges of `faces`."""
-    ordered = np.sort(directed_edges(faces))
-    group = ordered >> 1
-    begins = np.flatnonzero(np.diff(group, prepend=-1)).astype(np.int32)
-    sizes = np.diff(np.append(begins, len(group))).astype(np.int32)
-    return Edges(ordered, begins, sizes, _stride(faces))
+    """Sort the edges of `faces`; what that takes is freed at once, for millions of faces ask for little memory."""
+    ordered = directed_edges(faces)
+    ordered.sort()
+    first = np.ones(len(ordered), bool)
+    first[1:] = (ordered[1:] ^ ordered[:-1]) > 1  # all but the last bit is the edge's number
+    begins = np.flatnonzero(first).astype(np.int32)
+    sizes = np.diff(np.append(begins, np.int32(len(ordered))))
+    two = begins[sizes == 2]
+    disagreeing = ordered[two] == ordered[two + 1]
+    vertices = np.empty((len(begins), 2), np.int32)
+    for low in range(0, len(begins), _CHUNK):
+        keys = ordered[begins[low : low + _CHUNK]] >> 1
+        vertices[low : low + _CHUNK, 0], vertices[low : low + _CHUNK, 1] = np.divmod(keys, _stride(faces))
+    return Edges(vertices, begins, sizes, disagreeing)
 
 
 def directed_edges(faces: Int[Ints, "F 3"]) -> Int[Ints, " F_times_3"]:
-    """(3 F,) the numbers that `Edges.ordered` sorts: F of the edges 0-1, then of 1-2, then of 2-0."""
-    columns = np.ascontiguousarray(faces.T)
-    return 2 * edge_keys(faces, _stride(faces)) + (columns < columns[[1, 2, 0]]).ravel()
-
-
-def open_edges(faces: Int[Ints, "F 3"]) -> Int[Ints, "N 2"]:
-    """(N, 2) vertices of the edges that have one face."""
-    edges = edges_of(faces)
-    return edges.vertices[edges.sizes == 1]
+    """(3 F,) twice the number of each edge of each face (`edge_keys`), plus 1 if the face runs from the smaller vertex to
+    the larger.
+    """
+    keys = edge_keys(faces, _stride(faces))
+    keys *= 2
+    for k, found in enumerate(keys.reshape(3, -1)):
+        found += faces[:, k] < faces[:, (k + 1) % 3]
+    return keys
 
 
 def edge_keys(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " F_times_3"]:
     """(3 F,) a number for each edge of each face, the same both ways: F of the edges 0-1, then 1-2, 2-0."""
-    columns = np.ascontiguousarray(faces.T)
-    start, end = columns.ravel(), columns[[1, 2, 0]].ravel()
-    return np.asarray(np.minimum(start, end) * V + np.maximum(start, end))
+    keys = np.empty((3, len(faces)), np.int64)
+    for k, found in enumerate(keys):
+        start, end = faces[:, k], faces[:, (k + 1) % 3]
+        np.minimum(start, end, out=found)
+        found *= V
+        found += np.maximum(start, end)
+    return keys.ravel()
 
 
 def _stride(faces: Ints) -> int:
@@ -236,7 +240,7 @@ def _hash(rows: Floats | Ints) -> NDArray[np.uint64]:
     return total
 
 
-def edge_lengths(points: Float[Floats, "V 3"], edges: Int[Ints, "E 2"]) -> Float[Floats, " E"]:
+def edge_lengths(points: Float[Floats, "V 3"], edges: Int[NDArray[Any], "E 2"]) -> Float[Floats, " E"]:
     """Distance of the two ends of each edge, by parts: millions of edges cost no more memory than their lengths."""
     length = np.empty(len(edges))
     for low in range(0, len(edges), _CHUNK):

@@ -14,9 +14,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -157,8 +158,9 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
     near the median of its neighbours.
     """
     points, normals = in_core_frame(shape, fit)
-    surface = Surface(fit.points, fit.faces, vertex_normals(fit.points, fit.faces), fit.resting)
-    found = closest_footpoints(shape, fit, workers)
+    facing = vertex_normals(fit.points, fit.faces)
+    found = Surface(fit.points, fit.faces, facing).query(points, normals, workers)
+    surface = Surface(fit.points, fit.faces, facing, fit.resting)
 
     def resting(foot: Footpoints) -> Floats:
         return foot.values(fit.faces, fit.resting)
@@ -204,14 +206,14 @@ def in_core_frame(shape: Shape, fit: Fit) -> tuple[Float[Floats, "V 3"], Float[F
 
 def reassign_islands(
     verts: Float[Floats, "V 3"],
-    edges: Int[Ints, "E 2"],
+    edges: Int[NDArray[Any], "E 2"],
     areas: Float[Floats, " V"],
     found: Found,
     images: Callable[[Found], Float[Floats, "N 3"]],
     search: Callable[[Int[Ints, " M"], Float[Floats, "M 3"]], Found],
     rounds: int,
 ) -> tuple[Found, Float[Floats, "V 3"]]:
-    """Search again for the vertices on small islands of a map of a mesh.
+    """Search again for the vertices on small islands of a map of a mesh, whose edges are as `Edges` has them.
 
     The mesh is in units of sqrt(area), `areas` are those around its vertices in any unit. Each vertex lies at a place in
     `found`; `images` are the points themselves, in units of their own surface's sqrt(area), and `search` gives
@@ -233,41 +235,48 @@ def reassign_islands(
 
 
 def small_islands(
-    edges: Int[Ints, "E 2"], length: Float[Floats, " E"], image: Float[Floats, "V 3"], areas: Float[Floats, " V"]
+    edges: Int[NDArray[Any], "E 2"],
+    length: Float[Floats, " E"],
+    image: Float[Floats, "V 3"],
+    areas: Float[Floats, " V"],
 ) -> Bool[Bools, " V"]:
     """True on small pieces between discontinuities: edges whose ends have images much further apart than they are.
 
-    Lengths are in units of sqrt(area); ``areas`` are those around the vertices.
+    Edges are sorted by their first vertex. Lengths are in units of sqrt(area); ``areas`` are those around the vertices.
     """
     V = len(image)
     continuous = ~is_discontinuous(edge_lengths(image, edges), length)
     if continuous.all():
         return np.zeros(V, bool)
-    start, end = edges[continuous].astype(np.int32).T
-    graph = csr_matrix((np.ones(len(start), np.int8), (start, end)), (V, V))
-    del start, end
+    begins = np.zeros(V + 1, np.int32)
+    np.cumsum(np.bincount(edges[continuous, 0], minlength=V), out=begins[1:])
+    graph = csr_matrix((np.ones(begins[-1], np.int8), edges[continuous, 1], begins), (V, V))
     piece = connected_components(graph, directed=False)[1]
     return np.asarray((np.bincount(piece, areas) < _MAINLAND * areas.sum())[piece])
 
 
 def surrounding_values(
-    edges: Int[Ints, "E 2"], values: Float[Floats, "V D"], unknown: Bool[Bools, " V"]
+    edges: Int[NDArray[Any], "E 2"], values: Float[Floats, "V D"], unknown: Bool[Bools, " V"]
 ) -> Float[Floats, "V D"]:
     """Values with the unknown rows replaced by the average of their surroundings; NaN out of reach."""
-    V, rows = len(values), np.flatnonzero(unknown)
-    edges = edges[unknown[edges].any(axis=1)]
-    graph = csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (V, V))
-    graph = (graph + graph.T).tocsr()
-    part = graph[rows]
-    filled = np.where(unknown[:, None], 0.0, values)
-    known = (~unknown).astype(float)
+    edges = edges[unknown[edges[:, 0]] | unknown[edges[:, 1]]]
+    # the unknown vertices and those around them
+    near, ends = np.unique(np.concatenate([edges.reshape(-1), np.flatnonzero(unknown)]), return_inverse=True)
+    start, end = ends[: edges.size].reshape(-1, 2).T
+    graph = csr_matrix((np.ones(len(start)), (start, end)), (len(near), len(near)))
+    rows = np.flatnonzero(unknown[near])
+    part = (graph + graph.T).tocsr()[rows]
+    filled = np.where(unknown[near, None], 0.0, values[near])
+    known = (~unknown[near]).astype(float)
     for _ in range(_STEPS):
         weight = part @ known
         total = part @ (known[:, None] * filled)
         filled[rows] = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], filled[rows])
         known[rows] = weight > 0
     filled[rows[known[rows] == 0]] = np.nan
-    return filled
+    every = values.copy()
+    every[near[rows]] = filled[rows]
+    return every
 
 
 class SurfaceBinding:

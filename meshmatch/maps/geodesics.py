@@ -28,7 +28,7 @@ Arcs = tuple[Ints, Ints, Floats]
 
 def edge_arcs(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Arcs:
     """Every edge once: its ends, and its length in the unit of ``verts``."""
-    i, j = edges_of(faces).vertices.T
+    i, j = edges_of(faces).vertices.T.astype(np.int64)
     i, j = i[i != j], j[i != j]
     return i, j, np.linalg.norm(verts[i] - verts[j], axis=1)
 

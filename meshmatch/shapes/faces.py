@@ -12,8 +12,8 @@ from meshmatch.geometry.triangles import (
     Edges,
     directed_edges,
     edge_keys,
+    edges_of,
     face_parts,
-    open_edges,
     same_rows,
     squared_lengths,
 )
@@ -34,7 +34,7 @@ def seams(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, " V
     shared[twin[twin != own]] = True
     shared = shared[twin]
     border = np.zeros(len(verts), bool)
-    border[open_edges(faces[shared[faces].any(axis=1)])] = True
+    border[edges_of(faces[shared[faces].any(axis=1)]).open] = True
     # the first of a group need not be on the border: number the border alone
     place = np.flatnonzero(border & shared)
     own[place] = place[same_rows(verts[place])]

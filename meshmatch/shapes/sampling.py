@@ -11,7 +11,7 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.geometry.triangles import dot, interpolate, triangle_vectors
+from meshmatch.geometry.triangles import dot, interpolate, triangle_vectors, unit
 from meshmatch.shapes.shape import Shape
 
 _NEIGHBOURS = 16
@@ -57,7 +57,7 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
     points = interpolate(shape.verts, corners, weights)
     vertex = corners[np.arange(P), weights.argmax(axis=1)]
     trust = None if shape.weights is None else (weights * shape.weights[corners]).sum(axis=1)
-    return Samples(points, shape.face_normals[face], True, trust, face=face, barycentric=weights, vertex=vertex)
+    return Samples(points, unit(shape.face_vectors[face]), True, trust, face=face, barycentric=weights, vertex=vertex)
 
 
 def farthest_points(points: Float[Floats, "N 3"], K: int, start: int = 0) -> Int[Ints, " K"]:

@@ -62,7 +62,7 @@ def fake_fit(shape: Shape, verdict: str = "good", reasons: tuple[str, ...] = (),
     """A fit that nobody made: of two triangles."""
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     rest: dict[str, Any] = {"frame": Frame(2.0, np.eye(3), np.array([10.0, 0, 0])), "front": "-z", "residual": 0.0123}
-    rest |= {"template_hash": "0" * 16, "vertex_distance": np.zeros(shape.V), "verdict": verdict, "reasons": reasons}
+    rest |= {"template_hash": "0" * 16, "verts": shape.verts, "verdict": verdict, "reasons": reasons}
     return some_fit(corners, np.array([[0, 1, 2], [0, 2, 3]]), seconds=1.0, **(rest | other))
 
 

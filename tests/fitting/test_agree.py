@@ -105,9 +105,9 @@ def test_landmarks_hold(system: NodeSystem, model: TrainedModel) -> None:
 
 
 def fit_of(system: NodeSystem, vectors: np.ndarray, verdict: str = "good") -> Fit:
-    about = {"frame": Frame(2.0, TURNS[1], np.array([1.0, 2.0, 3.0])), "verdict": verdict, "residual": 0.02}
-    points, none = system.moved(vectors), np.zeros(len(system.verts))
-    return some_fit(points, system.faces, vectors=vectors, resting=system.verts, vertex_distance=none, **about)
+    frame = Frame(2.0, TURNS[1], np.array([1.0, 2.0, 3.0]))
+    about = {"frame": frame, "verts": frame.undo(system.verts), "verdict": verdict, "residual": 0.02}
+    return some_fit(system.moved(vectors), system.faces, vectors=vectors, resting=system.verts, **about)
 
 
 def test_fits_agree_in_their_own_frames(system: NodeSystem, model: TrainedModel) -> None:

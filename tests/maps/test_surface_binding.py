@@ -18,7 +18,7 @@ FRAME = Frame(2.5, TURN, np.array([7.0, -1, 4]))
 def ball_fit(rider: Shape) -> Fit:
     """The unit sphere as the template, laid near a shape."""
     ball = icosphere(2)
-    return some_fit(np.array(ball.verts), np.array(ball.faces), frame=FRAME, vertex_distance=np.zeros(rider.V))
+    return some_fit(np.array(ball.verts), np.array(ball.faces), frame=FRAME, verts=rider.verts)
 
 
 @pytest.fixture(scope="module")
