@@ -23,9 +23,8 @@ if TYPE_CHECKING or "jaxtyping" in sys.modules:
 else:
 
     class Bool:
-        """The array type alone."""
-
         def __class_getitem__(cls, what: tuple[Any, str]) -> Any:
+            """The array type alone."""
             return what[0]
 
     Float = Int = UInt8 = Bool

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, TypeVar
 
+Result = TypeVar("Result")
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 _lock = threading.Lock()
@@ -45,6 +47,33 @@ def thread_limit(count: int) -> Iterator[None]:
                 _open_blocks -= 1
                 # torch gives a new thread the count that was set last: not that of a block elsewhere
                 _set_torch_threads(here if nested else _torch_before)
+
+
+@contextmanager
+def one_of(threads: threading.Semaphore) -> Iterator[None]:
+    """Take one of some threads for the block, in which `beside` takes those that are free at the moment."""
+    with threads:
+        _of_thread.shared = threads
+        try:
+            yield
+        finally:
+            _of_thread.shared = None
+
+
+def beside(function: Callable[..., Result], *arguments: Iterable[Any]) -> list[Result]:
+    """Results of a function, as of `map`, on free threads of the block of `one_of` that this thread is in, if any."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    calls = list(zip(*arguments, strict=True))
+    threads = getattr(_of_thread, "shared", None) or threading.Semaphore(0)
+    with ExitStack() as taken:
+        count = 1
+        while count < len(calls) and threads.acquire(blocking=False):
+            taken.callback(threads.release)
+            count += 1
+        if count == 1:
+            return [function(*call) for call in calls]
+        return list(taken.enter_context(ThreadPoolExecutor(count)).map(lambda call: function(*call), calls))
 
 
 def set_threads(count: int) -> None:

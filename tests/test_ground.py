@@ -15,7 +15,7 @@ import meshmatch
 from meshmatch import errors
 from meshmatch.errors import InputError, MeshmatchError, OutputError
 from meshmatch.outputs import folder_on_success, replace_on_success
-from meshmatch.threads import set_threads, thread_limit
+from meshmatch.threads import beside, one_of, set_threads, thread_limit
 
 
 def test_error_has_a_line_and_a_hint() -> None:
@@ -224,3 +224,18 @@ def test_limits_of_threads_may_overlap(three_threads: dict[str, int]) -> None:
     leave.set()
     other.join()
     assert counts() == three_threads
+
+
+def test_work_is_shared_by_threads_that_are_free() -> None:
+    """Two calls wait for each other on two threads; results come in order; errors are handed on, and threads back."""
+    meeting = threading.Barrier(2, timeout=10)
+    threads = threading.Semaphore(2)
+    with one_of(threads):
+        assert sorted(set(beside(lambda n: (meeting.wait(), n)[1], range(4)))) == [0, 1, 2, 3]
+        assert beside(lambda n, m: n * m, range(5), range(5)) == [0, 1, 4, 9, 16]
+        with pytest.raises(ZeroDivisionError):
+            beside(lambda n: 1 // n, range(3))
+        with threads:  # another has the second thread
+            assert set(beside(lambda _: threading.get_ident(), range(3))) == {threading.get_ident()}
+    assert set(beside(lambda _: threading.get_ident(), range(3))) == {threading.get_ident()}
+    assert all(threads.acquire(blocking=False) for _ in range(2))

@@ -25,7 +25,7 @@ from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
-from meshmatch.threads import thread_limit
+from meshmatch.threads import one_of, thread_limit
 
 LandmarkPairs = tuple[ArrayLike, ArrayLike]
 """Corresponding points: vertices of the source (N,), vertices of the target (N,)."""
@@ -36,9 +36,10 @@ class Matcher:
 
     ``model`` is a name in the registry, a model folder, or what `load_model` returned; ``config`` says how all shapes
     are fitted. ``threads`` is how many shapes are fitted beside each other, each on one thread of the numerical
-    libraries; 2 by default. One shape alone is fitted on one thread by default, and on more if they are asked for, which
-    may change the last bits. Afterwards the libraries have their threads back. ``progress`` is called with the stage, the
-    name of the shape and the share of the stage that is done (0..1).
+    libraries; 2 by default. A thread that no shape needs helps the others' fits, whose results it does not change. The
+    libraries have one thread for one shape alone too, and more if they are asked for, which may change the last bits.
+    Afterwards they have their threads back. ``progress`` is called with the stage, the name of the shape and the share of
+    the stage that is done (0..1).
 
     >>> matcher = meshmatch.Matcher("human")
     >>> fits = [matcher.fit(path) for path in paths]
@@ -139,7 +140,7 @@ class Matcher:
         return configs
 
     def _fit_all(self, clean: Sequence[Repaired], configs: Sequence[FitConfig]) -> list[Fit]:
-        stop = threading.Event()
+        stop, threads = threading.Event(), threading.Semaphore(self.threads)
         names = [part.shape.name for part in clean]
         labels = [f"{name} ({number + 1})" if names.count(name) > 1 else name for number, name in enumerate(names)]
 
@@ -151,7 +152,8 @@ class Matcher:
                     self.progress(stage, labels[number], share)
 
             try:
-                found = Fitter(self.model, configs[number], report).fit(clean[number].shape)
+                with one_of(threads):
+                    found = Fitter(self.model, configs[number], report).fit(clean[number].shape)
             except BaseException:
                 stop.set()
                 raise

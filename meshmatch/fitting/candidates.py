@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
-from meshmatch.fitting.network_fit import Candidate, Predictor, best_first, one_way_residual, sized
+from meshmatch.fitting.network_fit import Candidate, Predictor, best_first, one_way_residual, sized, two_way_residual
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import FitTask, Refine, Registration
 from meshmatch.fitting.verdict import area_share, judge_registration, visible_vertices
@@ -32,6 +32,7 @@ from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.progress import Progress
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import beside
 
 # How the scale and the outliers of a cloud are found. Set by hand.
 _ROUNDS = 3
@@ -78,12 +79,15 @@ def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list
     """The task and the best candidates of a cloud in the scale, and without the outliers, that the best fit tells."""
 
     def fit_again(samples: OrientedPoints, pose: RigidPose) -> Candidate:
-        return task.predictor.fit(samples, pose, draws=1)
+        return task.predictor.fit(samples, pose, draws=1, measure=lambda *_: 0.0)
 
     near = _BEHIND * candidates[0].residual
     best = [each for each in candidates[: task.config.careful] if each.residual <= near]
-    estimates = [estimate_scale(task.system, task.samples, candidate, fit_again) for candidate in best]
-    scale, samples, first = min(estimates, key=lambda estimate: estimate[2].residual)
+    found = [estimate_scale(task.system, task.samples, candidate, fit_again) for candidate in best]
+    # the last fits alone need their residuals
+    residuals = [two_way_residual(task.system, left.to_local(fit.pose), fit.vectors) for _, left, fit in found]
+    scale, samples, first = found[int(np.argmin(residuals))]
+    first = replace(first, residual=min(residuals))
     others = [
         Candidate(RigidPose(each.pose.rotation, each.pose.center / scale), each.vectors, each.residual) for each in best
     ]
@@ -196,22 +200,26 @@ def _careful(task: FitTask, wide: bool, progress: Progress) -> list[Candidate]:
 def _fitted_again(task: FitTask, candidates: Sequence[Candidate]) -> list[Candidate]:
     """New fits of the samples, completed by the last fits; how much of these was visible is the new share."""
     system, starts, shares = task.system, [], []
-    for candidate in candidates:
+
+    def shown(candidate: Candidate) -> Bools:
+        return visible_vertices(system, candidate.local(task.samples).first(_COARSE), candidate.vectors)
+
+    for candidate, visible in zip(candidates, beside(shown, candidates), strict=True):
         local, vectors = candidate.local(task.samples), candidate.vectors
-        visible = visible_vertices(system, local.first(_COARSE), vectors)
         shares.append(float(np.clip(area_share(system, visible), _MIN_SHARE, 1.0)))
         whole = completed(system, local, vectors, candidate.share, task.predictor.rng, visible)
         growth = np.sqrt(shares[-1] / candidate.share)
         starts.append((replace(whole, points=whole.points * growth), RigidPose.identity()))
-    found = []
     # unmeasured: the residual is that of other samples, once these are placed
     again = task.predictor.fit_all(starts, measure=lambda *_: 0.0)
-    for candidate, fit, share in zip(candidates, again, shares, strict=True):
+
+    def measured(candidate: Candidate, fit: Candidate, share: float) -> Candidate:
         last = candidate.pose
         pose = RigidPose(last.rotation, np.sqrt(share / candidate.share) * last.center) @ fit.pose
         placed = replace(fit, pose=pose, share=share)
-        found.append(replace(placed, residual=one_way_residual(system, placed.local(task.samples), fit.vectors)))
-    return found
+        return replace(placed, residual=one_way_residual(system, placed.local(task.samples), fit.vectors))
+
+    return beside(measured, candidates, again, shares)
 
 
 def completed(

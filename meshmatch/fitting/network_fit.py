@@ -20,9 +20,10 @@ from meshmatch.errors import TemplateError
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.geometry.frames import RigidPose, kabsch
-from meshmatch.geometry.oriented import OrientedPoints, with_normals
+from meshmatch.geometry.oriented import OrientedPoints, nearest_unsigned, with_normals
 from meshmatch.models.network import Network
 from meshmatch.models.trained import TrainedModel, once_per_model
+from meshmatch.threads import beside
 
 # How many points the network sees of tilted copies, in turn: thin samples tip it either way where it is in doubt.
 _VARIANT_POINTS = (700, 1400)
@@ -151,10 +152,11 @@ class Predictor:
                 resting = self.system.verts[self.core]
                 moved = [self.system.moved(vectors)[self.core] for vectors in means]
                 poses = [pose @ kabsch(resting, core) for pose, core in zip(poses, moved, strict=True)]
-        return [
-            Candidate(pose, vectors, measure(self.system, samples.to_local(pose), vectors))
-            for (samples, _), pose, vectors in zip(starts, poses, means, strict=True)
-        ]
+
+        def measured(start: tuple[OrientedPoints, RigidPose], pose: RigidPose, vectors: Floats) -> Candidate:
+            return Candidate(pose, vectors, measure(self.system, start[0].to_local(pose), vectors))
+
+        return beside(measured, starts, poses, means)
 
     def fit(
         self, samples: OrientedPoints, pose: RigidPose, rounds: int = 2, draws: int = 2, measure: Residual | None = None
@@ -178,7 +180,7 @@ class Predictor:
         if self.mirror is not None:
             mirrored = replace(local, points=self.mirror.points(local.points))
             found += [self.mirror.vectors(vectors) for vectors in self._tilted(mirrored, tilts)]
-        return [Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors)) for vectors in found]
+        return beside(lambda vectors: Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors)), found)
 
     def _tilted(self, samples: OrientedPoints, tilts: Float[Floats, "N 3 3"]) -> list[Floats]:
         """Node vectors (K, 3) predicted from tilted samples, turned back."""
@@ -225,13 +227,12 @@ def _capped_distances(
 
     Normals without a sure sign are turned to the nearer side.
     """
-    distance, index = np.full(len(points), cap), np.full(len(points), tree.n)
-    for side in (1,) if signed else (1, -1):
-        # A search without a bound visits every point of a tree that is far away.
-        found, at = tree.query(with_normals(points, side * normals), distance_upper_bound=cap)
-        index = np.where(found < distance, at, index)
-        distance = np.minimum(distance, found)
-    return distance, index
+    # A search without a bound visits every point of a tree that is far away.
+    if signed:
+        distance, index = tree.query(with_normals(points, normals), distance_upper_bound=cap)
+    else:
+        distance, index, _ = nearest_unsigned(tree, points, normals, cap)
+    return np.minimum(distance, cap), index
 
 
 def weighted_mean(values: np.ndarray, weights: Float[Floats, " N"] | None) -> np.floating:

@@ -10,6 +10,7 @@ cannot see.
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import csc_matrix
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
@@ -161,11 +162,10 @@ def _shared_pairs(
     share *= 1.0 / np.square(1.0 + np.square(distance[:, :1] / scale)) / len(some.points)
     if some.weights is not None:
         share *= some.weights[:, None]
-    point = np.repeat(some.points, at.shape[1], axis=0)
-    at, share = at.reshape(-1), share.reshape(-1)
     # Directions are the template's, so all that pulls at a vertex is summed before they are asked.
-    total = _sums(at, share[:, None], V)[:, 0]
-    pull = _sums(at, share[:, None] * point, V)
+    begins = np.arange(0, share.size + 1, share.shape[1])
+    shares = csc_matrix((share.reshape(-1), at.reshape(-1), begins), (V, len(share)))
+    total, pull = shares @ np.ones(len(share)), shares @ some.points
     mean = pull / np.maximum(total, 1e-300)[:, None]
     return _summed(np.arange(V), mean, surface.normals, total, config.point_share, V)
 

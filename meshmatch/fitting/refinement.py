@@ -28,6 +28,7 @@ from meshmatch.fitting.task import FitTask, Refine
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import is_discontinuous
 from meshmatch.progress import Progress
+from meshmatch.threads import beside
 
 # All of these were set by hand. Lengths and residuals are in units of sqrt(area).
 _NEIGHBOURS = 6
@@ -123,20 +124,25 @@ def choose(candidates: Sequence[Candidate], count: int, comparison: Comparison, 
             known.append(verts)
     if len(finalists) > 1:
         finalists = _screened(finalists, comparison, progress)
-    refined = []
-    for number, candidate in enumerate(finalists):
-        refined.append(comparison.refined(candidate, in_full=True))
-        progress(0.6 + 0.4 * (number + 1) / len(finalists))
+
+    def finished(number: int, candidate: Candidate) -> Candidate:
+        progress(0.6 + 0.4 * number / len(finalists))
+        return comparison.refined(candidate, in_full=True)
+
+    refined = beside(finished, range(len(finalists)), finalists)
+    progress(1.0)
     return min(refined, key=lambda each: comparison.score(each, True)) if len(refined) > 1 else refined[0]
 
 
 def _screened(candidates: list[Candidate], comparison: Comparison, progress: Progress) -> list[Candidate]:
     """Those of several interpretations that a few steps neither bring together nor leave far behind, best first."""
-    rough = []
-    for number, candidate in enumerate(candidates):
+
+    def tried(number: int, candidate: Candidate) -> tuple[float, Candidate, Floats]:
+        progress(0.6 * number / len(candidates))
         found = comparison.refined(candidate, in_full=False)
-        rough.append((comparison.score(found, False), candidate, comparison.vertices(found)))
-        progress(0.6 * (number + 1) / len(candidates))
+        return comparison.score(found, False), candidate, comparison.vertices(found)
+
+    rough = beside(tried, range(len(candidates)), candidates)
     rough.sort(key=lambda entry: entry[0])
     kept: list[tuple[Candidate, Floats]] = []
     for score, candidate, verts in rough:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from meshmatch.shapes.shape import Shape
 
 # How much further than its neighbours from theirs an outlier is from its own, see `outlier_points`. Set by hand.
 _OUTLIER_RATIO = 1.3
+_CLEAN: WeakKeyDictionary[Shape, Shape | None] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,15 +104,18 @@ class Registration:
 
 
 def without_outliers(shape: Shape) -> Shape:
-    """A cloud without the points that lie apart from their neighbours; any other shape as it is.
+    """A cloud without the points that lie apart from their neighbours (found once); any other shape as it is.
 
     An outlier among neighbours bends their normals and turns the signs of whole regions, and it counts as surface.
     """
-    outlier = outlier_points(shape.verts, _OUTLIER_RATIO) if shape.is_cloud else np.zeros(0, bool)
-    if not outlier.any():
+    if not shape.is_cloud:
         return shape
-    weights = None if shape.weights is None else shape.weights[~outlier]
-    return Shape(shape.verts[~outlier], shape.faces, shape.name, weights=weights)
+    if shape not in _CLEAN:
+        kept = ~outlier_points(shape.verts, _OUTLIER_RATIO)
+        weights = None if shape.weights is None else shape.weights[kept]
+        clean = None if kept.all() else Shape(shape.verts[kept], shape.faces, shape.name, weights=weights)
+        _CLEAN[shape] = clean  # None, for the shape itself would never be forgotten
+    return _CLEAN[shape] or shape
 
 
 def take_samples(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.geometry.frames import Frame, RigidPose
 
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area). Set by hand.
@@ -19,6 +19,7 @@ NORMAL_WEIGHT = 0.15
 PAIR_WEIGHT = 0.06
 # Points that far from a reference learn nothing from it about their normals.
 _REACH = 0.5
+_GROUPS = 16  # of points whose nearest neighbours are about equally far
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +74,8 @@ class OrientedPoints:
         """The same samples; normals without a sure sign are turned to agree with those of the nearest reference points."""
         if self.signed:
             return self
-        out, back = (
-            reference.tree.query(with_normals(self.points, sign * self.normals), distance_upper_bound=_REACH)[0]
-            for sign in (1, -1)
-        )
-        turned = np.where((back < out)[:, None], -self.normals, self.normals)
+        back = nearest_unsigned(reference.tree, self.points, self.normals, _REACH)[2]
+        turned = np.where(back[:, None], -self.normals, self.normals)
         return replace(self, normals=turned, signed=True)
 
     def rows(self, rows: slice | Bool[Bools, " P"]) -> OrientedPoints:
@@ -85,6 +83,22 @@ class OrientedPoints:
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
         taken: dict[str, Any] = {name: array[rows] for name, array in arrays.items() if isinstance(array, np.ndarray)}
         return replace(self, **taken)
+
+
+def nearest_unsigned(
+    tree: cKDTree, points: Float[Floats, "N 3"], normals: Float[Floats, "N 3"], reach: float
+) -> tuple[Float[Floats, " N"], Int[Ints, " N"], Bool[Bools, " N"]]:
+    """Distances to the nearest of a tree over features within ``reach`` (infinite if none), which it is (``tree.n``), and
+    whether it is nearer with the normal turned: only what is nearer is looked for then, in groups of like distance.
+    """
+    distance, index = tree.query(with_normals(points, normals), distance_upper_bound=reach)
+    back, turned = with_normals(points, -normals), np.zeros(len(points), bool)
+    for rows in np.array_split(np.argsort(distance), _GROUPS):
+        limit = min(distance[rows].max(initial=0.0), reach)
+        found, at = tree.query(back[rows], distance_upper_bound=limit)
+        turned[rows] = nearer = found < distance[rows]
+        distance[rows[nearer]], index[rows[nearer]] = found[nearer], at[nearer]
+    return distance, index, turned
 
 
 def with_normals(

@@ -4,8 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from meshmatch.geometry.frames import Frame, RigidPose
-from meshmatch.geometry.oriented import NORMAL_WEIGHT, OrientedPoints, with_normals
-from meshmatch.geometry.triangles import edge_lengths, is_discontinuous
+from meshmatch.geometry.oriented import NORMAL_WEIGHT, OrientedPoints, nearest_unsigned, with_normals
+from meshmatch.geometry.triangles import edge_lengths, is_discontinuous, unit
 
 
 def ball(signed: bool = True) -> OrientedPoints:
@@ -55,3 +55,16 @@ def test_images_far_apart_of_near_neighbours_are_discontinuous() -> None:
     apart = edge_lengths(images, np.array([[0, 1], [0, 2], [3, 0]]))
     assert np.allclose(apart, [0.08, 0.1, 0.1])
     assert is_discontinuous(apart, np.array([0.01, 0.01, 0.02])).tolist() == [False, True, False]
+
+
+def test_normals_without_a_sign_are_compared_both_ways() -> None:
+    """What is found in groups is what two searches of all points find."""
+    rng = np.random.default_rng(0)
+    points, normals = rng.random((500, 3)), unit(rng.standard_normal((500, 3)))
+    tree = OrientedPoints(rng.random((300, 3)), unit(rng.standard_normal((300, 3)))).tree
+    both = [tree.query(with_normals(points, sign * normals), distance_upper_bound=0.2) for sign in (1, -1)]
+    distance, index, turned = nearest_unsigned(tree, points, normals, 0.2)
+    assert np.array_equal(distance, np.minimum(both[0][0], both[1][0]))
+    assert np.array_equal(turned, both[1][0] < both[0][0]) and 50 < turned.sum() < 450
+    assert np.array_equal(index, np.where(turned, both[1][1], both[0][1])) and (index == tree.n).any()
+    assert [len(each) for each in nearest_unsigned(tree, points[:0], normals[:0], 0.2)] == [0, 0, 0]

@@ -379,6 +379,7 @@ def test_edges_by_hand(cube: Shape) -> None:
     turned[0] = turned[0][::-1]
     assert edges_of(turned).disagreeing.sum() == 3
     assert edges_of(cube.faces[:1]).counts == (3, 0)
+    assert edges_of(np.array([[5, 2, 3], [2, 5, 9]])).open.tolist() == [[2, 3], [2, 9], [3, 5], [5, 9]]
     assert not is_watertight(cube.faces[1:])
 
 
