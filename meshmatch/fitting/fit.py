@@ -7,11 +7,11 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
 from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.quick_scipy import cKDTree
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 
