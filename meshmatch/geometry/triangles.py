@@ -189,7 +189,7 @@ def edges_of(faces: Int[Ints, "F 3"]) -> Edges:
     first = np.ones(len(ordered), bool)
     first[1:] = (ordered[1:] ^ ordered[:-1]) > 1  # all but the last bit is the edge's number
     begins = np.flatnonzero(first).astype(np.int32)
-    sizes = np.diff(np.append(begins, np.int32(len(ordered))))
+    sizes = np.diff(np.append(begins, np.int32(len(ordered)))).astype(np.int32)
     two = begins[sizes == 2]
     disagreeing = ordered[two] == ordered[two + 1]
     vertices = np.empty((len(begins), 2), np.int32)
