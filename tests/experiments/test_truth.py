@@ -1,51 +1,136 @@
 """What a set's truth says beside vertices in the same order, where shapes have them."""
 
 import json
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from meshmatch.experiments.sets import load_set
-from meshmatch.experiments.truth import groups, main, same_order
+from meshmatch.errors import InputError
+from meshmatch.experiments.sets import BenchSet, load_set
+from meshmatch.experiments.truth import main, measure, template_row
+from meshmatch.experiments.truths import Truths, consensus_points, same_triangles
 from meshmatch.maps.evaluate import CM_PER_UNIT
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from tests.experiments.small_bench import BODY, build
 
-
-def test_the_same_order_is_seen_and_a_shuffled_one_too() -> None:
-    bent = Shape(BODY.verts * [1, 2, 1] + 3, BODY.faces)
-    order = np.random.default_rng(0).permutation(BODY.V)
-    assert same_order(BODY, bent)
-    assert not same_order(BODY, Shape(BODY.verts[order], np.argsort(order)[BODY.faces]))
-    assert not same_order(BODY, Shape(BODY.verts[:-1], BODY.faces[:1]))
+STRETCHED = [1.0, 2.0, 1.0]
 
 
-def test_a_truth_that_is_wrong_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """SCAPE's little shapes keep their order, and their truth is just that; one landmark of the others is moved."""
-    data = build(tmp_path)
-    assert groups(load_set("scape", data)) == [["mesh000", "mesh001"]]
-    words = ["--data", str(data), "--cache", str(tmp_path / "kept")]
-    assert main([*words, "--set", "scape"]) == 0
-    record = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert record["groups"][0]["mean_cm"] == 0.0 and record["groups"][0]["pairs"] == 2
+@dataclass(frozen=True)
+class Keeps:
+    """Sends vertex i to vertex i, or to a neighbour of it, where that is in the target."""
 
-    assert main([*words, "--set", "shrec19"]) == 1  # every shape is shuffled in its own way
+    moved: int = 0
+
+    def fit(self, shape: Shape) -> Any:
+        return Path(shape.name).stem
+
+    def map(self, source: Shape, source_fit: Any, target: Shape, target_fit: Any) -> VertexMap:
+        index = np.minimum(np.arange(source.V), target.V - 1)
+        index[: self.moved] = 1
+        return VertexMap.between(source, target, index)
+
+
+def write(folder: Path, landmarks: dict[str, np.ndarray], faces: dict[str, np.ndarray] | None = None) -> BenchSet:
+    """SHREC'19 with shapes in the order of `BODY`, each with its own landmarks."""
+    (folder / "shrec19").mkdir()
+    for number, (name, ids) in enumerate(landmarks.items()):
+        verts = BODY.verts * np.power(STRETCHED, 0.1 * number)
+        save_shape(folder / "shrec19" / f"{name}.ply", Shape(verts, (faces or {}).get(name, BODY.faces), name))
+        np.save(folder / "shrec19" / f"{name}.landmarks.npy", ids)
+    names = list(landmarks)
+    lines = [f"{a} {b}" for a, b in pairwise(names)]
+    (folder / "shrec19" / "pairs.txt").write_text("\n".join(lines))
+    return load_set("shrec19", folder)
+
+
+def edge_cm(shape: Shape) -> float:
+    return float(np.linalg.norm(shape.verts[0] - shape.verts[1]) / np.sqrt(shape.area) * CM_PER_UNIT)
+
+
+def test_triangles_are_compared_and_not_positions() -> None:
+    turned = np.roll(BODY.faces, 1, axis=1)
+    assert same_triangles(BODY.faces, turned) == 1
+    turned[:3] = turned[:3, ::-1]
+    assert same_triangles(BODY.faces, turned) == pytest.approx(1 - 3 / len(BODY.faces))
+    other = np.random.default_rng(0).permutation(BODY.V)[BODY.faces]
+    assert same_triangles(BODY.faces, other) == 0
+    assert same_triangles(BODY.faces, BODY.faces[:-1]) == 0
+
+
+def test_a_set_without_such_shapes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = build(tmp_path)  # every shape is shuffled in its own way
+    for name in ("1", "2", "10"):
+        ids = np.load(data / "shrec19" / f"{name}.landmarks.npy")
+        np.save(data / "shrec19" / f"{name}.landmarks.npy", ids[:-1])  # no shape is the template
+    with pytest.raises(InputError, match="no two shapes"):
+        measure(load_set("shrec19", data), Keeps(), None, tmp_path / "kept")
+    assert main(["--set", "shrec19", "--data", str(data)]) == 1
     assert "no two shapes" in capsys.readouterr().err
+    assert Truths(load_set("scape", data)).groups == [["mesh000", "mesh001"]]
 
-    for name in ("1", "2"):
-        for suffix in (".ply", ".landmarks.npy"):
-            (data / "shrec19" / f"{name}{suffix}").unlink()
-    scape = load_set("scape", data)
-    for name, shape in (("1", "mesh000"), ("2", "mesh001")):
-        (data / "shrec19" / f"{name}.ply").write_bytes(scape.path(shape).read_bytes())
-        ids = np.arange(BODY.V)
-        if name == "2":
-            ids[0] = 1  # landmark 0 is one edge off
-        np.save(data / "shrec19" / f"{name}.landmarks.npy", ids)
-    assert main([*words, "--set", "shrec19"]) == 0
-    found = json.loads(capsys.readouterr().out.splitlines()[-1])["groups"][0]
-    shape = scape.shape("mesh001")
-    edge = np.linalg.norm(shape.verts[0] - shape.verts[1]) / np.sqrt(shape.area) * CM_PER_UNIT
-    assert found["shapes"] == ["1", "2"]
-    assert found["mean_cm"] == pytest.approx(edge / BODY.V, rel=0.02)
+
+def test_a_truth_that_is_wrong_by_hand(tmp_path: Path) -> None:
+    """Of the second shape landmark 0 is one edge off: a perfect map is charged for it, ours by identity is not."""
+    ids = np.arange(BODY.V - 1)  # one less than vertices: neither shape is the template
+    wrong = ids.copy()
+    wrong[0] = 1
+    bench = write(tmp_path, {"1": ids, "2": wrong})
+    found = measure(bench, Keeps(), None, tmp_path / "kept")
+    (row,), (identity, whole) = found["groups"], found["protocol"]
+    assert (row["names"], row["pairs"], row["alike"]) == ("1, 2", 2, 1.0)
+    edges = [edge_cm(bench.shape(name)) / len(ids) for name in ("1", "2")]
+    assert row["perfect_cm"] == pytest.approx(np.mean(edges), rel=0.02)
+    assert row["charged_cm"] == pytest.approx(row["perfect_cm"])
+    assert row["true_cm"] == row["true_over_15cm"] == 0.0
+    assert row["stretch_set"] > row["stretch_identity"] > 0
+    assert identity["kind"] == "identity" and (whole["kind"], whole["pairs"]) == ("all", 1)
+    assert identity["charged_cm"] == pytest.approx(edges[1], rel=0.02) and identity["true_cm"] == 0.0
+    ours = measure(bench, Keeps(moved=1), None, tmp_path / "kept")["groups"][0]  # vertex 0 to vertex 1 everywhere
+    assert ours["true_cm"] == pytest.approx(edges[1] / 2, rel=0.02)  # the second shape has no landmark there
+
+
+def test_the_mean_of_the_others_and_the_template(tmp_path: Path) -> None:
+    """Three shapes in one order; the landmark that one of them has elsewhere is put right by the two others."""
+    ids = np.arange(BODY.V - 1)
+    wrong = ids.copy()
+    wrong[5] = 40
+    faces = {"4": np.random.default_rng(0).permutation(BODY.V)[BODY.faces]}
+    bench = write(tmp_path, {"1": ids, "2": wrong, "3": ids, "4": ids}, faces)
+    truths = Truths(bench)
+    assert truths.groups == [["1", "2", "3"]] and not truths.templates
+    assert consensus_points(truths, "2")[5] == pytest.approx(bench.shape("2").verts[5], abs=1e-5)
+    here, there, kind = truths.of_pair(("2", "4"))
+    assert (here.tolist(), there.tolist(), kind) == (ids.tolist(), ids.tolist(), "consensus")
+    assert truths.of_pair(("4", "2"))[1].tolist() == ids.tolist()
+    assert truths.of_pair(("1", "2"))[2] == "identity"
+
+
+def test_a_shape_that_is_the_template(tmp_path: Path) -> None:
+    ids = np.arange(BODY.V)
+    ids[0] = 1
+    other = np.random.default_rng(0).permutation(BODY.V)
+    bench = write(tmp_path, {"1": ids, "2": np.argsort(other)}, {"2": other[BODY.faces]})
+    truths = Truths(bench)
+    assert truths.templates == ["1"] and truths.groups == []
+    assert truths.of_pair(("2", "1"))[1].tolist() == list(range(BODY.V))
+    assert truths.of_pair(("2", "1"))[2] == "own order"
+    row = template_row(truths, "1", tmp_path / "kept")
+    assert row["perfect_cm"] == pytest.approx(edge_cm(bench.shape("1")) / BODY.V, rel=0.02)
+    assert row["own_number"] == pytest.approx(1 - 1 / BODY.V)
+
+
+def test_the_tables_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], bench: Path) -> None:
+    """The real set, of which a perfect map alone is asked here; ours takes minutes."""
+    truths = Truths(load_set("shrec19", bench))
+    assert truths.groups == [["11", "13"], ["23", "29", "33", "35", "37", "39"], ["25", "31"]]
+    assert truths.templates == ["41"]
+    kinds = [truths.of_pair(pair)[2] for pair in truths.bench.pairs]
+    assert kinds.count("identity") == 9 and sum(kind != "the set's own" for kind in kinds) == 39
+    json.dumps(template_row(truths, "41", None))

@@ -1,0 +1,108 @@
+"""Better truths than the one that comes with SHREC'19.
+
+That truth is a template (SMPL) registered to every shape: landmark k is vertex k of it. On some shapes more is known:
+
+- *identity*: shapes whose arrays of triangles are the same (each triangle may be wound either way). Their makers mean
+  vertex i of one by vertex i of the other, be it one person's poses or another person registered with the same mesh.
+- *own order*: the shape that is the template itself. Its vertex k is landmark k.
+- *consensus*: where three or more shapes have the same triangles, the landmarks of all can be put on each of them.
+  The mean of what the others say of landmark k has less of the registrations' noise than the shape's own landmark.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.experiments.sets import BenchSet, Pair
+
+Kind = Literal["identity", "own order", "consensus", "own order and consensus", "the set's own"]
+_OWN_ORDER = 0.1  # share of landmarks that hit the vertex of their own number; by chance one would
+
+
+def same_triangles(a: Int[Ints, "F 3"], b: Int[Ints, "F2 3"]) -> float:
+    """Share (0..1) of the triangles that are wound alike, where two arrays have the same triangles row by row, else 0."""
+    if a.shape != b.shape or not np.array_equal(np.sort(a, axis=1), np.sort(b, axis=1)):
+        return 0.0
+    turned = [np.roll(b, turn, axis=1) for turn in range(3)]
+    return float(np.any([(a == each).all(axis=1) for each in turned], axis=0).mean())
+
+
+@dataclass(frozen=True)
+class Truths:
+    """What is known of a set beyond its own landmarks."""
+
+    bench: BenchSet
+
+    @cached_property
+    def groups(self) -> list[list[str]]:
+        """Names of shapes with the same triangles and as many vertices, in groups of at least two."""
+        found: list[list[str]] = []
+        for name in self.bench.shapes:
+            shape = self.bench.shape(name)
+            for group in found:
+                first = self.bench.shape(group[0])
+                if first.V == shape.V and same_triangles(first.faces, shape.faces):
+                    group.append(name)
+                    break
+            else:
+                found.append([name])
+        return [group for group in found if len(group) > 1]
+
+    @cached_property
+    def templates(self) -> list[str]:
+        """Names of shapes whose vertex k is landmark k: as many vertices as landmarks, and not by chance."""
+        found = []
+        for name in self.bench.shapes:
+            landmarks = self.bench.landmarks(name)
+            numbers = np.arange(len(landmarks))
+            if self.bench.shape(name).V == len(numbers) and (landmarks == numbers).mean() > _OWN_ORDER:
+                found.append(name)
+        return found
+
+    def wound_alike(self, pair: Pair) -> float:
+        """Share (0..1) of the triangles of two shapes of a group that are wound alike."""
+        a, b = (self.bench.shape(name).faces for name in pair)
+        return same_triangles(a, b)
+
+    def group_of(self, name: str) -> list[str]:
+        """The group of a shape; itself alone where it has none."""
+        return next((group for group in self.groups if name in group), [name])
+
+    def known(self, name: str) -> tuple[Int[Ints, " N"], Kind]:
+        """The best known vertex of every landmark on one shape, and how it is known."""
+        if name in self.templates:
+            return np.arange(len(self.bench.landmarks(name))), "own order"
+        if len(self.group_of(name)) > 2:
+            return consensus(self, name), "consensus"
+        return self.bench.landmarks(name), "the set's own"
+
+    def of_pair(self, pair: Pair) -> tuple[Int[Ints, " N"], Int[Ints, " N"], Kind]:
+        """For every landmark the vertex of the source and the one it belongs to on the target, and how this is known."""
+        source, target = pair
+        if target in self.group_of(source):
+            landmarks = self.bench.landmarks(source)
+            return landmarks, landmarks, "identity"
+        (here, how), (there, how_there) = self.known(source), self.known(target)
+        kinds = {how, how_there} - {"the set's own"}
+        kind: Kind = "the set's own" if not kinds else how if how in kinds else how_there
+        return here, there, "own order and consensus" if len(kinds) > 1 else kind
+
+
+def consensus_points(truths: Truths, name: str) -> Float[Floats, "N 3"]:
+    """Means of the points that the landmarks of the other shapes of a group have on this one."""
+    others = [other for other in truths.group_of(name) if other != name]
+    verts = truths.bench.shape(name).verts
+    return np.asarray(np.mean([verts[truths.bench.landmarks(other)] for other in others], axis=0))
+
+
+@cache
+def consensus(truths: Truths, name: str) -> Int[Ints, " N"]:
+    """The vertices nearest to `consensus_points`."""
+    points = consensus_points(truths, name)
+    return np.asarray(cKDTree(truths.bench.shape(name).verts).query(points)[1], dtype=np.int64)
