@@ -49,11 +49,15 @@ Cache = Annotated[Path | None, typer.Option(help="folder of kept geodesic distan
 
 @dataclass(frozen=True)
 class Report:
-    """What an experiment found: the record for the JSON line, tables, and lines to print below them."""
+    """What an experiment found: the record for the JSON line, tables, and lines to print below them.
+
+    ``stopped`` is told last, on stderr, and makes the status 1.
+    """
 
     record: Mapping[str, Any]
     tables: Sequence[Table] = ()
     notes: Sequence[str] = ()
+    stopped: MeshmatchError | None = None
 
 
 def command(run: Callable[..., Report]) -> Callable[..., int]:
@@ -83,6 +87,9 @@ def command(run: Callable[..., Report]) -> Callable[..., int]:
         head = {"experiment": name, **circumstances(threads, jobs), "options": plain(options)}
         seconds = round(time.perf_counter() - began, 1)
         print(json.dumps(plain({**head, "seconds": seconds, **report.record})), flush=True)
+        if report.stopped is not None:
+            explain(report.stopped)
+            raise SystemExit(1)
 
     def main(words: Sequence[str] | None = None) -> int:
         app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)

@@ -1,7 +1,8 @@
 """The sets of the benchmark: which shapes, which pairs, and what is true.
 
-The data are described in ``README.md`` beside them. In short, *landmark k is the same body point on every shape of a
-set*, and a set differs from another in how a landmark names its vertex:
+docs/datasets.md says where they come from and how to lay them out; `meshmatch.experiments.datasets` checks a folder. In
+short, *landmark k is the same body point on every shape of a set*, and a set differs from another in how a landmark names
+its vertex:
 
 - ``shrec19``: ``N.landmarks.npy`` (6890,) vertex ids; the pairs of ``pairs.txt``.
 - ``scape``: vertex i is landmark i on every shape (the triangulations differ); all ordered pairs.
@@ -89,7 +90,10 @@ def load_set(name: str, data: Path) -> BenchSet:
     if not shapes:
         raise InputError(f"no shapes in {folder}", f"--data names the folder that holds {', '.join(SET_NAMES)}")
     if name == "shrec19":
-        lines = (folder / "pairs.txt").read_text(encoding="ascii").split("\n")
+        try:
+            lines = (folder / "pairs.txt").read_text(encoding="ascii").split("\n")
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"cannot read {folder / 'pairs.txt'}", "a line for each pair: source target") from error
         pairs = tuple((words[0], words[1]) for words in (line.split() for line in lines) if words)
     else:
         pairs = tuple(permutations(shapes, 2))
