@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Protocol
@@ -142,7 +142,6 @@ class SetRun:
     map_seconds: dict[Pair, float]
     failed: dict[Pair, str]
     fits: dict[str, Any]
-    maps: Maps = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, those of each kind of pair, each fit's own judgement, and the times."""
@@ -194,7 +193,7 @@ def run_set(
             maps[pair], map_seconds[pair] = index, seconds
     if save is not None:
         save_maps(save, bench, maps)
-    return SetRun(evaluate_set(bench, maps, pairs=pairs, cache=cache), fit_seconds, map_seconds, failed, fits, maps)
+    return SetRun(evaluate_set(bench, maps, pairs=pairs, cache=cache), fit_seconds, map_seconds, failed, fits)
 
 
 def _map_path(folder: Path, bench: BenchSet, pair: Pair) -> Path:

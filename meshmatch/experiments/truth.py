@@ -19,9 +19,8 @@ from __future__ import annotations
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from itertools import permutations
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -30,11 +29,11 @@ from typer import Option
 
 from meshmatch.api.inputs import as_model
 from meshmatch.api.results import shape_of
-from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.errors import InputError
+from meshmatch.arrays import Int, Ints
+from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench import Maps, Method, OurMethod, SetRun, run_set
-from meshmatch.experiments.scores import TruthDistances, summary
+from meshmatch.experiments.bench import Maps, Method, OurMethod
+from meshmatch.experiments.scores import summary
 from meshmatch.experiments.sets import BenchSet, Pair, load_set
 from meshmatch.experiments.truths import Truths, consensus_points
 from meshmatch.fitting.fit import Fit
@@ -46,7 +45,7 @@ from meshmatch.templates.template import Template
 SAME_PERSON = {"shrec19": (("33", "35", "37", "39"),)}
 """Within groups of the same triangles, poses of one person: here SCAPE's man (33 is its mesh012, 35 its mesh030)."""
 STRETCHED_CM = (8.0, 20.0)
-_MARKS = 500  # landmarks between which distances are compared
+_MARKS = 300  # landmarks between which distances are compared
 COLUMNS = {
     **{"shapes": "names", "pairs": "pairs:d", "wound alike": "alike:.1%"},
     **{
@@ -68,62 +67,87 @@ PARTS = {"part": "part", "cm": "cm:.1f", "of the landmarks": "landmarks:.0%", "o
 OTHERS = {"shape": "name", "rms cm": "rms_cm:.2f", "median cm": "median_cm:.2f"}
 
 
-def true_errors(truths: Truths, maps: Maps, pairs: Sequence[Pair], cache: Path | None) -> dict[Pair, Errors]:
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Fits of all shapes, our map of every pair, and its errors by the set's truth."""
+
+    fits: dict[str, Any]
+    maps: dict[Pair, Ints]
+    charged: dict[Pair, Errors]
+
+
+def matched(truths: Truths, method: Method, pairs: Sequence[Pair]) -> Measured:
+    """Fit every shape of some pairs once, map and measure each pair; one that fails counts as a map to vertex 0."""
+    bench, fits, maps = truths.bench, {}, {}
+    shapes = {name: bench.seen(name) for name in dict.fromkeys(name for pair in pairs for name in pair)}
+    for name in runner.track(list(shapes), "fitting"):
+        fits[name] = method.fit(shapes[name])
+    for a, b in runner.track(pairs, "mapping"):
+        try:
+            maps[a, b] = method.map(shapes[a], fits[a], shapes[b], fits[b]).index
+        except MeshmatchError:
+            maps[a, b] = np.zeros(shapes[a].V, dtype=np.int64)
+    charged = {
+        (a, b): _errors(truths, b, bench.landmarks(b), maps[a, b][bench.landmarks(a)])
+        for a, b in runner.track(pairs, "by the set's truth")
+    }
+    return Measured(fits, maps, charged)
+
+
+def _errors(truths: Truths, name: str, right: Int[Ints, " N"], said: Int[Ints, " N"]) -> Errors:
+    return Errors(truths.distances(name).between(right, said).astype(np.float32))
+
+
+def true_errors(truths: Truths, maps: Maps, pairs: Sequence[Pair]) -> dict[Pair, Errors]:
     """Errors of maps against the best truth that is known of each pair."""
-    found: dict[Pair, Errors] = {}
-    for target in dict.fromkeys(target for _, target in pairs):
-        mine = [pair for pair in pairs if pair[1] == target]
-        known = [truths.of_pair(pair) for pair in mine]
-        distances = TruthDistances(truths.bench.shape(target), np.concatenate([there for _, there, _ in known]), cache)
-        predicted = np.concatenate([maps[pair][here] for pair, (here, _, _) in zip(mine, known, strict=True)])
-        parts = np.split(distances.errors([predicted])[0], np.cumsum([len(there) for _, there, _ in known])[:-1])
-        found |= {pair: Errors(part) for pair, part in zip(mine, parts, strict=True)}
-    return {pair: found[pair] for pair in pairs}
+    found = {}
+    for pair in runner.track(pairs, "by the best truth"):
+        here, there, _ = truths.of_pair(pair)
+        found[pair] = _errors(truths, pair[1], there, maps[pair][here])
+    return found
 
 
-def perfect_errors(bench: BenchSet, pairs: Sequence[Pair], cache: Path | None) -> dict[Pair, Errors]:
+def perfect_errors(truths: Truths, pairs: Sequence[Pair]) -> dict[Pair, Errors]:
     """What the set charges the map with that sends vertex i to vertex i."""
+    bench = truths.bench
     return {
-        (a, b): Errors(TruthDistances(bench.shape(b), bench.landmarks(b), cache).errors([bench.landmarks(a)])[0])
-        for a, b in runner.track(pairs, "the set's truth")
+        (a, b): _errors(truths, b, bench.landmarks(b), bench.landmarks(a)) for a, b in runner.track(pairs, "its truth")
     }
 
 
-def stretch(bench: BenchSet, pairs: Sequence[Pair], cache: Path | None) -> tuple[float, float]:
+def stretch(truths: Truths, pairs: Sequence[Pair]) -> tuple[float, float]:
     """Mean |log| of the factor by which identity, and the set's truth, change distances of `STRETCHED_CM`."""
+    bench = truths.bench
     marks = np.unique(np.linspace(0, len(bench.landmarks(pairs[0][0])) - 1, _MARKS).astype(np.int64))
     low, high = (cm / CM_PER_UNIT for cm in STRETCHED_CM)
+    ids = {name: bench.landmarks(name)[marks] for name in dict.fromkeys(name for pair in pairs for name in pair)}
+    rows = {  # all landmarks of the group at once on each shape
+        name: truths.distances(name).among(np.concatenate(list(ids.values()))) for name in runner.track(ids, "stretch")
+    }
+    part = {name: slice(k * len(marks), (k + 1) * len(marks)) for k, name in enumerate(ids)}
     found: list[list[float]] = [[], []]
-    for a, b in runner.track(pairs, "stretch"):
-        on_a, on_b = bench.landmarks(a)[marks], bench.landmarks(b)[marks]
-        before = _between(bench, a, on_a, cache)
+    for a, b in pairs:
+        before = rows[a][part[a], part[a]]
         near = (before > low) & (before < high)
-        for truth, ids in enumerate((on_a, on_b)):
-            after = np.maximum(_between(bench, b, ids, cache), 1e-3)  # landmarks may share a vertex
+        for truth, of in enumerate((a, b)):
+            after = np.maximum(rows[b][part[of], part[of]], 1e-3)  # landmarks may share a vertex
             found[truth].append(float(np.abs(np.log(after[near] / before[near])).mean()))
     return float(np.mean(found[0])), float(np.mean(found[1]))
 
 
-def _between(bench: BenchSet, name: str, ids: Int[Ints, " M"], cache: Path | None) -> Float[Floats, "M M"]:
-    distances = TruthDistances(bench.shape(name), ids, cache).of(np.arange(len(ids)))
-    return distances[:, ids].astype(np.float64)
-
-
-def group_row(
-    truths: Truths, names: Sequence[str], perfect: Mapping[Pair, Errors], run: SetRun, cache: Path | None
-) -> dict[str, Any]:
+def group_row(truths: Truths, names: Sequence[str], perfect: Mapping[Pair, Errors], run: Measured) -> dict[str, Any]:
     """What the two truths say on all ordered pairs of shapes with the same triangles."""
-    bench, pairs = truths.bench, list(permutations(names, 2))
+    pairs = list(permutations(names, 2))
     alike = [truths.wound_alike(pair) for pair in pairs]
     charged = summary([perfect[pair] for pair in pairs])
-    errors = true_errors(truths, run.maps, pairs, cache)
-    identity, own = stretch(bench, pairs, cache)
+    errors = true_errors(truths, run.maps, pairs)
+    identity, own = stretch(truths, pairs)
     return {
         **{"names": ", ".join(names), "shapes": list(names), "pairs": len(pairs), "alike": float(np.mean(alike))},
         **{"perfect_cm": charged["mean_cm"], "perfect_median_cm": charged["median_cm"]},
         "perfect_worst_cm": max(perfect[pair].mean_cm for pair in pairs),
         "perfect_over_15cm": charged["share_over_15cm"],
-        **_both({pair: run.scores.errors[pair] for pair in pairs}, errors),
+        **_both({pair: run.charged[pair] for pair in pairs}, errors),
         **{"stretch_identity": identity, "stretch_set": own},
     }
 
@@ -138,11 +162,11 @@ def _both(charged: Mapping[Pair, Errors], true: Mapping[Pair, Errors]) -> dict[s
     }
 
 
-def template_row(truths: Truths, name: str, cache: Path | None) -> dict[str, Any]:
+def template_row(truths: Truths, name: str) -> dict[str, Any]:
     """How far the landmarks of the template's own shape are from the vertices of their number."""
-    shape, landmarks = truths.bench.shape(name), truths.bench.landmarks(name)
+    landmarks = truths.bench.landmarks(name)
     numbers = np.arange(len(landmarks))
-    errors = Errors(TruthDistances(shape, landmarks, cache).errors([numbers])[0])
+    errors = _errors(truths, name, landmarks, numbers)
     return {
         **{"names": f"{name} (the template)", "shapes": [name], "pairs": 0},
         **{"perfect_cm": errors.mean_cm, "perfect_median_cm": errors.median_cm},
@@ -186,28 +210,24 @@ def part_rows(
     return sorted(rows, key=lambda row: -row["cm"])
 
 
-def protocol_rows(
-    truths: Truths, charged: Mapping[Pair, Errors], cache: Path | None, maps: Maps
-) -> list[dict[str, Any]]:
+def protocol_rows(truths: Truths, run: Measured) -> list[dict[str, Any]]:
     """The set's own pairs, by how much is known of their truth, and all together."""
     pairs = list(truths.bench.pairs)
-    better, kinds = true_errors(truths, maps, pairs, cache), defaultdict(list)
+    better, kinds = true_errors(truths, run.maps, pairs), defaultdict(list)
     for pair in pairs:
         kinds[str(truths.of_pair(pair)[2])].append(pair)
     kinds["all"] = pairs
     return [
         {
             **{"kind": kind, "pairs": len(some)},
-            **_both({pair: charged[pair] for pair in some}, {pair: better[pair] for pair in some}),
+            **_both({pair: run.charged[pair] for pair in some}, {pair: better[pair] for pair in some}),
         }
         for kind, some in kinds.items()
     ]
 
 
-def measure(
-    bench: BenchSet, method: Method, template: Template | None, cache: Path | None, **how: Any
-) -> dict[str, list[dict[str, Any]]]:
-    """All tables of a set, as rows. ``how`` is that of `run_set`.
+def measure(bench: BenchSet, method: Method, template: Template | None) -> dict[str, list[dict[str, Any]]]:
+    """All tables of a set, as rows.
 
     Raises
     ------
@@ -220,22 +240,21 @@ def measure(
             f"no two shapes of {bench.name} have the same triangles", "nothing better than its truth is known"
         )
     inside = [pair for group in truths.groups for pair in permutations(group, 2)]
-    pairs = list(dict.fromkeys([*bench.pairs, *inside]))
-    run = run_set(replace(bench, pairs=tuple(pairs)), method, pairs, cache=cache, **how)
-    perfect = perfect_errors(bench, inside, cache)
+    run = matched(truths, method, list(dict.fromkeys([*bench.pairs, *inside])))
+    perfect = perfect_errors(truths, inside)
     rows = []
     for group in truths.groups:
-        rows.append(group_row(truths, group, perfect, run, cache))
+        rows.append(group_row(truths, group, perfect, run))
         for names in SAME_PERSON.get(bench.name, ()):
             if set(names) < set(group):
-                rows.append(group_row(truths, names, perfect, run, cache))
-    rows += [template_row(truths, name, cache) for name in truths.templates]
+                rows.append(group_row(truths, names, perfect, run))
+    rows += [template_row(truths, name) for name in truths.templates]
     large = [name for group in truths.groups if len(group) > 2 for name in group]
     return {
         "groups": rows,
         "consensus": [consensus_row(truths, name) for name in large],
         "parts": [] if template is None else part_rows(bench, perfect, run.fits, template),
-        "protocol": protocol_rows(truths, run.scores.errors, cache, run.maps),
+        "protocol": protocol_rows(truths, run),
     }
 
 
@@ -246,12 +265,10 @@ def main(
     model: runner.Model = "human",
     refine: Refine = "nodes",
     seed: runner.Seed = 0,
-    jobs: runner.Jobs = 1,
     threads: runner.Threads = 1,
-    cache: runner.Cache = None,
 ) -> runner.Report:
     method = OurMethod(model, refine, seed, threads=threads)
-    found = measure(load_set(set, data), method, as_model(model).template, cache, jobs=jobs, threads=threads)
+    found = measure(load_set(set, data), method, as_model(model).template)
     titles = {
         "groups": ("its truth, and ours, against vertices in the same order, cm", COLUMNS),
         "consensus": ("landmarks of one shape against the mean of the others'", OTHERS),
