@@ -1,10 +1,9 @@
-"""The paper's tables, figures and claims, read off what is known of the ablation runs."""
+"""The paper's tables and figures, read off what is known of the ablation runs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -12,21 +11,9 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from meshmatch.experiments.ablation_views import (
-    BASE,
-    CLAIMS,
-    GRID,
-    HELD_OUT,
-    PAPER_MS,
-    PAPER_SETS,
-    TABLE4,
-    VIEWS,
-    Known,
-    View,
-)
+from meshmatch.experiments.ablation_views import BASE, HELD_OUT, PAPER_MS, PAPER_SETS, VIEWS, Known, View
 from meshmatch.experiments.charts import Bar, Chart, Line, draw_bars, draw_lines
 from meshmatch.experiments.runner import table
-from meshmatch.fields.shape_functions import FIELDS, has_nodes
 from meshmatch.outputs import make_folder
 
 _AXIS = "mean error, cm (1.9 square meters of skin)"
@@ -177,81 +164,3 @@ def _draw_descent(known: Known, path: Path) -> bool:
     ]
     draw_lines(charts, path, _AXIS)
     return True
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A statement, the numbers that it is about from the one that should be least to the largest, and whether it holds.
-
-    ``holds`` is None where something was not measured; ``where`` is empty, a set, or "held out".
-    """
-
-    words: str
-    numbers: tuple[float, ...]
-    holds: bool | None
-    where: str = ""
-
-    @property
-    def verdict(self) -> str:
-        """Whether it holds, in words."""
-        if self.holds is None:
-            return "not measured"
-        numbers = ", ".join(f"{value:.2f}" for value in self.numbers)
-        return f"{'holds' if self.holds else 'DOES NOT HOLD'} ({numbers})"
-
-
-def claims(known: Known, sets: Sequence[str]) -> list[Claim]:
-    """All claims, on the held-out shapes and each set."""
-    found = _costs(known)
-    for where in (HELD_OUT, *sets):
-        for words, runs in CLAIMS:
-            found.append(_rising(where, words, [known.error(run, where) for run in runs]))
-        found.append(_best_of_grid(known, where))
-        if where != HELD_OUT:
-            hows = ("code", "chamfer", "none")
-            alike = [  # what is measured once is not compared
-                run
-                for run in known.trained
-                if replace(run, seed=BASE.seed) == BASE and all((run, where, how) in known.errors for how in hows)
-            ]
-            errors = [[known.errors[run, where, how]["mean_cm"] for run in alike] for how in hows]
-            found.append(_rising(where, "refined with regularisers < by Chamfer alone < not at all", errors))
-    return found
-
-
-def _costs(known: Known) -> list[Claim]:
-    """What constraints cost: factors of the milliseconds of an iteration."""
-    factor: dict[str, float] = {}
-    full = {field: cost_of(known, field, TABLE4[-1]) for field in FIELDS}
-    for field in FIELDS:
-        plain, dear = cost_of(known, field, TABLE4[0]), full[field]
-        if plain and dear:
-            factor[field] = dear / plain
-    found = []
-    for field in (field for field in FIELDS if has_nodes(field)):
-        words = f"an iteration of {field} takes at most 2 times as long with vol+arap+Z"
-        there = (factor[field],) if field in factor else ()
-        found.append(Claim(words, there, there[0] <= 2 if there else None))
-    both = tuple(factor[field] for field in ("mls", "pointwise") if field in factor)
-    words = "vol+arap+Z slows an iteration of mls by less than one of pointwise"
-    found.append(Claim(words, both, both[0] < both[1] if len(both) == 2 else None))
-    dear_ones = tuple(cost for cost in (full["mls"], full["pointwise"]) if cost)
-    words = "with vol+arap+Z an iteration of pointwise takes at least 3 times as long as one of mls"
-    holds = dear_ones[1] > 3 * dear_ones[0] if len(dear_ones) == 2 else None
-    return [*found, Claim(words, dear_ones, holds)]
-
-
-def _best_of_grid(known: Known, where: str) -> Claim:
-    means = {run: fmean(errors) for run in GRID if (errors := known.error(run, where))}
-    words = "300 nodes of radius 0.2 are the best of the grid"
-    if BASE not in means or len(means) < 2:
-        return Claim(words, (), None, where)
-    others = min(value for run, value in means.items() if run != BASE)
-    return Claim(words, (means[BASE], others), means[BASE] <= others, where)
-
-
-def _rising(where: str, words: str, errors: Sequence[Sequence[float]]) -> Claim:
-    """Holds if the means rise; not measured if one lacks."""
-    means = tuple(fmean(each) for each in errors if each)
-    holds = all(a < b for a, b in pairwise(means)) if len(means) == len(errors) else None
-    return Claim(words, means, holds, where)

@@ -252,3 +252,9 @@ class Known:
         else:
             records = [self.errors.get((each, where, method), {}).get(what) for each in alike]
         return [record for record in records if record is not None]
+
+    def pairs(self, run: Run, where: str, method: str = "code") -> list[list[float]]:
+        """Errors in cm of every pair of a set, by a run and its repetitions; of those alone that kept them."""
+        alike = sorted((each for each in self.trained if replace(each, seed=0) == run), key=lambda r: r.seed)
+        kept = [self.errors.get((each, where, method), {}).get("pair_cm") for each in alike]
+        return [each for each in kept if each]

@@ -27,6 +27,7 @@ from typer import Option
 from meshmatch.api.inputs import as_model
 from meshmatch.errors import OptionError, TemplateError
 from meshmatch.experiments import runner
+from meshmatch.experiments.ablation_claims import Claim, claims
 from meshmatch.experiments.ablation_errors import (
     LINES,
     METHODS,
@@ -38,7 +39,7 @@ from meshmatch.experiments.ablation_errors import (
     oriented,
     subject,
 )
-from meshmatch.experiments.ablation_results import Claim, claims, draw_views, tables
+from meshmatch.experiments.ablation_results import draw_views, tables
 from meshmatch.experiments.ablation_setting import Preset, Setting
 from meshmatch.experiments.ablation_training import is_trained, memory, timed, train_run
 from meshmatch.experiments.ablation_views import BASE, CODED, VIEWS, Known, Run, all_runs, by_time, methods_of
@@ -211,7 +212,11 @@ def claims_table(found: Sequence[Claim]) -> Any:
     for claim in found:
         rows.setdefault(claim.words, {"claim": claim.words})[claim.where or "costs"] = claim.verdict
     columns = {"claim": "claim", **{(claim.where or "costs"): (claim.where or "costs") for claim in found}}
-    return runner.table("What the paper claims, here", list(rows.values()), columns)
+    return runner.table(
+        "What the paper claims, and what intervals of 95 % over seeds and pairs carry here",
+        list(rows.values()),
+        columns,
+    )
 
 
 @runner.command
