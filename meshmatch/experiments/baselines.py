@@ -78,16 +78,21 @@ def measured(
 
 
 def draw_results(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Mean errors as bars, with medians as ticks, a group for each set; where pairs failed a bar may run off the axis."""
+    """Mean errors as bars, with medians as ticks, a group for each set; where pairs failed a bar may run off the axis.
+
+    Beside each method stands how long it was trained, on one core, or that it learned nothing of the category.
+    """
     groups: dict[str, list[Bar]] = {}
     for row in rows:
         words = f"{row['mean_cm']:.1f} cm"
         words += f", {row['failures']} failed" if row["failures"] else ""
-        bar = Bar(row["label"], row["mean_cm"], words, row["name"].startswith("ours"), row["median_cm"])
+        trained = row.get("minutes")
+        known = "knows no category" if trained is None else f"trained {trained:.0f} min"
+        bar = Bar(f"{row['label']}; {known}", row["mean_cm"], words, row["name"].startswith("ours"), row["median_cm"])
         groups.setdefault(f"{row['set']}: {row['measured']} pairs", []).append(bar)
     whole = [row for row in rows if not row["failures"]]
     longest = max((max(row["mean_cm"], row["median_cm"]) for row in whole), default=0.0)
-    axis = "mean geodesic error, cm (target scaled to 1.9 square meters of skin); tick: median"
+    axis = "mean geodesic error, cm; tick: median"
     draw_bars(groups, path, axis, 1.1 * longest or None)
 
 
