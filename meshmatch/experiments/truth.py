@@ -11,7 +11,7 @@ The set's true points come from a template (SMPL) registered to every shape. Whe
 - on which parts of the body the error of the set's truth lies;
 - the pairs of the protocol, with the set's truth and with the best that is known.
 
-Every shape is fitted once; every landmark counts.
+Every shape is fitted once. Every landmark counts; --landmarks looks at some of them, evenly spread, in less time.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from __future__ import annotations
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import permutations
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -29,7 +28,7 @@ from typer import Option
 
 from meshmatch.api.inputs import as_model
 from meshmatch.api.results import shape_of
-from meshmatch.arrays import Int, Ints
+from meshmatch.arrays import Ints
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench import Maps, Method, OurMethod
@@ -45,7 +44,8 @@ from meshmatch.templates.template import Template
 SAME_PERSON = {"shrec19": (("33", "35", "37", "39"),)}
 """Within groups of the same triangles, poses of one person: here SCAPE's man (33 is its mesh012, 35 its mesh030)."""
 STRETCHED_CM = (8.0, 20.0)
-_MARKS = 300  # landmarks between which distances are compared
+_MARKS = 120  # landmarks between which distances are compared
+_FAR = 2.0  # no distance counts as stretched by more than so many times the longest, or the shortest, that is compared
 COLUMNS = {
     **{"shapes": "names", "pairs": "pairs:d", "wound alike": "alike:.1%"},
     **{
@@ -67,94 +67,86 @@ PARTS = {"part": "part", "cm": "cm:.1f", "of the landmarks": "landmarks:.0%", "o
 OTHERS = {"shape": "name", "rms cm": "rms_cm:.2f", "median cm": "median_cm:.2f"}
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """Fits of all shapes, our map of every pair, and its errors by the set's truth."""
-
-    fits: dict[str, Any]
-    maps: dict[Pair, Ints]
-    charged: dict[Pair, Errors]
+Question = tuple[Literal["charged", "true", "perfect"], Pair]
+Found = Mapping[Question, Errors]
 
 
-def matched(truths: Truths, method: Method, pairs: Sequence[Pair]) -> Measured:
-    """Fit every shape of some pairs once, map and measure each pair; one that fails counts as a map to vertex 0."""
-    bench, fits, maps = truths.bench, {}, {}
+def matched(bench: BenchSet, method: Method, pairs: Sequence[Pair]) -> tuple[dict[str, Any], dict[Pair, Ints]]:
+    """Fits of every shape of some pairs, and maps of the pairs; one that fails counts as a map to vertex 0."""
     shapes = {name: bench.seen(name) for name in dict.fromkeys(name for pair in pairs for name in pair)}
-    for name in runner.track(list(shapes), "fitting"):
-        fits[name] = method.fit(shapes[name])
+    fits = {name: method.fit(shape) for name, shape in runner.track(list(shapes.items()), "fitting")}
+    maps = {}
     for a, b in runner.track(pairs, "mapping"):
         try:
             maps[a, b] = method.map(shapes[a], fits[a], shapes[b], fits[b]).index
         except MeshmatchError:
             maps[a, b] = np.zeros(shapes[a].V, dtype=np.int64)
-    charged = {
-        (a, b): _errors(truths, b, bench.landmarks(b), maps[a, b][bench.landmarks(a)])
-        for a, b in runner.track(pairs, "by the set's truth")
-    }
-    return Measured(fits, maps, charged)
+    return fits, maps
 
 
-def _errors(truths: Truths, name: str, right: Int[Ints, " N"], said: Int[Ints, " N"]) -> Errors:
-    return Errors(truths.distances(name).between(right, said).astype(np.float32))
-
-
-def true_errors(truths: Truths, maps: Maps, pairs: Sequence[Pair]) -> dict[Pair, Errors]:
-    """Errors of maps against the best truth that is known of each pair."""
-    found = {}
-    for pair in runner.track(pairs, "by the best truth"):
+def all_errors(truths: Truths, maps: Maps, inside: Sequence[Pair]) -> dict[Question, Errors]:
+    """Errors of our maps by the set's truth ("charged") and by the best that is known ("true"); on the pairs of shapes
+    with the same triangles also what the set charges the map with that sends vertex i to vertex i ("perfect").
+    """
+    asked: dict[Question, tuple[Ints, Ints]] = {}
+    for pair, index in maps.items():
         here, there, _ = truths.of_pair(pair)
-        found[pair] = _errors(truths, pair[1], there, maps[pair][here])
+        asked["charged", pair] = truths.landmarks(pair[1]), index[truths.landmarks(pair[0])]
+        asked["true", pair] = there, index[here]
+    for a, b in inside:
+        asked["perfect", (a, b)] = truths.landmarks(b), truths.landmarks(a)
+    found: dict[Question, Errors] = {}
+    targets = dict.fromkeys(pair[1] for _, pair in asked)
+    for target in runner.track(list(targets), "measuring"):  # all questions of a target at once share their rows
+        mine = [question for question in asked if question[1][1] == target]
+        right, said = (np.concatenate([asked[question][side] for question in mine]) for side in (0, 1))
+        parts = np.split(
+            truths.distances(target).between(right, said), np.cumsum([len(asked[q][0]) for q in mine])[:-1]
+        )
+        found |= {question: Errors(part.astype(np.float32)) for question, part in zip(mine, parts, strict=True)}
     return found
-
-
-def perfect_errors(truths: Truths, pairs: Sequence[Pair]) -> dict[Pair, Errors]:
-    """What the set charges the map with that sends vertex i to vertex i."""
-    bench = truths.bench
-    return {
-        (a, b): _errors(truths, b, bench.landmarks(b), bench.landmarks(a)) for a, b in runner.track(pairs, "its truth")
-    }
 
 
 def stretch(truths: Truths, pairs: Sequence[Pair]) -> tuple[float, float]:
     """Mean |log| of the factor by which identity, and the set's truth, change distances of `STRETCHED_CM`."""
-    bench = truths.bench
-    marks = np.unique(np.linspace(0, len(bench.landmarks(pairs[0][0])) - 1, _MARKS).astype(np.int64))
     low, high = (cm / CM_PER_UNIT for cm in STRETCHED_CM)
-    ids = {name: bench.landmarks(name)[marks] for name in dict.fromkeys(name for pair in pairs for name in pair)}
+    names = list(dict.fromkeys(name for pair in pairs for name in pair))
+    ids = {name: np.array(runner.spread(truths.landmarks(name), _MARKS)) for name in names}
     rows = {  # all landmarks of the group at once on each shape
-        name: truths.distances(name).among(np.concatenate(list(ids.values()))) for name in runner.track(ids, "stretch")
+        name: truths.distances(name).among(np.concatenate(list(ids.values())), _FAR * high)
+        for name in runner.track(names, "stretch")
     }
-    part = {name: slice(k * len(marks), (k + 1) * len(marks)) for k, name in enumerate(ids)}
+    size = len(ids[names[0]])
+    part = {name: slice(k * size, (k + 1) * size) for k, name in enumerate(names)}
     found: list[list[float]] = [[], []]
     for a, b in pairs:
         before = rows[a][part[a], part[a]]
         near = (before > low) & (before < high)
         for truth, of in enumerate((a, b)):
-            after = np.maximum(rows[b][part[of], part[of]], 1e-3)  # landmarks may share a vertex
+            after = np.clip(rows[b][part[of], part[of]], low / _FAR, _FAR * high)  # landmarks may share a vertex
             found[truth].append(float(np.abs(np.log(after[near] / before[near])).mean()))
     return float(np.mean(found[0])), float(np.mean(found[1]))
 
 
-def group_row(truths: Truths, names: Sequence[str], perfect: Mapping[Pair, Errors], run: Measured) -> dict[str, Any]:
+def group_row(truths: Truths, names: Sequence[str], found: Found) -> dict[str, Any]:
     """What the two truths say on all ordered pairs of shapes with the same triangles."""
     pairs = list(permutations(names, 2))
-    alike = [truths.wound_alike(pair) for pair in pairs]
-    charged = summary([perfect[pair] for pair in pairs])
-    errors = true_errors(truths, run.maps, pairs)
+    perfect = summary([found["perfect", pair] for pair in pairs])
     identity, own = stretch(truths, pairs)
     return {
-        **{"names": ", ".join(names), "shapes": list(names), "pairs": len(pairs), "alike": float(np.mean(alike))},
-        **{"perfect_cm": charged["mean_cm"], "perfect_median_cm": charged["median_cm"]},
-        "perfect_worst_cm": max(perfect[pair].mean_cm for pair in pairs),
-        "perfect_over_15cm": charged["share_over_15cm"],
-        **_both({pair: run.charged[pair] for pair in pairs}, errors),
+        **{"names": ", ".join(names), "shapes": list(names), "pairs": len(pairs)},
+        "alike": float(np.mean([truths.wound_alike(pair) for pair in pairs])),
+        **{"perfect_cm": perfect["mean_cm"], "perfect_median_cm": perfect["median_cm"]},
+        "perfect_worst_cm": max(found["perfect", pair].mean_cm for pair in pairs),
+        "perfect_over_15cm": perfect["share_over_15cm"],
+        **_both(found, pairs),
         **{"stretch_identity": identity, "stretch_set": own},
     }
 
 
-def _both(charged: Mapping[Pair, Errors], true: Mapping[Pair, Errors]) -> dict[str, float]:
+def _both(found: Found, pairs: Sequence[Pair]) -> dict[str, float]:
     """Our errors by the set's truth, and by a better one."""
-    theirs, better = summary(list(charged.values())), summary(list(true.values()))
+    theirs, better = (summary([found[kind, pair] for pair in pairs]) for kind in ("charged", "true"))  # type: ignore[index]
     return {
         **{"charged_cm": theirs["mean_cm"], "charged_median_cm": theirs["median_cm"]},
         **{"true_cm": better["mean_cm"], "true_median_cm": better["median_cm"]},
@@ -164,9 +156,8 @@ def _both(charged: Mapping[Pair, Errors], true: Mapping[Pair, Errors]) -> dict[s
 
 def template_row(truths: Truths, name: str) -> dict[str, Any]:
     """How far the landmarks of the template's own shape are from the vertices of their number."""
-    landmarks = truths.bench.landmarks(name)
-    numbers = np.arange(len(landmarks))
-    errors = _errors(truths, name, landmarks, numbers)
+    landmarks, numbers = truths.landmarks(name), truths.known(name)[0]
+    errors = Errors(truths.distances(name).between(landmarks, numbers).astype(np.float32))
     return {
         **{"names": f"{name} (the template)", "shapes": [name], "pairs": 0},
         **{"perfect_cm": errors.mean_cm, "perfect_median_cm": errors.median_cm},
@@ -177,13 +168,13 @@ def template_row(truths: Truths, name: str) -> dict[str, Any]:
 def consensus_row(truths: Truths, name: str) -> dict[str, Any]:
     """Straight distances of a shape's landmarks from the consensus of the others of its group, cm."""
     shape = truths.bench.shape(name)
-    off = shape.verts[truths.bench.landmarks(name)] - consensus_points(truths, name)
+    off = shape.verts[truths.landmarks(name)] - consensus_points(truths, name)
     cm = np.linalg.norm(off, axis=1) / np.sqrt(shape.area) * CM_PER_UNIT
     return {"name": name, "rms_cm": float(np.sqrt((cm**2).mean())), "median_cm": float(np.median(cm))}
 
 
 def part_rows(
-    bench: BenchSet, errors: Mapping[Pair, Errors], fits: Mapping[str, Any], template: Template
+    truths: Truths, errors: Mapping[Pair, Errors], fits: Mapping[str, Any], template: Template
 ) -> list[dict[str, Any]]:
     """Where errors lie: by the part of the fitted template that a landmark of the source is on, both sides together."""
     labels, by_part = np.asarray(template.labels), defaultdict(list)
@@ -195,9 +186,9 @@ def part_rows(
             belongs = template_footpoints(shape_of(fit).shape, fit)[1]
             part = names[labels[cKDTree(fit.resting).query(belongs)[1]]]
             kept = shape_of(fit).kept_vertex
-            whole = np.full(bench.shape(name).V, "", dtype=part.dtype)
+            whole = np.full(truths.bench.shape(name).V, "", dtype=part.dtype)
             whole[kept] = part
-            parts[name] = whole[bench.landmarks(name)]
+            parts[name] = whole[truths.landmarks(name)]
     for (source, _), each in errors.items():
         for part in np.unique(parts[source]) if source in parts else ():
             by_part[str(part)].append(each.cm[parts[source] == part])
@@ -210,23 +201,16 @@ def part_rows(
     return sorted(rows, key=lambda row: -row["cm"])
 
 
-def protocol_rows(truths: Truths, run: Measured) -> list[dict[str, Any]]:
+def protocol_rows(truths: Truths, found: Found) -> list[dict[str, Any]]:
     """The set's own pairs, by how much is known of their truth, and all together."""
-    pairs = list(truths.bench.pairs)
-    better, kinds = true_errors(truths, run.maps, pairs), defaultdict(list)
-    for pair in pairs:
+    kinds = defaultdict(list)
+    for pair in truths.bench.pairs:
         kinds[str(truths.of_pair(pair)[2])].append(pair)
-    kinds["all"] = pairs
-    return [
-        {
-            **{"kind": kind, "pairs": len(some)},
-            **_both({pair: run.charged[pair] for pair in some}, {pair: better[pair] for pair in some}),
-        }
-        for kind, some in kinds.items()
-    ]
+    kinds["all"] = list(truths.bench.pairs)
+    return [{"kind": kind, "pairs": len(some), **_both(found, some)} for kind, some in kinds.items()]
 
 
-def measure(bench: BenchSet, method: Method, template: Template | None) -> dict[str, list[dict[str, Any]]]:
+def measure(truths: Truths, method: Method, template: Template | None) -> dict[str, list[dict[str, Any]]]:
     """All tables of a set, as rows.
 
     Raises
@@ -234,27 +218,28 @@ def measure(bench: BenchSet, method: Method, template: Template | None) -> dict[
     InputError
         Nothing is known beyond the set's own truth.
     """
-    truths = Truths(bench)
+    bench = truths.bench
     if not truths.groups and not truths.templates:
         raise InputError(
             f"no two shapes of {bench.name} have the same triangles", "nothing better than its truth is known"
         )
     inside = [pair for group in truths.groups for pair in permutations(group, 2)]
-    run = matched(truths, method, list(dict.fromkeys([*bench.pairs, *inside])))
-    perfect = perfect_errors(truths, inside)
+    fits, maps = matched(bench, method, list(dict.fromkeys([*bench.pairs, *inside])))
+    found = all_errors(truths, maps, inside)
     rows = []
     for group in truths.groups:
-        rows.append(group_row(truths, group, perfect, run))
+        rows.append(group_row(truths, group, found))
         for names in SAME_PERSON.get(bench.name, ()):
             if set(names) < set(group):
-                rows.append(group_row(truths, names, perfect, run))
+                rows.append(group_row(truths, names, found))
     rows += [template_row(truths, name) for name in truths.templates]
     large = [name for group in truths.groups if len(group) > 2 for name in group]
+    perfect = {pair: found["perfect", pair] for pair in inside}
     return {
         "groups": rows,
         "consensus": [consensus_row(truths, name) for name in large],
-        "parts": [] if template is None else part_rows(bench, perfect, run.fits, template),
-        "protocol": protocol_rows(truths, run),
+        "parts": [] if template is None else part_rows(truths, perfect, fits, template),
+        "protocol": protocol_rows(truths, found),
     }
 
 
@@ -265,10 +250,11 @@ def main(
     model: runner.Model = "human",
     refine: Refine = "nodes",
     seed: runner.Seed = 0,
+    landmarks: Annotated[int | None, Option(min=2, help="of each shape, evenly spread; by default all")] = None,
     threads: runner.Threads = 1,
 ) -> runner.Report:
     method = OurMethod(model, refine, seed, threads=threads)
-    found = measure(load_set(set, data), method, as_model(model).template)
+    found = measure(Truths(load_set(set, data), landmarks), method, as_model(model).template)
     titles = {
         "groups": ("its truth, and ours, against vertices in the same order, cm", COLUMNS),
         "consensus": ("landmarks of one shape against the mean of the others'", OTHERS),

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.experiments.runner import spread
 from meshmatch.experiments.sets import BenchSet, Pair
 from meshmatch.maps.geodesics import GeodesicDistances
 from meshmatch.shapes.shape import Shape
@@ -63,16 +64,32 @@ class NearDistances:
             found[far] = self.whole.between(a[far], b[far])
         return found
 
-    def among(self, ids: Int[Ints, " M"]) -> Float[Floats, "M M"]:
-        """Distances between all of some vertices, in units of sqrt(area)."""
-        return np.concatenate([rows[:, ids] for _, rows in self.whole.chunks(ids)])
+    def among(self, ids: Int[Ints, " M"], most: float) -> Float[Floats, "M M"]:
+        """Distances between all of some vertices, in units of sqrt(area); infinite beyond ``most``."""
+        reach = most * self.whole.unit
+        starts, row = np.unique(ids, return_inverse=True)
+        blocks = [
+            dijkstra(self.whole.graph, indices=starts[first : first + _ROWS], limit=reach)[:, ids]
+            for first in range(0, len(starts), _ROWS)
+        ]
+        return np.asarray(np.concatenate(blocks)[row] / self.whole.unit)
 
 
 @dataclass(frozen=True)
 class Truths:
-    """What is known of a set beyond its own landmarks."""
+    """What is known of a set beyond its own landmarks; of so many of them, evenly spread, or of all."""
 
     bench: BenchSet
+    marks: int | None = None
+
+    def chosen(self, count: int) -> Int[Ints, " N"]:
+        """Numbers of the landmarks that are looked at, of so many."""
+        return np.array(spread(range(count), self.marks))
+
+    def landmarks(self, name: str) -> Int[Ints, " N"]:
+        """Vertices of these landmarks on one shape, as the set has them."""
+        every = self.bench.landmarks(name)
+        return every[self.chosen(len(every))]
 
     @cached_property
     def _distances(self) -> dict[str, NearDistances]:
@@ -122,16 +139,16 @@ class Truths:
     def known(self, name: str) -> tuple[Int[Ints, " N"], Kind]:
         """The best known vertex of every landmark on one shape, and how it is known."""
         if name in self.templates:
-            return np.arange(len(self.bench.landmarks(name))), "own order"
+            return self.chosen(len(self.bench.landmarks(name))), "own order"
         if len(self.group_of(name)) > 2:
             return consensus(self, name), "consensus"
-        return self.bench.landmarks(name), "the set's own"
+        return self.landmarks(name), "the set's own"
 
     def of_pair(self, pair: Pair) -> tuple[Int[Ints, " N"], Int[Ints, " N"], Kind]:
         """For every landmark the vertex of the source and the one it belongs to on the target, and how this is known."""
         source, target = pair
         if target in self.group_of(source):
-            landmarks = self.bench.landmarks(source)
+            landmarks = self.landmarks(source)
             return landmarks, landmarks, "identity"
         (here, how), (there, how_there) = self.known(source), self.known(target)
         kinds = {how, how_there} - {"the set's own"}
@@ -143,7 +160,7 @@ def consensus_points(truths: Truths, name: str) -> Float[Floats, "N 3"]:
     """Means of the points that the landmarks of the other shapes of a group have on this one."""
     others = [other for other in truths.group_of(name) if other != name]
     verts = truths.bench.shape(name).verts
-    return np.asarray(np.mean([verts[truths.bench.landmarks(other)] for other in others], axis=0))
+    return np.asarray(np.mean([verts[truths.landmarks(other)] for other in others], axis=0))
 
 
 @cache

@@ -8,8 +8,10 @@ import pytest
 
 from meshmatch.api.matching import Matcher
 from meshmatch.experiments.scans import main, scan_panels
+from meshmatch.experiments.simulated_scans import scanned, simulated_scans
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.shapes.colors import label_colors
+from meshmatch.shapes.shape import Shape
 
 DANCER = Path(__file__).parents[2] / "templates" / "samples" / "dancer.ply"
 
@@ -38,3 +40,21 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.Cap
     (tmp_path / "taken").write_text("a file")
     assert main([str(DANCER), "-o", str(tmp_path / "taken")]) == 1
     assert "cannot make the folder" in capsys.readouterr().err
+
+
+def test_simulated_scans_have_holes_and_a_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--simulated", "1"]) == 0
+    (row,) = json.loads(capsys.readouterr().out.splitlines()[-1])["scans"]
+    assert row["verdict"] in ("good", "fair") and row["error_cm"] < 5
+    (body, scan), (_, again) = (*simulated_scans(1), *simulated_scans(1))
+    assert 0.6 * body.V < scan.V < 0.98 * body.V and np.array_equal(scan.verts, again.verts)
+    assert main([]) == 1
+    assert "nothing to fit" in capsys.readouterr().err
+
+
+def test_a_camera_ring_sees_the_outside_alone(cube: Shape) -> None:
+    """A box in a box: the inner one is seen by nobody."""
+    inner = Shape(0.5 * cube.verts + 0.25, cube.faces)
+    both = Shape(np.concatenate([cube.verts, inner.verts]), np.concatenate([cube.faces, inner.faces + cube.V]))
+    seen = scanned(both, 0)
+    assert seen.V == cube.V and 8 <= seen.F <= cube.F

@@ -70,7 +70,7 @@ def test_a_set_without_such_shapes(tmp_path: Path, capsys: pytest.CaptureFixture
         ids = np.load(data / "shrec19" / f"{name}.landmarks.npy")
         np.save(data / "shrec19" / f"{name}.landmarks.npy", ids[:-1])  # no shape is the template
     with pytest.raises(InputError, match="no two shapes"):
-        measure(load_set("shrec19", data), Keeps(), None)
+        measure(Truths(load_set("shrec19", data)), Keeps(), None)
     assert main(["--set", "shrec19", "--data", str(data)]) == 1
     assert "no two shapes" in capsys.readouterr().err
     assert Truths(load_set("scape", data)).groups == [["mesh000", "mesh001"]]
@@ -82,7 +82,7 @@ def test_a_truth_that_is_wrong_by_hand(tmp_path: Path) -> None:
     wrong = ids.copy()
     wrong[0] = 1
     bench = write(tmp_path, {"1": ids, "2": wrong})
-    found = measure(bench, Keeps(), None)
+    found = measure(Truths(bench), Keeps(), None)
     (row,), (identity, whole) = found["groups"], found["protocol"]
     assert (row["names"], row["pairs"], row["alike"]) == ("1, 2", 2, 1.0)
     edges = [edge_cm(bench.shape(name)) / len(ids) for name in ("1", "2")]
@@ -92,7 +92,7 @@ def test_a_truth_that_is_wrong_by_hand(tmp_path: Path) -> None:
     assert row["stretch_set"] > row["stretch_identity"] > 0
     assert identity["kind"] == "identity" and (whole["kind"], whole["pairs"]) == ("all", 1)
     assert identity["charged_cm"] == pytest.approx(edges[1], rel=0.02) and identity["true_cm"] == 0.0
-    ours = measure(bench, Keeps(moved=1), None)["groups"][0]  # vertex 0 to vertex 1 everywhere
+    ours = measure(Truths(bench), Keeps(moved=1), None)["groups"][0]  # vertex 0 to vertex 1 everywhere
     assert ours["true_cm"] == pytest.approx(edges[1] / 2, rel=0.02)  # the second shape has no landmark there
 
 
@@ -121,6 +121,8 @@ def test_a_shape_that_is_the_template(tmp_path: Path) -> None:
     assert truths.templates == ["1"] and truths.groups == []
     assert truths.of_pair(("2", "1"))[1].tolist() == list(range(BODY.V))
     assert truths.of_pair(("2", "1"))[2] == "own order"
+    some = Truths(bench, 3).known("1")[0]  # landmarks, evenly spread
+    assert len(some) == 3 and (some[0], some[-1]) == (0, BODY.V - 1)
     row = template_row(truths, "1")
     assert row["perfect_cm"] == pytest.approx(edge_cm(bench.shape("1")) / BODY.V, rel=0.02)
     assert row["own_number"] == pytest.approx(1 - 1 / BODY.V)

@@ -1,0 +1,90 @@
+"""Area distortion of fields, and what the rules for nodes refuse, beside numbers that are known."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from meshmatch.experiments import figure_fields
+from meshmatch.experiments.figure_fields import PULL, change, pull, pulled_by, pulled_nodes, volume
+from meshmatch.experiments.figure_nodes import across_parts, candidates_of, config_of, far_along, refused
+from meshmatch.experiments.figures import main, stacked
+from meshmatch.render.figures import Panel
+from meshmatch.render.picture import Look
+from meshmatch.shapes.sampling import farthest_points
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import choose_nodes
+from meshmatch.templates.template import Template, read_template
+
+
+@pytest.fixture(scope="module")
+def template() -> Template:
+    return read_template("human-T")
+
+
+def test_change_of_triangles(cube: Shape) -> None:
+    still, numbers = change(cube.verts, cube.verts, cube.faces)
+    assert not still.any() and set(numbers.values()) == {0.0}
+    twice, numbers = change(np.sqrt(2) * cube.verts, cube.verts, cube.faces)
+    assert twice == pytest.approx(np.ones(12))
+    assert (numbers["change"], numbers["over_quarter"], numbers["turned"]) == pytest.approx((1, 1, 0))
+    _, numbers = change(
+        cube.verts * [-1, 1, 1], cube.verts, cube.faces
+    )  # mirrored: four of six sides face the wrong way
+    assert numbers["turned"] == pytest.approx(4 / 6) and numbers["change"] == pytest.approx(0)
+    long, _ = change(cube.verts * [4, 1, 1], cube.verts, cube.faces)
+    assert sorted(set(long.round(6).tolist())) == [0.0, 2.0]
+    assert volume(cube.verts, cube.faces) == pytest.approx(1) and volume(2 * cube.verts, cube.faces) == pytest.approx(8)
+
+
+def test_handles_are_the_nodes_of_the_arm(template: Template) -> None:
+    arm = pulled_nodes(template)
+    assert 5 < arm.sum() < 60
+    assert template.nodes[arm, 0].min() > template.nodes[~arm, 0].mean()  # the left is at +x
+    for field in ("mls", "rbf"):
+        verts, nodes = pulled_by(field, template, "smooth", 0)
+        tip = template.shape.verts[:, 0].argmax()
+        assert verts[tip] - template.shape.verts[tip] == pytest.approx(PULL, abs=0.01)
+        assert np.linalg.norm(nodes - template.nodes - np.where(arm[:, None], PULL, 0), axis=1).mean() < 0.02
+    assert pulled_by("rbf", template, "smooth", 0)[1] - template.nodes == pytest.approx(
+        np.where(arm[:, None], PULL, 0), abs=1e-3
+    )
+
+
+def test_a_pull_by_every_field(template: Template, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figure_fields, "_MOST_STEPS", 3)
+    drawn = pull(template, "smooth", 0)
+    mls, rbf, pointwise = drawn.rows
+    assert [mls["what"], rbf["what"], pointwise["what"]] == ["mls", "rbf", "pointwise"]
+    assert mls["elsewhere_cm"] == pytest.approx(0, abs=1e-4) < rbf["elsewhere_cm"]  # compact support
+    assert rbf["missed_cm"] == pytest.approx(0, abs=0.01) < pointwise["missed_cm"]
+    assert [panel.label for panel in drawn.panels] == ["handles", "mls", "rbf", "pointwise"]
+
+
+def test_the_rules_refuse_what_the_choice_of_nodes_refuses(template: Template) -> None:
+    config = config_of(template, 100, 0.2)
+    found, rules, _ = refused(template, config)
+    assert np.array_equal(rules["parts"], across_parts(template.shape, template.labels, found))
+    kept = found.points[~rules["parts"]]
+    first = kept[farthest_points(kept, config.K)]
+    assert choose_nodes(template.shape, config, template.labels)[: config.K] == pytest.approx(first)
+    assert 0 < rules["geodesic"].mean() < far_along(template.shape, found, 0.1).mean()
+    assert len(candidates_of(template.shape, config).points) == 30 * config.K
+
+
+def test_rows_of_panels_are_stacked(cube: Shape, tmp_path: Path) -> None:
+    look = Look(size=(120, 80))
+    stacked([([Panel(cube)], look), ([Panel(cube), Panel(cube)], look)], tmp_path / "both.png")
+    assert Image.open(tmp_path / "both.png").size == (120, 160)
+
+
+def test_the_command_draws_figure_7(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--figures", "7", "--pictures", str(tmp_path), "--nodes", "60", "--radius", "0.25"]) == 0
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert {row["template"] for row in record["refused"]} == {"human-T", "human-A"}
+    assert record["stages"][0]["nodes"] >= 60 and len(record["bad"][0]["node moves"]) > 1
+    assert (tmp_path / "paper-figure-7.png").stat().st_size > 10_000
+    assert main(["--figures", "6"]) == 1
+    assert "unknown figure '6'" in capsys.readouterr().err
