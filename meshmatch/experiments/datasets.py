@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -78,7 +79,7 @@ def checked_truth(path: Path, layout: Layout, shape: Shape) -> int:
     return rows
 
 
-def check_shapes(folder: Path, name: str, layout: Layout) -> dict[str, Any]:
+def check_shapes(name: str, layout: Layout, folder: Path) -> dict[str, Any]:
     """What is in a folder of ply files; "pairs" where the benchmark has a protocol for it."""
     files = sorted((folder / name).glob("*.ply"))
     if not files:
@@ -126,10 +127,7 @@ def _range(numbers: list[int]) -> str:
 
 
 CHECKS: dict[str, tuple[int, Callable[[Path], dict[str, Any]]]] = {
-    **{
-        name: (layout.published, lambda folder, name=name, layout=layout: check_shapes(folder, name, layout))
-        for name, layout in LAYOUTS.items()
-    },
+    **{name: (layout.published, partial(check_shapes, name, layout)) for name, layout in LAYOUTS.items()},
     FILE: (30, check_outliers),
     "textured": (3, check_textured),
 }

@@ -42,13 +42,16 @@ def candidates_of(shape: Shape, config: NodeConfig) -> Candidates:
     return Candidates(points, own, list(cKDTree(shape.verts).query_ball_point(points, config.radius)))
 
 
+def bordering(shape: Shape, parts: Int[Ints, " V"]) -> Bool[Bools, "P P"]:
+    """Which parts have an edge from one to the other; each has one to itself."""
+    joined = np.eye(int(parts.max()) + 1, dtype=bool)
+    joined[parts[shape.faces], parts[shape.faces[:, [1, 2, 0]]]] = True
+    return np.asarray(joined | joined.T)
+
+
 def across_parts(shape: Shape, parts: Int[Ints, " V"], found: Candidates) -> Bool[Bools, " N"]:
     """Candidates that touch a part which has no border with their own."""
-    count = int(parts.max()) + 1
-    joined = np.eye(count, dtype=bool)
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        joined[parts[shape.faces[:, a]], parts[shape.faces[:, b]]] = True
-    joined |= joined.T
+    joined = bordering(shape, parts)
     return np.array(
         [
             not joined[parts[own], np.unique(parts[hits])].all()
@@ -89,13 +92,11 @@ def refusals(template: Template, config: NodeConfig) -> dict[str, Any]:
 
 def worst_candidate(template: Template, found: Candidates, bad: Bool[Bools, " N"]) -> int:
     """The refused candidate that would move most vertices of parts that have no border with its own part."""
+    shape, labels = template.shape, template.labels
+    joined = bordering(shape, labels)
     strangers = np.zeros(len(bad), np.int64)
     for k in np.flatnonzero(bad).tolist():
-        parts = template.labels[found.touched[k]]
-        strangers[k] = min(
-            np.bincount(parts, minlength=len(template.label_names))[np.unique(parts)].max(),
-            (parts != template.labels[found.own[k]]).sum(),
-        )
+        strangers[k] = (~joined[labels[found.own[k]], labels[found.touched[k]]]).sum()
     return int(strangers.argmax())
 
 
@@ -147,7 +148,6 @@ def stages(template: Template, config: NodeConfig) -> tuple[list[Panel], dict[st
     every = np.linspace(0, len(found.points) - 1, min(3000, len(found.points))).astype(np.int64)
     kept = np.flatnonzero(~bad)
     chosen = found.points[kept][farthest_points(found.points[kept], min(config.K, len(kept)))]
-    ball = {"glass": True, "point_radius": 0.006}
     panels = [
         Panel(
             shape,
@@ -155,7 +155,8 @@ def stages(template: Template, config: NodeConfig) -> tuple[list[Panel], dict[st
             f"{len(bad):,} candidates",
             points=found.points[every],
             point_colors=np.tile(KEPT, (len(every), 1)),
-            **ball,
+            glass=True,
+            point_radius=0.006,
         ),
         Panel(
             shape,
@@ -163,7 +164,8 @@ def stages(template: Template, config: NodeConfig) -> tuple[list[Panel], dict[st
             f"{bad.sum():,} refused by parts",
             points=found.points[np.r_[every, np.flatnonzero(bad)]],
             point_colors=np.where(np.r_[bad[every], bad[bad]][:, None], REFUSED, KEPT),
-            **ball,
+            glass=True,
+            point_radius=0.006,
         ),
         Panel(
             shape,

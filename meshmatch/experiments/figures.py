@@ -1,12 +1,13 @@
 """The paper's figures 4, 5 and 7, drawn, with the numbers behind them.
 
 - 4: area distortion of the three representations of a field. Above, an arm pulled by the same handles; below, one body
-  that nobody learned from, fitted by runs that differ in the field alone.
-- 5: the same body fitted by runs that differ in their regularisers.
+  that nobody learned from, fitted with each.
+- 5: the same body fitted after different regularisers.
 - 7: what the rules for nodes look at, a node that they refuse, and the three stages of choosing.
 
-The runs are those of the ablations (`meshmatch.experiments.ablations`) with the same choices: they are trained where the
-output folder lacks them, so that a stopped command goes on, and the ablations' own folder will do.
+By default fields are fitted to the body themselves (`meshmatch.experiments.figure_direct`), without a network. With
+--output, by runs of the ablations (`meshmatch.experiments.ablations`) with the same choices: they are trained where the
+folder lacks them, so that a stopped command goes on, and the ablations' own folder will do.
 """
 
 from __future__ import annotations
@@ -14,21 +15,35 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
+import numpy as np
 from PIL import Image
 from typer import Option
 
 from meshmatch.api.inputs import as_model
-from meshmatch.experiments import figure_fields, figure_nodes, runner
+from meshmatch.arrays import Floats
+from meshmatch.experiments import figure_nodes, runner
 from meshmatch.experiments.ablation_errors import METHODS, Measure
 from meshmatch.experiments.ablation_setting import Setting
-from meshmatch.experiments.ablation_views import BASE, Run
+from meshmatch.experiments.ablation_views import Run
 from meshmatch.experiments.ablations import Kept
-from meshmatch.experiments.figure_fields import FIGURE4, FIGURE5, FIT_COLUMNS, LOSSES, PULL_COLUMNS, SCALE
-from meshmatch.fields.shape_functions import FIELDS
+from meshmatch.experiments.figure_direct import CONSTRAINTS, Direct, direct_fits
+from meshmatch.experiments.figure_fields import (
+    FIGURE4,
+    FIGURE5,
+    FIT_COLUMNS,
+    LOSSES,
+    PULL_COLUMNS,
+    SCALE,
+    Drawn,
+    fits,
+    pull,
+)
+from meshmatch.experiments.human_bodies import unseen_bodies
+from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.render.figures import Panel
@@ -36,8 +51,8 @@ from meshmatch.render.picture import Look, render_shapes
 from meshmatch.templates.template import read_template
 
 FIGURES = ("4", "5", "7")
-_FRONT = {"turn": 0.0, "tilt": 4.0}
-_BODY = 5  # seed of the body that is fitted
+_FRONT = Look(turn=0.0, tilt=4.0)
+_WIDEST = 1400  # pixels
 
 
 def stacked(rows: Sequence[tuple[Sequence[Panel], Look]], path: Path) -> None:
@@ -47,13 +62,16 @@ def stacked(rows: Sequence[tuple[Sequence[Panel], Look]], path: Path) -> None:
         for number, (panels, look) in enumerate(rows):
             part = Path(folder) / f"{number}.png"
             render_shapes(panels, part, look)
-            images.append(Image.open(part).convert("RGB"))
+            with Image.open(part) as image:
+                images.append(image.convert("RGB"))
     width = max(image.width for image in images)
     whole = Image.new("RGB", (width, sum(image.height for image in images)), (255, 255, 255))
     top = 0
     for image in images:
         whole.paste(image, ((width - image.width) // 2, top))
         top += image.height
+    if width > _WIDEST:
+        whole = whole.resize((_WIDEST, round(whole.height * _WIDEST / width)), Image.Resampling.LANCZOS)
     with replace_on_success(path) as temporary:
         whole.save(temporary, format="PNG", compress_level=9)
 
@@ -65,20 +83,15 @@ def models_of(kept: Kept, runs: Sequence[Run]) -> dict[Run, TrainedModel]:
     return {run: as_model(kept.folder / run.name / "model") for run in runs}
 
 
-def figure_4(kept: Kept, body: Any, method: str, path: Path) -> dict[str, list[dict[str, Any]]]:
-    """Both rows of figure 4."""
-    template = read_template("human-T")
-    above = figure_fields.pull(template, "smooth", kept.measure.seed)
-    below = figure_fields.fits(models_of(kept, FIGURE4), FIELDS, body, method, kept.measure)
-    stacked([(above.panels, Look(**_FRONT)), (below.panels, Look(**_FRONT, legend=SCALE))], path)
-    return {"pull": above.rows, "fits": below.rows}
-
-
-def figure_5(kept: Kept, body: Any, method: str, path: Path) -> dict[str, list[dict[str, Any]]]:
-    """The row of figure 5."""
-    drawn = figure_fields.fits(models_of(kept, FIGURE5), LOSSES, body, method, kept.measure)
-    render_shapes(drawn.panels, path, Look(**_FRONT, legend=SCALE))
-    return {"losses": drawn.rows}
+def drawn_fits(figure: str, body: Floats, kept: Kept | None, method: str, how: Direct) -> Drawn:
+    """The fits of figure 4 or 5: by trained runs, or without a network where there is no folder for them."""
+    if kept is None:
+        cases: list[tuple[FieldName, str, str]]
+        cases = [(field, "vol+arap", field) for field in FIELDS] if figure == "4" else []
+        cases = cases or [("mls", constraint, constraint) for constraint in CONSTRAINTS]
+        return direct_fits(cases, read_template("human-T"), body, how)
+    runs, names = (FIGURE4, list(FIELDS)) if figure == "4" else (FIGURE5, list(LOSSES))
+    return fits(models_of(kept, runs), names, body, method, kept.measure)
 
 
 def figure_7(nodes: int, radius: float | None, path: Path) -> dict[str, list[dict[str, Any]]]:
@@ -88,10 +101,10 @@ def figure_7(nodes: int, radius: float | None, path: Path) -> dict[str, list[dic
     rows, bad = [], []
     for template, config in zip(templates, configs, strict=True):
         panels, numbers = figure_nodes.segmentations(template, config)
-        rows.append((panels, Look(**_FRONT)))
+        rows.append((panels, _FRONT))
         bad.append(numbers)
     panels, steps = figure_nodes.stages(templates[1], configs[1])
-    stacked([*rows, (panels, Look(**_FRONT))], path)
+    stacked([*rows, (panels, _FRONT)], path)
     shares = [
         figure_nodes.refusals(template, figure_nodes.config_of(template, nodes, each))
         for template in templates
@@ -102,38 +115,48 @@ def figure_7(nodes: int, radius: float | None, path: Path) -> dict[str, list[dic
 
 @runner.command
 def main(
-    output: Annotated[Path, Option(help="folder of the trained runs")] = Path("ablations"),
     figures: Annotated[str, Option(help=f"of {', '.join(FIGURES)}")] = ",".join(FIGURES),
     pictures: Annotated[Path, Option(help="folder of paper-figure-N.png")] = Path("docs/images"),
+    output: Annotated[Path | None, Option(help="folder of trained runs; by default none are used")] = None,
     minutes: Annotated[float, Option(min=0.01, help="of training a run")] = 1.0,
-    method: Annotated[str, Option(help=f"refinement of the fits, of {', '.join(METHODS)}")] = "code",
+    method: Annotated[str, Option(help=f"refinement of a run's fits, of {', '.join(METHODS)}")] = "code",
     code_steps: Annotated[int, Option(min=1, help="of the search over codes")] = 60,
+    supervised: Annotated[int, Option(min=4, help="template points with a known place, without a network")] = 100,
+    steps: Annotated[int, Option(min=1, help="of Adam, without a network")] = 400,
     nodes: Annotated[int, Option(min=4, help="of figure 7")] = 300,
     radius: Annotated[float | None, Option(help="of figure 7's nodes, sqrt(area); by default the template's")] = None,
-    identities: Annotated[int, Option(min=1, help="of generated bodies")] = 1024,
+    seed: runner.Seed = 5,
     threads: runner.Threads = 1,
 ) -> runner.Report:
     wanted = runner.names_of(figures, FIGURES, "figure")
-    make_folder(pictures)
-    setting = Setting(identities=identities, threads=threads)
     method = runner.names_of(method, METHODS, "method")[0]
-    kept = Kept(output, setting, Measure(code_steps=code_steps), minutes, "human", [], None, False)
-    body = None
-    if {"4", "5"} & set(wanted):
-        body = setting.sources(BASE.pose)[1](1, torch.Generator().manual_seed(_BODY))[0].double().numpy()
+    make_folder(pictures)
+    template, how = read_template("human-T"), Direct(supervised=supervised, steps=steps)
+    kept = None
+    if output is not None:
+        measure = Measure(code_steps=code_steps)
+        kept = Kept(output, Setting(threads=threads), measure, minutes, "human", [], None, False)
     found: dict[str, list[dict[str, Any]]] = {}
     notes = []
+    body = unseen_bodies(template, 1, seed=seed)[0] if {"4", "5"} & set(wanted) else np.empty((0, 3))
     for name in wanted:
         path = pictures / f"paper-figure-{name}.png"
         if name == "7":
             found |= figure_7(nodes, radius, path)
         else:
-            found |= (figure_4 if name == "4" else figure_5)(kept, body, method, path)
+            below = drawn_fits(name, body, kept, method, how)
+            found[f"fits {name}"] = below.rows
+            rows = [(below.panels, replace(_FRONT, legend=SCALE))]
+            if name == "4":
+                above = pull(template, "smooth", 0)
+                found["pull"] = above.rows
+                rows = [(above.panels, _FRONT), *rows]
+            stacked(rows, path)
         notes.append(f"wrote {path}")
     titles = {
         "pull": ("Figure 4, an arm pulled by the same handles: change of triangles (log2 of area)", PULL_COLUMNS),
-        "fits": ("Figure 4, one body fitted with each field", FIT_COLUMNS),
-        "losses": ("Figure 5, one body fitted after each loss", FIT_COLUMNS),
+        "fits 4": ("Figure 4, one body fitted with each field", FIT_COLUMNS),
+        "fits 5": ("Figure 5, one body fitted after each loss", FIT_COLUMNS),
         "refused": ("Figure 7, candidates that the rules refuse", figure_nodes.COLUMNS),
     }
     drawn = [runner.table(words, found[key], columns) for key, (words, columns) in titles.items() if key in found]

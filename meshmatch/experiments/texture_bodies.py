@@ -42,11 +42,8 @@ def main(
     (whole, _), (_, scan) = simulated_scans(2, seed)
     shape = load_shape(source)
     panels = [Panel(shape, label="the sample", appearance=load_appearance(source, shape))]
-    targets = {
-        "the other sample": samples / "climber.ply",
-        "a generated body": whole,
-        "a scan of one, with holes": scan,
-    }
+    targets: dict[str, Path | Shape] = {"the other sample": samples / "climber.ply"}
+    targets |= {"a generated body": whole, "a scan of one, with holes": scan}
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for label, target in targets.items():

@@ -111,7 +111,7 @@ def stretch(truths: Truths, pairs: Sequence[Pair]) -> tuple[float, float]:
     """Mean |log| of the factor by which identity, and the set's truth, change distances of `STRETCHED_CM`."""
     low, high = (cm / CM_PER_UNIT for cm in STRETCHED_CM)
     names = list(dict.fromkeys(name for pair in pairs for name in pair))
-    ids = {name: np.array(runner.spread(truths.landmarks(name), _MARKS)) for name in names}
+    ids = {name: np.array(runner.spread(truths.landmarks(name).tolist(), _MARKS)) for name in names}
     rows = {  # all landmarks of the group at once on each shape
         name: truths.distances(name).among(np.concatenate(list(ids.values())), _FAR * high)
         for name in runner.track(names, "stretch")
@@ -146,7 +146,7 @@ def group_row(truths: Truths, names: Sequence[str], found: Found) -> dict[str, A
 
 def _both(found: Found, pairs: Sequence[Pair]) -> dict[str, float]:
     """Our errors by the set's truth, and by a better one."""
-    theirs, better = (summary([found[kind, pair] for pair in pairs]) for kind in ("charged", "true"))  # type: ignore[index]
+    theirs, better = (summary([found[kind, pair] for pair in pairs]) for kind in ("charged", "true"))
     return {
         **{"charged_cm": theirs["mean_cm"], "charged_median_cm": theirs["median_cm"]},
         **{"true_cm": better["mean_cm"], "true_median_cm": better["median_cm"]},

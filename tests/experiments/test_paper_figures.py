@@ -1,6 +1,7 @@
 """Area distortion of fields, and what the rules for nodes refuse, beside numbers that are known."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,11 @@ import pytest
 from PIL import Image
 
 from meshmatch.experiments import figure_fields
+from meshmatch.experiments.figure_direct import Direct, direct_fits, fitted, in_template_frame
 from meshmatch.experiments.figure_fields import PULL, change, pull, pulled_by, pulled_nodes, volume
 from meshmatch.experiments.figure_nodes import across_parts, candidates_of, config_of, far_along, refused
 from meshmatch.experiments.figures import main, stacked
+from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look
 from meshmatch.shapes.sampling import farthest_points
@@ -77,7 +80,8 @@ def test_the_rules_refuse_what_the_choice_of_nodes_refuses(template: Template) -
 def test_rows_of_panels_are_stacked(cube: Shape, tmp_path: Path) -> None:
     look = Look(size=(120, 80))
     stacked([([Panel(cube)], look), ([Panel(cube), Panel(cube)], look)], tmp_path / "both.png")
-    assert Image.open(tmp_path / "both.png").size == (120, 160)
+    with Image.open(tmp_path / "both.png") as image:
+        assert image.size == (120, 160)
 
 
 def test_the_command_draws_figure_7(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,3 +92,18 @@ def test_the_command_draws_figure_7(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert (tmp_path / "paper-figure-7.png").stat().st_size > 10_000
     assert main(["--figures", "6"]) == 1
     assert "unknown figure '6'" in capsys.readouterr().err
+
+
+def test_a_field_is_fitted_without_a_network(template: Template) -> None:
+    """A still template and a moved one: where points are known exactly and nothing resists, the error goes away."""
+    how = Direct(supervised=300, noise=0.0, steps=60, strained=50)
+    target = in_template_frame(template, 2 * template.shape.verts @ np.diag([-1.0, 1.0, -1.0]) + 5)
+    assert target == pytest.approx(template.shape.verts, abs=1e-6)
+    bent = template.shape.verts * [1.0, 1.0, 1.0] + np.square(template.shape.verts[:, [1, 2, 0]]) * [0.1, 0.0, 0.0]
+    off = np.linalg.norm(bent - template.shape.verts, axis=1).mean()
+    drawn = direct_fits([("mls", "none", "free"), ("mls", "vol+arap", "stiff")], template, bent, how)
+    free, stiff = drawn.rows
+    assert free["error_cm"] < 0.2 * off * CM_PER_UNIT and len(drawn.panels) == 3
+    assert stiff["error_cm"] != free["error_cm"]
+    moved = fitted("pointwise", "vol", template, bent, replace(how, steps=2))
+    assert moved.shape == bent.shape
