@@ -62,8 +62,8 @@ def stacked(rows: Sequence[tuple[Sequence[Panel], Look]], path: Path) -> None:
         for number, (panels, look) in enumerate(rows):
             part = Path(folder) / f"{number}.png"
             render_shapes(panels, part, look)
-            with Image.open(part) as image:
-                images.append(image.convert("RGB"))
+            with Image.open(part) as drawn:
+                images.append(drawn.convert("RGB"))
     width = max(image.width for image in images)
     whole = Image.new("RGB", (width, sum(image.height for image in images)), (255, 255, 255))
     top = 0
