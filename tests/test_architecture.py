@@ -32,7 +32,7 @@ ROOMS = (
 
 # Which rooms know which third-party library.
 OWNERS = {
-    "PIL": {"shapes", "maps", "transfer", "render"},
+    "PIL": {"shapes", "maps", "transfer", "render", "experiments"},
     "anny": {"training"},
     "embreex": {"render"},
     "fast_simplification": {"shapes"},
