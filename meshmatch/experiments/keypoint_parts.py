@@ -17,6 +17,13 @@ from meshmatch.shapes.shape import Shape
 
 _TOPS, _FEET = (4, 6, 8, 10), (5, 7, 9, 11)  # keypoints of a table's legs
 _SQUARE = [[(first + way * k) % 4 for k in range(4)] for first in range(4) for way in (1, -1)]
+_SIDES = (14, 17, 16, 15)  # keypoints in the middle of a table's sides, from the first corner to the second, and on
+# All numberings of the corners with the sides between them, and of the legs, tops and feet; the given one first.
+_AROUND = [
+    [*order, *(_SIDES[min(a, b) if {a, b} != {0, 3} else 3] for a, b in zip(order, order[1:] + order[:1], strict=True))]
+    for order in _SQUARE
+]
+_LEGS = [[ends[k] for ends in (_TOPS, _FEET) for k in order] for order in _SQUARE]
 _BELOW = 0.25  # of the way from the legs' tops to their feet: there legs are apart
 _SMALLEST = 20  # vertices of a leg
 
@@ -62,6 +69,25 @@ def leg_confidence(legs: Mapping[str, Int[Ints, " V"]], maps: Maps) -> dict[str,
         "legs_alike": float(values[same].mean()) if same.any() else None,
         "legs_unlike": float(values[~same].mean()) if (~same).any() else None,
     }
+
+
+def renumbered_errors(
+    shapes: Shapes, keypoints: Mapping[str, Int[Ints, " N"]], maps: Maps, near: float
+) -> dict[str, float]:
+    """Errors at all keypoints of tables, over the target's diagonal, where corners and sides, and apart from them legs,
+    are counted from whichever of the four and in whichever direction suits a pair best; and `leg_errors`."""
+    found = []
+    for (source, target), each in maps.items():
+        shape, truth = shapes[target], shapes[target].verts[keypoints[target]]
+        places = shape.verts[each.index[keypoints[source]]]
+        rows = [np.linalg.norm(places[[12, 13]] - truth[[12, 13]], axis=1)]
+        for numberings in (_AROUND, _LEGS):
+            off = [np.linalg.norm(places[numberings[0]] - truth[order], axis=1) for order in numberings]
+            rows.append(min(off, key=lambda each: float(each.mean())))
+        found.append(np.concatenate(rows) / shape.diagonal)
+    error = np.concatenate(found)
+    share = {"renumbered_mean": float(error.mean()), "renumbered_arrived": float((error < near).mean())}
+    return share | leg_errors(shapes, keypoints, maps, near)
 
 
 def leg_errors(shapes: Shapes, keypoints: Mapping[str, Int[Ints, " N"]], maps: Maps, near: float) -> dict[str, float]:

@@ -137,10 +137,14 @@ class SurfacePoints(LossPoints):
 
 @dataclass(frozen=True)
 class ChamferLoss(Objective):
-    """The template is pulled to the nearest points of a shape, and they to it; ``landmarks`` weighs known points."""
+    """The template is pulled to the nearest points of a shape, and they to it; ``landmarks`` weighs known points.
+
+    Nearest in position and normal, and far ones pull less; ``plain``: in position, by squared distance, as in the paper.
+    """
 
     needs_correspondence: ClassVar[bool] = False
     landmarks: float = 1.0
+    plain: bool = False
 
     def __call__(self, model: Deformer, batch: CloudBatch, points: SurfacePoints, generator: torch.Generator) -> Terms:
         code = model.encoder(batch.encode_features)
@@ -167,8 +171,10 @@ class ChamferLoss(Objective):
         moved = points.moved(rows)
         F = points.field.deformation_gradient(rows)
         normals = deformed_normals(F.detach(), points.normals)
-        there, back = chamfer(moved, normals, batch.points, batch.normals)
-        terms = {"reconstruction": self.reconstruction * (robust(there).mean() + robust(back).mean())}
+        share = 0.0 if self.plain else 1.0
+        there, back = chamfer(moved, share * normals, batch.points, share * batch.normals)
+        pull = torch.Tensor.float if self.plain else robust
+        terms = {"reconstruction": self.reconstruction * (pull(there).mean() + pull(back).mean())}
         terms |= self.rigidity(F)
         known = ~batch.landmarks.isnan().any(-1)
         if self.landmarks and known.any():
