@@ -155,6 +155,32 @@ def test_the_ends_of_legs_are_measured_in_the_best_of_a_squares_numberings() -> 
     assert measured([1, 0, 2, 3]) == {"legs_mean": pytest.approx(0.5 / np.sqrt(3), abs=1e-4), "legs_arrived": 0.5}
 
 
+def test_all_keypoints_of_a_table_are_measured_in_the_best_numbering() -> None:
+    ring = np.array([[0, 0], [2, 0], [2, 2], [0, 2]], float)
+    places = np.zeros((18, 3))
+    places[:4, :2], places[[4, 6, 8, 10], :2], places[[5, 7, 9, 11], :2] = ring, ring, ring
+    places[[4, 6, 8, 10], 2], places[[5, 7, 9, 11], 2], places[12:14] = 1, 2, [[1, 1, 0], [1, 1, 1]]
+    places[[14, 17, 16, 15], :2] = 0.5 * (ring + np.roll(ring, -1, axis=0))
+    table, keypoints = Shape(places, np.zeros((0, 3), int)), np.arange(18)
+
+    def arrived(corners: list[int], legs: list[int]) -> dict[str, float]:
+        """A map that numbers corners (and the sides between them) and legs in these ways."""
+        sides, index = [14, 17, 16, 15], np.arange(18)
+        index[:4] = corners
+        index[sides] = [
+            next(side for side, edge in zip(sides, ({0, 1}, {1, 2}, {2, 3}, {3, 0}), strict=True) if edge == {a, b})
+            for a, b in zip(corners, corners[1:] + corners[:1], strict=True)
+        ]
+        index[[4, 6, 8, 10]], index[[5, 7, 9, 11]] = 4 + 2 * np.array(legs), 5 + 2 * np.array(legs)
+        both = {"a": table, "b": table}
+        return keypoint_parts.renumbered_errors(both, dict.fromkeys(both, keypoints), mapped({("a", "b"): index}), 0.1)
+
+    assert arrived([1, 2, 3, 0], [3, 2, 1, 0])["renumbered_arrived"] == 1
+    assert arrived([2, 1, 0, 3], [0, 1, 2, 3])["renumbered_mean"] == 0
+    crossed = arrived([0, 1, 2, 3], [1, 0, 2, 3])
+    assert crossed["renumbered_arrived"] == pytest.approx(14 / 18) and crossed["legs_arrived"] == 0.5
+
+
 def test_shapes_are_stood_alike() -> None:
     ball = icosphere(1)
     verts = ball.verts * [1, 2, 3]

@@ -152,6 +152,18 @@ def test_the_robust_function() -> None:
     assert further - far < 0.01 * far  # what is far away pulls no harder
 
 
+def test_plain_chamfer_is_squared_distances_by_position(template: Template, data: CloudDataset) -> None:
+    model = build_deformer(template, data, SMALL.network, SMALL.scan, SMALL.kernel, 0).eval()
+    points = build_surface_points(template, "smooth", model, np.zeros(0, np.int64), 60)
+    batch = data[0]
+    loss = ChamferLoss(blend=0.0, landmarks=0.0, plain=True)
+    terms = loss(model, batch, points, torch.Generator())
+    with torch.no_grad():
+        moved = points.moved(model.decoder(model.encoder(batch.encode_features)))
+    every = (moved[:, :, None] - batch.points[:, None]).square().sum(-1)
+    assert terms["reconstruction"].item() == pytest.approx(float(every.amin(2).mean() + every.amin(1).mean()), rel=1e-4)
+
+
 def test_known_points_are_pulled_to_their_places(eggs: ShapeSamples, template: Template, data: CloudDataset) -> None:
     model = build_deformer(template, data, SMALL.network, SMALL.scan, SMALL.kernel, 0).eval()
     points = build_surface_points(template, "smooth", model, eggs.template_landmarks, 60)

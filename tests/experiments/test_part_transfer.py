@@ -1,0 +1,68 @@
+"""Labels carried by models of generated shapes: the templates, one small training of ours, its tests."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("skimage", reason="scikit-image is of the extra `bench`")
+
+from meshmatch.experiments import part_transfer
+from meshmatch.experiments.furniture import KINDS, furniture
+from meshmatch.experiments.part_transfer import Learned, chosen_templates, cloud_template, learned_shapes
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.templates.template import template_radius
+from meshmatch.training.recipes import clouds
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
+    return learned_shapes("plane", 4, 0, tmp_path_factory.mktemp("learned") / "samples.npz")
+
+
+def test_shapes_are_drawn_once_and_of_radius_one(learned: Learned, tmp_path: Path) -> None:
+    again = learned_shapes("plane", 4, 0, tmp_path / "samples.npz")
+    kept = learned_shapes("plane", 4, 0, tmp_path / "samples.npz")
+    for one in (again, kept):
+        assert np.array_equal(one.points, learned.points) and np.array_equal(one.parts, learned.parts)
+    assert 0.95 < np.linalg.norm(learned.points, axis=2).max() <= 1.001
+    assert np.allclose(np.linalg.norm(learned.normals, axis=2), 1, atol=1e-5)
+
+
+def test_templates_are_near_to_all_and_the_first_has_every_part() -> None:
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(300, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    sizes = [1.0, 1.01, 0.99, 3.0, 3.02, 0.2]
+    points = np.stack([size * ball for size in sizes]).astype(np.float32)
+    parts = np.zeros((6, 300), np.int64)
+    parts[[1, 5], :100] = 1
+    shapes = Learned(points, points, parts)
+    chosen = chosen_templates(shapes, 2, 2)
+    assert chosen[0] == 1 and chosen[1] in (3, 4)
+
+
+def test_the_papers_template_is_a_labelled_cloud() -> None:
+    template = cloud_template("plane", 0, 2)
+    assert template.radius == pytest.approx(0.4 * template_radius(template), rel=0.02)  # a fifth of the diameter
+    assert 300 <= template.K < 330
+    assert template.dense is template.shape and set(template.labels) == {0, 1, 2}
+    weights = part_transfer.paper_recipe().train.loss
+    assert (weights.reconstruction, weights.volume, weights.arap, weights.blend) == (1, 1e-4, 1e-3, 1e-4)
+
+
+def test_a_model_gives_labels_to_held_out_shapes(learned: Learned, tmp_path: Path) -> None:
+    template = part_transfer.mesh_template("plane", 0, 0)
+    recipe = clouds().changed(steps=2, threads=1)
+    model = part_transfer.learn(tmp_path / "ours", template, learned, recipe)
+    assert part_transfer.learn(tmp_path / "ours", template, learned, recipe).card.steps == 2
+    config = FitConfig(refine="none", partial="no", samples=500)
+    found = part_transfer.part_overlap([model], "plane", range(4, 5), 0, config)
+    assert 0.3 < found["generated_iou"] <= 1 and set(found["parts_iou"]) == set(KINDS["plane"])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_real_shapes_are_turned_like_generated_ones(kind: str) -> None:
+    turn = part_transfer.UPRIGHT[kind]
+    assert np.linalg.det(turn) == 1 and np.array_equal(turn @ turn.T, np.eye(3))
+    assert furniture(kind, 0, 0).kind == kind
