@@ -27,11 +27,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 from typer import Option
 
-from meshmatch.api.inputs import as_model, validated
-from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
+from meshmatch.api.inputs import validated
+from meshmatch.arrays import Int, Ints
 from meshmatch.experiments import category, runner
 from meshmatch.experiments.category import Maps, Shapes
 from meshmatch.experiments.furniture import KINDS, furniture
+from meshmatch.experiments.furniture_models import (
+    chosen_templates,
+    cloud_template,
+    learn,
+    learned_shapes,
+    mesh_template,
+    paper_recipe,
+)
 from meshmatch.experiments.keypoint_parts import mean_overlap, renumbered_errors
 from meshmatch.experiments.segments import KEYPOINTS, RIGHT, keypoint_errors, stood_alike
 from meshmatch.experiments.sets import Pair, load_folder
@@ -45,14 +53,8 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
 from meshmatch.render.picture import Look, Panel, render_shapes
 from meshmatch.shapes.colors import label_colors
-from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import NodeConfig, make_template
-from meshmatch.templates.prepared_folder import ShapeSamples
-from meshmatch.templates.template import Template, template_radius, unit_frame
-from meshmatch.training.losses import ChamferLoss
-from meshmatch.training.recipes import Recipe, clouds, paper_clouds
-from meshmatch.training.train import CardFacts, train_model
+from meshmatch.training.recipes import clouds
 
 UPRIGHT = {
     "table": np.array([[-1, 0, 0], [0, 0, -1], [0, -1, 0]]),
@@ -60,10 +62,6 @@ UPRIGHT = {
     "chair": np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
 }
 """From the axes of each class's first real shape to those of generated ones: y up, z to the front."""
-_POINTS = 2048  # of each training shape
-_COARSE = 64  # voxels along a training shape
-_COMPARED, _CANDIDATES, _OTHERS = 128, 24, 200  # points and shapes, where these are compared to choose templates
-_TEMPLATE_POINTS = 4000
 _PAPER = LatentRefineConfig(steps=200)
 COLUMNS = {
     **{"class": "class", "method": "method", "generated IoU": "generated_iou:.3f"},
@@ -71,97 +69,6 @@ COLUMNS = {
     **{"best numbering": "renumbered_arrived:.1%", "legs": "legs_arrived:.1%", "IoU": "iou:.2f"},
     **{"s a fit": "fit_seconds:.1f"},
 }
-
-
-@dataclass(frozen=True)
-class Learned:
-    """Generated shapes to learn from: points (N, P, 3) with normals and parts, around their centers, of radius 1."""
-
-    points: Float[Floats32, "N P 3"]
-    normals: Float[Floats32, "N P 3"]
-    parts: Int[Ints, "N P"]
-
-
-def learned_shapes(kind: str, count: int, seed: int, kept: Path) -> Learned:
-    """Samples of the first ``count`` generated shapes, drawn once and kept in a file."""
-    if kept.is_file():
-        with np.load(kept) as arrays:
-            if len(arrays["points"]) == count:
-                return Learned(**arrays)
-    points, normals, parts = [], [], []
-    for number in runner.track(range(count), kind):
-        made = furniture(kind, seed, number)
-        mesh = made.mesh(_COARSE)
-        drawn = sample_surface(mesh, _POINTS, np.random.default_rng([seed, number]))
-        points.append(unit_frame(mesh, "sphere", 1.0).apply(drawn.points).astype(np.float32))
-        normals.append(drawn.normals.astype(np.float32))
-        parts.append(made.parts_at(drawn.points))
-    found = Learned(np.stack(points), np.stack(normals), np.stack(parts))
-    np.savez(kept, **vars(found))
-    return found
-
-
-def chosen_templates(shapes: Learned, parts: int, count: int) -> list[int]:
-    """Numbers of the shapes that together lie nearest to all others, the best first; the first one has all parts."""
-    some = shapes.points[:, :_COMPARED].astype(np.float64)
-    trees = [cKDTree(each) for each in some]
-    others = range(min(_OTHERS, len(some)))
-    whole = [k for k, each in enumerate(shapes.parts) if len(np.unique(each)) == parts]
-    pool = np.unique([*whole[:_CANDIDATES], *range(min(_CANDIDATES, len(some)))])
-    apart = np.array([[_apart(some[k], trees[k], some[n], trees[n]) for n in others] for k in pool])
-    chosen: list[int] = []
-    nearest = np.full(len(others), np.inf)
-    for place in range(min(count, len(pool))):
-        cost = np.minimum(apart, nearest).mean(1)
-        if place == 0:
-            cost = np.where(np.isin(pool, whole), cost, np.inf) if whole else cost
-        best = int(cost.argmin())
-        chosen.append(int(pool[best]))
-        nearest = np.minimum(nearest, apart[best])
-    return chosen
-
-
-def _apart(a: Floats, tree_a: cKDTree, b: Floats, tree_b: cKDTree) -> float:
-    return float(tree_b.query(a)[0].mean() + tree_a.query(b)[0].mean())
-
-
-def cloud_template(kind: str, seed: int, number: int) -> Template:
-    """The paper's: a labelled point cloud with 300 nodes whose reach is a fifth of its diameter."""
-    points, _, parts = furniture(kind, seed, number).sample(_TEMPLATE_POINTS, np.random.default_rng([seed, number, 1]))
-    cloud = Shape(points, np.empty((0, 3), np.int64), f"{kind}{number}")
-
-    def made(radius: float) -> Template:
-        nodes = NodeConfig("uniform", 300, radius, 0.03, seed=seed)
-        return make_template(cloud, cloud.name, nodes, labels=parts, label_names=KINDS[kind])
-
-    return made(0.2 * 2 * template_radius(made(0.3)))
-
-
-def mesh_template(kind: str, seed: int, number: int) -> Template:
-    """Ours: a labelled mesh with 320 nodes of reach 0.2 sqrt(area)."""
-    made = furniture(kind, seed, number)
-    mesh = made.surface
-    nodes = NodeConfig("uniform", 320, 0.2, 0.03, seed=seed)
-    return make_template(mesh, f"{kind}{number}", nodes, labels=made.parts_at(mesh.verts), label_names=KINDS[kind])
-
-
-def paper_recipe() -> Recipe:
-    """The paper's network and weights, neighbours by position alone and squared distances; no warm-up."""
-    return paper_clouds().changed(loss=ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4, plain=True), warm_up=1)
-
-
-def learn(folder: Path, template: Template, shapes: Learned, recipe: Recipe) -> TrainedModel:
-    """A model of one template, trained or read; its folder goes on where it was stopped."""
-    radius = np.float32(template_radius(template))
-    none = np.zeros((len(shapes.points), 0, 3), np.float32)
-    samples = ShapeSamples(radius * shapes.points, shapes.normals, none, np.zeros(0, np.int64), "none", "sphere")
-    card = folder / "card.json"
-    if not card.is_file() or as_model(folder).card.steps < recipe.train.steps:
-        facts = CardFacts(folder.name, template.name, data="generated shapes", licence="Apache-2.0")
-        train_model(
-            template, samples, folder, recipe, facts, report=lambda now: runner.tell(f"{folder.name}: {now.words}")
-        )
-    return as_model(folder)
 
 
 def part_overlap(

@@ -9,7 +9,15 @@ pytest.importorskip("skimage", reason="scikit-image is of the extra `bench`")
 
 from meshmatch.experiments import part_transfer
 from meshmatch.experiments.furniture import KINDS, furniture
-from meshmatch.experiments.part_transfer import Learned, chosen_templates, cloud_template, learned_shapes
+from meshmatch.experiments.furniture_models import (
+    Learned,
+    chosen_templates,
+    cloud_template,
+    learn,
+    learned_shapes,
+    mesh_template,
+    paper_recipe,
+)
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.templates.template import template_radius
 from meshmatch.training.recipes import clouds
@@ -47,15 +55,15 @@ def test_the_papers_template_is_a_labelled_cloud() -> None:
     assert template.radius == pytest.approx(0.4 * template_radius(template), rel=0.02)  # a fifth of the diameter
     assert 300 <= template.K < 330
     assert template.dense is template.shape and set(template.labels) == {0, 1, 2}
-    weights = part_transfer.paper_recipe().train.loss
+    weights = paper_recipe().train.loss
     assert (weights.reconstruction, weights.volume, weights.arap, weights.blend) == (1, 1e-4, 1e-3, 1e-4)
 
 
 def test_a_model_gives_labels_to_held_out_shapes(learned: Learned, tmp_path: Path) -> None:
-    template = part_transfer.mesh_template("plane", 0, 0)
+    template = mesh_template("plane", 0, 0)
     recipe = clouds().changed(steps=2, threads=1)
-    model = part_transfer.learn(tmp_path / "ours", template, learned, recipe)
-    assert part_transfer.learn(tmp_path / "ours", template, learned, recipe).card.steps == 2
+    model = learn(tmp_path / "ours", template, learned, recipe)
+    assert learn(tmp_path / "ours", template, learned, recipe).card.steps == 2
     config = FitConfig(refine="none", partial="no", samples=500)
     found = part_transfer.part_overlap([model], "plane", range(4, 5), 0, config)
     assert 0.3 < found["generated_iou"] <= 1 and set(found["parts_iou"]) == set(KINDS["plane"])
