@@ -83,8 +83,12 @@ def trained(
     template: str | None = None,
     landmarks: Path | None = None,
     stiffness: float = 1.0,
+    pointwise: bool = False,
 ) -> tuple[Path, dict[str, Any]]:
-    """Prepare a folder and learn from it as `meshmatch train` does; the model's folder, and how that went."""
+    """Prepare a folder and learn from it as `meshmatch train` does; the model's folder, and how that went.
+
+    ``pointwise``: as 3D-CODED does (a network at every point, no constraints) instead.
+    """
     began = time.monotonic()
     work, name = training.work, folder.name
     tell(f"preparing {name}")
@@ -92,6 +96,10 @@ def trained(
     made = prepare(folder, work / "prepared", chosen)
     prepared = time.monotonic() - began
     plain = small_data() if frame_of(work / "prepared") else clouds()
+    if pointwise:
+        loss = replace(plain.train.loss, volume=0.0, arap=0.0, blend=0.0)
+        network = replace(plain.network, field="pointwise", corrections=0)
+        plain = replace(plain, network=network, train=replace(plain.train, loss=loss))
     asked = {key: getattr(training, key) for key in ("steps", "minutes", "threads", "seed")}
     model = train(
         work / "model",

@@ -34,10 +34,12 @@ from typer import Option
 
 from meshmatch.api.inputs import validated
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.errors import InputError
 from meshmatch.experiments import category, runner
-from meshmatch.experiments.baseline_methods import viscoelastic
+from meshmatch.experiments.baseline_methods import ZoomOut, viscoelastic
 from meshmatch.experiments.category import Maps, Shapes
 from meshmatch.experiments.sets import Pair, load_folder
+from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.maps.footpoints import Surface
@@ -52,7 +54,7 @@ from meshmatch.templates.prepared_folder import medoid
 from meshmatch.templates.template import Template
 
 TRUTH = ".truth.npy"
-WAYS = ("meshmonk", "unregistered", "registered")
+WAYS = ("zoomout", "coded", "meshmonk", "unregistered", "registered")
 _NEAR = 40  # known vertices that say where another one goes
 Truth = Mapping[str, Int[Ints, "V 2"]]
 """For each shape and vertex: the vertex of the original mesh, and the chamber."""
@@ -138,6 +140,25 @@ def meshmonk_places(
     return places
 
 
+def by_zoomout(shapes: Shapes, pairs: Sequence[Pair], kept: Path) -> dict[Pair, VertexMap]:
+    """Maps of pyfmaps' ZoomOut, kept as files; a pair on which the library gives up is the map of everything to vertex 0."""
+    method, fits = ZoomOut(), {}
+    make_folder(kept)
+    maps = {}
+    for a, b in runner.track(pairs, "ZoomOut"):
+        file = kept / f"{a}-{b}.npy"
+        if not file.is_file():
+            fits |= {name: method.fit(shapes[name]) for name in (a, b) if name not in fits}
+            try:
+                index = method.map(shapes[a], fits[a], shapes[b], fits[b]).index
+            except InputError as error:
+                runner.tell(f"{a} to {b}: {error.message}")
+                index = np.zeros(shapes[a].V, np.int64)
+            np.save(file, index)
+        maps[a, b] = VertexMap.between(shapes[a], shapes[b], np.load(file, allow_pickle=False))
+    return maps
+
+
 def by_meshmonk(folder: Path, training: category.Training, nodes: NodeConfig, template: str, shapes: Shapes) -> Maps:
     """Maps through meshmonk's registrations of the template, prepared as for a training."""
     made = prepare(folder, training.work, PrepareConfig(nodes, template=template, align="near"))
@@ -155,6 +176,8 @@ def main(
     ways: Annotated[str, Option(help=f"of {', '.join(WAYS)}")] = ",".join(WAYS),
     unseen: Annotated[int, Option(min=0, help="hearts kept from `registered`")] = 4,
     measure: Annotated[Literal["all", "unseen"], Option(help="which hearts are fitted")] = "all",
+    rival_pairs: Annotated[int | None, Option(min=1, help="pairs of ZoomOut and 3D-CODED, evenly spread")] = None,
+    coded_steps: Annotated[int, Option(min=1, help="of 3D-CODED's search over codes")] = 200,
     stiffness: Annotated[float, Option(min=1e-9, help="as in meshmatch train")] = 0.05,
     picture: Annotated[Path | None, Option(help="draw one heart's chambers on the others")] = None,
     minutes: category.Minutes = 25,
@@ -173,6 +196,7 @@ def main(
     strange = others[len(others) - unseen :]
     measured = {name: shapes[name] for name in (strange if measure == "unseen" else shapes)}
     pairs = category.ordered_pairs(measured)
+    few = runner.spread(pairs, rival_pairs)
     errors = partial(heart_errors, shapes, truth, unseen=strange)
     # walls that touch move together; less than the radius that suits a body
     config = NodeConfig("uniform", nodes, radius, 0.01, seed=seed)
@@ -189,6 +213,20 @@ def main(
                     continue
                 maps = by_meshmonk(folder, here, config, template, measured)
                 rows.append({"method": way, **errors(maps)})
+                continue
+            if way == "zoomout":
+                if find_spec("pyFM") is None:
+                    notes.append("pyfmaps is not installed: the row of ZoomOut is left out")
+                    continue
+                rows.append({"method": "ZoomOut", **errors(by_zoomout(measured, few, here.work))})
+                continue
+            if way == "coded":
+                model, went[way] = category.trained(
+                    folder, here, config, how="near", scale="area", template=template, pointwise=True
+                )
+                latent = LatentRefineConfig(steps=coded_steps, volume=0.0, arap=0.0)
+                search = FitConfig(seed=seed, refine="latent", partial="no", latent=latent)
+                rows += category.compared(model, measured, {"3D-CODED": search}, few, errors)[0]
                 continue
             source = folder
             if way == "registered":

@@ -28,11 +28,12 @@ _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], 
     ".glb": (gltf.read, gltf_out.write),
     ".gltf": (gltf.read, None),
     ".xyz": (plain.read_xyz, plain.write_xyz),
+    ".pcd": (ply.read_pcd, None),
     ".npy": (plain.read_points, plain.write_points),
 }
 _WRITERS = {suffix: write for suffix, (_, write) in _FORMATS.items() if write is not None}
 SUFFIXES = tuple(_FORMATS)
-"""The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf."""
+"""The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf and .pcd."""
 _HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
 
 

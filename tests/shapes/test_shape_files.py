@@ -252,6 +252,47 @@ def test_npy(tmp_path: Path, kind: type, width: int) -> None:
     np.testing.assert_array_equal(shape.verts, points[:, :3])
 
 
+PCD = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z {rgb}\nSIZE 4 4 4 4\nTYPE F F F {kind}\nCOUNT 1 1 1 1\n"
+PCD += "WIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA {how}\n"
+
+
+@pytest.mark.parametrize("how", ["ascii", "binary"])
+@pytest.mark.parametrize("field", ["rgb", "rgba"])
+@pytest.mark.parametrize("kind", ["F", "U", "I"])
+def test_pcd_with_packed_colours(tmp_path: Path, how: str, field: str, kind: str) -> None:
+    verts = np.array([[0, 0, 0.5], [1, 2, 3], [np.nan, np.nan, np.nan]], np.float32)
+    bytes_ = np.array([[255, 128, 0], [1, 2, 3], [0, 0, 255]], np.uint32)
+    packed = bytes_ @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    packed = packed.astype(np.uint32).view({"F": "f4", "U": "u4", "I": "i4"}[kind])
+    head = PCD.format(rgb=field, kind=kind, how=how)
+    if how == "ascii":
+        body = "".join(f"{x} {y} {z} {c!s}\n" for (x, y, z), c in zip(verts.tolist(), packed.tolist(), strict=True)).encode()
+    else:
+        rows = np.empty(3, [("v", "<f4", 3), ("c", packed.dtype)])
+        rows["v"], rows["c"] = verts, packed
+        body = rows.tobytes()
+    shape = load(tmp_path, "a.pcd", head.encode() + body)
+    assert shape.is_cloud and shape.invalid is not None
+    np.testing.assert_array_equal(shape.verts[:2], verts[:2])
+    np.testing.assert_array_equal(shape.invalid, [False, False, True])
+    np.testing.assert_allclose(shape.colors, np.column_stack([bytes_ / 255, np.ones(3)]))
+
+
+def test_pcd_as_pcl_packs_it(tmp_path: Path) -> None:
+    """The number of the format's own description; padding between the fields; no colours at all."""
+    text = PCD.format(rgb="rgb", kind="F", how="ascii").replace("POINTS 3", "POINTS 1")
+    shape = load(tmp_path, "a.pcd", text + "0.93773 0.33763 0 4.2108e+06\n")
+    np.testing.assert_allclose(255 * shape.colors, [[0x80, 0x80, 0xE0, 255]])
+    head = "FIELDS x y z _ rgb\nSIZE 4 4 4 1 4\nTYPE F F F U U\nCOUNT 1 1 1 4 1\nPOINTS 2\nDATA binary\n"
+    rows = np.zeros(2, [("v", "<f4", 3), ("_", "u1", 4), ("c", "<u4")])
+    rows["v"], rows["c"] = [[1, 2, 3], [4, 5, 6]], 0xFF00FF
+    shape = load(tmp_path, "b.pcd", head.encode() + rows.tobytes())
+    np.testing.assert_array_equal(shape.verts, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_allclose(shape.colors, [[1, 0, 1, 1]] * 2)
+    plain = "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nPOINTS 1\nDATA ascii\n1 2 3\n"
+    assert load(tmp_path, "c.pcd", plain).colors is None
+
+
 # --- glTF
 
 
@@ -513,6 +554,10 @@ BINARY = PLY_HEADER.format(format="binary_little_endian").encode() + bytes(60)
         ("a.stl", b"solid x\nfacet normal 0 0 0\nouter loop\n" + b"vertex 0 0 1\n" * 3, "triangles"),
         ("a.stl", b"x".ljust(84, b"\0"), "triangles"),
         ("a.glb", b"glTF" + struct.pack("<III4s", 2, 10**9, 10**9, b"JSON"), "should be"),
+        ("a.pcd", b"FIELDS x y\nSIZE 4 4\nTYPE F F\nPOINTS 1\nDATA ascii\n1 2\n", "no x, y and z"),
+        ("a.pcd", b"FIELDS x\nSIZE 4\nTYPE F\nCOUNT 99999999999\nPOINTS 1\nDATA binary\n1 2\n", "fewer vertex rows"),
+        ("a.pcd", b"FIELDS x\nSIZE 4\nTYPE Q\nPOINTS 1\nDATA binary\n1 2\n", "makes no sense"),
+        ("a.pcd", b"FIELDS x\nDATA binary_compressed\n1 2\n", "plain binary points"),
         ("a.xyz", b"# nothing\n", "no points"),
         ("a.xyz", b"1 2 3\n4 5\n", "point 1 has only 2 of 3"),
     ],

@@ -1,4 +1,4 @@
-"""Stanford PLY, text and binary of either byte order: rows are read all at once where they are equally long."""
+"""Stanford PLY, text and binary of either byte order, and points of PCL's PCD: rows of equal length are read at once."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ _TYPES = {
 }  # fmt: skip
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 _END = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:\r\n|[\r\n]|\Z)")
+_DATA = re.compile(rb"^DATA[ \t]+(ascii|binary)[ \t]*\r?\n", re.MULTILINE)
 _CHANNELS = ("red", "green", "blue", "alpha")
 Columns: TypeAlias = Mapping[str, NDArray[Any]]
 _NONE: Columns = MappingProxyType({})
@@ -72,6 +73,30 @@ def read(path: Path, data: bytes) -> Raw:
     if len(places) < 3:
         raise InputError(f"{name}: the vertices have no x, y and z", NO_MESH)
     return Raw(np.stack(places, axis=1), faces, colors)
+
+
+def read_pcd(path: Path, data: bytes) -> Raw:
+    """Points with the colours that a field rgb or rgba packs into four bytes; not compressed ones."""
+    name, start, colors = path.name, _DATA.search(data), None
+    if not start:
+        raise InputError(f"{name} is not a pcd file of text or plain binary points", "write it uncompressed, or as ply")
+    lines = data[: start.start()].decode("latin-1").splitlines()
+    head = {line.split()[0]: line.split()[1:] for line in lines if line.strip()}
+    try:
+        points = _Element("vertex", int(head["POINTS"][0]))
+        counts = head.get("COUNT", ["1"] * len(head["FIELDS"]))
+        for label, kind, size, count in zip(head["FIELDS"], head["TYPE"], head["SIZE"], counts, strict=True):
+            known = _TYPES[{"F": "float", "I": "int", "U": "uint"}[kind] + str(8 * int(size))]
+            points.properties += [_Property(label, known)] * min(int(count), len(data))
+        table = _Body(name, data, start.end(), None if start[1] == b"ascii" else "<").element(points)
+        verts = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    except (KeyError, ValueError, IndexError) as error:
+        raise damaged(name, "its header makes no sense, or names no x, y and z") from error
+    for p in points.properties:
+        if p.name in ("rgb", "rgba"):  # of a float its bits count, not its value
+            packed = table[p.name].astype(p.kind[0] + "4").view(np.uint32)[:, None]
+            colors = np.insert((packed >> np.array([16, 8, 0], np.uint32) & 255) / 255.0, 3, 1.0, axis=1)
+    return Raw(verts, NO_FACES, colors)
 
 
 def write(
@@ -239,10 +264,8 @@ class _Body:
         for _ in range(element.count):
             for p, where, item in steps:
                 where.append(at)
-                if p.count_kind:
-                    at += self._dtype(p.count_kind).itemsize + self._count(at, p.count_kind) * item
-                else:
-                    at += item
+                kind = p.count_kind
+                at += self._dtype(kind).itemsize + self._count(at, kind) * item if kind else item
             self._check(element, at)
         self.at = at
         out: dict[str, Any] = {}
