@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from meshmatch.errors import InputError
 from meshmatch.experiments import animals, category, hearts, keypoint_parts, segments
 from meshmatch.experiments.category import RIGID, nearest_maps, ordered_pairs
 from meshmatch.experiments.sets import load_folder
@@ -243,14 +244,25 @@ def test_hearts_from_end_to_end(
     monkeypatch.setattr(hearts, "find_spec", lambda name: None)
     drawn = []
     monkeypatch.setattr(category, "render_shapes", lambda panels, path, look: drawn.append(len(panels)))
-    words = ["--data", str(tmp_path), *QUICK, "--work", str(tmp_path / "work")]
+    words = [
+        "--data",
+        str(tmp_path),
+        *QUICK,
+        "--work",
+        str(tmp_path / "work"),
+        "--coded-steps",
+        "2",
+        "--rival-pairs",
+        "2",
+    ]
     assert hearts.main([*words, "--unseen", "1", "--picture", str(tmp_path / "hearts.png")]) == 0
     record, rows = rows_of(capsys.readouterr().out)
     assert record["training"]["registered"]["steps"] == record["training"]["unregistered"]["steps"] == 2
     assert rows[RIGID]["mean_x100"] < 10
     assert rows["unregistered, nodes refined"]["pairs"] == 6
     assert rows["registered, nodes refined"]["unseen_x100"] is None
-    assert "meshmonk" not in rows  # where it is not installed
+    assert "meshmonk" not in rows and "ZoomOut" not in rows  # where they are not installed
+    assert rows["3D-CODED"]["pairs"] == 2
     assert len(record["unseen"]) == 1 and record["template"] not in record["unseen"]
     learned = json.loads((tmp_path / "work" / "registered" / "prepared" / "prepared.json").read_text())
     assert learned["registered"] and len(learned["names"]) == 2
@@ -277,6 +289,30 @@ def test_registrations_of_meshmonk_are_kept(tmp_path: Path, monkeypatch: pytest.
         places = hearts.meshmonk_places(template, shapes, frames, tmp_path / "kept")
         assert np.array_equal(hearts.through(places, shapes)["0", "1"].index, np.arange(162))
     assert asked == [162, 162]
+
+
+def test_maps_of_zoomout_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One pair is mapped to itself, on the other the library gives up."""
+    balls(tmp_path, ".truth.npy")
+    shapes, _ = load_folder(tmp_path, ".truth.npy")
+    asked = []
+
+    class Known:
+        def fit(self, shape):
+            return shape.name
+
+        def map(self, source, first, target, second):
+            asked.append((first, second))
+            if first.startswith("1"):
+                raise InputError("gave up")
+            return VertexMap.between(source, target, np.arange(162))
+
+    monkeypatch.setattr(hearts, "ZoomOut", Known)
+    for _ in range(2):
+        maps = hearts.by_zoomout(shapes, [("0", "1"), ("1", "0")], tmp_path / "kept")
+        assert np.array_equal(maps["0", "1"].index, np.arange(162))
+        assert not maps["1", "0"].index.any()
+    assert len(asked) == 2
 
 
 def test_segments_from_end_to_end(

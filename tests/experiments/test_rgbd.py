@@ -38,7 +38,9 @@ def test_noise_and_steps_of_depth_grow_with_its_square() -> None:
     body = ball(0.3)
     apart = {}
     for distance in (1.5, 3.0):
-        cloud = scan(body, 1, 0, replace(SMALL, distance=distance, width=160, height=120, turn_error=0.0, place_error=0.0))
+        cloud = scan(
+            body, 1, 0, replace(SMALL, distance=distance, width=160, height=120, turn_error=0.0, place_error=0.0)
+        )
         apart[distance] = np.linalg.norm(cloud.shape.verts - cloud.on(body.faces, body.verts), axis=1)
     # half a count of noise and the rounding: sqrt(1/4 + 1/12) counts
     expected = np.sqrt(1 / 4 + 1 / 12) * 2.6**2 / (8 * 580 * 0.075)
@@ -48,7 +50,10 @@ def test_noise_and_steps_of_depth_grow_with_its_square() -> None:
 
 def test_pixels_fly_from_silhouettes_and_strays_belong_to_nothing() -> None:
     body = ball()
-    clean, rough = scan(body, 1, 0, SMALL), scan(body, 1, 0, replace(SMALL, flying=1.0, stray=0.1, missing=0.2, patches=3.0))
+    clean, rough = (
+        scan(body, 1, 0, SMALL),
+        scan(body, 1, 0, replace(SMALL, flying=1.0, stray=0.1, missing=0.2, patches=3.0)),
+    )
     assert (clean.face >= 0).all()
     lost = rough.face < 0
     assert 0.1 < lost.mean() < 0.3

@@ -266,7 +266,9 @@ def test_pcd_with_packed_colours(tmp_path: Path, how: str, field: str, kind: str
     packed = packed.astype(np.uint32).view({"F": "f4", "U": "u4", "I": "i4"}[kind])
     head = PCD.format(rgb=field, kind=kind, how=how)
     if how == "ascii":
-        body = "".join(f"{x} {y} {z} {c!s}\n" for (x, y, z), c in zip(verts.tolist(), packed.tolist(), strict=True)).encode()
+        body = "".join(
+            f"{x} {y} {z} {c!s}\n" for (x, y, z), c in zip(verts.tolist(), packed.tolist(), strict=True)
+        ).encode()
     else:
         rows = np.empty(3, [("v", "<f4", 3), ("c", packed.dtype)])
         rows["v"], rows["c"] = verts, packed
