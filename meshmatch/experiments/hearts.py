@@ -142,7 +142,7 @@ def meshmonk_places(
 
 def by_zoomout(shapes: Shapes, pairs: Sequence[Pair], kept: Path) -> dict[Pair, VertexMap]:
     """Maps of pyfmaps' ZoomOut, kept as files; a pair on which the library gives up is the map of everything to vertex 0."""
-    method, fits = ZoomOut(), {}
+    method, fits = ZoomOut(), dict[str, Any]()
     make_folder(kept)
     maps = {}
     for a, b in runner.track(pairs, "ZoomOut"):
