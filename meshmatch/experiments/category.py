@@ -51,7 +51,8 @@ Work = Annotated[Path | None, Option(help="keep what was prepared and trained he
 @dataclass(frozen=True)
 class Training:
     """How an experiment learns: minutes and steps at most, nodes of the template and their radius (units of sqrt(area)),
-    and the folder in which the prepared shapes and the model are kept."""
+    and the folder in which the prepared shapes and the model are kept. ``pointwise``: as 3D-CODED learns, a network at
+    every point without constraints."""
 
     work: Path
     minutes: float
@@ -60,6 +61,7 @@ class Training:
     seed: int
     nodes: int
     radius: float
+    pointwise: bool = False
 
     def inside(self, name: str) -> Training:
         """The same in a folder of this one's."""
@@ -83,12 +85,8 @@ def trained(
     template: str | None = None,
     landmarks: Path | None = None,
     stiffness: float = 1.0,
-    pointwise: bool = False,
 ) -> tuple[Path, dict[str, Any]]:
-    """Prepare a folder and learn from it as `meshmatch train` does; the model's folder, and how that went.
-
-    ``pointwise``: as 3D-CODED does (a network at every point, no constraints) instead.
-    """
+    """Prepare a folder and learn from it as `meshmatch train` does; the model's folder, and how that went."""
     began = time.monotonic()
     work, name = training.work, folder.name
     tell(f"preparing {name}")
@@ -96,7 +94,7 @@ def trained(
     made = prepare(folder, work / "prepared", chosen)
     prepared = time.monotonic() - began
     plain = small_data() if frame_of(work / "prepared") else clouds()
-    if pointwise:
+    if training.pointwise:
         loss = replace(plain.train.loss, volume=0.0, arap=0.0, blend=0.0)
         network = replace(plain.network, field="pointwise", corrections=0)
         plain = replace(plain, network=network, train=replace(plain.train, loss=loss))

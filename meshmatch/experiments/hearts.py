@@ -13,15 +13,21 @@ the right chamber.
   alone, which is quicker.
 - unregistered: all ten as they are, without correspondence. Trained and measured on the same ten: a registration of a
   collection, not a test of what a model knows of hearts it never saw. It has seen no truth.
-- meshmonk: a baseline (Apache-2.0, pip install meshmonk): its viscoelastic registration of the same template, from the
-  same alignment, with its defaults. Beside them all: rigid alignment and the nearest vertex.
+- collection: the same ten without any training: each is the template once, fitted to the others by node vectors, and
+  maps through all of them are averaged (`experiments.collection`). It has seen no truth.
+- meshmonk (Apache-2.0, pip install meshmonk): its viscoelastic registration of the same template, from the same
+  alignment, with its defaults; zoomout: pyfmaps' ZoomOut (pip install 'meshmatch[bench]'); coded: 3D-CODED, a network at
+  every point that learns the same ten by the Chamfer distance, and a search over its codes. Beside them all: rigid
+  alignment and the nearest vertex.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,6 +44,7 @@ from meshmatch.errors import InputError
 from meshmatch.experiments import category, runner
 from meshmatch.experiments.baseline_methods import ZoomOut, viscoelastic
 from meshmatch.experiments.category import Maps, Shapes
+from meshmatch.experiments.collection import CollectionConfig, collection_maps
 from meshmatch.experiments.sets import Pair, load_folder
 from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig
 from meshmatch.geometry.frames import Frame
@@ -54,7 +61,7 @@ from meshmatch.templates.prepared_folder import medoid
 from meshmatch.templates.template import Template
 
 TRUTH = ".truth.npy"
-WAYS = ("zoomout", "coded", "meshmonk", "unregistered", "registered")
+WAYS = ("zoomout", "coded", "meshmonk", "unregistered", "collection", "registered")
 _NEAR = 40  # known vertices that say where another one goes
 Truth = Mapping[str, Int[Ints, "V 2"]]
 """For each shape and vertex: the vertex of the original mesh, and the chamber."""
@@ -221,12 +228,19 @@ def main(
                 rows.append({"method": "ZoomOut", **errors(by_zoomout(measured, few, here.work))})
                 continue
             if way == "coded":
+                pointwise = replace(here, pointwise=True)
                 model, went[way] = category.trained(
-                    folder, here, config, how="near", scale="area", template=template, pointwise=True
+                    folder, pointwise, config, how="near", scale="area", template=template
                 )
                 latent = LatentRefineConfig(steps=coded_steps, volume=0.0, arap=0.0)
                 search = FitConfig(seed=seed, refine="latent", partial="no", latent=latent)
                 rows += category.compared(model, measured, {"3D-CODED": search}, few, errors)[0]
+                continue
+            if way == "collection":
+                began = time.process_time()
+                maps = collection_maps(measured, template, CollectionConfig(seed=seed), here.work)
+                spent = round((time.process_time() - began) / 60, 2)
+                rows.append({"method": "collection, no training", **errors(maps), "cpu_minutes": spent})
                 continue
             source = folder
             if way == "registered":

@@ -153,9 +153,10 @@ def _view(
     hits = scene.look(x, y, 1.0 / camera.focal)
     hit = hits.face >= 0
     true = np.where(hit, 1.0 / np.where(hit, hits.place[:, 2], 1.0), np.inf)
-    rows = np.flatnonzero(hit & ~_dark(hits.face, x, y, true, body, eye, axes, camera, rng))
+    rays = np.column_stack([x, y, -np.ones(len(x))]) @ axes
+    rows = np.flatnonzero(hit & ~_dark(hits.face, np.column_stack([x, y]), rays, body, camera, rng))
 
-    place = np.column_stack([x[rows], y[rows], -np.ones(len(rows))]) * true[rows, None] @ axes + eye
+    place = rays[rows] * true[rows, None] + eye
     corners = body.verts[body.faces[hits.face[rows]]]
     barycentric = closest_on_triangles(place, corners[:, 0], corners[:, 1], corners[:, 2])
     colors = interpolate(body.colors, body.faces[hits.face[rows]], barycentric)
@@ -166,7 +167,7 @@ def _view(
     colors = np.clip(colors + camera.color_noise * rng.standard_normal(colors.shape), 0.0, 1.0)
     scale = 8 * camera.focal_of_disparity * camera.baseline
     counts = np.rint(scale / behind + camera.noise * rng.standard_normal(len(rows)))
-    points = np.column_stack([x[rows], y[rows], -np.ones(len(rows))]) * (scale / counts)[:, None] @ axes + eye
+    points = rays[rows] * (scale / counts)[:, None] + eye
     turn = Rotation.from_rotvec(np.radians(camera.turn_error) * rng.standard_normal(3)).as_matrix()
     points = (points - eye) @ turn.T + eye + camera.place_error * rng.standard_normal(3)
     return points, colors, np.where(flies, -1, hits.face[rows]), barycentric
@@ -174,26 +175,22 @@ def _view(
 
 def _dark(
     face: Int[Ints, " P"],
-    x: Float[Floats, " P"],
-    y: Float[Floats, " P"],
-    depth: Float[Floats, " P"],
+    pixels: Float[Floats, "P 2"],
+    rays: Float[Floats, "P 3"],
     body: Body,
-    eye: Float[Floats, " 3"],
-    axes: Float[Floats, "3 3"],
     camera: Camera,
     rng: np.random.Generator,
 ) -> Bool[Bools, " P"]:
-    """Pixels that return nothing."""
-    ray = np.column_stack([x, y, -np.ones(len(x))]) @ axes
+    """Pixels that return nothing; ``face`` is what each of them sees, -1 for nothing."""
     a, b, c = (body.verts[body.faces[np.maximum(face, 0)][:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(ray, axis=1)
-    dark = np.abs((normal * ray).sum(1)) < camera.steep * lengths
-    dark |= rng.random(len(x)) < camera.missing
+    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(rays, axis=1)
+    dark = np.abs((normal * rays).sum(1)) < camera.steep * lengths
+    dark |= rng.random(len(rays)) < camera.missing
     inside = np.flatnonzero(face >= 0)
     for _ in range(rng.poisson(camera.patches)):
-        spot = rng.choice(inside)
-        dark |= np.hypot(x - x[spot], y - y[spot]) < rng.uniform(2, 7) / camera.focal
+        radius = rng.uniform(2, 7) / camera.focal
+        dark |= np.linalg.norm(pixels - pixels[rng.choice(inside)], axis=1) < radius
     return dark
 
 

@@ -1,14 +1,15 @@
 """What the benchmarks of categories compute, by hand; hearts and keypoints through their own doors."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from meshmatch.errors import InputError
-from meshmatch.experiments import animals, category, hearts, keypoint_parts, segments
+from meshmatch.errors import InputError, OptionError
+from meshmatch.experiments import animals, category, collection, hearts, keypoint_parts, segments
 from meshmatch.experiments.category import RIGID, nearest_maps, ordered_pairs
 from meshmatch.experiments.sets import load_folder
 from meshmatch.maps.vertex_map import VertexMap
@@ -242,6 +243,8 @@ def test_hearts_from_end_to_end(
 ) -> None:
     balls(tmp_path / "heart", ".truth.npy", 3)
     monkeypatch.setattr(hearts, "find_spec", lambda name: None)
+    small = collection.CollectionConfig(nodes=60, radius=0.35, steps=2, samples=500)
+    monkeypatch.setattr(hearts, "CollectionConfig", lambda seed: small)
     drawn = []
     monkeypatch.setattr(category, "render_shapes", lambda panels, path, look: drawn.append(len(panels)))
     words = [
@@ -262,7 +265,7 @@ def test_hearts_from_end_to_end(
     assert rows["unregistered, nodes refined"]["pairs"] == 6
     assert rows["registered, nodes refined"]["unseen_x100"] is None
     assert "meshmonk" not in rows and "ZoomOut" not in rows  # where they are not installed
-    assert rows["3D-CODED"]["pairs"] == 2
+    assert rows["3D-CODED"]["pairs"] == 2 and rows["collection, no training"]["pairs"] == 6
     assert len(record["unseen"]) == 1 and record["template"] not in record["unseen"]
     learned = json.loads((tmp_path / "work" / "registered" / "prepared" / "prepared.json").read_text())
     assert learned["registered"] and len(learned["names"]) == 2
@@ -313,6 +316,26 @@ def test_maps_of_zoomout_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert np.array_equal(maps["0", "1"].index, np.arange(162))
         assert not maps["1", "0"].index.any()
     assert len(asked) == 2
+
+
+def test_a_collection_is_registered_without_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three bent balls that share their vertices; a second run reads what the first one kept."""
+    ball = icosphere(3)
+    shapes = {}
+    for n in range(3):
+        bent = ball.verts * [1, 1.2 + 0.1 * n, 1.5] + 0.1 * n * ball.verts[:, [1, 2, 0]] ** 2
+        shapes[str(n)] = Shape((10 + n) * bent + n, ball.faces, str(n))
+    config = collection.CollectionConfig(nodes=120, radius=0.3, samples=4000, steps=6)
+    nearest = nearest_maps(shapes, "near", "area", [("0", "2")])["0", "2"]
+    for _ in range(2):
+        maps = collection.collection_maps(shapes, "0", config, tmp_path)
+        apart = shapes["2"].verts[maps["0", "2"].index] - shapes["2"].verts
+        rigid = shapes["2"].verts[nearest.index] - shapes["2"].verts
+        assert np.linalg.norm(apart, axis=1).mean() < 0.85 * np.linalg.norm(rigid, axis=1).mean()
+        assert len(maps) == 6
+        monkeypatch.setattr(collection, "fit", None)  # it is not asked again
+    with pytest.raises(OptionError, match="other choices"):
+        collection.collection_maps(shapes, "0", replace(config, steps=7), tmp_path)
 
 
 def test_segments_from_end_to_end(

@@ -1,0 +1,146 @@
+"""A collection of aligned shapes registered to each other without training: each is the template once.
+
+Node vectors of a template are fitted to every other shape by Gauss-Newton. Its prior differs from that of a fit by a
+trained model, which keeps the template's stretch: here the deformation gradient at every strain point is held near the
+mean of its neighbours' in the step before, so that the stretch may be any, but changes slowly from place to place, and
+what a step has gained is kept (a viscous prior, as in meshmonk's registration of surfaces). Maps of a pair through all
+templates are averaged on the target, where errors along the surface are partly independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.experiments import runner
+from meshmatch.experiments.sets import Pair
+from meshmatch.fields.shape_functions import build_field
+from meshmatch.fitting.fit_config import NodeRefineConfig, geometric_between
+from meshmatch.fitting.nodes import pair_terms
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.triangles import vertex_normals
+from meshmatch.maps.footpoints import Surface
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.outputs import make_folder
+from meshmatch.shapes.normalise import align, sqrt_area_frame
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import NodeConfig, choose_nodes, low_mesh
+
+Shapes = Mapping[str, Shape]
+_ALIGNED_BY = 2400  # samples
+
+
+@dataclass(frozen=True)
+class CollectionConfig:
+    """Nodes of a template, and the schedule of its fits; lengths in units of sqrt(area). Tuned on three of the hearts."""
+
+    nodes: int = 600
+    radius: float = 0.085
+    faces: int = 10_000  # of a template
+    samples: int = 16_000  # of a shape
+    steps: int = 10
+    strain_first: float = 1e-3
+    strain_last: float = 1e-5
+    scale_first: float = 0.1  # of the robust weight
+    scale_last: float = 0.02
+    point_share: float = 0.1
+    back_points: int = 8000
+    near: int = 12  # strain points, itself included, whose gradients are averaged
+    damping: float = 1e-6
+    seed: int = 0
+
+
+def aligned(shapes: Shapes, first: str, seed: int = 0) -> dict[str, Shape]:
+    """All shapes at area 1, turned to one of them as scans of one machine are (`align`: near)."""
+    frames = {name: sqrt_area_frame(shape) for name, shape in shapes.items()}
+    seen = {
+        name: sample_surface(shape, _ALIGNED_BY, np.random.default_rng(seed)).in_frame(frames[name])
+        for name, shape in shapes.items()
+    }
+    found = {}
+    for name, shape in shapes.items():
+        verts = frames[name].apply(shape.verts)
+        if name != first:
+            verts = align(seen[name], seen[first], "near")[0].pose.to_local(verts)
+        found[name] = Shape(verts, shape.faces, name)
+    return found
+
+
+def system_of(shape: Shape, config: CollectionConfig) -> NodeSystem:
+    """A shape as a template: thinned, with nodes anywhere near its surface."""
+    keep, faces = low_mesh(shape, config.faces)
+    thin = Shape(shape.verts[keep], faces, shape.name)
+    nodes = choose_nodes(thin, NodeConfig("uniform", config.nodes, config.radius, 0.01, seed=config.seed))
+    return NodeSystem(thin, build_field(thin.verts, nodes, config.radius, "smooth"))
+
+
+def fit(system: NodeSystem, samples: OrientedPoints, config: CollectionConfig) -> Float[Floats, "V 3"]:
+    """Where the template's vertices lie on the shape of the samples."""
+    places = system.verts[system.strain_points]
+    near = cKDTree(places).query(places, config.near)[1]
+    rows = np.repeat(np.arange(len(places)), config.near)
+    mean = csr_matrix((np.full(near.size, 1 / config.near), (rows, near.reshape(-1))), (len(places),) * 2)
+    vectors = np.zeros((system.K, 3))
+    pairing = NodeRefineConfig(point_share=config.point_share, back_points=config.back_points)
+    for step in range(config.steps):
+        t = step / max(config.steps - 1, 1)
+        strain = geometric_between(config.strain_first, config.strain_last, t)
+        scale = geometric_between(config.scale_first, config.scale_last, t)
+        terms = pair_terms(system, samples, vectors, scale, pairing)
+        wanted = (mean @ system.deformation_gradient(vectors).reshape(-1, 9)).reshape(-1, 3, 3)
+        vectors = system.solve(*terms, strain / len(places), wanted, config.damping / system.K, vectors)
+    return system.moved(vectors)
+
+
+def registered_places(shapes: Shapes, template: str, config: CollectionConfig, kept: Path) -> dict[str, Floats]:
+    """The template's vertices (V, 3) on every shape, kept as one file."""
+    file = kept / f"{template}.npz"
+    asked = {**asdict(config), "shapes": list(shapes)}
+    words = kept / f"{template}.json"
+    if runner.recall(words, asked) is None:
+        runner.tell(f"fitting {template} to all others")
+        system = system_of(shapes[template], config)
+        places = {template: system.verts, "faces": system.faces}
+        for name in (each for each in shapes if each != template):
+            samples = sample_surface(shapes[name], config.samples, np.random.default_rng(config.seed + 1))
+            places[name] = fit(system, samples, config)
+        make_folder(kept)
+        np.savez(file, **places)
+        runner.keep(words, asked, runner.circumstances(1))
+    with np.load(file, allow_pickle=False) as found:
+        return dict(found)
+
+
+def carried(shapes: Shapes, places: Mapping[str, Floats]) -> dict[Pair, Float[Floats, "V_src 3"]]:
+    """Where the vertices of each shape lie on each other one through one template."""
+    faces = places["faces"]
+    foot = {}
+    for name, shape in shapes.items():
+        surface = Surface(places[name], faces, vertex_normals(places[name], faces))
+        foot[name] = surface.query(shape.verts, shape.vertex_normals)
+    return {(a, b): foot[a].values(faces, places[b]) for a, b in permutations(shapes, 2)}
+
+
+def collection_maps(
+    shapes: Shapes, first: str, config: CollectionConfig, kept: Path, templates: Sequence[str] = ()
+) -> dict[Pair, VertexMap]:
+    """Maps of all ordered pairs: the mean over templates (by default all shapes) of where each vertex goes."""
+    there = aligned(shapes, first, config.seed)
+    used = list(templates) or list(shapes)
+    sums = {(a, b): np.zeros((shapes[a].V, 3)) for a, b in permutations(shapes, 2)}
+    for name in runner.track(used, "templates"):
+        for pair, points in carried(there, registered_places(there, name, config, kept)).items():
+            sums[pair] += points / len(used)
+    trees = {name: cKDTree(shape.verts) for name, shape in there.items()}
+    return {
+        (a, b): VertexMap.between(shapes[a], shapes[b], trees[b].query(points)[1]) for (a, b), points in sums.items()
+    }
