@@ -3,8 +3,8 @@
 Node vectors of a template are fitted to every other shape by Gauss-Newton. Its prior differs from that of a fit by a
 trained model, which keeps the template's stretch: here the deformation gradient at every strain point is held near the
 mean of its neighbours' in the step before, so that the stretch may be any, but changes slowly from place to place, and
-what a step has gained is kept (a viscous prior, as in meshmonk's registration of surfaces). Maps of a pair through all
-templates are averaged on the target, where errors along the surface are partly independent.
+what a step has gained is kept (a viscous prior, as in meshmonk's registration of surfaces). Of the maps of a pair through
+all templates the median is taken on the target, where errors along the surface are partly independent; the nearest vertex that faces the same way follows.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit_config import NodeRefineConfig, geometric_between
 from meshmatch.fitting.nodes import pair_terms
 from meshmatch.fitting.system import NodeSystem
-from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.geometry.triangles import vertex_normals
-from meshmatch.maps.footpoints import Surface
+from meshmatch.maps.footpoints import Footpoints, Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.normalise import align, sqrt_area_frame
@@ -37,6 +37,8 @@ from meshmatch.templates.make import NodeConfig, choose_nodes, low_mesh
 
 Shapes = Mapping[str, Shape]
 _ALIGNED_BY = 2400  # samples
+_NORMAL_WEIGHT = 0.0075  # of normals where the nearest vertex is looked for, units of sqrt(area)
+_FOOT_NORMALS = 0.5  # how much normals count where footpoints are, beside a map of bodies
 
 
 @dataclass(frozen=True)
@@ -120,27 +122,40 @@ def registered_places(shapes: Shapes, template: str, config: CollectionConfig, k
         return dict(found)
 
 
-def carried(shapes: Shapes, places: Mapping[str, Floats]) -> dict[Pair, Float[Floats, "V_src 3"]]:
-    """Where the vertices of each shape lie on each other one through one template."""
-    faces = places["faces"]
-    foot = {}
-    for name, shape in shapes.items():
-        surface = Surface(places[name], faces, vertex_normals(places[name], faces))
-        foot[name] = surface.query(shape.verts, shape.vertex_normals)
-    return {(a, b): foot[a].values(faces, places[b]) for a, b in permutations(shapes, 2)}
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """One template on all shapes, and where their vertices lie on it."""
+
+    places: Mapping[str, Floats]
+    feet: Mapping[str, Footpoints]
+
+    @classmethod
+    def of(cls, shapes: Shapes, places: Mapping[str, Floats]) -> Registered:
+        """``places`` are those of `registered_places`."""
+        feet, faces = {}, places["faces"]
+        for name, shape in shapes.items():
+            normals = _FOOT_NORMALS * vertex_normals(places[name], faces)
+            feet[name] = Surface(places[name], faces, normals).query(shape.verts, _FOOT_NORMALS * shape.vertex_normals)
+        return cls(places, feet)
+
+    def carried(self, source: str, target: str) -> Float[Floats, "V_src 3"]:
+        """Where the vertices of one shape lie on another one."""
+        return self.feet[source].values(self.places["faces"], self.places[target])
 
 
 def collection_maps(
     shapes: Shapes, first: str, config: CollectionConfig, kept: Path, templates: Sequence[str] = ()
 ) -> dict[Pair, VertexMap]:
-    """Maps of all ordered pairs: the mean over templates (by default all shapes) of where each vertex goes."""
+    """Maps of all ordered pairs: the median over templates (by default all shapes) of where each vertex goes."""
     there = aligned(shapes, first, config.seed)
     used = list(templates) or list(shapes)
-    sums = {(a, b): np.zeros((shapes[a].V, 3)) for a, b in permutations(shapes, 2)}
-    for name in runner.track(used, "templates"):
-        for pair, points in carried(there, registered_places(there, name, config, kept)).items():
-            sums[pair] += points / len(used)
-    trees = {name: cKDTree(shape.verts) for name, shape in there.items()}
-    return {
-        (a, b): VertexMap.between(shapes[a], shapes[b], trees[b].query(points)[1]) for (a, b), points in sums.items()
-    }
+    known = [Registered.of(there, registered_places(there, name, config, kept)) for name in used]
+    # the shapes stand alike, so their normals may be compared: a sheet of a wall is not the other one
+    normals = {name: shape.vertex_normals for name, shape in there.items()}
+    trees = {name: cKDTree(with_normals(shape.verts, normals[name], _NORMAL_WEIGHT)) for name, shape in there.items()}
+    maps = {}
+    for a, b in permutations(shapes, 2):
+        points = np.median([each.carried(a, b) for each in known], axis=0)
+        index = trees[b].query(with_normals(points, normals[a], _NORMAL_WEIGHT))[1]
+        maps[a, b] = VertexMap.between(shapes[a], shapes[b], index)
+    return maps

@@ -14,7 +14,7 @@ the right chamber.
 - unregistered: all ten as they are, without correspondence. Trained and measured on the same ten: a registration of a
   collection, not a test of what a model knows of hearts it never saw. It has seen no truth.
 - collection: the same ten without any training: each is the template once, fitted to the others by node vectors, and
-  maps through all of them are averaged (`experiments.collection`). It has seen no truth.
+  of the maps through all of them the median counts (`experiments.collection`). It has seen no truth.
 - meshmonk (Apache-2.0, pip install meshmonk): its viscoelastic registration of the same template, from the same
   alignment, with its defaults; zoomout: pyfmaps' ZoomOut (pip install 'meshmatch[bench]'); coded: 3D-CODED, a network at
   every point that learns the same ten by the Chamfer distance, and a search over its codes. Beside them all: rigid
