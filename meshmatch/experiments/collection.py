@@ -3,8 +3,9 @@
 Node vectors of a template are fitted to every other shape by Gauss-Newton. Its prior differs from that of a fit by a
 trained model, which keeps the template's stretch: here the deformation gradient at every strain point is held near the
 mean of its neighbours' in the step before, so that the stretch may be any, but changes slowly from place to place, and
-what a step has gained is kept (a viscous prior, as in meshmonk's registration of surfaces). Of the maps of a pair through
-all templates the median is taken on the target, where errors along the surface are partly independent; the nearest vertex that faces the same way follows.
+what a step has gained is kept (a viscous prior, as in meshmonk's registration of surfaces). Of the maps of a pair
+through all templates the median is taken on the target, where errors along the surface are partly independent, and then
+the nearest vertex that faces the same way.
 """
 
 from __future__ import annotations
