@@ -19,7 +19,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.sets import Pair
 from meshmatch.fields.shape_functions import build_field
@@ -30,7 +30,6 @@ from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.maps.footpoints import Footpoints, Surface
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.outputs import make_folder
 from meshmatch.shapes.normalise import align, sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -50,7 +49,7 @@ class CollectionConfig:
     radius: float = 0.085
     faces: int = 10_000  # of a template
     samples: int = 16_000  # of a shape
-    steps: int = 10
+    steps: int = 12
     strain_first: float = 1e-3
     strain_last: float = 1e-5
     scale_first: float = 0.1  # of the robust weight
@@ -78,10 +77,14 @@ def aligned(shapes: Shapes, first: str, seed: int = 0) -> dict[str, Shape]:
     return found
 
 
-def system_of(shape: Shape, config: CollectionConfig) -> NodeSystem:
-    """A shape as a template: thinned, with nodes anywhere near its surface."""
-    keep, faces = low_mesh(shape, config.faces)
-    thin = Shape(shape.verts[keep], faces, shape.name)
+def thinned(shape: Shape, faces: int) -> Shape:
+    """A shape as a template, with about so many triangles."""
+    keep, corners = low_mesh(shape, faces)
+    return Shape(shape.verts[keep], corners, shape.name)
+
+
+def system_of(thin: Shape, config: CollectionConfig) -> NodeSystem:
+    """A template with nodes anywhere near its surface."""
     nodes = choose_nodes(thin, NodeConfig("uniform", config.nodes, config.radius, 0.01, seed=config.seed))
     return NodeSystem(thin, build_field(thin.verts, nodes, config.radius, "smooth"))
 
@@ -104,44 +107,42 @@ def fit(system: NodeSystem, samples: OrientedPoints, config: CollectionConfig) -
     return system.moved(vectors)
 
 
-def registered_places(shapes: Shapes, template: str, config: CollectionConfig, kept: Path) -> dict[str, Floats]:
-    """The template's vertices (V, 3) on every shape, kept as one file."""
-    file = kept / f"{template}.npz"
-    asked = {**asdict(config), "shapes": list(shapes)}
-    words = kept / f"{template}.json"
-    if runner.recall(words, asked) is None:
-        runner.tell(f"fitting {template} to all others")
-        system = system_of(shapes[template], config)
-        places = {template: system.verts, "faces": system.faces}
-        for name in (each for each in shapes if each != template):
-            samples = sample_surface(shapes[name], config.samples, np.random.default_rng(config.seed + 1))
-            places[name] = fit(system, samples, config)
-        make_folder(kept)
-        np.savez(file, **places)
-        runner.keep(words, asked, runner.circumstances(1))
-    with np.load(file, allow_pickle=False) as found:
-        return dict(found)
-
-
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """One template on all shapes, and where their vertices lie on it."""
+    """One template on all shapes: its vertices (V, 3) on each, and where the vertices of each lie on it."""
 
+    faces: Int[Ints, "F 3"]
     places: Mapping[str, Floats]
     feet: Mapping[str, Footpoints]
 
     @classmethod
-    def of(cls, shapes: Shapes, places: Mapping[str, Floats]) -> Registered:
-        """``places`` are those of `registered_places`."""
-        feet, faces = {}, places["faces"]
+    def of(cls, shapes: Shapes, places: Mapping[str, Floats], faces: Int[Ints, "F 3"]) -> Registered:
+        """Find the feet."""
+        feet = {}
         for name, shape in shapes.items():
             normals = _FOOT_NORMALS * vertex_normals(places[name], faces)
             feet[name] = Surface(places[name], faces, normals).query(shape.verts, _FOOT_NORMALS * shape.vertex_normals)
-        return cls(places, feet)
+        return cls(faces, places, feet)
 
     def carried(self, source: str, target: str) -> Float[Floats, "V_src 3"]:
         """Where the vertices of one shape lie on another one."""
-        return self.feet[source].values(self.places["faces"], self.places[target])
+        return self.feet[source].values(self.faces, self.places[target])
+
+
+def registered(shapes: Shapes, template: str, config: CollectionConfig, kept: Path) -> Registered:
+    """One shape as the template of all, each fit kept as a file."""
+    runner.once(kept / f"{template}.json", asdict(config), lambda: runner.circumstances(1))
+    thin = thinned(shapes[template], config.faces)
+    system, places = None, {template: np.asarray(thin.verts)}
+    for name in (each for each in shapes if each != template):
+        file = kept / f"{template}-{name}.npy"
+        if not file.is_file():
+            runner.tell(f"fitting {template} to {name}")
+            system = system or system_of(thin, config)
+            samples = sample_surface(shapes[name], config.samples, np.random.default_rng(config.seed + 1))
+            np.save(file, fit(system, samples, config))
+        places[name] = np.load(file, allow_pickle=False)
+    return Registered.of(shapes, places, np.asarray(thin.faces))
 
 
 def collection_maps(
@@ -150,7 +151,7 @@ def collection_maps(
     """Maps of all ordered pairs: the median over templates (by default all shapes) of where each vertex goes."""
     there = aligned(shapes, first, config.seed)
     used = list(templates) or list(shapes)
-    known = [Registered.of(there, registered_places(there, name, config, kept)) for name in used]
+    known = [registered(there, name, config, kept) for name in used]
     # the shapes stand alike, so their normals may be compared: a sheet of a wall is not the other one
     normals = {name: shape.vertex_normals for name, shape in there.items()}
     trees = {name: cKDTree(with_normals(shape.verts, normals[name], _NORMAL_WEIGHT)) for name, shape in there.items()}

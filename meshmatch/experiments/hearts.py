@@ -185,6 +185,7 @@ def main(
     measure: Annotated[Literal["all", "unseen"], Option(help="which hearts are fitted")] = "all",
     rival_pairs: Annotated[int | None, Option(min=1, help="pairs of ZoomOut and 3D-CODED, evenly spread")] = None,
     coded_steps: Annotated[int, Option(min=1, help="of 3D-CODED's search over codes")] = 200,
+    templates: Annotated[int | None, Option(min=1, help="of `collection`, evenly spread; by default all")] = None,
     stiffness: Annotated[float, Option(min=1e-9, help="as in meshmatch train")] = 0.05,
     picture: Annotated[Path | None, Option(help="draw one heart's chambers on the others")] = None,
     minutes: category.Minutes = 25,
@@ -238,7 +239,8 @@ def main(
                 continue
             if way == "collection":
                 began = time.process_time()
-                maps = collection_maps(measured, template, CollectionConfig(seed=seed), here.work)
+                used = runner.spread(list(measured), templates)
+                maps = collection_maps(measured, template, CollectionConfig(seed=seed), here.work, used)
                 spent = round((time.process_time() - began) / 60, 2)
                 rows.append({"method": "collection, no training", **errors(maps), "cpu_minutes": spent})
                 continue
