@@ -45,7 +45,7 @@ class Direct:
     width : of a pointwise network
     """
 
-    supervised: int = 100
+    supervised: int = 300
     noise: float = 0.007
     strained: int = 400
     steps: int = 400
@@ -113,12 +113,13 @@ def direct_fits(
     """A body and its fits, by cases of field, constraint and label. The change is beside the body's own triangles."""
     faces = template.shape.faces
     target = in_template_frame(template, body)
-    panels, rows = [Panel(Shape(target, faces, "body"), None, "the body")], []
+    panels, rows = [Panel(Shape(target, faces, "body"), None, "the body", rotation=np.eye(3))], []
     for field, constraint, label in cases:
         verts = fitted(field, constraint, template, target, how)
         found, numbers = change(verts, target, faces)
         row: dict[str, Any] = {"what": label, **numbers, "volume": volume(verts, faces) / volume(target, faces) - 1}
         off = np.linalg.norm(verts - target, axis=1).mean()
         rows.append(row | {"error_cm": float(off * CM_PER_UNIT)})
-        panels.append(Panel(Shape(verts, faces, label), label=label, face_colors=SCALE.colors(found)))
+        colors = SCALE.colors(found)
+        panels.append(Panel(Shape(verts, faces, label), label=label, face_colors=colors, rotation=np.eye(3)))
     return Drawn(panels, rows)

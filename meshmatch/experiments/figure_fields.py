@@ -127,7 +127,7 @@ def pull(template: Template, kernel: Kernel, seed: int) -> Drawn:
     side = [k for k, name in enumerate(template.label_names) if name in (*PULLED, "left upper arm", "chest", "neck")]
     elsewhere = ~np.isin(template.labels, side)
     colors = np.where(arm[:, None], (0.86, 0.30, 0.12), (0.45, 0.47, 0.50))
-    panels = [Panel(shape, None, "handles", points=template.nodes, point_colors=colors, point_radius=0.012)]
+    panels = [Panel(shape, None, "handles", points=template.nodes, point_colors=colors, point_radius=0.012, glass=True)]
     rows = []
     for field in FIELDS:
         verts, nodes = pulled_by(field, template, kernel, seed)

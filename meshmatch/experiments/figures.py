@@ -121,11 +121,11 @@ def main(
     minutes: Annotated[float, Option(min=0.01, help="of training a run")] = 1.0,
     method: Annotated[str, Option(help=f"refinement of a run's fits, of {', '.join(METHODS)}")] = "code",
     code_steps: Annotated[int, Option(min=1, help="of the search over codes")] = 60,
-    supervised: Annotated[int, Option(min=4, help="template points with a known place, without a network")] = 100,
+    supervised: Annotated[int, Option(min=4, help="template points with a known place, without a network")] = 300,
     steps: Annotated[int, Option(min=1, help="of Adam, without a network")] = 400,
     nodes: Annotated[int, Option(min=4, help="of figure 7")] = 300,
     radius: Annotated[float | None, Option(help="of figure 7's nodes, sqrt(area); by default the template's")] = None,
-    seed: runner.Seed = 5,
+    seed: runner.Seed = 4,
     threads: runner.Threads = 1,
 ) -> runner.Report:
     wanted = runner.names_of(figures, FIGURES, "figure")

@@ -61,8 +61,10 @@ def test_a_pull_by_every_field(template: Template, monkeypatch: pytest.MonkeyPat
     drawn = pull(template, "smooth", 0)
     mls, rbf, pointwise = drawn.rows
     assert [mls["what"], rbf["what"], pointwise["what"]] == ["mls", "rbf", "pointwise"]
-    assert mls["elsewhere_cm"] == pytest.approx(0, abs=1e-4) < rbf["elsewhere_cm"]  # compact support
-    assert rbf["missed_cm"] == pytest.approx(0, abs=0.01) < pointwise["missed_cm"]
+    assert mls["elsewhere_cm"] == pytest.approx(0, abs=1e-4)  # compact support
+    assert rbf["elsewhere_cm"] > 1e-3
+    assert rbf["missed_cm"] == pytest.approx(0, abs=0.01)
+    assert pointwise["missed_cm"] > 1
     assert [panel.label for panel in drawn.panels] == ["handles", "mls", "rbf", "pointwise"]
 
 
