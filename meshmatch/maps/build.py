@@ -75,6 +75,7 @@ def build_map(
     normals = vertex_normals(target_fit.points, target_fit.faces)
     facing = unit(on_source.values(source_fit.faces, normals))
     found = _points_of_target(target.shape, target_fit, moved, facing, resting, workers)
+    del moved, facing, resting  # of a million vertices 25 MB each
 
     confidence = np.exp(-np.square(distance / _DISTANCE_SCALE) - np.square(found.distance / _DISTANCE_SCALE))
     if before_agreement is not None:
@@ -113,8 +114,9 @@ def _points_of_target(
     if is_noisy(target):
         noise = noise_level(closest_footpoints(target, fit, workers).distance)
         return most_likely_points(target, fit, noise, moved, resting, workers)
+    places = template_footpoints(target, fit, workers)[1]
     points, normals = in_core_frame(target, fit)
-    surface = Surface(points, target.faces, normals, template_footpoints(target, fit, workers)[1])
+    surface = Surface(points, target.faces, normals, places)
     if target.is_cloud:
         facing = np.zeros_like(facing)
     return surface.query(moved, facing, workers, resting)

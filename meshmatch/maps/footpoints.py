@@ -72,7 +72,12 @@ class Footpoints:
 
     def values(self, faces: Int[Ints, "F 3"], values: Float[Floats, "V D"]) -> Float[Floats, "N D"]:
         """Values of the surface's vertices, interpolated at the points."""
-        return interpolate(values, corners_of(faces, self.face, self.vertex), self.barycentric)
+        found = np.empty((len(self.vertex), values.shape[1]))
+        for low in range(0, len(found), _CHUNK):
+            part = slice(low, low + _CHUNK)
+            corners = corners_of(faces, self.face[part], self.vertex[part])
+            found[part] = interpolate(values, corners, self.barycentric[part])
+        return found
 
     def updated(self, rows: Int[Ints, " M"], other: Self) -> Self:
         """These points with M rows taken from `other`."""
@@ -98,10 +103,12 @@ class Surface:
     ) -> None:
         self.verts, self.faces = verts, faces
         # the faces at every vertex, one vertex after the other
-        self._around = np.argsort(faces.reshape(-1), kind="stable") // 3
+        self._around = np.argsort(faces.reshape(-1), kind="stable")
+        self._around //= 3
         self._start = np.concatenate([[0], np.cumsum(np.bincount(faces.reshape(-1), minlength=len(verts)))])
         self._used = np.flatnonzero(np.diff(self._start)) if len(faces) else np.arange(len(verts))
-        self._tree = cKDTree(_features(verts, normals, resting)[self._used])
+        features = _features(verts, normals, resting)
+        self._tree = cKDTree(features if len(self._used) == len(verts) else features[self._used])
 
     def query(
         self,
