@@ -101,10 +101,11 @@ def closest_on_triangles(
     ab, ac, ap = b - a, c - a, points - a
     d00, d01, d11 = dot(ab, ab), dot(ab, ac), dot(ac, ac)
     d20, d21 = dot(ap, ab), dot(ap, ac)
-    scale = np.maximum(d00 * d11 - d01 * d01, 1e-300)
+    area = d00 * d11 - d01 * d01
+    scale = np.maximum(area, 1e-300)
     v = (d11 * d20 - d01 * d21) / scale
     w = (d00 * d21 - d01 * d20) / scale
-    inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (d00 * d11 - d01 * d01 > 1e-14 * d00 * d11)
+    inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (area > 1e-14 * d00 * d11)
     result = np.stack([1 - v - w, v, w], 1)
     out = np.flatnonzero(~inside)
     if len(out):

@@ -276,10 +276,10 @@ def surrounding_values(
     filled = np.where(unknown[near, None], 0.0, values[near])
     known = (~unknown[near]).astype(float)
     for _ in range(_STEPS):
-        weight = part @ known
-        total = part @ (known[:, None] * filled)
-        filled[rows] = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], filled[rows])
-        known[rows] = weight > 0
+        total = part @ (known[:, None] * np.column_stack([filled, known]))
+        weight = total[:, -1:]
+        filled[rows] = np.where(weight > 0, total[:, :-1] / np.maximum(weight, 1e-12), filled[rows])
+        known[rows] = weight[:, 0] > 0
     filled[rows[known[rows] == 0]] = np.nan
     every = values.copy()
     every[near[rows]] = filled[rows]
