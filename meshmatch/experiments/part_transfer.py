@@ -63,6 +63,8 @@ UPRIGHT = {
 }
 """From the axes of each class's first real shape to those of generated ones: y up, z to the front."""
 _PAPER = LatentRefineConfig(steps=200)
+_UPRIGHT_ONCE: dict[str, Any] = {"partial": "no", "variants": 0, "finalists": 1, "samples": 4000}
+"""Shapes are whole and stand upright: no other interpretation is tried."""
 COLUMNS = {
     **{"class": "class", "method": "method", "generated IoU": "generated_iou:.3f"},
     **{"real: mean": "mean:.3f", "median": "median:.3f", f"within {RIGHT:g}": "arrived:.1%"},
@@ -172,15 +174,15 @@ def measure(kind: str, plan: Plan, methods: Sequence[str], pictures: Path | None
             template = cloud_template(kind, plan.seed, chosen[0])
             models = [learn(folder / "paper", template, shapes, paper_recipe().changed(bf16=True, **size))]
             fits = {
-                "paper, network alone": FitConfig(seed=plan.seed, refine="none", partial="no"),
-                "paper, 200 steps": FitConfig(seed=plan.seed, refine="latent", latent=_PAPER, partial="no"),
+                "paper, network alone": FitConfig(seed=plan.seed, refine="none", **_UPRIGHT_ONCE),
+                "paper, 200 steps": FitConfig(seed=plan.seed, refine="latent", latent=_PAPER, **_UPRIGHT_ONCE),
             }
         else:
             models = [
                 learn(folder / f"ours{k}", mesh_template(kind, plan.seed, k), shapes, clouds().changed(**size))
                 for k in chosen
             ]
-            fits = {"ours, nodes refined": FitConfig(seed=plan.seed, partial="no")}
+            fits = {"ours, nodes refined": FitConfig(seed=plan.seed, **_UPRIGHT_ONCE)}
         for name, config in fits.items():
             asked = {"count": plan.count, "test": plan.test, "templates": chosen, "steps": plan.steps[method]}
             asked["seed"] = plan.seed
@@ -209,8 +211,8 @@ def main(
     count: Annotated[int, Option(min=2, help="generated shapes to learn from")] = 500,
     test: Annotated[int, Option(min=1, help="held-out generated shapes")] = 25,
     paper_steps: Annotated[int, Option(min=1, help="of the paper's training")] = 200,
-    steps: Annotated[int, Option(min=1, help="of ours")] = 300,
-    templates: Annotated[int, Option(min=1, help="of ours; each has a model")] = 4,
+    steps: Annotated[int, Option(min=1, help="of ours")] = 600,
+    templates: Annotated[int, Option(min=1, help="of ours; each has a model")] = 3,
     pictures: Annotated[Path | None, Option(help="draw labels as they are carried into this folder")] = None,
     work: category.Work = None,
     threads: runner.Threads = 1,
