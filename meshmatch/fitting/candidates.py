@@ -43,7 +43,6 @@ _NEIGHBOURS = 8
 _SETTLED = 0.005  # a relative change of the scale that ends the search
 _BEHIND = 1.1  # times the best residual: candidates further behind say nothing about a cloud's scale
 
-FitAgain = Callable[[OrientedPoints, RigidPose], Candidate]
 STAGE = "fitting as a part"
 # Shares of the surface that a part may show, and all that follows, were set by hand.
 SHARES = (1.0, 0.8, 0.62, 0.48, 0.36)
@@ -200,12 +199,10 @@ def _careful(task: FitTask, wide: bool, progress: Progress) -> list[Candidate]:
 def _fitted_again(task: FitTask, candidates: Sequence[Candidate]) -> list[Candidate]:
     """New fits of the samples, completed by the last fits; how much of these was visible is the new share."""
     system, starts, shares = task.system, [], []
-
-    def shown(candidate: Candidate) -> Bools:
-        return visible_vertices(system, candidate.local(task.samples).first(_COARSE), candidate.vectors)
-
-    for candidate, visible in zip(candidates, beside(shown, candidates), strict=True):
-        local, vectors = candidate.local(task.samples), candidate.vectors
+    placed = [candidate.local(task.samples) for candidate in candidates]
+    shown = beside(lambda local, each: visible_vertices(system, local.first(_COARSE), each.vectors), placed, candidates)
+    for candidate, local, visible in zip(candidates, placed, shown, strict=True):
+        vectors = candidate.vectors
         shares.append(float(np.clip(area_share(system, visible), _MIN_SHARE, 1.0)))
         whole = completed(system, local, vectors, candidate.share, task.predictor.rng, visible)
         growth = np.sqrt(shares[-1] / candidate.share)
@@ -216,8 +213,8 @@ def _fitted_again(task: FitTask, candidates: Sequence[Candidate]) -> list[Candid
     def measured(candidate: Candidate, fit: Candidate, share: float) -> Candidate:
         last = candidate.pose
         pose = RigidPose(last.rotation, np.sqrt(share / candidate.share) * last.center) @ fit.pose
-        placed = replace(fit, pose=pose, share=share)
-        return replace(placed, residual=one_way_residual(system, placed.local(task.samples), fit.vectors))
+        moved = replace(fit, pose=pose, share=share)
+        return replace(moved, residual=one_way_residual(system, moved.local(task.samples), fit.vectors))
 
     return beside(measured, candidates, again, shares)
 

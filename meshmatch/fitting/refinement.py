@@ -124,12 +124,8 @@ def choose(candidates: Sequence[Candidate], count: int, comparison: Comparison, 
             known.append(verts)
     if len(finalists) > 1:
         finalists = _screened(finalists, comparison, progress)
-
-    def finished(number: int, candidate: Candidate) -> Candidate:
-        progress(0.6 + 0.4 * number / len(finalists))
-        return comparison.refined(candidate, in_full=True)
-
-    refined = beside(finished, range(len(finalists)), finalists)
+    progress(0.6)
+    refined = beside(lambda candidate: comparison.refined(candidate, in_full=True), finalists)
     progress(1.0)
     return min(refined, key=lambda each: comparison.score(each, True)) if len(refined) > 1 else refined[0]
 
@@ -137,13 +133,12 @@ def choose(candidates: Sequence[Candidate], count: int, comparison: Comparison, 
 def _screened(candidates: list[Candidate], comparison: Comparison, progress: Progress) -> list[Candidate]:
     """Those of several interpretations that a few steps neither bring together nor leave far behind, best first."""
 
-    def tried(number: int, candidate: Candidate) -> tuple[float, Candidate, Floats]:
-        progress(0.6 * number / len(candidates))
+    def tried(candidate: Candidate) -> tuple[float, Candidate, Floats]:
         found = comparison.refined(candidate, in_full=False)
         return comparison.score(found, False), candidate, comparison.vertices(found)
 
-    rough = beside(tried, range(len(candidates)), candidates)
-    rough.sort(key=lambda entry: entry[0])
+    progress(0.0)
+    rough = sorted(beside(tried, candidates), key=lambda entry: entry[0])
     kept: list[tuple[Candidate, Floats]] = []
     for score, candidate, verts in rough:
         if score <= _BEHIND * rough[0][0] and all(differ(verts, other) for _, other in kept):

@@ -14,15 +14,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self, TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Ints32
 from meshmatch.fitting.fit import Fit
 from meshmatch.geometry.triangles import (
     blend,
@@ -213,7 +212,7 @@ def in_core_frame(shape: Shape, fit: Fit) -> tuple[Float[Floats, "V 3"], Float[F
 
 def reassign_islands(
     verts: Float[Floats, "V 3"],
-    edges: Int[NDArray[Any], "E 2"],
+    edges: Int[Ints32, "E 2"],
     areas: Float[Floats, " V"],
     found: Found,
     images: Callable[[Found], Float[Floats, "N 3"]],
@@ -242,10 +241,7 @@ def reassign_islands(
 
 
 def small_islands(
-    edges: Int[NDArray[Any], "E 2"],
-    length: Float[Floats, " E"],
-    image: Float[Floats, "V 3"],
-    areas: Float[Floats, " V"],
+    edges: Int[Ints32, "E 2"], length: Float[Floats, " E"], image: Float[Floats, "V 3"], areas: Float[Floats, " V"]
 ) -> Bool[Bools, " V"]:
     """True on small pieces between discontinuities: edges whose ends have images much further apart than they are.
 
@@ -263,7 +259,7 @@ def small_islands(
 
 
 def surrounding_values(
-    edges: Int[NDArray[Any], "E 2"], values: Float[Floats, "V D"], unknown: Bool[Bools, " V"]
+    edges: Int[Ints32, "E 2"], values: Float[Floats, "V D"], unknown: Bool[Bools, " V"]
 ) -> Float[Floats, "V D"]:
     """Values with the unknown rows replaced by the average of their surroundings; NaN out of reach."""
     edges = edges[unknown[edges[:, 0]] | unknown[edges[:, 1]]]

@@ -21,6 +21,7 @@ from meshmatch.fields.shape_functions import has_nodes
 from meshmatch.geometry.oriented import quick_tree
 from meshmatch.models.checkpoint import load_weights
 from meshmatch.models.network import POINT_SIZES, Network, NetworkConfig, weight_shapes
+from meshmatch.threads import beside
 
 if TYPE_CHECKING:
     from meshmatch.models.deformer import Deformer
@@ -72,7 +73,7 @@ class NodeNetwork:
 
     def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B K 3"]:
         points = [np.asarray(cloud, np.float32) for cloud in clouds]
-        trees = [quick_tree(cloud) for cloud in points]
+        trees = beside(quick_tree, points)
         vectors = self._decode(self._encode(points, trees))
         for _ in range(self.config.corrections):
             vectors = self._correct(vectors, points, trees)
@@ -98,7 +99,7 @@ class NodeNetwork:
         if self.config.encoder == "point":
             return np.stack([self._encode_points(cloud) for cloud in clouds])
         basis = self.weights["encoder.basis"]
-        seen = [5 * _offsets(basis, cloud, tree) for cloud, tree in zip(clouds, trees, strict=True)]
+        seen = beside(lambda cloud, tree: 5 * _offsets(basis, cloud, tree), clouds, trees)
         return self._residual_mlp("encoder.network", np.stack(seen).reshape(len(clouds), -1))
 
     def _encode_points(self, cloud: Float[Floats32, "P 3"]) -> Float[Floats32, " D"]:
@@ -129,8 +130,7 @@ class NodeNetwork:
         anchors, phi = self.weights["anchors"], self.weights["anchor_phi"]
         B, K, _ = vectors.shape
         moved = (phi @ vectors.transpose(1, 0, 2).reshape(K, -1)).reshape(len(phi), B, 3).transpose(1, 0, 2)
-        triples = zip(anchors + moved, clouds, trees, strict=True)
-        seen = np.stack([_two_way_offsets(placed, cloud, tree) for placed, cloud, tree in triples])
+        seen = np.stack(beside(_two_way_offsets, anchors + moved, clouds, trees))
         features = np.concatenate([10 * seen[..., :6], seen[..., 6:], 3 * moved], -1)
         change = self._residual_mlp("corrector", features.reshape(B, -1))
         return vectors + np.float32(0.1) * change.reshape(B, -1, 3)
