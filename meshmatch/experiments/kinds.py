@@ -49,6 +49,7 @@ def species(name: str) -> str:
 
 def maps_of(matcher: Matcher, fits: Mapping[str, Fit], pairs: Sequence[Pair], agree: Agree) -> dict[Pair, VertexMap]:
     """Maps of pairs through their fits, which agree first: those of each pair, or all of them at once."""
+    threads = matcher.threads
     clean = {name: validated(fit.repaired.original) for name, fit in fits.items() if fit.repaired is not None}
 
     def agreed(names: Sequence[str]) -> dict[str, Fit]:
@@ -56,7 +57,7 @@ def maps_of(matcher: Matcher, fits: Mapping[str, Fit], pairs: Sequence[Pair], ag
         if agree == "no":
             return dict(zip(names, own, strict=True))
         shapes = [clean[name].shape for name in names]
-        return dict(zip(names, agreed_fits(matcher.model, shapes, own, matcher.config), strict=True))
+        return dict(zip(names, agreed_fits(matcher.model, shapes, own, matcher.config, threads=threads), strict=True))
 
     together = agreed(list(fits)) if agree == "all" else {}
     found = {}
@@ -114,7 +115,7 @@ def main(
     shapes = {name: shapes[name] for name in runner.spread(list(shapes), limit_shapes)}
     matcher = Matcher(model, FitConfig(seed=seed), threads)
     began = time.perf_counter()
-    fits = {name: matcher.fit(shape) for name, shape in runner.track(list(shapes.items()), "fitting")}
+    fits = dict(zip(shapes, matcher.fit_all(list(shapes.values())), strict=True))
     fitted = time.perf_counter() - began
     pairs = ordered_pairs(shapes, limit_pairs)
     maps = maps_of(matcher, fits, pairs, agree)

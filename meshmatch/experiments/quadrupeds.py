@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from typer import Argument, Option
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig, ramp, skinned, smooth_step
 from meshmatch.geometry.triangles import vertex_normals
@@ -58,7 +58,7 @@ KINDS: dict[str, dict[str, float]] = {
              "neck_down": 5, "head": 1.0, "snout": 1.15, "snout_wide": 0.95, "ear": 0.75, "ear_out": 0.5,
              "tail": 0.25, "tail_thick": 1.5, "hoof": 0.9, "straight": 0.5},
     "hippo": {"leg": 0.8, "thick": 1.8, "cannon": 0.9, "wide": 2.0, "tall": 1.6, "long": 1.3, "belly": 0.9,
-              "neck": 0.5, "neck_thick": 2.0, "neck_down": 45, "head": 1.65, "snout": 1.15, "snout_wide": 1.8,
+              "neck": 0.5, "neck_thick": 2.0, "neck_down": 45, "head": 1.4, "snout": 1.7, "snout_wide": 1.8,
               "snout_deep": 1.4, "muzzle": 0.6, "ear": 0.22, "ear_out": 0.3, "tail": 0.3, "tail_thick": 1.4,
               "hoof": 0.6, "straight": 0.8},
     "bear": {"leg": 0.88, "thick": 2.0, "cannon": 0.7, "wide": 1.6, "tall": 1.3, "long": 1.05, "belly": 0.65,
@@ -236,7 +236,8 @@ def draw_angles(rig: AnimalRig, traits: dict[str, float], rng: np.random.Generat
             first = int(name.split("_")[1]) <= 5
             angles[name][:2] += np.array([curl[1 - first], sway[1 - first]]) / (5 if first else number["tail"] - 5)
     add("skull", -rng.uniform(0.4, 0.9) * (traits["neck_down"] if carriage == "down" else bow))
-    gape = rng.choice([rng.uniform(-34, -28), rng.uniform(-28, -8), rng.uniform(-8, 55)], p=[0.5, 0.2, 0.3])
+    wide = 0.25 + 0.3 * min(traits["muzzle"], 1.0)  # as hippos like to
+    gape = rng.choice([rng.uniform(-34, -28), rng.uniform(-28, -8), rng.uniform(-8, 65)], p=[0.8 - wide, 0.2, wide])
     add("jaw", gape)
     add("skull", -max(gape, 0.0) * rng.uniform(0.1, 1.1))
     found = np.zeros((len(rig.names), 3))
@@ -281,7 +282,7 @@ def make_animal(rig: AnimalRig, seed: int, number: int) -> Float[Floats, "V 3"]:
 
 
 def resting_animal(rig: AnimalRig) -> Float[Floats, "V 3"]:
-    """The symmetric animal that becomes the template: of middling proportions, its mouth closed."""
+    """The symmetric animal that becomes the template: of middling proportions, its mouth a little open."""
     traits = {name: float(name not in _NONE) for name in TRAITS}
     traits |= {"leg": 0.85, "thick": 1.3, "wide": 1.25, "tall": 1.1, "belly": 0.5, "neck_thick": 1.25, "ear": 0.6,
                "ear_out": 0.3, "tail_thick": 1.6, "neck": 0.85, "straight": 0.3, "shoulder": 1.0}  # fmt: skip
@@ -289,6 +290,13 @@ def resting_animal(rig: AnimalRig) -> Float[Floats, "V 3"]:
     for bone, name in enumerate(rig.names):
         angles[bone, 0] = {"jaw": -14.0, "neck": 3.0, "skull": -12.0}.get(group_of(name), 0.0)
     return skinned(rig, morphed(rig, traits), scales(rig, traits, np.random.default_rng(0)), angles)
+
+
+def body_parts(rig: AnimalRig) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
+    """Part of every vertex, by the bone that carries it most: labels and their names, sides apart."""
+    sides = {"_L": "left ", "_R": "right "}
+    names, label = np.unique([sides.get(name[-2:], "") + group_of(name) for name in rig.names], return_inverse=True)
+    return label[rig.weights.argmax(1)].astype(np.int64), tuple(names.tolist())
 
 
 @runner.command

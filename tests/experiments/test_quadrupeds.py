@@ -114,6 +114,14 @@ def test_the_animal_at_rest_is_symmetric(rig: AnimalRig) -> None:
     assert np.abs(rest[rig.mirror] * [-1, 1, 1] - rest).max() < 1e-9
 
 
+def test_parts_are_those_of_the_bones(rig: AnimalRig) -> None:
+    labels, names = quadrupeds.body_parts(rig)
+    assert {"trunk", "tail", "left hock", "right hock"} <= set(names)
+    exchanged = [name.replace("left", "x").replace("right", "left").replace("x", "right") for name in names]
+    sides = np.abs(rig.verts[:, 0]) > 0.02
+    assert (np.array(exchanged)[labels] == np.array(names)[labels[rig.mirror]])[sides].all()
+
+
 def test_bones_turn_within_the_limits_of_their_joints(rig: AnimalRig) -> None:
     rng = np.random.default_rng(0)
     seen = np.array([draw_angles(rig, draw_traits(rng), rng) for _ in range(60)])
