@@ -44,10 +44,12 @@ def test_a_dead_link_is_noticed(tmp_path: Path) -> None:
     assert dead_links(text, tmp_path / "page.md") == ["gone.png", "here.md#no-heading", "#f"]
 
 
-def test_the_readme_matches_the_two_shapes_that_ship() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    call = next(line for line in text.splitlines() if line.startswith("meshmatch match "))
-    samples = [ROOT / word for word in shlex.split(call)[2:4]]
+def test_the_pages_match_the_shapes_that_ship() -> None:
+    samples = []
+    for page in ("README.md", "docs/models.md"):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        call = next(line for line in text.splitlines() if line.startswith("meshmatch match "))
+        samples += [ROOT / word for word in shlex.split(call)[2:4]]
     assert sorted(samples) == sorted((ROOT / "templates" / "samples").glob("*.ply"))
 
 
