@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from meshmatch.templates.template import Template
 
 KEPT, REFUSED, NODE = (0.20, 0.55, 0.80), (0.85, 0.15, 0.12), (0.86, 0.30, 0.12)
 COLUMNS = {"template": "template", "radius": "radius:.2f", "candidates": "candidates:d"}
-COLUMNS |= {"refused by parts": "parts:.1%", "spectral": "spectral:.1%", "geodesic": "geodesic:.1%"}
+COLUMNS |= {"refused by parts": "parts:.1%", "spectral": "spectral:.1%", "from own vertex": "geodesic:.1%"}
 SHARE = 0.2  # of the diameter along the surface
 
 
@@ -61,7 +62,10 @@ def across_parts(shape: Shape, parts: Int[Ints, " V"], found: Candidates) -> Boo
 
 
 def far_along(shape: Shape, found: Candidates, share: float = SHARE) -> Bool[Bools, " N"]:
-    """Candidates that touch a vertex further from their own, along the surface, than a share of the diameter."""
+    """Candidates that touch a vertex further from their own, along the surface, than a share of the diameter.
+
+    `meshmatch.templates.make` compares all pairs of the vertices that a node would move, which refuses more.
+    """
     graph = edge_graph(shape)
     ends = dijkstra(graph, indices=farthest_points(shape.verts, 40))
     limit = share * ends[np.isfinite(ends)].max()
@@ -70,6 +74,7 @@ def far_along(shape: Shape, found: Candidates, share: float = SHARE) -> Bool[Boo
     return np.array([not np.isfinite(reach[at, hits]).all() for at, hits in zip(place, found.touched, strict=True)])
 
 
+@cache
 def refused(template: Template, config: NodeConfig) -> tuple[Candidates, dict[str, Bool[Bools, " N"]], Int[Ints, " V"]]:
     """Candidates of a template, which of them each rule refuses, and its spectral clusters."""
     shape = template.shape
