@@ -31,7 +31,7 @@ from meshmatch.api.inputs import validated
 from meshmatch.arrays import Int, Ints
 from meshmatch.experiments import category, runner
 from meshmatch.experiments.category import Maps, Shapes
-from meshmatch.experiments.furniture import KINDS, furniture
+from meshmatch.experiments.furniture import KINDS, VIEWS, furniture
 from meshmatch.experiments.furniture_models import (
     chosen_templates,
     cloud_template,
@@ -51,7 +51,7 @@ from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.maps.build import build_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
-from meshmatch.render.picture import Look, Panel, render_shapes
+from meshmatch.render.picture import Panel, render_shapes
 from meshmatch.shapes.colors import label_colors
 from meshmatch.shapes.shape import Shape
 from meshmatch.training.recipes import clouds
@@ -139,8 +139,7 @@ def labelled_picture(
         best = min(range(len(models)), key=lambda k: fits[k].residual)
         near = cKDTree(fits[best].points_in_file).query(shape.verts)[1]
         panels.append(Panel(shape, colors[models[best].template.labels[near]], label=shape.name.removesuffix(".ply")))
-    turn, tilt = {"table": (-25.0, -15.0), "plane": (40.0, 40.0), "chair": (-35.0, 15.0)}[kind]
-    render_shapes(panels, path, Look(up="y", front="z", turn=turn, tilt=tilt))
+    render_shapes(panels, path, VIEWS[kind])
 
 
 @dataclass(frozen=True)
