@@ -240,7 +240,8 @@ def main(
             if way == "collection":
                 began = time.process_time()
                 used = runner.spread(list(measured), templates)
-                maps = collection_maps(measured, template, CollectionConfig(seed=seed), here.work, used)
+                upright = template if template in measured else used[0]
+                maps = collection_maps(measured, upright, CollectionConfig(seed=seed), here.work, used)
                 spent = round((time.process_time() - began) / 60, 2)
                 rows.append({"method": "collection, no training", **errors(maps), "cpu_minutes": spent})
                 continue
