@@ -37,14 +37,8 @@ OFF = 0.1
 """In units of sqrt(area): a point further off is lost."""
 VERDICTS = ("good", "fair", "poor")
 _COLUMNS = {"pairs": "pairs:d", "mean": "mean_x100:.2f", "median": "median_x100:.2f", "off": "off:.1%"}
-_HORSES = ("muybridge", "ferrari", "horse")  # names of files that do not say it themselves
 
 Agree = Literal["pairs", "all", "no"]
-
-
-def species(name: str) -> str:
-    """What kind of animal a file's name says it is."""
-    return "horse" if any(sign in name.lower() for sign in _HORSES) else kind_of(name)
 
 
 def maps_of(matcher: Matcher, fits: Mapping[str, Fit], pairs: Sequence[Pair], agree: Agree) -> dict[Pair, VertexMap]:
@@ -124,7 +118,7 @@ def main(
     verdicts = {name: fit.verdict for name, fit in fits.items()}
     worse = {pair: max((verdicts[name] for name in pair), key=VERDICTS.index) for pair in maps}
     whole = rows_of(errors, lambda _: "all")[0] | {"euclid": animal_errors(shapes, truth, maps)["mean_x100"]}
-    kinds = rows_of(errors, lambda pair: f"{species(pair[0])} to {species(pair[1])}")
+    kinds = rows_of(errors, lambda pair: f"{kind_of(pair[0])} to {kind_of(pair[1])}")
     judged = rows_of(errors, worse.__getitem__)
     each = [
         row
