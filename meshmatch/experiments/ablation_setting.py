@@ -28,7 +28,7 @@ from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import CorrespondenceLoss
 from meshmatch.training.recipes import Recipe, recipe_for
 from meshmatch.training.scans import ScanConfig
-from meshmatch.training.setup import build_dataset, build_deformer
+from meshmatch.training.train import build_dataset, build_deformer
 
 Preset = Literal["small", "default", "paper"]
 SPHERE = 0.65

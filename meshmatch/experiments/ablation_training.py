@@ -26,8 +26,7 @@ from meshmatch.outputs import make_folder
 from meshmatch.threads import set_threads
 from meshmatch.training.loop import Trainer
 from meshmatch.training.losses import LossPoints, held_out_error
-from meshmatch.training.setup import build_dataset, build_deformer, build_loss_points
-from meshmatch.training.train import CardFacts, export
+from meshmatch.training.train import CardFacts, build_dataset, build_deformer, build_loss_points, export
 
 _BATCHES = 2
 

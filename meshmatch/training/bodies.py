@@ -12,30 +12,20 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import platformdirs
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn.functional import normalize as unit
 
 from meshmatch.arrays import Float
 from meshmatch.errors import OptionError
-from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import Source
 from meshmatch.training.limbs import FOLDED, Draw, Limbs, draw_arms, draw_limbs, mirrored, with_legs
 from meshmatch.training.pose_files import GivenPoses
-from meshmatch.training.rig import (
-    RIG_VERSION,
-    Rig,
-    build_rig,
-    forward_kinematics,
-    load_rig,
-    penetration,
-    save_rig,
-    skin,
-)
-from meshmatch.training.rotations import DEGREE, rotation_between, rotation_from_vector, unit
+from meshmatch.training.rig import Rig, cached_rig, forward_kinematics, penetration, skin
+from meshmatch.training.rotations import DEGREE, rotation_between, rotation_from_vector
 
 
 @dataclass(frozen=True)
@@ -101,16 +91,6 @@ def human_source(
     return partial(sample_bodies, rig.restricted(keep, np.array(template.shape.faces)), poses=poses)
 
 
-def cached_rig(identities: int, seed: int, progress: Progress | None = None) -> Rig:
-    """The body rig from the cache, or built into it (a minute or two, once)."""
-    cache = Path(platformdirs.user_cache_dir("meshmatch"))
-    path = cache / f"rig-v{RIG_VERSION}-{identities}-{seed}.safetensors"
-    if not path.is_file():
-        make_folder(path.parent)
-        save_rig(build_rig(identities, seed, progress=progress), path)
-    return load_rig(path)
-
-
 def sample_free_pose(
     rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Generator, tries: int = 8, tolerance: float = 0.02
 ) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
@@ -151,29 +131,22 @@ def sample_pose(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Genera
     neck = torch.stack([draw.normal(2, 18), draw.normal(0, 28), draw.normal(0, 14)], -1) * DEGREE
     for name, share in (("neck01", 0.3), ("neck02", 0.2), ("neck03", 0.2), ("head", 0.3)):
         vectors[:, joint(name)] = neck * share
-    return joint_rotations(vectors, matrices)
+    rotations = rotation_from_vector(vectors)
+    for index, rotation in matrices.items():
+        rotations[:, index] = rotation
+    return rotations
 
 
 def pose_limbs(
     vectors: Float[Tensor, "B J 3"], rig: Rig, heads: Float[Tensor, "B J 3"], left: Limbs, right: Limbs, draw: Draw
 ) -> dict[int, Float[Tensor, "B 3 3"]]:
-    """Write both sides into ``vectors``; returns the rotations of joints that are no single turn, for `joint_rotations`."""
+    """Write both sides into ``vectors``; returns the rotations of joints that are no single turn."""
     matrices: dict[int, Tensor] = {}
     for side, suffix, limbs in ((1.0, ".L", left), (-1.0, ".R", right)):
         _pose_arm(vectors, matrices, rig, heads, side, suffix, limbs, draw)
         _pose_leg(vectors, matrices, rig, heads, side, suffix, limbs, draw)
         _pose_hand(vectors, rig, heads, suffix, limbs, draw)
     return matrices
-
-
-def joint_rotations(
-    vectors: Float[Tensor, "B J 3"], matrices: dict[int, Float[Tensor, "B 3 3"]]
-) -> Float[Tensor, "B J 3 3"]:
-    """Rotation vectors as matrices; some joints have theirs already."""
-    rotations = rotation_from_vector(vectors)
-    for index, rotation in matrices.items():
-        rotations[:, index] = rotation
-    return rotations
 
 
 def _pose_arm(vectors, matrices, rig, heads, side, suffix, limbs, draw) -> None:

@@ -19,16 +19,8 @@ from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.models.layers import BasisEncoder, PointEncoder
 from meshmatch.templates.prepared_folder import ShapeSamples
-from meshmatch.training.scans import (
-    ScanConfig,
-    bump,
-    normalise,
-    random_rotations,
-    rigid_fit,
-    sample_scan,
-    small_rotations,
-    yaw_rotations,
-)
+from meshmatch.training import scans
+from meshmatch.training.scans import ScanConfig, small_rotations
 
 DEFORM = 0.08
 """Standard deviation of the vectors of a coarse lattice, whose field deforms a shape smoothly, units of sqrt(area)."""
@@ -102,19 +94,19 @@ class BatchDataset(torch.utils.data.Dataset):
         generator = step_generator(self.seed, step)
         verts = self.source(self.shapes, generator)
         scale = verts.flatten(1).std(1)[:, None, None]
-        verts = bump(verts / scale * 0.3, self.scan.bumps, generator)
-        verts, areas = normalise(verts, self.faces)
+        verts = scans.bump(verts / scale * 0.3, self.scan.bumps, generator)
+        verts, areas = scans.normalise(verts, self.faces)
         if self.radius is not None:
             verts = verts * (self.radius / verts.norm(dim=-1).amax(1))[:, None, None]
         verts, areas = (table.repeat_interleave(self.scans_per_shape, 0) for table in (verts, areas))
         B = len(verts)
         verts = verts * (1 + self.scan.scale * torch.randn(B, 1, 1, generator=generator).clamp(-2, 2))
-        points = sample_scan(verts, areas, self.faces, self.scan, generator)
-        R, t = rigid_fit(self.template_core, verts[:, self.core])
+        points = scans.sample_scan(verts, areas, self.faces, self.scan, generator)
+        R, t = scans.rigid_fit(self.template_core, verts[:, self.core])
         # The roughly right frame in which the encoder works: x_core = S R^T (x - t) + shift.
         if self.scan.upright:
             t = points.mean(1)
-            turn, shift = yaw_rotations(B, generator), torch.zeros(B, 1, 3)
+            turn, shift = scans.yaw_rotations(B, generator), torch.zeros(B, 1, 3)
         else:
             turn = small_rotations(B, generator) @ R.transpose(1, 2)
             shift = 0.03 * torch.randn(B, 1, 3, generator=generator)
@@ -125,7 +117,7 @@ class BatchDataset(torch.utils.data.Dataset):
             return Batch(in_core, targets, features)
         # The aligner sees the scan centred on its own points and turned anywhere.
         middle = points.mean(1, keepdim=True)
-        anywhere = random_rotations(B, generator)
+        anywhere = scans.random_rotations(B, generator)
         turned = (points - middle) @ anywhere.transpose(1, 2)
         center = (anywhere @ (t - middle[:, 0])[..., None])[..., 0]
         return Batch(in_core, targets, features, self.aligner.features(turned), anywhere @ R, center)

@@ -100,21 +100,12 @@ def draw_limbs(draw: Draw, arm: torch.Tensor, family: torch.Tensor) -> Limbs:
         draw.normal(7, 8), draw.uniform(-15, 55), draw.normal(12, 18), draw.normal(8, 10),
         draw.normal(10, 12), draw.normal(10, 14),
     ])[family, at].clamp(-20, 65)  # fmt: skip
-    return Limbs(
-        arm_elevation=elevation,
-        arm_azimuth=azimuth,
-        arm_twist=twist.clamp(-130, 85),
-        elbow=elbow.clamp(0, 150),
-        pronation=pronation.clamp(-90, 95),
-        hip_flexion=flexion,
-        hip_abduction=spread,
-        hip_twist=draw.normal(5, 16) + 0.25 * flexion.clamp_min(0) * draw.uniform(-0.6, 1.2),
-        knee=knee,
-        ankle=draw.normal(0, 16).clamp(-35, 40),
-        curl=draw.choice(
-            [0.5, 0.25, 0.25], [draw.uniform(-0.3, 0.35), draw.normal(-0.3, 0.08), draw.uniform(0.4, 1.0)]
-        ),
-    )
+    hip_twist = draw.normal(5, 16) + 0.25 * flexion.clamp_min(0) * draw.uniform(-0.6, 1.2)
+    ankle = draw.normal(0, 16).clamp(-35, 40)
+    curls = [draw.uniform(-0.3, 0.35), draw.normal(-0.3, 0.08), draw.uniform(0.4, 1.0)]
+    curl = draw.choice([0.5, 0.25, 0.25], curls)
+    arms = elevation, azimuth, twist.clamp(-130, 85), elbow.clamp(0, 150), pronation.clamp(-90, 95)
+    return Limbs(*arms, flexion, spread, hip_twist, knee, ankle, curl)
 
 
 def mirrored(source: Limbs, own: Limbs, mask: torch.Tensor, draw: Draw) -> Limbs:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -98,13 +99,8 @@ class Trainer:
         self.model = model.to(self.device)
         self.points = points.to(self.device)
         self.average = {n: p.detach().clone() for n, p in model.named_parameters()}
-        self.optimiser = torch.optim.AdamW(
-            model.parameters(),
-            lr=config.rate,
-            betas=(0.9, config.momentum),
-            weight_decay=config.weight_decay,
-            fused=True,
-        )
+        settings: dict[str, Any] = {"betas": (0.9, config.momentum), "weight_decay": config.weight_decay, "fused": True}
+        self.optimiser = torch.optim.AdamW(model.parameters(), config.rate, **settings)
         self.step, self.seconds = 0, 0.0
 
     def save(self, path: Path) -> None:

@@ -67,10 +67,8 @@ class GivenPoses:
         angle = np.linalg.norm(vectors, axis=2)
         if angle.max() > 2 * math.pi + 1e-3:
             pose, joint = np.unravel_index(int(angle.argmax()), angle.shape)
-            raise InputError(
-                f"pose {pose} turns {self.joints[joint][:80]!r} by {angle[pose, joint]:.4g}, more than a full turn",
-                "angles are in radians: divide degrees by 57.3",
-            )
+            turned = f"pose {pose} turns {self.joints[joint][:80]!r} by {angle[pose, joint]:.4g}"
+            raise InputError(f"{turned}, more than a full turn", "angles are in radians: divide degrees by 57.3")
         if not 0 <= self.share <= 1:
             raise OptionError(f"a share must be from 0 to 1, not {self.share:g}")
         object.__setattr__(self, "vectors", vectors)

@@ -69,19 +69,8 @@ def paper() -> Recipe:
     1,000 shapes. Its 300 nodes are those of the template `PAPER_TEMPLATE`.
     """
     train = TrainConfig(steps=75_000, shapes=16, scans_per_shape=1, **_PLAIN_ADAM)
-    scan = ScanConfig(
-        3000,
-        noise=0.0,
-        holes=0.0,
-        outliers=0.0,
-        partial=0.0,
-        density=0.0,
-        bumps=0.0,
-        scale=0.0,
-        upright=True,
-        sphere=True,
-    )
-    return Recipe(PAPER, train, scan, "cubic")
+    clean = dict.fromkeys(("noise", "holes", "outliers", "partial", "density", "bumps", "scale"), 0.0)
+    return Recipe(PAPER, train, ScanConfig(3000, upright=True, sphere=True, **clean), "cubic")
 
 
 def small_data() -> Recipe:
@@ -89,9 +78,8 @@ def small_data() -> Recipe:
     hearts and animals (docs/categories.md)."""
     network = NetworkConfig(code=128, width=256, depth=1, basis=384, align_basis=0, corrections=2, correct_width=256)
     loss = CorrespondenceLoss(volume=1e-3, arap=1e-3, blend=1e-3, robust=True)
-    train = TrainConfig(
-        steps=3000, shapes=8, scans_per_shape=1, decay=0.5, warm_up=100, average=0.99, loss=loss, workers=0
-    )
+    speed: dict[str, Any] = {"decay": 0.5, "warm_up": 100, "average": 0.99}
+    train = TrainConfig(steps=3000, shapes=8, scans_per_shape=1, loss=loss, workers=0, **speed)
     return Recipe(network, train, ScanConfig(points=1024), "smooth", deform=True)
 
 

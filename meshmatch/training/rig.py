@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import platformdirs
 import torch
 from safetensors import safe_open
 from safetensors.numpy import save_file
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from meshmatch.arrays import Float, Int, Ints
 from meshmatch.errors import OptionError
-from meshmatch.outputs import replace_on_success
+from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.progress import Progress
 
 RIG_VERSION = 1
@@ -132,6 +133,16 @@ def load_rig(path: str | Path) -> Rig:
         names = tuple(file.metadata()["names"].split("\n"))
     parents = tuple(int(parent) for parent in tensors.pop("parents"))
     return Rig(parents=parents, names=names, **tensors)
+
+
+def cached_rig(identities: int, seed: int, progress: Progress | None = None) -> Rig:
+    """The body rig from the cache, or built into it (a minute or two, once)."""
+    cache = Path(platformdirs.user_cache_dir("meshmatch"))
+    path = cache / f"rig-v{RIG_VERSION}-{identities}-{seed}.safetensors"
+    if not path.is_file():
+        make_folder(path.parent)
+        save_rig(build_rig(identities, seed, progress=progress), path)
+    return load_rig(path)
 
 
 def forward_kinematics(

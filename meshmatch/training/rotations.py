@@ -6,6 +6,7 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from meshmatch.arrays import Float
 
@@ -29,11 +30,6 @@ def rotation_between(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Floa
     cosine = (a * b).sum(-1, keepdim=True)
     # Half a turn has no axis of its own: any that is perpendicular will do.
     other = torch.nn.functional.one_hot(a.abs().argmin(-1), 3).to(a)
-    across = unit(torch.linalg.cross(a, other))
+    across = normalize(torch.linalg.cross(a, other), dim=-1)
     half = (sine < 1e-6) & (cosine < 0)
     return torch.where(half, across * math.pi, axis / sine.clamp_min(1e-9) * torch.atan2(sine, cosine))
-
-
-def unit(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-    """The same vectors with length 1."""
-    return torch.nn.functional.normalize(vector, dim=-1)

@@ -15,7 +15,7 @@ from meshmatch.experiments.ablation_training import built, fewer, is_trained, me
 from meshmatch.experiments.ablation_views import BASE, CODED, CONSTRAINTS, TABLE4, VIEWS, Run, all_runs, methods_of
 from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.models.registry import load_model
-from meshmatch.training.setup import build_loss_points
+from meshmatch.training.train import build_loss_points
 from tests.experiments.egg_runs import make_small, prepare_eggs
 
 

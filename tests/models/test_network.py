@@ -27,7 +27,7 @@ from meshmatch.models.layers import (
 from meshmatch.models.network import PAPER, NetworkConfig, weight_shapes
 from meshmatch.models.registry import built_in_folder, load_model
 from meshmatch.models.trained import TrainedModel
-from meshmatch.training.setup import build_deformer
+from meshmatch.training.train import build_deformer
 from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, bent_eggs, egg_template
 
 CONFIGS = pytest.mark.parametrize("config", [NETWORK, POINTS], ids=["basis", "point"])

@@ -12,7 +12,7 @@ from meshmatch.templates.template import Template
 from meshmatch.training.datasets import BatchDataset, Source
 from meshmatch.training.losses import LossPoints
 from meshmatch.training.scans import ScanConfig
-from meshmatch.training.setup import build_dataset, build_deformer, build_loss_points
+from meshmatch.training.train import build_dataset, build_deformer, build_loss_points
 from tests.conftest import icosphere
 
 NETWORK = NetworkConfig(

@@ -17,7 +17,7 @@ from meshmatch.training.loop import TrainConfig, Trainer
 from meshmatch.training.losses import ChamferLoss, chamfer, held_out_error, robust
 from meshmatch.training.recipes import Recipe
 from meshmatch.training.scans import ScanConfig
-from meshmatch.training.setup import build_cloud_dataset, build_deformer, build_surface_points
+from meshmatch.training.train import build_cloud_dataset, build_deformer, build_surface_points
 from tests.training.small import egg_template
 
 SMALL = Recipe(

@@ -14,7 +14,7 @@ from meshmatch.templates.template import Template
 from meshmatch.training.bodies import sample_bodies
 from meshmatch.training.datasets import Batch, BatchDataset, registered_source, step_generator
 from meshmatch.training.scans import ScanConfig
-from meshmatch.training.setup import anchor_vertices, build_dataset, fill_basis, loss_vertices
+from meshmatch.training.train import anchor_vertices, build_dataset, fill_basis, loss_vertices
 from tests.training.small import UPRIGHT, egg_template, small_data, small_network
 from tests.training.stick import stick_figure
 

@@ -12,7 +12,7 @@ from meshmatch.models.deformer import Deformer
 from meshmatch.templates.template import Template
 from meshmatch.training.datasets import Batch
 from meshmatch.training.losses import CorrespondenceLoss, LossPoints, distance
-from meshmatch.training.setup import loss_vertices
+from meshmatch.training.train import loss_vertices
 from tests.training.small import POINTS, UPRIGHT, egg_template, small_data, small_network, small_points
 
 

@@ -22,7 +22,7 @@ from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.template import read_template, template_radius
 from meshmatch.training import recipes
-from meshmatch.training.setup import build_dataset
+from meshmatch.training.train import build_dataset
 from tests.training.small import POINTS, egg_template
 
 QUICK = FitConfig(samples=1000, coarse_samples=300)

@@ -18,6 +18,7 @@ from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import Template, read_template, save_template
 from meshmatch.training import bodies
+from meshmatch.training import rig as rigs
 from meshmatch.training.datasets import Source, registered_source
 from meshmatch.training.loop import StepReport, TrainConfig
 from meshmatch.training.losses import CorrespondenceLoss
@@ -227,14 +228,14 @@ def test_the_rig_is_built_once_and_kept(monkeypatch: pytest.MonkeyPatch, tmp_pat
         built.append(identities)
         return stick_figure(identities)
 
-    monkeypatch.setattr(bodies, "build_rig", build)
-    monkeypatch.setattr(bodies.platformdirs, "user_cache_dir", lambda name: str(tmp_path / "cache"))
-    first = bodies.cached_rig(3, 0)
-    second = bodies.cached_rig(3, 0)
+    monkeypatch.setattr(rigs, "build_rig", build)
+    monkeypatch.setattr(rigs.platformdirs, "user_cache_dir", lambda name: str(tmp_path / "cache"))
+    first = rigs.cached_rig(3, 0)
+    second = rigs.cached_rig(3, 0)
     assert built == [3]
     assert torch.equal(first.heads, second.heads)
-    bodies.cached_rig(4, 0)
-    bodies.cached_rig(3, 1)
+    rigs.cached_rig(4, 0)
+    rigs.cached_rig(3, 1)
     assert built == [3, 4, 3]
 
 
