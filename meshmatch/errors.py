@@ -51,6 +51,5 @@ def needs(library: str, extra: str) -> Iterator[None]:
     except ModuleNotFoundError as error:
         if error.name != library:
             raise
-        raise OptionError(
-            f"this needs {library}, which is not installed", f"pip install 'meshmatch[{extra}]'"
-        ) from error
+        hint = f"pip install 'meshmatch[{extra}]'"
+        raise OptionError(f"this needs {library}, which is not installed", hint) from error

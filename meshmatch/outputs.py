@@ -21,9 +21,8 @@ def as_path(path: str | Path) -> Path:
     try:
         return Path(path)
     except TypeError as error:
-        raise InputError(
-            f"expected a path, not {type(path).__name__}", "write it as text or as a pathlib.Path"
-        ) from error
+        hint = "write it as text or as a pathlib.Path"
+        raise InputError(f"expected a path, not {type(path).__name__}", hint) from error
 
 
 def make_folder(path: Path) -> None:
@@ -97,9 +96,8 @@ def folder_on_success(path: str | Path) -> Iterator[Path]:
     try:
         temporary.mkdir()
     except OSError as error:
-        raise OutputError(
-            f"cannot make the folder {path}: {error.strerror}", "choose another folder with -o"
-        ) from error
+        hint = "choose another folder with -o"
+        raise OutputError(f"cannot make the folder {path}: {error.strerror}", hint) from error
     try:
         yield temporary
         if path.is_dir():

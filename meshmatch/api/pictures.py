@@ -15,15 +15,8 @@ from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.arrays import Floats, as_numbers
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
-from meshmatch.render.compose import (
-    Composition,
-    compose_fit,
-    compose_labels,
-    compose_match,
-    compose_shapes,
-    compose_values,
-    merge_labels,
-)
+from meshmatch.render import compose
+from meshmatch.render.compose import Composition, merge_labels
 from meshmatch.render.facing import facing, facing_alike
 from meshmatch.render.picture import Look, check_picture
 from meshmatch.render.viewer.looks import share_look
@@ -93,7 +86,7 @@ def _composed(
         if len(shapes) != 2:
             raise OptionError(f"a map is of two shapes, not of {len(shapes)}", "give the source, then the target")
         maps = find_maps(shapes[0], shapes[1], match)
-        return compose_match(shapes[0], shapes[1], maps.forward, maps.rotations, look)
+        return compose.compose_match(shapes[0], shapes[1], maps.forward, maps.rotations, look)
     if values is not None:
         tables = []
         for numbers, shape in zip(values, shapes, strict=True):
@@ -102,11 +95,11 @@ def _composed(
             if table.ndim not in (1, 2) or len(table) != shape.V:
                 hint = "one number or one color for each vertex, and one array for each shape"
                 raise InputError(f"{what} must be an array of ({shape.V},), not {table.shape}", hint)
-        return compose_values(shapes, tables)
+        return compose.compose_values(shapes, tables)
     if labels is not None:
         pairs = zip(labels, shapes, strict=True)
         read = [own if isinstance(own, Labels) else labels_of(own, shape) for own, shape in pairs]
-        return compose_labels(shapes, *merge_labels(read), [own.on == "faces" for own in read])
+        return compose.compose_labels(shapes, *merge_labels(read), [own.on == "faces" for own in read])
     if fit is not None:
         if len(shapes) != 1:
             raise OptionError(f"a fit is of one shape, not of {len(shapes)}", "make a picture for each")
@@ -114,9 +107,9 @@ def _composed(
         if own is not None and own.hash != shapes[0].hash:
             what = f"the fit is of {own.name or 'another shape'}, not of {shapes[0].name or 'this one'}"
             raise InputError(what, "draw the shape that was fitted")
-        return compose_fit(shapes[0], fit.shape, fit.frame.rotation)
+        return compose.compose_fit(shapes[0], fit.shape, fit.frame.rotation)
     looks = [_read_look(source, shape)[0] for source, shape in zip(given, shapes, strict=True)]
-    return compose_shapes(list(zip(shapes, looks, strict=True)))
+    return compose.compose_shapes(list(zip(shapes, looks, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)

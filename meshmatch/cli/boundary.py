@@ -45,10 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _kill_as_interrupt() -> Iterator[Callable[[], bool]]:
-    """Inside, SIGTERM ends the program as Ctrl-C does, so that nothing half-written stays; gives whether it came.
-
-    A program that runs this one inside itself may have its own way with the signal, which is left as it is.
-    """
+    """Inside, SIGTERM ends the program as Ctrl-C does (unless it has another handler); gives whether it came."""
     came: list[float] = []
     owner = os.getpid()
 

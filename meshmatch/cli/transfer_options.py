@@ -77,9 +77,8 @@ class Transfer:
         files = files or [self.output]
         self.options.check()
         if self.options.map is not None and self.options.given:
-            raise OptionError(
-                f"{self.options.given[0]} is for matching, and --map gives the match", "leave one of them out"
-            )
+            problem = f"{self.options.given[0]} is for matching, and --map gives the match"
+            raise OptionError(problem, "leave one of them out")
         check_outputs([self.source, self.target, self.options.map, read], *files, picture=self.picture)
         with ExitStack() as claims:  # the first is renamed last: it names the others
             temporary = [claims.enter_context(replace_on_success(file)) for file in files]

@@ -26,6 +26,7 @@ from meshmatch.experiments.scores import TruthDistances, area_under_curve, joine
 from meshmatch.experiments.sets import SET_NAMES, BenchSet, load_set
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import Partial
+from meshmatch.geometry.triangles import unit
 from meshmatch.maps.evaluate import LOST_CM, Errors
 from meshmatch.render.scene import Scene
 from meshmatch.render.surface import Surface, face_paint
@@ -58,10 +59,10 @@ def part_of(shape: Shape, kind: Kind, seed: int) -> tuple[Shape, Int[Ints, " V_p
 
 def seen_faces(shape: Shape, centers: Float[Floats, "F 3"], direction: Float[Floats, " 3"]) -> Bool[Bools, " F"]:
     """Whether a camera far away in a direction sees the middle of each face."""
-    facing = shape.face_normals @ direction > 0
+    facing = unit(shape.face_vectors) @ direction > 0
     white = face_paint(np.ones((shape.F, 3)))
     scene = Scene([Surface(shape.verts, shape.faces, np.zeros_like(shape.verts), white)])
-    lifted = (centers + 1e-4 * shape.diagonal * shape.face_normals).astype(np.float32)
+    lifted = (centers + 1e-4 * shape.diagonal * unit(shape.face_vectors)).astype(np.float32)
     towards = np.broadcast_to(direction.astype(np.float32), lifted.shape)
     return np.asarray(facing & ~scene.blocked(lifted, towards, 2 * shape.diagonal))
 

@@ -125,12 +125,9 @@ def _check_support(moment: Float[Floats, "P 4 4"]) -> None:
     trace = np.maximum(np.trace(moment, axis1=1, axis2=2), 1e-30)
     bad = np.flatnonzero(np.linalg.eigvalsh(moment)[:, 0] / trace < MINIMUM_EIGENVALUE)
     if len(bad):
-        some = ", ".join(str(index) for index in bad[:5])
-        raise TemplateError(
-            f"{len(bad)} points have fewer than four non-coplanar nodes in reach (points {some}"
-            + (", ...)" if len(bad) > 5 else ")"),
-            "use more nodes or a larger radius",
-        )
+        some = ", ".join([*map(str, bad[:5]), *(["..."] if len(bad) > 5 else [])])
+        problem = f"{len(bad)} points have fewer than four non-coplanar nodes in reach (points {some})"
+        raise TemplateError(problem, "use more nodes or a larger radius")
 
 
 def build_rbf(points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"]) -> ShapeFunctions:
@@ -145,9 +142,8 @@ def build_rbf(points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"]) -> Shap
     q = nodes / unit
     among = multiquadric(q[:, None] - q)
     if not np.linalg.cond(among) < _MAX_CONDITION:
-        raise TemplateError(
-            "nodes lie too close together to interpolate between them", "use fewer nodes, or another field than rbf"
-        )
+        hint = "use fewer nodes, or another field than rbf"
+        raise TemplateError("nodes lie too close together to interpolate between them", hint)
     inverse = np.linalg.inv(among)
     phi = np.empty((len(points), len(q)), np.float32)
     gradient = np.empty((len(points), 3, len(q)), np.float32)

@@ -13,15 +13,8 @@ import torch
 from torch import nn
 
 from meshmatch.arrays import Float, Floats, Floats32
-from meshmatch.fields.field import (
-    TURN_ROWS,
-    Field,
-    PointField,
-    PointwiseField,
-    apply_shape_functions,
-    code_rows,
-    turned_rows,
-)
+from meshmatch.fields import field as fields
+from meshmatch.fields.field import TURN_ROWS, PointField, PointwiseField
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models import layers
@@ -70,7 +63,7 @@ class Deformer(nn.Module):
         self.decoder: layers.FlatDecoder | layers.NodeDecoder | layers.PointDecoder
         rows = K
         if not has_nodes(config.field):
-            self.decoder, rows = layers.PointDecoder(config.code, config.width), code_rows(config.code)
+            self.decoder, rows = layers.PointDecoder(config.code, config.width), fields.code_rows(config.code)
         elif config.decoder == "flat":
             self.decoder = layers.FlatDecoder(config.code, config.width, 1, K)
         else:
@@ -91,7 +84,7 @@ class Deformer(nn.Module):
         """
         if isinstance(self.decoder, layers.PointDecoder):
             return self.pointwise_field(points)
-        return Field.of(shape_functions(self.config.field, points, nodes, radius, kernel))
+        return fields.Field.of(shape_functions(self.config.field, points, nodes, radius, kernel))
 
     def pointwise_field(self, points: Float[Floats, "P 3"]) -> PointwiseField:
         """The field of a pointwise network."""
@@ -101,7 +94,7 @@ class Deformer(nn.Module):
 
     def rotate_rows(self, vectors: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Float[Floats, "R 3"]:
         if isinstance(self.decoder, layers.PointDecoder):
-            return turned_rows(vectors, turn)
+            return fields.turned_rows(vectors, turn)
         nodes = self.nodes.double().cpu().numpy()  # as `NodeNetwork` does
         return (nodes + vectors) @ turn - nodes
 
@@ -123,7 +116,7 @@ class Deformer(nn.Module):
             moved = PointwiseField(self.anchors, self.anchors, motion, self.config.code).displacement(vectors)
         else:
             assert self.anchor_phi is not None
-            moved = apply_shape_functions(self.anchor_phi, vectors)  # B A 3
+            moved = fields.apply_shape_functions(self.anchor_phi, vectors)  # B A 3
         seen = layers.two_way_offsets(self.anchors + moved, points)
         features = torch.cat([seen[..., :6] * 10.0, seen[..., 6:], moved * 3.0], -1)
         change = 0.1 * self.corrector(features.flatten(1)).unflatten(-1, (-1, 3))
@@ -169,14 +162,10 @@ class Deformer(nn.Module):
 def blank_deformer(config: NetworkConfig, K: int) -> Deformer:
     """A network for K nodes whose weights and buffers have shapes but no memory: a card cannot ask for gigabytes."""
     with torch.device("meta"):
-        return Deformer(
-            config,
-            nodes=torch.zeros(K, 3),
-            anchors=torch.zeros(K, 3),
-            anchor_phi=torch.zeros(K, K) if has_nodes(config.field) else None,
-            basis=torch.zeros(config.basis, 3),
-            align_basis=torch.zeros(max(config.align_basis, 1), 3),
-        )
+        nodes, anchors = torch.zeros(K, 3), torch.zeros(K, 3)
+        phi = torch.zeros(K, K) if has_nodes(config.field) else None
+        basis, align_basis = torch.zeros(config.basis, 3), torch.zeros(max(config.align_basis, 1), 3)
+        return Deformer(config, nodes, anchors, phi, basis, align_basis)
 
 
 def with_weights(config: NetworkConfig, K: int, weights: Mapping[str, np.ndarray]) -> Deformer:

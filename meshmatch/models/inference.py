@@ -56,9 +56,8 @@ def in_torch(network: Network, K: int, device: str = "cpu") -> Deformer:
     try:
         return copy.deepcopy(network).to(torch.device(device)) if device != "cpu" else network
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise OptionError(
-            f"device {device!r} cannot be used: {str(error).splitlines()[0]}", "write cpu, or cuda"
-        ) from error
+        problem = f"device {device!r} cannot be used: {str(error).splitlines()[0]}"
+        raise OptionError(problem, "write cpu, or cuda") from error
 
 
 class NodeNetwork:

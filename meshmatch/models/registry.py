@@ -98,11 +98,9 @@ def find_model(name: str | Path) -> tuple[Path, ModelCard]:
     with (folder / WEIGHTS).open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if digest != card.weights_sha256:
-        raise ModelError(
-            f"the weights of model {card.name} are not those of its card "
-            f"(sha256 {digest[:12]}..., not {card.weights_sha256[:12]}...)",
-            "fetch or add the model again",
-        )
+        hashes = f"sha256 {digest[:12]}..., not {card.weights_sha256[:12]}..."
+        problem = f"the weights of model {card.name} are not those of its card ({hashes})"
+        raise ModelError(problem, "fetch or add the model again")
     return folder, card
 
 
@@ -171,9 +169,8 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
                 raise taken from error  # another process was faster
             raise
     except OSError as error:
-        raise OutputError(
-            f"cannot write {user_folder()}: {error.strerror}", f"set {HOME_VARIABLE} to a folder of yours"
-        ) from error
+        hint = f"set {HOME_VARIABLE} to a folder of yours"
+        raise OutputError(f"cannot write {user_folder()}: {error.strerror}", hint) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         _restore_interrupted()

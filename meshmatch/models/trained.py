@@ -109,15 +109,11 @@ def trained_model(card: ModelCard, template_file: Path, weights_file: Path) -> T
     """
     template = load_template(template_file)
     if template.hash != card.template_hash or template.K != card.field["nodes"]:
-        raise ModelError(
-            f"model {card.name} was trained with another template "
-            f"({card.template_hash}, {card.field['nodes']} nodes; here {template.hash}, {template.K} nodes)",
-            "fetch or add the model again",
-        )
+        both = f"{card.template_hash}, {card.field['nodes']} nodes; here {template.hash}, {template.K} nodes"
+        problem = f"model {card.name} was trained with another template ({both})"
+        raise ModelError(problem, "fetch or add the model again")
     if card.field["kernel"] not in KERNELS:
-        raise ModelError(
-            f"model {card.name} has the kernel {card.field['kernel']!r}, not {' or '.join(KERNELS)}",
-            "it may need a newer meshmatch: update it",
-        )
+        problem = f"model {card.name} has the kernel {card.field['kernel']!r}, not {' or '.join(KERNELS)}"
+        raise ModelError(problem, "it may need a newer meshmatch: update it")
     network = load_network(weights_file, NetworkConfig.from_dict(card.network), template.K)
     return TrainedModel(card, template, network)

@@ -8,15 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.geometry.triangles import (
-    Edges,
-    directed_edges,
-    edge_keys,
-    edges_of,
-    face_parts,
-    same_rows,
-    squared_lengths,
-)
+from meshmatch.geometry import triangles
+from meshmatch.geometry.triangles import Edges, edge_keys, same_rows, squared_lengths
 
 OUTLIER_SHARE = 0.02
 """A part with less than this share of the largest part's area is an outlier. This and the next two are set by hand."""
@@ -34,7 +27,7 @@ def seams(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, " V
     shared[twin[twin != own]] = True
     shared = shared[twin]
     border = np.zeros(len(verts), bool)
-    border[edges_of(faces[shared[faces].any(axis=1)]).open] = True
+    border[triangles.edges_of(faces[shared[faces].any(axis=1)]).open] = True
     # the first of a group need not be on the border: number the border alone
     place = np.flatnonzero(border & shared)
     own[place] = place[same_rows(verts[place])]
@@ -98,7 +91,7 @@ def find_parts(
     Returns the faces of outlier parts; how many parts are outliers, and how many are not; how many of the latter are
     big but lie far from the rest; and the share of the surface that these have, in 0..1.
     """
-    part = face_parts(faces, len(verts))
+    part = triangles.face_parts(faces, len(verts))
     if part.max() == 0:
         return np.zeros(len(faces), bool), 0, 1, 0, 0.0
     face_areas = 0.5 * np.sqrt(squared_lengths(cross))
@@ -215,7 +208,7 @@ def _flips(faces: Ints, edges: Edges) -> tuple[Bools, Ints, Bools]:
     from scipy.sparse.csgraph import connected_components
 
     disagreeing = edges.disagreeing
-    face = np.argsort(directed_edges(faces)) % len(faces)
+    face = np.argsort(triangles.directed_edges(faces)) % len(faces)
     two = edges.begins[edges.sizes == 2]
     first, second = face[two], face[two + 1]
     # faces that agree already are one thing: far fewer are left to walk through

@@ -60,7 +60,7 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
     return Samples(points, unit(shape.face_vectors[face]), True, trust, face=face, barycentric=weights, vertex=vertex)
 
 
-def farthest_points(points: Float[Floats, "N 3"], K: int, start: int = 0) -> Int[Ints, " K"]:
+def farthest_points(points: Float[Floats, "N D"], K: int, start: int = 0) -> Int[Ints, " K"]:
     """Indices of points that are each as far as possible from all before them, beginning with `start`.
 
     Takes K passes over the points. With fewer distinct points than `K` the last ones repeat positions, never
@@ -71,15 +71,15 @@ def farthest_points(points: Float[Floats, "N 3"], K: int, start: int = 0) -> Int
         raise InputError(f"cannot choose {K} of {len(points)} points")
     if not 0 <= start < len(points):
         raise ValueError(f"start {start} is not one of {len(points)} points")
-    x, y, z = np.ascontiguousarray(points.T)
+    first, *others = np.ascontiguousarray(points.T)
     chosen = np.empty(K, np.int64)
     nearest = np.full(len(points), np.inf)
     current = start
     for k in range(K):
         chosen[k] = current
-        squared = (x - x[current]) ** 2
-        squared += (y - y[current]) ** 2
-        squared += (z - z[current]) ** 2
+        squared = (first - first[current]) ** 2
+        for axis in others:
+            squared += (axis - axis[current]) ** 2
         np.minimum(nearest, squared, out=nearest)
         nearest[current] = -1.0  # never again
         current = int(nearest.argmax())

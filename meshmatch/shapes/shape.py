@@ -12,15 +12,8 @@ import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, frozen, read_only
 from meshmatch.errors import InputError
-from meshmatch.geometry.triangles import (
-    Edges,
-    average_normals,
-    edges_of,
-    share_areas,
-    squared_lengths,
-    triangle_vectors,
-    unit,
-)
+from meshmatch.geometry import triangles
+from meshmatch.geometry.triangles import average_normals, share_areas, squared_lengths, triangle_vectors
 from meshmatch.shapes.cloud import estimate_normals, local_areas, roughness
 
 if TYPE_CHECKING:
@@ -147,11 +140,6 @@ class Shape:
         """(F,) areas, squared units of the file."""
         return frozen(0.5 * np.sqrt(squared_lengths(self.face_vectors)))
 
-    @cached_property
-    def face_normals(self) -> Floats:
-        """(F, 3) unit normals by the right-hand rule; zeros for a face without area."""
-        return frozen(unit(self.face_vectors))
-
     @property
     def _valid(self) -> Floats:
         return self.verts if self.invalid is None else self.verts[~self.invalid]
@@ -183,9 +171,9 @@ class Shape:
         return frozen(average_normals(self.face_vectors, self.faces, self.V))
 
     @cached_property
-    def edges(self) -> Edges:
+    def edges(self) -> triangles.Edges:
         """The edges of the faces."""
-        return edges_of(self.faces)
+        return triangles.edges_of(self.faces)
 
     @cached_property
     def area(self) -> float:

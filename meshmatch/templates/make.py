@@ -153,12 +153,6 @@ def choose_nodes(
     raise failure
 
 
-def rejected_share(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None) -> float:
-    """Share (0..1) of the candidates that a strategy rejects, before it becomes milder where vertices go without."""
-    samples, candidates = _candidates(shape, config, noisy=False)
-    return float(1 - next(_allowed(shape, config, candidates, labels, samples)).mean())
-
-
 def _candidates(shape: Shape, config: NodeConfig, noisy: bool) -> tuple[Samples, Float[Floats, "N 3"]]:
     """Samples of the surface, and where nodes may be: below them, or around them."""
     rng = np.random.default_rng(config.seed)
@@ -190,9 +184,7 @@ def _complete(
 def _allowed(
     shape: Shape, config: NodeConfig, candidates: Float[Floats, "N 3"], labels: Int[Ints, " V"] | None, samples: Samples
 ) -> Iterator[Bool[Bools, " N"]]:
-    """Which candidates a strategy keeps; then those of milder rules, for where clusters narrower than the radius
-    (fingers, ears) leave no candidate near them.
-    """
+    """Which candidates a strategy keeps; then those of milder rules, where narrow clusters (fingers, ears) keep none."""
     if config.strategy == "uniform" or shape.is_cloud:
         yield np.ones(len(candidates), bool)
         return
@@ -229,12 +221,8 @@ def _geodesic_allowed(shape: Shape, radius: float, candidates: Float[Floats, "N 
     some = farthest_points(shape.verts, min(shape.V, _MAX_PAIRED))
     far = dijkstra(graph, indices=some[:40])
     limit = share * far[np.isfinite(far)].max()
-    near = np.concatenate(
-        [
-            np.isfinite(dijkstra(graph, indices=some[start : start + 200], limit=limit)[:, some])
-            for start in range(0, len(some), 200)
-        ]
-    )
+    blocks = (dijkstra(graph, indices=some[at : at + 200], limit=limit) for at in range(0, len(some), 200))
+    near = np.concatenate([np.isfinite(block[:, some]) for block in blocks])
     touched = cKDTree(shape.verts[some]).query_ball_point(candidates, radius)
     # A few of the vertices tell most candidates apart before all pairs are looked at.
     return np.array(
@@ -259,20 +247,10 @@ def spectral_clusters(shape: Shape, clusters: int, rng: np.random.Generator) -> 
     # Not a constant start: that is an eigenvector already, and the search would go on from a random one.
     values, vectors = eigsh(stiffness, count, mass, sigma=-1e-8, v0=rng.standard_normal(shape.V))
     signature = vectors[:, 1:] / np.sqrt(np.maximum(values[1:], 1e-9))
-    centers = signature[farthest_points_any(signature, clusters)]
+    centers = signature[farthest_points(signature, min(clusters, shape.V))]
     for _ in range(20):
         label = cKDTree(centers).query(signature)[1]
         for axis in range(signature.shape[1]):
             total = np.bincount(label, signature[:, axis], len(centers))
             centers[:, axis] = total / np.maximum(np.bincount(label, minlength=len(centers)), 1)
     return np.unique(cKDTree(centers).query(signature)[1], return_inverse=True)[1].astype(np.int64)
-
-
-def farthest_points_any(points: Float[Floats, "N D"], K: int) -> Int[Ints, " K"]:
-    """Farthest-point sampling in any dimension: indices, starting from the first point."""
-    chosen = [0]
-    distance = np.full(len(points), np.inf)
-    for _ in range(min(K, len(points)) - 1):
-        distance = np.minimum(distance, np.square(points - points[chosen[-1]]).sum(1))
-        chosen.append(int(distance.argmax()))
-    return np.array(chosen)

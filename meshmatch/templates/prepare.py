@@ -125,11 +125,9 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         *(made, found, marks, template_marks, how, config.scale, config.nodes.seed), progress.between(0.5, 1.0)
     )
     if not registered and np.median(residuals) > MAX_RESIDUAL:
-        raise InputError(
-            f"most shapes of the folder are nothing like the template {name}: aligned, they lie "
-            f"{100 * np.median(residuals):.0f} % of sqrt(area) apart",
-            "name one of the shapes with --template, or try another --align or --scale",
-        )
+        far = f"aligned, they lie {100 * np.median(residuals):.0f} % of sqrt(area) apart"
+        hint = "name one of the shapes with --template, or try another --align or --scale"
+        raise InputError(f"most shapes of the folder are nothing like the template {name}: {far}", hint)
     stems = [Path(clean.original.name).stem for clean in found]
     for clean, stem, frame, residual in zip(found, stems, frames, residuals, strict=True):
         label = stem if stems.count(stem) == 1 else clean.original.name
@@ -144,19 +142,11 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     save_arrays(output / "points.safetensors", arrays, {"align": samples.align, "scale": samples.scale})
     save_arrays(output / "shapes.safetensors", {"verts": stack})
     names = tuple(clean.original.name for clean in found)
-    words: dict[str, Any] = {
-        "names": names,
-        "registered": registered,
-        "notes": notes,
-        "template": made.hash,
-        "source": first.original.name,
-        "align": how,
-        "scale": config.scale,
-        "landmarks": samples.landmarks.shape[1],
-        "frames": [{"scale": f.scale, "rotation": f.rotation.tolist(), "center": f.center.tolist()} for f in frames],
-        "apart": [round(residual, 5) for residual in residuals],
-        "config": asdict(config.nodes),
-    }
+    words: dict[str, Any] = {"names": names, "registered": registered, "notes": notes, "template": made.hash}
+    words |= {"source": first.original.name, "align": how, "scale": config.scale}
+    words["landmarks"] = samples.landmarks.shape[1]
+    words["frames"] = [{"scale": f.scale, "rotation": f.rotation.tolist(), "center": f.center.tolist()} for f in frames]
+    words |= {"apart": [round(residual, 5) for residual in residuals], "config": asdict(config.nodes)}
     with replace_on_success(output / "prepared.json") as temporary:
         Path(temporary).write_text(json.dumps(words, indent=1), encoding="utf-8")
     return Prepared(made, stack, names, tuple(notes), how, samples.landmarks.shape[1])

@@ -178,10 +178,8 @@ def find_landmarks(where: str | Path | None, folder: Path, files: Sequence[Path]
         names = (place / f"{file.stem}{suffix}" for suffix in suffixes)
         found.append(next((name for name in names if name.is_file() and name != file), None))
     if not any(found):
-        raise OptionError(
-            f"no shape of {folder} has landmarks at {where}",
-            "give a folder of NAME.npy files, or their suffix beside the shapes, such as .landmarks.npy",
-        )
+        hint = "give a folder of NAME.npy files, or their suffix beside the shapes, such as .landmarks.npy"
+        raise OptionError(f"no shape of {folder} has landmarks at {where}", hint)
     return found
 
 
@@ -210,15 +208,13 @@ def read_registered(folder: str | Path, template: Template) -> Float[Floats32, "
     """
     words, shapes = _read(Path(folder), "shapes", template, lambda arrays, _: arrays["verts"])
     if words.get("scale", "area") != "area":
-        raise InputError(
-            f"{folder} was prepared with --scale {words['scale']}, but registered shapes are learned at equal areas",
-            "prepare it with --scale area, or learn without correspondence (--unsupervised)",
+        problem = (
+            f"{folder} was prepared with --scale {words['scale']}, but registered shapes are learned at equal areas"
         )
+        raise InputError(problem, "prepare it with --scale area, or learn without correspondence (--unsupervised)")
     if not len(shapes):
-        raise InputError(
-            f"the shapes of {folder} do not share one connectivity",
-            "learn without correspondence (--unsupervised); registered means the same triangles in every file",
-        )
+        hint = "learn without correspondence (--unsupervised); registered means the same triangles in every file"
+        raise InputError(f"the shapes of {folder} do not share one connectivity", hint)
     return shapes
 
 

@@ -80,15 +80,11 @@ class Template:
 
 def save_template(template: Template, path: str | Path) -> None:
     """Write a bundle as one safetensors file (arrays, and a JSON header for the words)."""
-    arrays: dict[str, np.ndarray] = {
-        "verts": template.shape.verts,
-        "faces": template.shape.faces.astype(np.int32),
-        "dense_verts": template.dense.verts.astype(np.float32),
-        "dense_faces": template.dense.faces.astype(np.int32),
-        "nodes": template.nodes,
-        "labels": template.labels.astype(np.int32),
-        "core": template.core.astype(np.int32),
-    }
+    whole = {"faces": template.shape.faces, "dense_faces": template.dense.faces}
+    whole |= {"labels": template.labels, "core": template.core}
+    arrays: dict[str, np.ndarray] = {name: values.astype(np.int32) for name, values in whole.items()}
+    arrays |= {"verts": template.shape.verts, "nodes": template.nodes}
+    arrays["dense_verts"] = template.dense.verts.astype(np.float32)
     keys = ("name", "radius", "label_names", "pose", "source", "licence", "hash")
     words = {"schema": SCHEMA, **{key: getattr(template, key) for key in keys}}
     save_arrays(path, arrays, {"template": json.dumps(words)})

@@ -94,9 +94,8 @@ def build_rig(identities: int = 4096, seed: int = 0, progress: Progress | None =
         try:
             import anny
         except ImportError as error:
-            raise OptionError(
-                "generated human bodies need the package anny", "pip install 'meshmatch[train]'"
-            ) from error
+            hint = "pip install 'meshmatch[train]'"
+            raise OptionError("generated human bodies need the package anny", hint) from error
         model = anny.Anny(topology="notoes", phenotypes="all", local_changes="all", skinning_method="lbs")
     rng = np.random.default_rng(seed)
     rest, heads = [], []

@@ -48,13 +48,9 @@ class Landmarks:
 def at_vertices(shape: Shape, vertex: Int[Ints, " N"], names: tuple[str, ...] = ()) -> Landmarks:
     """Landmarks that are vertices (N,) of `shape`; `InputError` for one that it does not have."""
     vertex = np.asarray(vertex, np.int64)
-    _refuse(
-        (vertex < 0) | (vertex >= shape.V),
-        names,
-        lambda k: f" is vertex {vertex[k]}, but {shape.name or 'the source'} has {shape.V} vertices",
-        "vertices are counted from 0; are they landmarks of the source?",
-    )
-    N = len(vertex)
+    N, held = len(vertex), f"{shape.name or 'the source'} has {shape.V} vertices"
+    hint = "vertices are counted from 0; are they landmarks of the source?"
+    _refuse((vertex < 0) | (vertex >= shape.V), names, lambda k: f" is vertex {vertex[k]}, but {held}", hint)
     return _on_surface(shape, names, vertex, np.full(N, -1), np.tile([1.0, 0.0, 0.0], (N, 1)))
 
 
@@ -68,14 +64,10 @@ def at_points(
     usable = (np.abs(points) < 1e60).all(axis=1)
     _refuse(~usable, names, lambda k: f" has no position: {points[k].tolist()}")
     places = MappedMesh.of(shape).query(points)
-    _refuse(
-        places.distance > _ELSEWHERE * max(shape.diagonal, 1e-30),
-        names,
-        lambda k: (
-            f" lies {places.distance[k]:.4g} away from {shape.name or 'the source'}, whose size is {shape.diagonal:.4g}"
-        ),
-        "landmarks must be in the frame and unit of the source's file",
-    )
+    elsewhere = places.distance > _ELSEWHERE * max(shape.diagonal, 1e-30)
+    there = f"{shape.name or 'the source'}, whose size is {shape.diagonal:.4g}"
+    hint = "landmarks must be in the frame and unit of the source's file"
+    _refuse(elsewhere, names, lambda k: f" lies {places.distance[k]:.4g} away from {there}", hint)
     return _on_surface(shape, names, places.vertex, places.face, places.barycentric), places.distance
 
 
@@ -84,18 +76,12 @@ def at_faces(
 ) -> Landmarks:
     """Landmarks in faces, by weights of corners; `InputError` if there is no such face, or they do not sum to 1."""
     face, weights = np.asarray(face, np.int64), np.asarray(barycentric, np.float64).reshape(-1, 3)
-    _refuse(
-        (face < 0) | (face >= shape.F),
-        names,
-        lambda k: f" is in face {face[k]}, but {shape.name or 'the source'} has {shape.F} faces",
-        "faces are counted from 0; are they landmarks of the source?",
-    )
-    _refuse(
-        ~((weights >= -1e-9).all(axis=1) & (np.abs(weights.sum(axis=1) - 1.0) < 1e-4)),
-        names,
-        lambda k: f": its weights {weights[k].tolist()} do not sum to 1",
-        "the weights of a face's corners are 0 or more",
-    )
+    held = f"{shape.name or 'the source'} has {shape.F} faces"
+    hint = "faces are counted from 0; are they landmarks of the source?"
+    _refuse((face < 0) | (face >= shape.F), names, lambda k: f" is in face {face[k]}, but {held}", hint)
+    shares = (weights >= -1e-9).all(axis=1) & (np.abs(weights.sum(axis=1) - 1.0) < 1e-4)
+    hint = "the weights of a face's corners are 0 or more"
+    _refuse(~shares, names, lambda k: f": its weights {weights[k].tolist()} do not sum to 1", hint)
     weights = np.clip(weights, 0.0, None)
     weights /= weights.sum(axis=1, keepdims=True)
     return _on_surface(shape, names, shape.faces[face, weights.argmax(axis=1)], face, weights)

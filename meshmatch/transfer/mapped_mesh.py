@@ -110,9 +110,7 @@ class MappedMesh:
         return MappedFootpoints(vertex, face, weights, distance, confidence)
 
     def _search(self, points: Floats, normals: Floats, workers: int, near: Floats | None) -> tuple[Ints, Floats]:
-        """The best item of each point, a triangle or a lone vertex, and the weights of its corners. Nearest centers
-        come first, and none after which no item can be better: exact until `_MAX_TRIED` of a size have been tried.
-        """
+        """The best triangle or lone vertex of each point, with weights: exact until `_MAX_TRIED` of a size were tried."""
         N = len(points)
         best, item, weights = np.full(N, np.inf), np.zeros(N, np.int64), np.zeros((N, 3))
 
@@ -166,9 +164,7 @@ class MappedMesh:
         return weights, squared + self.unit**2 * (_UNCERTAIN**2 * doubt + (_FACING * opposed) ** 2)
 
     def _opposed(self, normals: Floats, corners: Ints) -> Floats:
-        """(N,) 0 where one of three corners faces into one half of space with a normal, up to 1 where all of
-        them face the opposite way. At a sharp edge their mean may face anywhere.
-        """
+        """(N,) 0 where one of three corners faces into one half of space with a normal, up to 1 where all face away."""
         cosine = np.einsum("nd,nkd->nk", normals, self.normals[corners]).max(axis=1)
         return np.maximum(-cosine, 0.0)
 
@@ -245,9 +241,7 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
 
 
 def _meeting_vertices(found: VertexMap, source: Shape, V: int) -> tuple[Int[Ints, " N"], Int[Ints, " N"]]:
-    """Target vertices on which several source vertices meet, and of these, any of which would be closest, the one
-    nearest to their mean: a map of vertex numbers to a coarser target puts a patch of the source on each vertex.
-    """
+    """Target vertices on which several source vertices meet, and of these the one nearest to their mean."""
     highest = np.zeros(V)
     rows = np.flatnonzero(found.on_vertex)
     at = found.index[rows]

@@ -66,9 +66,7 @@ def atlas_of(shape: Shape, own: Floats | None, size: int, padding: int, keep: Ke
 
 
 def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str]:
-    """Coordinates brought into 0..1 by whole numbers, a triangle at a time, which changes nothing on a repeated
-    image; and why they are not an atlas, empty if they are.
-    """
+    """Coordinates brought into 0..1 by whole numbers, a triangle at a time; why they are no atlas, empty if they are."""
     real = shape.face_areas > 0
     if not np.isfinite(uv[real]).all():
         return uv, "some are not numbers"
@@ -134,9 +132,7 @@ def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
 
 
 def _packed(charts: Floats, faces: Ints, grid: int, padding: float) -> Floats:
-    """(N, 2) charts side by side on a grid of about `grid`, at least `padding` of it apart: the most square of a few
-    attempts, as xatlas finds a width and a height by itself.
-    """
+    """(N, 2) charts side by side on about `grid` texels, `padding` apart: the most square of a few attempts of xatlas."""
     area = float(_flat_areas(charts[faces]).sum())
     best, most = charts, 0.0
     for density in _DENSITIES:

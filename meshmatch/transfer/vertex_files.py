@@ -148,9 +148,8 @@ def light_of(shape: Shape, colors: ArrayLike | None = None) -> Float[Floats, "V 
 def checked_colors(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
     """The same colors; `OptionError` where they are not 3 or 4 numbers within 0..1."""
     if colors.ndim == 0 or colors.shape[-1] not in (3, 4) or not ((colors >= 0) & (colors <= 1)).all():
-        raise OptionError(
-            "a color has 3 or 4 numbers within 0..1: red, green, blue and alpha", "such as 0.5,0.5,0.5 or #808080"
-        )
+        hint = "such as 0.5,0.5,0.5 or #808080"
+        raise OptionError("a color has 3 or 4 numbers within 0..1: red, green, blue and alpha", hint)
     return colors
 
 

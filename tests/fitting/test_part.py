@@ -23,6 +23,7 @@ from meshmatch.fitting.task import FitTask, take_samples
 from meshmatch.fitting.verdict import empty_share, judge
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.triangles import unit
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
@@ -70,7 +71,7 @@ def test_what_is_not_visible_is_not_held_against_a_part() -> None:
 
 def side_of(body: Shape, direction: np.ndarray) -> tuple[Shape, np.ndarray]:
     """The faces that look one way, as a mesh of their own, and which vertices it kept."""
-    faces = body.faces[body.face_normals @ direction > 0]
+    faces = body.faces[unit(body.face_vectors) @ direction > 0]
     used = np.unique(faces)
     return Shape(body.verts[used], np.searchsorted(used, faces), "side"), used
 

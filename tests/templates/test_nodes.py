@@ -6,18 +6,11 @@ import pytest
 from meshmatch.errors import OptionError, TemplateError
 from meshmatch.geometry.kernels import poorly_supported, support_pairs
 from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates import make
 from meshmatch.templates.location import bundled_folder
-from meshmatch.templates.make import (
-    STRATEGIES,
-    NodeConfig,
-    Strategy,
-    choose_nodes,
-    edge_graph,
-    farthest_points_any,
-    rejected_share,
-    spectral_clusters,
-)
+from meshmatch.templates.make import STRATEGIES, NodeConfig, Strategy, choose_nodes, edge_graph, spectral_clusters
 from meshmatch.templates.template import Template, load_template
 
 
@@ -33,6 +26,12 @@ def ring(torus: Shape) -> Shape:
 @pytest.fixture(scope="module")
 def human() -> Template:
     return load_template(bundled_folder() / "human" / "human-T.safetensors")
+
+
+def rejected_share(shape: Shape, config: NodeConfig, labels: np.ndarray | None = None) -> float:
+    """Share (0..1) of the candidates that a strategy rejects, before it becomes milder where vertices go without."""
+    samples, candidates = make._candidates(shape, config, noisy=False)
+    return float(1 - next(make._allowed(shape, config, candidates, labels, samples)).mean())
 
 
 def badly_held(verts: np.ndarray, nodes: np.ndarray, radius: float) -> list[int]:
@@ -190,8 +189,8 @@ def test_spectral_clusters_are_all_used_and_connected_pieces(ring: Shape) -> Non
 
 def test_farthest_points_in_any_dimension_by_hand() -> None:
     points = np.array([[0.0] * 5, [1.0] * 5, [10.0] * 5, [4.0] * 5])
-    assert farthest_points_any(points, 3).tolist() == [0, 2, 3]
-    assert farthest_points_any(points, 9).tolist()[:4] == [0, 2, 3, 1]
+    assert farthest_points(points, 3).tolist() == [0, 2, 3]
+    assert farthest_points(points, 4).tolist() == [0, 2, 3, 1]
 
 
 def test_vertices_out_of_reach_are_named(ring: Shape) -> None:

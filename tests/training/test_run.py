@@ -169,7 +169,7 @@ def test_the_presets_are_what_they_say() -> None:
     assert (papers.train.shapes, papers.train.scans_per_shape, papers.train.rate) == (16, 1, 1e-3)
     # 1,200 epochs of 1,000 shapes in batches of 16
     assert papers.train.steps == 1_200_000 // 16
-    assert papers.scan == ScanConfig(3000, 0, 0, 0, 0, 0, 0, 0, upright=True)
+    assert papers.scan == ScanConfig(3000, 0, 0, 0, 0, 0, 0, 0, upright=True, sphere=True)
     assert usual.network.encoder == "basis"
     assert usual.scan.noise > 0
     with pytest.raises(OptionError, match="unknown preset 'best'") as caught:

@@ -46,21 +46,14 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
     """
     vertex, uv, faces = split_at_seams(mesh)
     normals = smooth_normals(mesh.verts, mesh.faces)
-    material: dict[str, Any] = {
-        "name": name,
-        "doubleSided": True,
-        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0},
-    }
+    paint = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    material: dict[str, Any] = {"name": name, "doubleSided": True, "pbrMetallicRoughness": paint}
     if mesh.alpha != "opaque":
         material["alphaMode"] = mesh.alpha.upper()
     if mesh.alpha == "mask":
         material["alphaCutoff"] = mesh.cutoff
-    wrap = {"wrapS": _WRAPS[mesh.wrap], "wrapT": _WRAPS[mesh.wrap]}
-    look = {
-        "materials": [material],
-        "textures": [{"sampler": 0, "source": 0}],
-        "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPS, **wrap}],
-    }
+    sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPS, **dict.fromkeys(("wrapS", "wrapT"), _WRAPS[mesh.wrap])}
+    look = {"materials": [material], "textures": [{"sampler": 0, "source": 0}], "samplers": [sampler]}
     attributes = {"POSITION": mesh.verts[vertex], "NORMAL": normals[vertex], "TEXCOORD_0": uv}
     _write(path, name, attributes, faces, look, png)
 
@@ -86,17 +79,9 @@ def _write(path: Path, name: str, attributes: dict[str, Floats], faces: Ints, lo
         kinds = {"componentType": _UNSIGNED if whole else _FLOAT, "type": _TYPES[values.shape[1]]}
         accessors.append({"bufferView": k, **kinds, "count": len(values)})
     accessors[0] |= {"min": arrays[0].min(0).tolist(), "max": arrays[0].max(0).tolist()}  # positions need their box
-    document = {
-        "asset": {"version": "2.0", "generator": "meshmatch"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": name}],
-        "meshes": [{"primitives": [primitive], "name": name}],
-        **look,
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": starts[-1]}],
-    }
+    document = {"asset": {"version": "2.0", "generator": "meshmatch"}, "scene": 0, "scenes": [{"nodes": [0]}]}
+    document |= {"nodes": [{"mesh": 0, "name": name}], "meshes": [{"primitives": [primitive], "name": name}]} | look
+    document |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
     if png:
         primitive["material"] = 0
         document["images"] = [{"bufferView": len(arrays), "mimeType": "image/png", "name": name}]
