@@ -26,8 +26,8 @@ from meshmatch.render.scene import Scene
 from meshmatch.render.surface import Surface, face_paint
 from meshmatch.shapes.colors import oklab_to_linear, to_srgb
 from meshmatch.shapes.shape import Shape
-from meshmatch.training.bodies import cached_rig, draw_identities, sample_free_pose
-from meshmatch.training.rig import Rig, skin
+from meshmatch.training.bodies import draw_identities, sample_free_pose
+from meshmatch.training.rig import Rig, cached_rig, skin
 
 BACKGROUND = 0.55  # grey of the room
 _IDENTITIES = 64

@@ -112,16 +112,11 @@ def make_template(
     if parts.min() < 0:
         raise TemplateError(f"{shape.name} has a label below 0: {parts.min()}", "count parts from 0")
     in_core = np.ones(shape.V, bool) if core is None else np.isin(np.arange(shape.V), core)
-    return Template(
-        name=name,
-        shape=small,
-        dense=small if shape.is_cloud else Shape(frame.apply(shape.verts), shape.faces, name),
-        nodes=choose_nodes(small, config, None if labels is None else parts[keep], noisy=shape.is_cloud),
-        radius=config.radius,
-        labels=parts[keep],
-        label_names=tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1)),
-        core=np.flatnonzero(in_core[keep]),
-    )
+    dense = small if shape.is_cloud else Shape(frame.apply(shape.verts), shape.faces, name)
+    nodes = choose_nodes(small, config, None if labels is None else parts[keep], noisy=shape.is_cloud)
+    words = tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1))
+    core = np.flatnonzero(in_core[keep])
+    return Template(name, small, dense, nodes, config.radius, parts[keep], words, core)
 
 
 def choose_nodes(

@@ -154,10 +154,8 @@ def train_model(
     make_folder(checkpoint.parent)
     config, kernel = recipe.train, recipe.kernel
     if recipe.scan.sphere:  # lengths of the paper are in the unit sphere
-        config = replace(
-            config,
-            loss=replace(config.loss, reconstruction=config.loss.reconstruction / template_radius(template) ** 2),
-        )
+        reconstruction = config.loss.reconstruction / template_radius(template) ** 2
+        config = replace(config, loss=replace(config.loss, reconstruction=reconstruction))
         facts = replace(facts, frame=facts.frame or {"orientation": "searched", "scale": "sphere"})
     points: Any
     data: Any = source

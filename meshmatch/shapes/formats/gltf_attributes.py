@@ -98,12 +98,9 @@ class _Look:
         """A material of the file, with its image if there are coordinates."""
         entry, texture, factor = self._base(number)
         red, green, blue, alpha = (float(np.clip(value, 0.0, 1.0)) for value in factor)
-        made = Material(
-            str(entry.get("name", "")),
-            factor=(red, green, blue, alpha),
-            alpha=_ALPHAS[entry.get("alphaMode", "OPAQUE")],
-            cutoff=float(entry.get("alphaCutoff", 0.5)),
-        )
+        meaning, cutoff = _ALPHAS[entry.get("alphaMode", "OPAQUE")], float(entry.get("alphaCutoff", 0.5))
+        name, factor = str(entry.get("name", "")), (red, green, blue, alpha)
+        made = Material(name, factor=factor, alpha=meaning, cutoff=cutoff)
         if laid and self.picture is not None:
             made = replace(made, image=self.picture, factor=(1.0, 1.0, 1.0, 1.0))
         if not laid or texture is None:
