@@ -194,7 +194,7 @@ class PointwiseField:
 
     def deformation_gradient(self, rows: Float[torch.Tensor, "B R 3"]) -> Float[torch.Tensor, "B G 3 3"]:
         code, turn = unpack(rows, self.D)
-        F = jacobian(self.motion, self.strained.expand(len(code), -1, -1), code)
+        F = value_and_jacobian(self.motion, self.strained.expand(len(code), -1, -1), code)[1]
         F = F + torch.eye(3, dtype=F.dtype, device=F.device)
         return F + turn.transpose(1, 2)[:, None] @ F
 
@@ -226,23 +226,24 @@ class PointwiseField:
         return PointwiseField(points, strained, self.motion, self.D)
 
 
-def jacobian(
+def value_and_jacobian(
     motion: Motion, points: Float[torch.Tensor, "B P 3"], code: Float[torch.Tensor, "B D"]
-) -> Float[torch.Tensor, "B P 3 3"]:
-    """du_a / dx_k of a motion, by automatic differentiation; itself differentiable where gradients are.
+) -> tuple[Float[torch.Tensor, "B P O"], Float[torch.Tensor, "B P O 3"]]:
+    """What a network answers at points (of a motion u), and du_a / dx_k; differentiable where gradients are.
 
     Points do not act on one another, so the gradient of a sum over points holds each point's own. Backwards through the
-    network once for each coordinate: forward mode costs the same here and more memory for its tangents.
+    network once for each output: forward mode costs the same here and more memory for its tangents.
     """
     wanted = torch.is_grad_enabled() and not torch.is_inference_mode_enabled()
     with torch.inference_mode(False), torch.enable_grad():
         at = points.clone().requires_grad_(True)
         moved = motion(at, code.clone())
+        last = moved.shape[-1] - 1
         rows = [
-            torch.autograd.grad(moved[..., a].sum(), at, create_graph=wanted, retain_graph=wanted or a < 2)[0]
-            for a in range(3)
+            torch.autograd.grad(moved[..., a].sum(), at, create_graph=wanted, retain_graph=wanted or a < last)[0]
+            for a in range(last + 1)
         ]
-    return torch.stack(rows, -2)
+    return moved if wanted else moved.detach(), torch.stack(rows, -2)
 
 
 # A representation on P fixed points; both answer the same questions, and take rows (B, R, 3).

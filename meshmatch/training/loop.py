@@ -19,7 +19,9 @@ from torch import Tensor
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.models.deformer import Deformer
 from meshmatch.outputs import replace_on_success
-from meshmatch.training.losses import CorrespondenceLoss, LossPoints, Objective
+from meshmatch.training.losses import CorrespondenceLoss, Objective
+
+_OF_TEMPLATE = ("nodes", "anchors")  # what a checkpoint must share with the training that goes on from it
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ def learning_rate(step: int, config: TrainConfig) -> float:
 class Trainer:
     """State of a run: weights, their average, the optimiser and the next step. All of it is in a checkpoint."""
 
-    def __init__(self, model: Deformer, points: LossPoints, config: TrainConfig) -> None:
+    def __init__(self, model: Any, points: Any, config: TrainConfig) -> None:
         self.config = config
         self.rank = int(os.environ.get("RANK", 0))
         self.world = int(os.environ.get("WORLD_SIZE", 1))
@@ -97,7 +99,7 @@ class Trainer:
         if self.world > 1 and not dist.is_initialized():
             dist.init_process_group("nccl" if cuda else "gloo")
         self.model = model.to(self.device)
-        self.points = points.to(self.device)
+        self.points: Any = None if points is None else points.to(self.device)
         self.average = {n: p.detach().clone() for n, p in model.named_parameters()}
         settings: dict[str, Any] = {"betas": (0.9, config.momentum), "weight_decay": config.weight_decay, "fused": True}
         self.optimiser = torch.optim.AdamW(model.parameters(), config.rate, **settings)
@@ -135,7 +137,7 @@ class Trainer:
         weights, here = parts["model"], self.model.state_dict()
         if {n: t.shape for n, t in weights.items()} != {n: t.shape for n, t in here.items()}:
             raise ModelError(f"{path} is a checkpoint of another network", hint)
-        if not all(torch.equal(weights[n], here[n].cpu()) for n in ("nodes", "anchors")):
+        if not all(torch.equal(weights[n], here[n].cpu()) for n in here if n.endswith(_OF_TEMPLATE)):
             raise ModelError(f"{path} is a checkpoint for another template", hint)
         self.step, self.seconds = step, seconds
         self.model.load_state_dict(weights)
