@@ -77,3 +77,15 @@ def test_the_check_of_the_page_fails_on_a_stale_one(tmp_path: Path, capsys: pyte
     with pytest.raises(SystemExit):
         reference.main(["--help"])
     assert not Path("--help").exists()
+
+
+def test_the_paper_page_names_what_there_is() -> None:
+    text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`((?:\w+/)+\w+\.py)`", text))
+    assert len(named) > 30
+    assert sorted(name for name in named if not any((root / name).is_file() for root in (ROOT, ROOT / "meshmatch"))) == []
+    modules = set(re.findall(r"python -m meshmatch\.([\w.]+)", text))
+    assert [name for name in modules if not (ROOT / "meshmatch" / f"{name.replace('.', '/')}.py").is_file()] == []
+    for row in re.findall(r"^\| (.*) \|$", text, re.MULTILINE):
+        for path, name in re.findall(r"`(\w+/\w+\.py)` `(\w+)`", row):
+            assert name.split(".")[0] in (ROOT / "meshmatch" / path).read_text(encoding="utf-8"), row
