@@ -83,7 +83,9 @@ def test_the_paper_page_names_what_there_is() -> None:
     text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`((?:\w+/)+\w+\.py)`", text))
     assert len(named) > 30
-    assert sorted(name for name in named if not any((root / name).is_file() for root in (ROOT, ROOT / "meshmatch"))) == []
+    assert (
+        sorted(name for name in named if not any((root / name).is_file() for root in (ROOT, ROOT / "meshmatch"))) == []
+    )
     modules = set(re.findall(r"python -m meshmatch\.([\w.]+)", text))
     assert [name for name in modules if not (ROOT / "meshmatch" / f"{name.replace('.', '/')}.py").is_file()] == []
     for row in re.findall(r"^\| (.*) \|$", text, re.MULTILINE):
