@@ -1,7 +1,7 @@
 """The paper's preset from the first word to a map: `train --preset paper`, then `match` and `register` with it."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +25,21 @@ from meshmatch.training import recipes
 from meshmatch.training.train import build_dataset
 from tests.training.small import POINTS, egg_template
 
-QUICK = FitConfig(samples=1000, coarse_samples=300)
+
+@dataclass(frozen=True)
+class QuickConfig(FitConfig):
+    """Fewer samples."""
+
+    samples: int = 1000
+    coarse_samples: int = 300
+
+
+QUICK = QuickConfig()
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("meshmatch.fitting.fit_config.FitConfig", lambda **choices: replace(QUICK, **choices))
+    monkeypatch.setattr("meshmatch.fitting.fit_config.FitConfig", QuickConfig)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +55,7 @@ def eggs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def model(eggs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The preset as it is, but for a narrow network, few points, small batches and a rate that suits 60 steps."""
+    """The preset as it is, but for a narrow network, few points, small batches and a rate that suits 120 steps."""
     root = tmp_path_factory.mktemp("paper")
     prepare(eggs, root / "prepared", PrepareConfig(NodeConfig("uniform", 36, 0.45)))
     plain = recipes.paper
@@ -60,7 +69,7 @@ def model(eggs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recipes, "paper", narrow)
-        words = ["--preset", "paper", "--steps", "60", "--workers", "0", "--name", "eggs", "-q"]
+        words = ["--preset", "paper", "--steps", "120", "--workers", "0", "--name", "eggs", "-q"]
         prepared = str(root / "prepared")
         assert main(["train", "--shapes", prepared, "-o", str(root / "model"), *words]) == 0
     return root / "model"
@@ -73,7 +82,7 @@ def loaded(model: Path) -> TrainedModel:
 
 def test_the_model_has_the_papers_choices(loaded: TrainedModel) -> None:
     card = loaded.card
-    assert card.steps == 60
+    assert card.steps == 120
     assert card.field["kernel"] == "cubic"
     assert (card.network["encoder"], card.network["decoder"]) == ("point", "node")
     assert card.recipe["scan"]["upright"] is True
