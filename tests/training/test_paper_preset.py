@@ -55,7 +55,7 @@ def eggs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def model(eggs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The preset as it is, but for a narrow network, few points, small batches and a rate that suits 120 steps."""
+    """The preset as it is, but for a narrow network, few points, small batches, and what suits 200 steps."""
     root = tmp_path_factory.mktemp("paper")
     prepare(eggs, root / "prepared", PrepareConfig(NodeConfig("uniform", 36, 0.45)))
     plain = recipes.paper
@@ -64,12 +64,12 @@ def model(eggs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         chosen = plain()
         same = (chosen.network.encoder, chosen.network.decoder, chosen.network.align_basis, chosen.network.corrections)
         assert same == (POINTS.encoder, POINTS.decoder, POINTS.align_basis, POINTS.corrections)
-        train = replace(chosen.train, shapes=6, rate=5e-3, warm_up=5)
+        train = replace(chosen.train, shapes=6, rate=5e-3, warm_up=5, average=0.99)
         return replace(chosen, network=POINTS, scan=replace(chosen.scan, points=96), train=train)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recipes, "paper", narrow)
-        words = ["--preset", "paper", "--steps", "120", "--workers", "0", "--name", "eggs", "-q"]
+        words = ["--preset", "paper", "--steps", "200", "--workers", "0", "--name", "eggs", "-q"]
         prepared = str(root / "prepared")
         assert main(["train", "--shapes", prepared, "-o", str(root / "model"), *words]) == 0
     return root / "model"
@@ -82,7 +82,7 @@ def loaded(model: Path) -> TrainedModel:
 
 def test_the_model_has_the_papers_choices(loaded: TrainedModel) -> None:
     card = loaded.card
-    assert card.steps == 120
+    assert card.steps == 200
     assert card.field["kernel"] == "cubic"
     assert (card.network["encoder"], card.network["decoder"]) == ("point", "node")
     assert card.recipe["scan"]["upright"] is True
