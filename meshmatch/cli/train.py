@@ -182,7 +182,7 @@ def train(
         from meshmatch.training import train as training
         from meshmatch.training.bodies import Bodies
         from meshmatch.training.pose_files import load_poses
-        from meshmatch.training.recipes import PAPER_TEMPLATE, recipe_for
+        from meshmatch.training.recipes import recipe_for
 
     set_threads(how.threads)
     if how.picture is not None:
@@ -197,8 +197,7 @@ def train(
     recipe = recipe_for(how.shapes, how.preset, how.unsupervised)
     recipe = recipe.changed(**{name: getattr(how, name) for name in settings})
     known = None if how.poses is None else load_poses(how.poses, how.pose_share)
-    template = how.template or (PAPER_TEMPLATE if how.preset == "paper" else "human-T")
-    bodies = Bodies(template, how.identities, known) if how.shapes is None or known is not None else None
+    bodies = Bodies(how.template, how.identities, known) if how.shapes is None or known is not None else None
     facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, how.start)
     if not how.fresh and (output / training.CHECKPOINT).is_file():
         console.say(f"going on from the checkpoint in {output}; --fresh starts anew")

@@ -51,10 +51,12 @@ def in_torch(network: Network, K: int, device: str = "cpu") -> Deformer:
         from meshmatch.models.deformer import Deformer, with_weights
 
     if isinstance(network, NodeNetwork):
-        network = with_weights(network.config, K, network.weights)
-    assert isinstance(network, Deformer)
+        found = with_weights(network.config, K, network.weights)
+    else:  # pointwise; others may use it on the CPU
+        assert isinstance(network, Deformer)
+        found = network if device == "cpu" else copy.deepcopy(network)
     try:
-        return copy.deepcopy(network).to(torch.device(device)) if device != "cpu" else network
+        return found.to(torch.device(device))
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         problem = f"device {device!r} cannot be used: {str(error).splitlines()[0]}"
         raise OptionError(problem, "write cpu, or cuda") from error

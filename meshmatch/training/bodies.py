@@ -32,7 +32,7 @@ from meshmatch.training.rotations import DEGREE, rotation_between, rotation_from
 class Bodies:
     """Which human bodies are generated: on the vertices of a template, of so many different people, some in given poses."""
 
-    template: str | Path = "human-T"
+    template: str | Path | None = None  # the recipe's, see `meshmatch.training.recipes.Recipe`
     identities: int = 4096
     poses: GivenPoses | None = None
 

@@ -16,8 +16,6 @@ from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss
 from meshmatch.training.scans import ScanConfig
 
 Preset = Literal["default", "paper"]
-PAPER_TEMPLATE = "human-T-300"
-"""The bundled template with the paper's 300 nodes, each with a radius of a fifth of the diameter."""
 _PLAIN_ADAM: dict[str, Any] = {
     "warm_up": 0, "decay": 0.0, "weight_decay": 0.0, "average": 0.0, "momentum": 0.999, "clip": None,
 }  # fmt: skip
@@ -29,7 +27,8 @@ class Recipe:
     """Network, training (with its loss), simulated scans and kernel.
 
     ``deform``: registered shapes are smoothly deformed whenever they are drawn, and the card says how a fit finds the
-    orientation, as the network does not. ``storage``: how compactly the weights are written.
+    orientation, as the network does not. ``storage``: how compactly the weights are written. ``template``: the bundled one
+    that generated bodies have, unless they name another.
     """
 
     network: NetworkConfig
@@ -38,6 +37,7 @@ class Recipe:
     kernel: Kernel
     deform: bool = False
     storage: Storage = "int8"
+    template: str = "human-T"
 
     def changed(self, **settings: Any) -> Recipe:
         """Another recipe: fields of `TrainConfig`, ``field`` of the network, ``volume``, ``arap`` and ``blend`` of the loss;
@@ -66,11 +66,11 @@ def paper() -> Recipe:
     Adam as it is.
 
     Scans are 3,000 clean points in the unit sphere, turned about the vertical axis; 75,000 steps are its 1,200 epochs of
-    1,000 shapes. Its 300 nodes are those of the template `PAPER_TEMPLATE`.
+    1,000 shapes. The template has its 300 nodes, each with a radius of a fifth of the diameter.
     """
     train = TrainConfig(steps=75_000, shapes=16, scans_per_shape=1, **_PLAIN_ADAM)
     clean = dict.fromkeys(("noise", "holes", "outliers", "partial", "density", "bumps", "scale"), 0.0)
-    return Recipe(PAPER, train, ScanConfig(3000, upright=True, sphere=True, **clean), "cubic")
+    return Recipe(PAPER, train, ScanConfig(3000, upright=True, sphere=True, **clean), "cubic", template="human-T-300")
 
 
 def small_data() -> Recipe:

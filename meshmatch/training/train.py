@@ -100,7 +100,7 @@ def train(
     source: Source | ShapeSamples
     if shapes is None:
         bodies = bodies or Bodies()
-        template = read_template(bodies.template)
+        template = read_template(bodies.template or recipe.template)
         making = Progress(progress, "bodies").stage("making bodies (once)")
         source = human_source(template, bodies.identities, recipe.train.seed, making, bodies.poses)
         category, data = "human", bodies.words

@@ -66,6 +66,11 @@ def test_match_refuses_values_that_do_not_exist(
     assert not output.exists()
 
 
+def test_match_hands_on_the_device(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
+    run("match", *two, "-o", two[0].with_name("map.npy"), "--device", "cuda")
+    assert [config.device for config in stub.called["config"]] == ["cuda", "cuda"]
+
+
 def test_match_reads_landmarks(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
     file = two[0].with_name("pairs.txt")
     file.write_text("source target\n0 10\n5 11  # the nose\n")

@@ -65,11 +65,12 @@ def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
     assert "unfinished: step 2 of 13,000; the same command goes on" in answer.err
 
 
+@pytest.mark.parametrize("weight", ["volume", "arap", "blend"])
 @pytest.mark.parametrize("preset", ["default", "paper"])
-def test_the_weight_of_blends_alone_is_changed(run: Run, stub: Recorder, tmp_path: Path, preset: Any) -> None:
-    assert run("train", "-o", tmp_path / "mine", "--preset", preset, "--blend", 1).status == 0
+def test_one_weight_alone_is_changed(run: Run, stub: Recorder, tmp_path: Path, preset: Any, weight: str) -> None:
+    assert run("train", "-o", tmp_path / "mine", "--preset", preset, f"--{weight}", 1).status == 0
     usual = recipe_for(preset=preset)
-    wanted = replace(usual.train, loss=replace(usual.train.loss, blend=1.0))
+    wanted = replace(usual.train, loss=replace(usual.train.loss, **{weight: 1.0}))
     assert stub.called["recipe"] == replace(usual, train=wanted) != usual
 
 
@@ -119,6 +120,13 @@ def test_a_training_starts_from_a_model(run: Run, stub: Recorder, tmp_path: Path
     answer = run("train", "-o", tmp_path / "mine", "--start", "humam")
     assert answer.status == 1
     assert "human" in answer.err
+
+
+def test_a_preset_has_its_template(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    run("train", "-o", tmp_path / "mine", "--preset", "paper")
+    assert stub.bodies[0] == "human-T-300"
+    run("train", "-o", tmp_path / "mine", "--preset", "paper", "--template", "human-A")
+    assert stub.bodies[0] == "human-A"
 
 
 def test_identities(run: Run, stub: Recorder, tmp_path: Path) -> None:

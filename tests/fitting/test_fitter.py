@@ -64,6 +64,18 @@ def test_a_device_that_is_not_there_is_said(model: TrainedModel, egg: Shape, dev
         Fitter(model, replace(QUICK, device=device)).fit(egg)
 
 
+def test_a_device_that_is_not_there_ends_the_command(
+    model: TrainedModel, egg: Shape, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, file, output = write_model(model, tmp_path / "egg"), tmp_path / "a.ply", tmp_path / "map.npy"
+    save_shape(file, egg)
+    words = ["match", file, file, "-o", output, "--model", folder, "--device", "abacus", "-q"]
+    assert main([str(word) for word in words]) == 1
+    told = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[0] for line in told] == ["error", "hint"]
+    assert not output.exists()
+
+
 @pytest.mark.parametrize("refine", REFINEMENTS)
 def test_a_fit_is_whole(model: TrainedModel, egg: Shape, fits: dict[Refine, Fit], refine: Refine) -> None:
     fit = fits[refine]

@@ -11,6 +11,7 @@ from meshmatch.fitting.latent import LatentRefineConfig, PaperEnergy, refine_cod
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress
+from meshmatch.templates.template import template_radius
 from tests.fitting.eggs import bent_egg, egg_model, gentle_vectors, scan_of
 from tests.training.small import POINTS
 
@@ -31,6 +32,14 @@ def energy(
     model: TrainedModel, scan: OrientedPoints, vectors: np.ndarray, config: LatentRefineConfig = CONFIG
 ) -> float:
     return PaperEnergy(model, scan, config, np.random.default_rng(0)).value(vectors)
+
+
+def test_lengths_are_in_the_unit_sphere_where_the_model_scales_by_it(model: TrainedModel, scan: OrientedPoints) -> None:
+    chamfer, still = replace(CONFIG, volume=0.0, arap=0.0), np.zeros((model.template.K, 3))
+    sphere = replace(model, card=replace(model.card, frame={"orientation": "searched", "scale": "sphere"}))
+    radius = template_radius(model.template)
+    assert abs(radius - 1) > 0.1
+    assert energy(sphere, scan, still, chamfer) == pytest.approx(energy(model, scan, still, chamfer) / radius**2)
 
 
 def search(model: TrainedModel, scan: OrientedPoints, config: LatentRefineConfig = CONFIG, **more) -> np.ndarray:

@@ -22,7 +22,8 @@ from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.template import read_template, template_radius
 from meshmatch.training import recipes
-from meshmatch.training.train import build_dataset
+from meshmatch.training.loop import TrainConfig
+from meshmatch.training.train import CardFacts, build_dataset, train_model
 from tests.training.small import POINTS, egg_template
 
 
@@ -100,7 +101,7 @@ def test_the_papers_numbers() -> None:
     assert (chosen.scan.points, chosen.scan.sphere, chosen.kernel) == (3000, True, "cubic")
     config = recipes.paper_clouds().train.loss  # table 2
     assert (config.reconstruction, config.volume, config.arap, config.blend) == (1.0, 1e-4, 1e-3, 1e-4)
-    template = read_template(recipes.PAPER_TEMPLATE)
+    template = read_template(chosen.template)
     assert template.K == 300
     middle = 0.5 * (template.shape.verts.min(0) + template.shape.verts.max(0))
     diameter = 2 * np.linalg.norm(template.shape.verts - middle, axis=1).max()
@@ -119,6 +120,27 @@ def test_shapes_to_learn_from_have_the_templates_radius() -> None:
         )
         far = data[0].targets.norm(dim=-1).amax(1)
         assert (abs(far - template_radius(template)).max() < 0.05) == sphere
+
+
+def test_lengths_of_the_loss_are_those_of_the_unit_sphere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A distance in the template's unit is divided by its radius, so its square, and the weight, by the radius squared."""
+
+    class Seen(Exception):
+        pass
+
+    def trainer(_model: object, _points: object, config: TrainConfig) -> None:
+        raise Seen(config.loss.reconstruction)
+
+    monkeypatch.setattr("meshmatch.training.train.Trainer", trainer)
+    template, narrow = egg_template(), replace(recipes.paper(), network=POINTS)
+    verts = torch.tensor(template.shape.verts).float()
+    for sphere, unit in ((True, template_radius(template)), (False, 1.0)):
+        recipe = replace(narrow, scan=replace(narrow.scan, points=50, sphere=sphere))
+        with pytest.raises(Seen) as found:
+            train_model(
+                template, lambda n, _: verts.expand(n, -1, -1), tmp_path / str(sphere), recipe, CardFacts("egg")
+            )
+        assert found.value.args[0] == pytest.approx(unit**-2)
 
 
 def test_weights_of_losses_can_be_set() -> None:
