@@ -153,6 +153,9 @@ class TrainOptions:
     licence: str = Option("unstated", help="Terms of use of the weights; written on the card.")
     steps: int | None = Option(None, min=1, help="Training steps; default: the preset's.")
     minutes: float | None = Option(None, min=0.0, help="Stop after so many minutes; the same command goes on later.")
+    points: int | None = Option(
+        None, min=64, help="Points of a scan that are learned from; fewer are quicker at first. Default: the preset's."
+    )
     identities: int = Option(4096, min=1, help="How many different bodies are generated.")
     poses: Path | None = optional("FILE", "Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md).")
     pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
@@ -193,7 +196,20 @@ def train(
     check_writable(how.picture)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
     console = Console(quiet or not first)
-    settings = ("field", "volume", "arap", "blend", "rate", "steps", "minutes", "bf16", "workers", "threads", "seed")
+    settings = (
+        "field",
+        "volume",
+        "arap",
+        "blend",
+        "rate",
+        "points",
+        "steps",
+        "minutes",
+        "bf16",
+        "workers",
+        "threads",
+        "seed",
+    )
     recipe = recipe_for(how.shapes, how.preset, how.unsupervised)
     recipe = recipe.changed(**{name: getattr(how, name) for name in settings})
     known = None if how.poses is None else load_poses(how.poses, how.pose_share)

@@ -137,8 +137,7 @@ class NodeNetwork:
         return vectors + np.float32(0.1) * change.reshape(B, -1, 3)
 
     def _linear(self, name: str, x: Floats32) -> Floats32:
-        matrix = self.weights[f"{name}.weight"]
-        out = x @ matrix.reshape(matrix.shape[:2]).T
+        out = x @ self.weights[f"{name}.weight"].T
         bias = self.weights.get(f"{name}.bias")
         return out if bias is None else out + bias
 

@@ -133,7 +133,7 @@ class PointEncoder(nn.Module):
         sizes = [2 * frequencies, latent // 8, latent // 4, latent // 2, latent]
         layers: list[nn.Module] = []
         for i, (a, b) in enumerate(pairwise(sizes)):
-            layers += [nn.Conv1d(a, b, 1), nn.BatchNorm1d(b)]
+            layers += [nn.Linear(a, b), nn.BatchNorm1d(b)]
             layers += [nn.ReLU()] if i < len(sizes) - 2 else []
         self.points = nn.Sequential(*layers)
         self.head = nn.Sequential(nn.Linear(latent, latent), nn.ReLU(), nn.Dropout(dropout), nn.Linear(latent, outputs))
@@ -144,7 +144,8 @@ class PointEncoder(nn.Module):
         return torch.cat([angle.sin(), angle.cos()], -1) / math.sqrt(len(self.frequencies))
 
     def forward(self, features: Float[torch.Tensor, "B ..."]) -> Float[torch.Tensor, "B D"]:
-        return self.head(self.points(features.transpose(1, 2)).amax(-1))
+        found = self.points(features.flatten(0, 1)).unflatten(0, features.shape[:2])
+        return self.head(found.amax(1))
 
 
 class FlatDecoder(nn.Module):

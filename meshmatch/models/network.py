@@ -95,8 +95,8 @@ def weight_shapes(config: NetworkConfig, K: int) -> dict[str, tuple[int, ...]]:
     """Shapes of the weights and buffers of a network with K nodes, by name; not for pointwise fields."""
     found: dict[str, tuple[int, ...]] = {"nodes": (K, 3), "anchors": (K, 3), "anchor_phi": (K, K)}
 
-    def linear(name: str, inputs: int, outputs: int, *rest: int) -> None:
-        found.update({f"{name}.weight": (outputs, inputs, *rest), f"{name}.bias": (outputs,)})
+    def linear(name: str, inputs: int, outputs: int) -> None:
+        found.update({f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)})
 
     def norm(name: str, width: int) -> None:
         found.update({f"{name}.weight": (width,), f"{name}.bias": (width,)})
@@ -122,7 +122,7 @@ def weight_shapes(config: NetworkConfig, K: int) -> dict[str, tuple[int, ...]]:
     else:
         found["encoder.frequencies"] = (POINT_SIZES[0] // 2, 3)
         for number, (inputs, outputs) in enumerate(pairwise(POINT_SIZES)):
-            linear(f"encoder.points.{3 * number}", inputs, outputs, 1)
+            linear(f"encoder.points.{3 * number}", inputs, outputs)
             batch_norm(f"encoder.points.{3 * number + 1}", outputs)
         linear("encoder.head.0", 1024, 1024)
         linear("encoder.head.3", 1024, code)

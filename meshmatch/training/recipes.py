@@ -40,19 +40,20 @@ class Recipe:
     template: str = "human-T"
 
     def changed(self, **settings: Any) -> Recipe:
-        """Another recipe: fields of `TrainConfig`, ``field`` of the network, ``volume``, ``arap`` and ``blend`` of the loss;
-        None changes nothing.
+        """Another recipe: fields of `TrainConfig`, ``field`` of the network, ``points`` of a scan, ``volume``, ``arap`` and
+        ``blend`` of the loss; None changes nothing.
 
         `OptionError` if a setting is unknown or out of range.
         """
         wanted = {name: value for name, value in settings.items() if value is not None}
         network = replace(self.network, field=wanted.pop("field", self.network.field))
+        scan = replace(self.scan, points=wanted.pop("points", self.scan.points))
         weights = {name: wanted.pop(name) for name in ("volume", "arap", "blend") & wanted.keys()}
         loss = replace(self.train.loss, **weights)
         known = {each.name for each in fields(TrainConfig)}
         if unknown := sorted(wanted.keys() - known):
             raise OptionError(f"unknown training setting {unknown[0]!r}", f"choose from {', '.join(sorted(known))}")
-        return replace(self, network=network, train=replace(self.train, **({"loss": loss} | wanted)))
+        return replace(self, network=network, scan=scan, train=replace(self.train, **({"loss": loss} | wanted)))
 
 
 def default() -> Recipe:
