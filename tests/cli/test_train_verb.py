@@ -74,6 +74,13 @@ def test_one_weight_alone_is_changed(run: Run, stub: Recorder, tmp_path: Path, p
     assert stub.called["recipe"] == replace(usual, train=wanted) != usual
 
 
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_scans_can_have_fewer_points(run: Run, stub: Recorder, tmp_path: Path, preset: Any) -> None:
+    assert run("train", "-o", tmp_path / "mine", "--preset", preset, "--points", 512).status == 0
+    usual = recipe_for(preset=preset)
+    assert stub.called["recipe"] == replace(usual, scan=replace(usual.scan, points=512)) != usual
+
+
 @pytest.mark.parametrize(
     ("words", "name", "value"),
     [
