@@ -1,229 +1,22 @@
-"""The methods of the comparison (`METHODS`), each behind the benchmark's `Method`; the libraries do the work.
-
-Those that bend one shape onto the other begin with the same rigid alignment: both shapes scaled to area 1 and centered,
-all orientations tried (`shapes.align`). A library that gives up on a pair fails that pair (`InputError`); a bug of ours
-stays a bug.
-"""
+"""The rows of the comparison (`METHODS`): classical methods by themselves and from our orientation, learned ones, ours."""
 
 from __future__ import annotations
 
-import os
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
-from scipy.spatial import cKDTree
 
 from meshmatch.api.matching import Matcher
-from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.errors import InputError
 from meshmatch.experiments.bench import Method, OurMethod
+from meshmatch.experiments.classical_baselines import Registration, ZoomOut
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.latent import LatentRefineConfig
-from meshmatch.geometry.frames import Frame
-from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.footpoints import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import find_model
-from meshmatch.shapes.decimate import decimate
-from meshmatch.shapes.normalise import align, sqrt_area_frame
-from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-
-_SAMPLES = 2400
-MONK_UNIT = 100.0
-"""What sqrt(area) is for meshmonk, whose defaults are for faces in millimeters."""
-
-
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """A shape of area 1, centered, and samples of it; ``thin`` is the same with fewer triangles, where asked for."""
-
-    whole: Shape
-    thin: Shape
-    samples: OrientedPoints
-
-
-def placed(shape: Shape, seed: int = 0, faces: int | None = None) -> Placed:
-    """Scale and center a shape, sample it, and thin it to about so many faces."""
-    frame = sqrt_area_frame(shape)
-    drawn = sample_surface(shape, _SAMPLES, np.random.default_rng(seed))
-    whole = Shape(frame.apply(shape.verts), shape.faces, shape.name, invalid=shape.invalid)
-    thin = whole if faces is None or whole.is_cloud else decimate(whole, faces)
-    return Placed(whole, thin, drawn.in_frame(frame))
-
-
-def turn_to(source: Placed, target: Placed) -> Frame:
-    """The rigid motion that brings a source onto a target."""
-    return align(source.samples, target.samples, "rigid")[0].pose.frame
-
-
-def carried(source: Placed, moved: Float[Floats, "V_thin 3"]) -> Float[Floats, "V_src 3"]:
-    """Where the whole source's vertices go when those of the thin one go to ``moved``."""
-    thin = source.thin
-    surface = Surface(thin.verts, thin.faces, thin.vertex_normals)
-    foot = surface.query(source.whole.verts, source.whole.vertex_normals)
-    return interpolate(moved, thin.faces[foot.face], foot.barycentric)
-
-
-def need_meshes(name: str, shape: Shape) -> None:
-    """Refuse clouds (`InputError`)."""
-    if shape.is_cloud:
-        raise InputError(f"{name} needs triangles: {shape.name} is a point cloud")
-
-
-@contextmanager
-def library(name: str) -> Iterator[None]:
-    """What a library does with its input: failures become `InputError`, its warnings and words go nowhere."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 2)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    except (ValueError, ArithmeticError, RuntimeError, IndexError) as error:
-        raise InputError(f"{name} gave up: {error or type(error).__name__}") from error
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
-
-
-@dataclass(frozen=True)
-class Registration:
-    """Rigid alignment, a registration of the source (thinned to ``faces``) onto the target, the nearest vertex.
-
-    - rigid: no registration.
-    - nricp: non-rigid ICP (Amberg et al. 2007) of trimesh with its own weights. Nearest points are the target's
-      vertices: the nearest on its faces would take rtree. Landmarks are not given.
-    - meshmonk: viscoelastic registration with its defaults; the target is thinned too.
-    """
-
-    kind: Literal["rigid", "nricp", "meshmonk"]
-    faces: int | None = None
-    seed: int = 0
-
-    def fit(self, shape: Shape) -> Placed:
-        """Scale, center, sample, thin."""
-        if self.kind != "rigid":
-            need_meshes(self.kind, shape)
-        return placed(shape, self.seed, self.faces)
-
-    def map(self, source: Shape, source_fit: Placed, target: Shape, target_fit: Placed) -> VertexMap:
-        """Align, register."""
-        turn = turn_to(source_fit, target_fit)
-        if self.kind == "rigid":
-            moved = turn.apply(source_fit.whole.verts)
-        else:
-            register = nricp if self.kind == "nricp" else viscoelastic
-            thin, there = source_fit.thin, target_fit.thin if self.kind == "meshmonk" else target_fit.whole
-            moved = carried(
-                source_fit,
-                register(
-                    (turn.apply(thin.verts), thin.vertex_normals @ turn.rotation.T, thin.faces),
-                    (there.verts, there.vertex_normals, there.faces),
-                ),
-            )
-        if not np.isfinite(moved).all():
-            raise InputError(f"{source.name}: the registration diverged")
-        return VertexMap.between(source, target, cKDTree(target_fit.whole.verts).query(moved)[1])
-
-
-Mesh = tuple[Floats, Floats, Ints]
-"""Vertices (V, 3), unit normals (V, 3), faces (F, 3); of area 1."""
-
-
-def nricp(floating: Mesh, target: Mesh) -> Float[Floats, "V 3"]:
-    """trimesh: where the vertices of a floating mesh go."""
-    import trimesh
-
-    with library("nricp"):
-        mesh = trimesh.Trimesh(floating[0], floating[2], process=False)
-        moved = trimesh.registration.nricp_amberg(mesh, trimesh.PointCloud(target[0]), use_faces=False)
-    return np.asarray(moved, float)
-
-
-def viscoelastic(floating: Mesh, target: Mesh) -> Float[Floats, "V 3"]:
-    """meshmonk: where the vertices of a floating mesh go."""
-    import meshmonk
-
-    with library("meshmonk"):
-        found = meshmonk.nonrigid_register(
-            floating_features=np.concatenate([MONK_UNIT * floating[0], floating[1]], 1).astype(np.float32),
-            target_features=np.concatenate([MONK_UNIT * target[0], target[1]], 1).astype(np.float32),
-            floating_faces=floating[2].astype(np.int32),
-            target_faces=target[2].astype(np.int32),
-        )
-    return np.asarray(found.aligned_vertices, float) / MONK_UNIT
-
-
-@dataclass(frozen=True, eq=False)
-class Spectrum:
-    """A thinned mesh of pyFM (V_thin vertices, area 1) with its eigenfunctions."""
-
-    mesh: Any
-    at: Float[Floats, "V k"]  # the eigenfunctions at the original's vertices
-    original: Int[Ints, " V_thin"]  # the original vertex nearest to each of the thinned mesh
-
-
-@dataclass(frozen=True)
-class ZoomOut:
-    """pyfmaps: HKS and WKS give a functional map of ``first`` functions, ZoomOut takes it to ``last`` by ``step``.
-
-    Meshes of more than ``faces`` triangles are thinned to that first. Source vertices keep their exact place in the
-    spectrum; targets are the vertices nearest to the thinned mesh's, so large targets cost about half an edge there.
-    ``first`` and the weight of orientation were the best of seven choices on seven pairs of the benchmark.
-    """
-
-    faces: int = 10_000
-    first: int = 30
-    last: int = 120
-    step: int = 5
-    descriptors: int = 100
-    orient: float = 1.0
-
-    def fit(self, shape: Shape) -> Spectrum:
-        """Thin, and find the eigenfunctions."""
-        need_meshes("ZoomOut", shape)
-        frame = sqrt_area_frame(shape)
-        whole = Shape(frame.apply(shape.verts), shape.faces, shape.name, invalid=shape.invalid)
-        thin = decimate(whole, self.faces)
-        used, faces = np.unique(thin.faces, return_inverse=True)  # a lone vertex makes the mass matrix singular
-        thin = Shape(thin.verts[used], faces.reshape(-1, 3), thin.name)
-        with library("ZoomOut"):
-            from pyFM.mesh import TriMesh
-
-            mesh = TriMesh(np.array(thin.verts), np.array(thin.faces), area_normalize=True, center=True)
-            mesh.process(k=self.last, robust=True)
-        surface = Surface(thin.verts, thin.faces, thin.vertex_normals)
-        foot = surface.query(whole.verts, whole.vertex_normals)
-        at = interpolate(mesh.eigenvectors, thin.faces[foot.face], foot.barycentric)
-        return Spectrum(mesh, at, cKDTree(whole.verts).query(thin.verts)[1])
-
-    def map(self, source: Shape, source_fit: Spectrum, target: Shape, target_fit: Spectrum) -> VertexMap:
-        """Fit the functional map from target to source, which pulls vertices from source to target; refine it."""
-        first, second = target_fit.mesh, source_fit.mesh
-        with library("ZoomOut"):
-            from pyFM.functional import FunctionalMapping
-            from pyFM.signatures import mesh_HKS
-            from pyFM.spectral import FM_to_p2p
-
-            model = FunctionalMapping(first, second)
-            model.preprocess(self.descriptors, "WKS", subsample_step=5, k_process=self.last, k_descr=self.last)
-            heat = [mesh_HKS(mesh, self.descriptors, k=self.last)[:, ::5] for mesh in (first, second)]
-            model.add_descriptors(*heat)
-            model.fit(K=(self.first, self.first), w_orient=self.orient)
-            rounds = (self.last - self.first) // self.step
-            refined = model.zoomout_refine(nit=rounds, step=self.step)
-            index = FM_to_p2p(refined, first.eigenvectors, source_fit.at, n_jobs=1)
-        return VertexMap.between(source, target, target_fit.original[index])
 
 
 @dataclass(frozen=True)
@@ -272,11 +65,19 @@ class Choices:
     threads: int = 1
 
 
-def _plain(name: str, label: str, method: Method, package: str = "") -> list[Baseline]:
-    """The row of a method that learns nothing; where its package is not installed it cannot run."""
+def _plain(
+    choices: Choices, name: str, label: str, method: Registration | ZoomOut, package: str = ""
+) -> list[Baseline]:
+    """The rows of a method that learns nothing: by itself, and from our orientation; it cannot run without its package."""
+    method = replace(method, seed=choices.seed)
+    digest = find_model(choices.model)[1].weights_sha256
+    rows = [Baseline(name, label, method)]
+    oriented = replace(method, oriented_by=choices.model)
+    rows.append(Baseline(f"{name}-oriented", f"{label}, our orientation", oriented, model=digest))
     if not package or find_spec(package) is not None:
-        return [Baseline(name, label, method)]
-    return [Baseline(name, label, None, f"{package} is not installed: pip install 'meshmatch[bench]'")]
+        return rows
+    missing = f"{package} is not installed: pip install 'meshmatch[bench]'"
+    return [replace(row, method=None, missing=missing) for row in rows]
 
 
 def _coded(choices: Choices) -> list[Baseline]:
@@ -306,11 +107,13 @@ def _ours(choices: Choices) -> list[Baseline]:
 
 _NOT_GIVEN = "give --{0} MODEL, made by python -m meshmatch.experiments.learned_baselines {0}"
 METHODS: dict[str, Callable[[Choices], list[Baseline]]] = {
-    "rigid": lambda choices: _plain("rigid", "rigid, nearest", Registration("rigid", None, choices.seed)),
-    "zoomout": lambda choices: _plain("zoomout", "ZoomOut (pyfmaps)", ZoomOut(), "pyFM"),
-    "nricp": lambda choices: _plain("nricp", "nricp (trimesh)", Registration("nricp", 5000, choices.seed), "trimesh"),
-    "meshmonk": lambda choices: _plain(
-        "meshmonk", "meshmonk", Registration("meshmonk", 20_000, choices.seed), "meshmonk"
+    "rigid": partial(_plain, name="rigid", label="rigid, nearest", method=Registration("rigid")),
+    "zoomout": partial(_plain, name="zoomout", label="ZoomOut (pyfmaps)", method=ZoomOut(), package="pyFM"),
+    "nricp": partial(
+        _plain, name="nricp", label="nricp (trimesh)", method=Registration("nricp", 5000), package="trimesh"
+    ),
+    "meshmonk": partial(
+        _plain, name="meshmonk", label="meshmonk", method=Registration("meshmonk", 20_000), package="meshmonk"
     ),
     "coded": _coded,
     "transmatch": _transmatch,

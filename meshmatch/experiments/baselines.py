@@ -12,6 +12,9 @@ model is not given, is skipped, and the output says so.
 - transmatch: a transformer (--transmatch), not refined.
 - ours: this project, refined and not.
 
+The first four have a second row each, with both shapes in the frames of our unrefined fits: what they do where the
+orientation is no question.
+
 The learned ones are trained by `experiments.learned_baselines`; zoomout, nricp and meshmonk need
 pip install 'meshmatch[bench]'. Each result, a method on a set, is one JSON file in the output folder; a second run
 measures only what is not there. --minutes starts nothing new after that time. The table says how many pairs were

@@ -42,8 +42,8 @@ from meshmatch.api.inputs import validated
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.experiments import category, runner
-from meshmatch.experiments.baseline_methods import ZoomOut, viscoelastic
 from meshmatch.experiments.category import Maps, Shapes
+from meshmatch.experiments.classical_baselines import ZoomOut, viscoelastic
 from meshmatch.experiments.collection import CollectionConfig, collection_maps
 from meshmatch.experiments.sets import Pair, load_folder
 from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig

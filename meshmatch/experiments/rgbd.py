@@ -40,7 +40,8 @@ from meshmatch.api.matching import Matcher
 from meshmatch.api.transfer import transfer_colors
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.experiments import runner
-from meshmatch.experiments.baseline_methods import Coded, Registration
+from meshmatch.experiments.baseline_methods import Coded
+from meshmatch.experiments.classical_baselines import Registration
 from meshmatch.experiments.rgbd_clouds import Body, Camera, Cloud, draw_bodies, save_pcd, scan
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig

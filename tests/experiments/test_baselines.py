@@ -11,20 +11,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import InputError, ModelError
-from meshmatch.experiments import baseline_methods, learned_baselines
-from meshmatch.experiments.baseline_methods import (
-    METHODS,
-    Baseline,
-    Choices,
-    Coded,
-    Registration,
-    ZoomOut,
-    carried,
-    library,
-    placed,
-)
+from meshmatch.experiments import baseline_methods, classical_baselines, learned_baselines
+from meshmatch.experiments.baseline_methods import METHODS, Baseline, Choices, Coded
 from meshmatch.experiments.baselines import main
 from meshmatch.experiments.bench import Method
+from meshmatch.experiments.classical_baselines import Registration, ZoomOut, carried, library, placed
 from meshmatch.experiments.learned_baselines import (
     TransConfig,
     Transformer,
@@ -34,6 +25,8 @@ from meshmatch.experiments.learned_baselines import (
     load_transmatch,
     train_transmatch,
 )
+from meshmatch.geometry.frames import Frame
+from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.scans import ScanConfig
@@ -80,6 +73,40 @@ def test_a_moved_copy_is_found_again(package: str | None, method: Method) -> Non
     far = np.linalg.norm(target.verts[found.index] - target.verts[truth], axis=1) / np.sqrt(target.area)
     guess = np.linalg.norm(target.verts[::-1] - target.verts[truth], axis=1) / np.sqrt(target.area)
     assert far.mean() < 0.05 < 0.3 < guess.mean()
+
+
+@pytest.mark.parametrize(
+    ("package", "method"),
+    [(None, Registration("rigid", oriented_by="m")), ("pyFM", ZoomOut(1000, 10, 30, oriented_by="m"))],
+    ids=["rigid", "zoomout"],
+)
+def test_a_ball_is_found_again_from_the_orientation_that_it_is_given(
+    package: str | None, method: Method, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No other start could tell one point of a ball from another."""
+    if package is not None:
+        pytest.importorskip(package)
+    ball = icosphere(3)
+    turn = Rotation.from_rotvec([1.4, 0.4, -0.9]).as_matrix()
+    source = Shape(ball.verts, ball.faces, "ball")
+    target = Shape(ball.verts @ turn.T, ball.faces, "turned")
+    frames = {"ball": np.eye(3), "turned": turn.T}
+
+    def frame_by(model: str, shape: Shape, seed: int) -> Frame:
+        assert model == "m"
+        return Frame(3.5, frames[shape.name], np.zeros(3))
+
+    monkeypatch.setattr(classical_baselines, "frame_by", frame_by)
+    found = method.map(source, method.fit(source), target, method.fit(target))
+    assert np.linalg.norm(target.verts[found.index] - target.verts, axis=1).mean() < 0.06
+
+
+def test_the_frame_of_a_model_is_upright_whatever_the_files_is() -> None:
+    dancer = load_shape("templates/samples/dancer.ply")
+    turn = Rotation.from_rotvec([1.4, 0.4, -0.9]).as_matrix()
+    turned = Shape(7 * dancer.verts @ turn.T, dancer.faces, "turned")
+    first, second = (classical_baselines.frame_by("human", shape).apply(shape.verts) for shape in (dancer, turned))
+    assert np.linalg.norm(first - second, axis=1).mean() < 0.05
 
 
 @pytest.mark.parametrize("method", [Registration("nricp"), Registration("meshmonk"), ZoomOut()])
@@ -186,11 +213,17 @@ def test_what_is_not_there_is_skipped_with_a_reason(
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baseline_methods, "find_spec", lambda name: None)
-    (rigid,) = METHODS["rigid"](Choices())
-    assert rigid.method is not None
+    assert all(row.method is not None for row in METHODS["rigid"](Choices()))
     for name in ("zoomout", "nricp", "meshmonk"):
-        (row,) = METHODS[name](Choices())
-        assert row.method is None and "pip install 'meshmatch[bench]'" in row.missing
+        rows = METHODS[name](Choices())
+        assert all(row.method is None and "pip install 'meshmatch[bench]'" in row.missing for row in rows)
+
+
+def test_methods_that_know_no_category_have_a_row_from_our_orientation() -> None:
+    plain, oriented = METHODS["rigid"](Choices(seed=4))
+    assert (plain.method, oriented.method) == (Registration("rigid", seed=4), Registration("rigid", None, 4, "human"))
+    assert (oriented.name, oriented.label) == ("rigid-oriented", "rigid, nearest, our orientation")
+    assert oriented.model and not plain.model
 
 
 def test_our_own_rows() -> None:
