@@ -8,6 +8,8 @@ that the cases ask for.
 
 ``--profile`` shows instead where a match spends its CPU, with one thread; the row ``import`` is a process of its own that
 imports what the command does, and ends. ``--roofline`` shows how near its dearest stages come to what the machine can do.
+``--living`` shows what one more fit and map take in a process that has matched before, in seconds of CPU; ``--shared`` what
+workers that share a model take of memory.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ import numpy as np
 from typer import Option
 
 from meshmatch.errors import MeshmatchError, OptionError
+from meshmatch.experiments import living as lives
 from meshmatch.experiments import roofline as roofs
 from meshmatch.experiments import runner, stages
 from meshmatch.experiments.charts import draw_stack
@@ -196,9 +199,14 @@ COLUMNS = {
 STAGE_COLUMNS = {"stage": "stage", "CPU s": "cpu:.3f", "share": "share:.1%", "calls": "calls:d"}
 
 
+def pair_files(folder: Path) -> list[Path]:
+    """The two shapes of the case ``pair``."""
+    return [shape_file(word, folder) for word in CASES["pair"].words if "@" in word[1:]]
+
+
 def profiled(runs: int, folder: Path, picture: Path | None) -> runner.Report:
     """Stages of the case ``pair``: of the match with the median CPU time."""
-    paths = [shape_file(word, folder) for word in CASES["pair"].words if "@" in word[1:]]
+    paths = pair_files(folder)
     imports = [cost_of([sys.executable, "-c", stages.IMPORTS]).cpu for _ in range(runs + 1)][1:]
     clocks = stages.profile(paths[0], paths[1], folder / "map.npy", runs)
     rows = stages.rows_of(clocks[(runs - 1) // 2], statistics.median(imports))
@@ -218,6 +226,8 @@ def main(
     profile: Annotated[bool, Option("--profile", help="the stages of a match instead")] = False,
     picture: Annotated[Path | None, Option(help="draw the stages as .png or .svg, with --profile")] = None,
     roofline: Annotated[bool, Option("--roofline", help="the dearest stages against the machine instead")] = False,
+    living: Annotated[bool, Option("--living", help="stages of a process that stays alive instead")] = False,
+    shared: Annotated[bool, Option("--shared", help="memory of workers that share a model instead")] = False,
 ) -> runner.Report:
     if picture is not None:
         if not profile:
@@ -226,9 +236,13 @@ def main(
     kept = keep_to_cores(cores)
     if roofline:
         return roofs.report(runs)
+    if shared:
+        return lives.shared(runs)
     with tempfile.TemporaryDirectory() as folder:
         if profile:
             return profiled(runs, Path(folder), picture)
+        if living:
+            return lives.living(pair_files(Path(folder)), runs)
         rows = [
             record_of(name, CASES[name], measure(CASES[name], runs, Path(folder)))
             for name in runner.track(runner.names_of(cases, CASES, "case"), "running")

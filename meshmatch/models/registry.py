@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -105,7 +106,7 @@ def find_model(name: str | Path) -> tuple[Path, ModelCard]:
 
 
 def load_model(name: str | Path = "human") -> TrainedModel:
-    """Load a model by its registry name or folder.
+    """Load a model by its registry name or folder; processes share the weights of a model of the registry.
 
     `ModelError` for an unknown name, damaged files, a kernel that is not known here, weights that are not those of the
     card's network, or a template that is not the one the model was trained with; `TemplateError` if its file is damaged.
@@ -113,7 +114,7 @@ def load_model(name: str | Path = "human") -> TrainedModel:
     from meshmatch.models.trained import trained_model  # torch
 
     folder, card = find_model(name)
-    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS)
+    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, folder.name if _is_registered(folder) else None)
 
 
 def verify_model(name: str | Path) -> ModelCard:
@@ -125,8 +126,7 @@ def verify_model(name: str | Path) -> ModelCard:
         raise
     except MeshmatchError as error:
         raise ModelError(f"model {folder.name}: {error.message}", "fetch or add the model again") from error
-    registered = folder.parent in (built_in_folder(), user_folder()) and not folder.name.startswith(".")
-    if registered and folder.name != card.name:
+    if _is_registered(folder) and folder.name != card.name:
         hint = "remove it, and add it again from its source"
         raise ModelError(f"the folder {folder.name} holds a model called {card.name}", hint)
     return card
@@ -179,9 +179,13 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
 
 def remove_model(name: str) -> None:
     """Remove one of the user's own models: `ModelError` if there is no such model, `OutputError` if it cannot be done."""
+    from meshmatch.models.shared_weights import shared_file
+
     folder = _registered(name)
     if folder.parent == built_in_folder():
         raise ModelError(f"{name} is a built-in model and cannot be removed")
+    with suppress(OSError):  # of no use to anybody, and replaced if it stays
+        shared_file(name).unlink(missing_ok=True)
     try:
         if folder.is_symlink():
             folder.unlink()
@@ -204,6 +208,10 @@ def _registered(name: str) -> Path:
     near = get_close_matches(name, names, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {', '.join(names) or 'none'}"
     raise ModelError(f"there is no model {name!r}", f"{hint} (see `meshmatch models list`)")
+
+
+def _is_registered(folder: Path) -> bool:
+    return folder.parent in (built_in_folder(), user_folder()) and not folder.name.startswith(".")
 
 
 def _restore_interrupted() -> None:

@@ -101,8 +101,12 @@ def torch_network(model: TrainedModel, device: str = "cpu") -> Deformer:
     return in_torch(model.inference, model.template.K, device)
 
 
-def trained_model(card: ModelCard, template_file: Path, weights_file: Path) -> TrainedModel:
+def trained_model(
+    card: ModelCard, template_file: Path, weights_file: Path, shared_as: str | None = None
+) -> TrainedModel:
     """The model of a card, from files that are safe to read; `meshmatch.models.registry.load_model` finds them.
+
+    Processes share the weights under the name ``shared_as``, where there is one.
 
     `ModelError` for a kernel that is not known here, weights that are not those of the card's network, or a template that
     is not the one the model was trained with; `TemplateError` if its file is damaged.
@@ -115,5 +119,6 @@ def trained_model(card: ModelCard, template_file: Path, weights_file: Path) -> T
     if card.field["kernel"] not in KERNELS:
         problem = f"model {card.name} has the kernel {card.field['kernel']!r}, not {' or '.join(KERNELS)}"
         raise ModelError(problem, "it may need a newer meshmatch: update it")
-    network = load_network(weights_file, NetworkConfig.from_dict(card.network), template.K)
+    shared = None if shared_as is None else (shared_as, card.weights_sha256)
+    network = load_network(weights_file, NetworkConfig.from_dict(card.network), template.K, shared)
     return TrainedModel(card, template, network)
