@@ -27,7 +27,7 @@ GROUND = ("errors", "threads", "outputs", "progress")
 ROOMS = (
     *GROUND,
     *("arrays", "geometry", "shapes", "templates", "fields", "models", "training", "fitting"),
-    *("maps", "transfer", "render", "api", "cli", "__main__", "experiments"),
+    *("maps", "implicit", "transfer", "render", "api", "cli", "__main__", "experiments"),
 )
 
 # Which rooms know which third-party library.
@@ -56,15 +56,16 @@ OWNERS = {
             "training",
             "fitting",
             "maps",
+            "implicit",
             "transfer",
             "render",
             "api",
         ),
         "experiments",
     },
-    "skimage": {"experiments"},
+    "skimage": {"implicit", "experiments"},
     "threadpoolctl": {"threads"},
-    "torch": {"arrays", "fields", "models", "training", "fitting", "experiments"},
+    "torch": {"arrays", "fields", "models", "training", "fitting", "implicit", "experiments"},
     "trimesh": {"shapes", "fitting", "experiments"},
     "typer": {"cli", "experiments"},
     "xatlas": {"transfer"},
@@ -76,7 +77,7 @@ DISTRIBUTIONS = {
     "robust_laplacian": "robust-laplacian",
     "skimage": "scikit-image",
 }
-EXTRAS = ("meshlab", "train", "bench", "plots")  # what the package imports only where it is installed
+EXTRAS = ("meshlab", "train", "implicit", "bench", "plots")  # what the package imports only where it is installed
 HEAVY = {"torch", "trimesh", "pymeshlab", "scipy", "safetensors", "matplotlib", "jaxtyping"}
 NO_TORCH = ("geometry", "shapes", "templates", "maps", "transfer", "render")
 FORBIDDEN_NAMES = {"utils", "util", "common", "helpers", "helper", "base", "misc"}

@@ -1,7 +1,7 @@
 """Implicit surfaces: DIF-Net's pointwise deformation beside the reduced field, on generated chairs, tables and planes.
 
 For each kind both learn the same shapes with the same template, correction, losses, batches and steps
-(`experiments.implicit_training`); only the deformation differs, and that the reduced field has energies (volume, rigidity,
+(`meshmatch.implicit`); only the deformation differs, and that the reduced field has energies (volume, rigidity,
 also between codes) which are cheap for it. Measured on the shapes of the training, whose parts are known:
 
 reconstruction: Chamfer distance (both ways, mean, % of the longest side) and IoU of the insides;
@@ -34,11 +34,12 @@ from typer import Option
 from meshmatch.arrays import Floats, Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.furniture import KINDS, furniture
-from meshmatch.experiments.implicit_model import IMPLICIT, ImplicitModel, load_implicit
-from meshmatch.experiments.implicit_network import ImplicitConfig
-from meshmatch.experiments.implicit_samples import ImplicitSamples, read_implicit_samples
-from meshmatch.experiments.implicit_training import TRAINING, ImplicitDataset, build_implicit, train_implicit
 from meshmatch.fields.field import arap_energy, volume_energy
+from meshmatch.implicit.card import IMPLICIT
+from meshmatch.implicit.model import Coded, ImplicitModel, load_implicit
+from meshmatch.implicit.network import ImplicitConfig
+from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
+from meshmatch.implicit.training import TRAINING, ImplicitDataset, build_implicit, train_implicit
 from meshmatch.outputs import make_folder
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
@@ -47,7 +48,7 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.training.loop import TrainConfig, Trainer
 
-METHODS = {"DIF-Net": "pointwise", "reduced": "reduced"}
+METHODS = {"DIF-Net": "pointwise", "reduced": "mls"}
 FRAMES = 5
 _POINTS = 2000
 _MOVED = 0.25  # of the cube's half side: the last color
@@ -74,6 +75,11 @@ def trained(folder: Path, samples: ImplicitSamples, config: ImplicitConfig, trai
     return load_implicit(folder)
 
 
+def learned(model: ImplicitModel, number: int) -> Coded:
+    """A shape of the training."""
+    return model.known(model.card.shapes[number])
+
+
 def chamfer(a: Floats, b: Floats) -> float:
     """Mean distance to the nearest point of the other set, of both ways."""
     return float(0.5 * (cKDTree(b).query(a)[0].mean() + cKDTree(a).query(b)[0].mean()))
@@ -83,12 +89,13 @@ def reconstruction(model: ImplicitModel, kind: str, numbers: list[int], seed: in
     """Mean errors of the surfaces of some shapes."""
     found = []
     for number in numbers:
-        truth, frame, rng = furniture(kind, seed, number), model.frames[number], np.random.default_rng(number)
-        drawn = sample_surface(model.surface(model.names[number]), 5 * _POINTS, rng).points
+        truth, rng = furniture(kind, seed, number), np.random.default_rng(number)
+        shape = learned(model, number)
+        drawn = sample_surface(model.surface(shape), 5 * _POINTS, rng).points
         distance = chamfer(drawn, truth.sample(5 * _POINTS, rng)[0])
         anywhere = rng.uniform(-1, 1, (20_000, 3))
-        inside = truth.field(frame.undo(anywhere)) < 0
-        ours = model.distance(anywhere, model.network.codes[number])[0] < 0
+        inside = truth.field(shape.frame.undo(anywhere)) < 0
+        ours = model.distance(anywhere, shape.code)[0] < 0
         side = float(np.ptp(truth.surface.verts, axis=0).max())
         found.append((100 * distance / side, np.count_nonzero(inside & ours) / np.count_nonzero(inside | ours)))
     return dict(zip(("chamfer", "iou"), np.mean(found, 0).tolist(), strict=True))
@@ -110,8 +117,9 @@ def label_transfer(model: ImplicitModel, kind: str, pairs: list[tuple[int, int]]
         (a, _, labels), (b, _, truth) = sampled
         common = np.intersect1d(labels, truth).tolist()
         known, asked = labels[np.isin(labels, common)], np.isin(truth, common)
-        places = [model.to_template(points, model.names[k]) for points, k in zip((a, b), pair, strict=True)]
-        cubes = [model.frames[k].apply(points) for points, k in zip((a, b), pair, strict=True)]
+        shapes = [learned(model, k) for k in pair]
+        places = [model.to_template(points, shape) for points, shape in zip((a, b), shapes, strict=True)]
+        cubes = [shape.frame.apply(points) for points, shape in zip((a, b), shapes, strict=True)]
         row = []
         for from_a, from_b in (places, cubes):
             index = cKDTree(from_a[np.isin(labels, common)]).query(from_b[asked])[1]
@@ -136,19 +144,18 @@ def interpolation(model: ImplicitModel, pairs: list[tuple[int, int]]) -> dict[st
     times, found = np.linspace(0, 1, FRAMES), []
     step = 100 / 1.7
     for pair in pairs:
-        a, b = (model.names[k] for k in pair)
-        shapes = [model.surface(a, b, float(time)) for time in times]
-        codes = [model.between(a, b, float(time)) for time in times]
-        volumes = np.array([volume(shape) / frame.scale**3 for shape, (_, frame) in zip(shapes, codes, strict=True)])
+        coded = [model.blend(learned(model, pair[0]), learned(model, pair[1]), float(time)) for time in times]
+        shapes = [model.surface(each) for each in coded]
+        volumes = np.array([volume(shape) / each.frame.scale**3 for shape, each in zip(shapes, coded, strict=True)])
         even = volumes[0] + times * (volumes[-1] - volumes[0])
         rows = []
         for k in range(1, FRAMES - 1):
             drawn = sample_surface(shapes[k], _POINTS, np.random.default_rng(k)).points
-            points = np.clip(codes[k][1].apply(drawn), -1, 1)
-            before, here, after = (model.distance(points, codes[j][0])[0] for j in (k - 1, k, k + 1))
+            points = np.clip(coded[k].frame.apply(drawn), -1, 1)
+            before, here, after = (model.distance(points, coded[j].code)[0] for j in (k - 1, k, k + 1))
             bent, moved = np.abs(after - 2 * here + before).mean(), 0.5 * np.abs(after - before).mean()
             with torch.no_grad():
-                F = model.network(torch.from_numpy(points).float()[None], codes[k][0][None]).F
+                F = model.network(torch.from_numpy(points).float()[None], coded[k].code[None]).F
             energies = float(volume_energy(F).mean()), float(arap_energy(F).mean())
             rows.append((step * bent, bent / moved, pieces(shapes[k]), *energies))
         found.append((*np.mean(rows, 0), 100 * np.abs(volumes / even - 1).mean()))
@@ -173,11 +180,10 @@ def pairs_of(shapes: int, count: int, seed: int) -> list[tuple[int, int]]:
     return [tuple(rng.choice(shapes, 2, replace=False).tolist()) for _ in range(count)]
 
 
-def moved_colors(model: ImplicitModel, a: str, b: str, time: float, shape: Shape) -> Floats:
+def moved_colors(model: ImplicitModel, coded: Coded, shape: Shape) -> Floats:
     """How far the deformation moves each vertex: white is not at all, dark red far."""
-    code, frame = model.between(a, b, time)
-    points = np.clip(frame.apply(shape.verts), -1, 1)
-    far = np.clip(np.linalg.norm(model.distance(points, code)[1] - points, axis=1) / _MOVED, 0, 1)[:, None]
+    points = np.clip(coded.frame.apply(shape.verts), -1, 1)
+    far = np.clip(np.linalg.norm(model.to_template(shape.verts, coded) - points, axis=1) / _MOVED, 0, 1)[:, None]
     stops = np.array([[0.93, 0.93, 0.90], [0.98, 0.72, 0.35], [0.70, 0.10, 0.15]])
     return np.where(
         far < 0.5, stops[0] + 2 * far * (stops[1] - stops[0]), stops[1] + (2 * far - 1) * (stops[2] - stops[1])
@@ -188,11 +194,11 @@ def draw(path: Path, models: Mapping[tuple[str, str], ImplicitModel], pair: tupl
     """Figure 12: a row for each kind and method."""
     rows = []
     for (kind, method), model in models.items():
-        a, b = (model.names[k] for k in pair)
         panels = []
         for time_ in np.linspace(0, 1, 6).tolist():
-            shape = model.surface(a, b, time_, resolution=96)
-            colors = moved_colors(model, a, b, time_, shape)
+            coded = model.blend(learned(model, pair[0]), learned(model, pair[1]), time_)
+            shape = model.surface(coded, resolution=96)
+            colors = moved_colors(model, coded, shape)
             panels.append(Panel(shape, colors, f"{kind}, {method}" if time_ == 0 else f"{time_:.1f}"))
         strip = path.with_name(f"{path.stem}-{kind}-{METHODS[method]}.png")
         tilt = 35.0 if kind == "plane" else 14.0
@@ -226,9 +232,9 @@ def main(
     for kind in runner.names_of(kinds, KINDS, "kind"):
         samples = read_implicit_samples(prepared(work, kind, shapes, seed), seed)
         for method in runner.names_of(methods, METHODS, "method"):
-            deformation = METHODS[method]
-            config = ImplicitConfig(deformation)  # type: ignore[arg-type]
-            folder = work / f"{kind}-{deformation}"
+            field = METHODS[method]
+            config = ImplicitConfig(field)  # type: ignore[arg-type]
+            folder = work / f"{kind}-{field}"
             model = models[kind, method] = trained(folder, samples, config, training)
             asked = {"shapes": shapes, "steps": steps, "compared": compared, "seed": seed}
 

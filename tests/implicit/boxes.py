@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from meshmatch.experiments.implicit_network import ImplicitConfig
-from meshmatch.experiments.implicit_training import TRAINING
+from meshmatch.implicit.network import ImplicitConfig
+from meshmatch.implicit.training import TRAINING
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 
 TRAIN = replace(TRAINING, steps=6, shapes=2, warm_up=1)
 
 
-def config(deformation: str) -> ImplicitConfig:
-    return ImplicitConfig(deformation, code=8, width=24, depth=2, inner=8, nodes=20)  # type: ignore[arg-type]
+def config(field: str) -> ImplicitConfig:
+    return ImplicitConfig(field, code=8, width=24, depth=2, inner=8, nodes=20)  # type: ignore[arg-type]
 
 
 def box(half: np.ndarray, name: str = "box") -> Shape:

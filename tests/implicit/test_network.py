@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("skimage", reason="scikit-image is of the extra `bench`")
+from meshmatch.implicit.network import ImplicitNetwork
+from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
+from tests.implicit.boxes import config
 
-from meshmatch.experiments.implicit_network import ImplicitNetwork
-from meshmatch.experiments.implicit_nodes import CUBE_RADIUS, cube_nodes
-from tests.experiments.small_implicit import config
-
-BOTH = pytest.mark.parametrize("deformation", ["reduced", "pointwise"])
+BOTH = pytest.mark.parametrize("deformation", ["mls", "pointwise"])
 
 
 def network(deformation: str) -> ImplicitNetwork:

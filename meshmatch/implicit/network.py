@@ -22,11 +22,11 @@ import torch
 from torch import nn
 
 from meshmatch.arrays import Float
-from meshmatch.experiments.implicit_nodes import field_at
-from meshmatch.fields.field import Field, value_and_jacobian
+from meshmatch.fields.field import value_and_jacobian
 from meshmatch.geometry.kernels import Kernel
+from meshmatch.implicit.space import SpaceField
 
-Deformation = Literal["reduced", "pointwise"]
+Deformation = Literal["mls", "pointwise"]
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class ImplicitConfig:
     their radius (the cube's half side is 1), and the frequency that sines begin with.
     """
 
-    deformation: Deformation = "reduced"
+    field: Deformation = "mls"
     code: int = 64
     width: int = 128
     depth: int = 3
@@ -139,26 +139,22 @@ class ReducedDeformation(nn.Module):
         self.decoder = nn.Sequential(nn.Linear(config.code, 128), nn.ReLU(), last)
         self.network = HyperNetwork(config, 1)
 
-    def field(self, points: Float[torch.Tensor, "B P 3"], gradient: bool = True) -> Field:
+    def at(self, points: Float[torch.Tensor, "B P 3"], gradient: bool = True) -> SpaceField:
         """Shape functions at the points of all shapes."""
-        return field_at(points.flatten(0, 1), self.nodes, self.radii, self.kernel, gradient)
+        return SpaceField.at(points, self.nodes, self.radii, self.kernel, gradient)
 
-    def apply_field(self, matrix: Float[torch.Tensor, "R K"], code: Float[torch.Tensor, "B D"]) -> torch.Tensor:
-        """A field's phi or gradient (R / B rows for each shape) on the vectors of the nodes."""
-        return matrix.unflatten(0, (len(code), -1)) @ self.decoder(code).unflatten(1, (-1, 3))
-
-    def jacobian(self, field: Field, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B P 3 3"]:
-        """du_a / dx_k at the points of a field."""
-        return self.apply_field(field.gradient, code).unflatten(1, (-1, 3)).transpose(-1, -2)
+    def vectors(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B K 3"]:
+        """Where the nodes go, relative to where they are."""
+        return self.decoder(code).unflatten(1, (-1, 3))
 
     def forward(self, points: torch.Tensor, code: torch.Tensor, slopes: bool = True) -> tuple[torch.Tensor, ...]:
         """u and c at points (B, P, 3); with ``slopes`` also their gradients."""
-        field = self.field(points, slopes)
-        u = self.apply_field(field.phi, code)
+        field, vectors = self.at(points, slopes), self.vectors(code)
+        u = field.displacement(vectors)
         if not slopes:
             return u, self.network(points, code)[..., 0]
         answer, slope = value_and_jacobian(self.network, points, code)
-        return u, answer[..., 0], self.jacobian(field, code), slope[..., 0, :]
+        return u, answer[..., 0], field.jacobian(vectors), slope[..., 0, :]
 
 
 class ImplicitNetwork(nn.Module):
@@ -169,7 +165,7 @@ class ImplicitNetwork(nn.Module):
         self.config = config
         self.codes = nn.Parameter(torch.randn(S, config.code) / math.sqrt(config.code))
         self.template = SineNetwork(config.width, config.depth, config.frequency)
-        kind = ReducedDeformation if config.deformation == "reduced" else PointwiseDeformation
+        kind = ReducedDeformation if config.field == "mls" else PointwiseDeformation
         self.deformation = kind(config, nodes, radii)
 
     def forward(self, points: Float[torch.Tensor, "B P 3"], code: Float[torch.Tensor, "B D"]) -> Evaluated:

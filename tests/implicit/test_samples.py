@@ -5,14 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("skimage", reason="scikit-image is of the extra `bench`")
-
 from meshmatch.errors import InputError
-from meshmatch.experiments.implicit_samples import FILLED, read_implicit_samples
+from meshmatch.implicit.samples import FAR, FILLED, read_implicit_samples, samples_of
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from tests.experiments.small_implicit import box, box_sdf, boxes
+from tests.implicit.boxes import box, box_sdf, boxes
 
 HALF = np.array([1.0, 0.4, 0.6])
 
@@ -47,27 +45,45 @@ def test_clouds_and_given_distances(tmp_path: Path) -> None:
     np.savez(tmp_path / "normals.npz", points=drawn.points, normals=drawn.normals)
     save_shape(tmp_path / "cloud.ply", Shape(drawn.points, np.zeros((0, 3), np.int64)))
     anywhere = rng.uniform(-1.3, 1.3, (20_000, 3))
-    np.savez(tmp_path / "sdf.npz", points=anywhere, sdf=box_sdf(anywhere, HALF))
+    np.savez(tmp_path / "sdf.npz", points=anywhere, distances=box_sdf(anywhere, HALF))
     np.save(tmp_path / "cloud.labels.npy", np.zeros(4000))
     found = read_implicit_samples(tmp_path)
     assert found.names == ("cloud", "normals", "sdf")
-    for number, limit in ((0, 0.02), (1, 0.02), (2, 1e-4)):
-        frame = found.frames[number]
-        truth = box_sdf(frame.undo(found.rows[number, :, :3]), HALF) / frame.scale
-        assert np.abs(truth - found.rows[number, :, 3]).mean() < limit
-    assert not found.rows[2, :, 4:].any()
+    for number in (0, 1):  # of clouds only the surface is known, and where it is not
+        frame, rows = found.frames[number], found.rows[number]
+        truth = box_sdf(frame.undo(rows[:, :3]), HALF) / frame.scale
+        half = len(rows) // 2
+        assert np.abs(truth[:half]).max() < 1e-5
+        assert not rows[:half, 3].any()
+        assert np.isnan(rows[half:, 3]).all()
+        assert np.quantile(np.abs(truth[half:]), 0.01) > 0.9 * FAR  # but where the cloud has gaps
+        assert (truth[half:] < 0).any()
+    kept = np.sign(found.frames[1].undo(found.rows[1, :10, :3])) * found.rows[1, :10, 4:]
+    assert (kept.sum(1) > 0).all()  # outwards, as the file has them
+    frame, rows = found.frames[2], found.rows[2]
+    assert np.abs(box_sdf(frame.undo(rows[:, :3]), HALF) / frame.scale - rows[:, 3]).mean() < 1e-4
+    assert not rows[:, 4:].any()
+
+
+def test_a_mesh_with_a_hole_may_be_taken_as_a_surface() -> None:
+    whole = box(HALF)
+    open_one = Shape(whole.verts, whole.faces[1:])
+    rows = samples_of(open_one, 400, np.random.default_rng(0), closed=False)[1]
+    assert np.isnan(rows[200:, 3]).all()
+    solid = samples_of(whole, 400, np.random.default_rng(0), closed=False)[1]
+    assert (solid[200:, 3] < 0).any()
 
 
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
         ({"points": np.zeros((5, 3))}, "needs points"),
-        ({"points": np.zeros((5, 2)), "sdf": np.zeros(5)}, "needs points"),
-        ({"points": np.zeros((5, 3)), "sdf": np.full(5, np.nan)}, "finite"),
-        ({"points": np.full((5, 3), "a"), "sdf": np.zeros(5)}, "finite"),
-        ({"points": np.zeros((5, 3)), "sdf": np.ones(5)}, "four are needed"),
-        ({"points": np.zeros((5, 3)), "sdf": -np.ones(5)}, "scale"),
-        ({"points": np.array([{}] * 5, object), "sdf": np.zeros(5)}, "objects"),
+        ({"points": np.zeros((5, 2)), "distances": np.zeros(5)}, "needs points"),
+        ({"points": np.zeros((5, 3)), "distances": np.full(5, np.nan)}, "finite"),
+        ({"points": np.full((5, 3), "a"), "distances": np.zeros(5)}, "finite"),
+        ({"points": np.zeros((5, 3)), "distances": np.ones(5)}, "four are needed"),
+        ({"points": np.zeros((5, 3)), "distances": -np.ones(5)}, "scale"),
+        ({"points": np.array([{}] * 5, object), "distances": np.zeros(5)}, "objects"),
     ],
 )
 def test_bad_arrays_are_told_in_a_line(tmp_path: Path, arrays: dict[str, np.ndarray], said: str) -> None:

@@ -1,0 +1,72 @@
+"""The code of a shape that no training saw: found by gradient descent on its samples, the network as it is.
+
+As for the shapes of the training (an auto-decoder), there is no encoder. The descent begins with the code of the training
+whose distances fit the samples best.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from meshmatch.arrays import Float
+from meshmatch.errors import OptionError
+from meshmatch.implicit.model import Coded, ImplicitModel, percent_of_side
+from meshmatch.implicit.objective import ImplicitLoss
+from meshmatch.implicit.samples import samples_of
+from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.files import ShapeLike, as_shape
+
+_SAMPLES, _POINTS, _FEW = 8192, 1024, 512  # of the shape, in a step, and to choose where to begin
+_RATE = 1e-2
+
+
+def fit_implicit(
+    model: ImplicitModel, shape: ShapeLike, *, steps: int = 200, seed: int = 0, progress: ProgressCallback | None = None
+) -> Coded:
+    """The code of a shape, so that the model's surface is the shape's.
+
+    ``shape`` is a mesh, a cloud, or the path of one or of `.npz` samples (docs/formats.md); it must stand as the shapes of
+    the training did. Of meshes that are not watertight only the surface is known, as of clouds. The same ``seed`` gives
+    the same code.
+
+    `MeshmatchError`: a shape that cannot be read, or has fewer than four points; steps below 1.
+    """
+    if steps < 1:
+        raise OptionError(f"a code is not found in {steps} steps", "200 are usual")
+    path = isinstance(shape, str | Path) and Path(shape).suffix.lower() == ".npz"
+    source = Path(shape) if path else as_shape(shape)  # type: ignore[arg-type]
+    name = Path(source).stem if isinstance(source, str | Path) else source.name or "shape"
+    rng = np.random.default_rng(seed)
+    frame, found = samples_of(source, _SAMPLES, rng, closed=False)
+    rows, half = torch.from_numpy(found), _SAMPLES // 2
+    network, loss = model.network, ImplicitLoss()
+    generator = torch.Generator().manual_seed(seed)
+    code = nearest_code(model, rows[:: _SAMPLES // _FEW]).clone().requires_grad_(True)
+    descent = torch.optim.Adam([code], _RATE)
+    for step in range(steps):
+        for group in descent.param_groups:
+            group["lr"] = _RATE * (1 - step / steps)
+        drawn = rng.integers(half, size=(2, _POINTS // 2))
+        some = rows[np.concatenate([drawn[0], drawn[1] + half])]
+        total = loss.of(network, code[None], some[None], generator)["total"]
+        (code.grad,) = torch.autograd.grad(total, [code])
+        descent.step()
+        if progress is not None:
+            progress("code", name, (step + 1) / steps)
+    with torch.no_grad():
+        on = rows[:half]
+        away = network.distance(on[None, :, :3], code[None])[0][0] - on[:, 3]
+    return Coded(name, code.detach(), frame, percent_of_side(float(away.abs().mean())))
+
+
+@torch.no_grad()
+def nearest_code(model: ImplicitModel, rows: Float[torch.Tensor, "P 7"]) -> Float[torch.Tensor, " D"]:
+    """The code of the training that fits samples best."""
+    network, known = model.network, rows[rows[:, 3].isfinite()]
+    errors = [
+        (network.distance(known[None, :, :3], code[None])[0][0] - known[:, 3]).abs().mean() for code in network.codes
+    ]
+    return network.codes[int(torch.stack(errors).argmin())].detach()

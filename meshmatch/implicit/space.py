@@ -1,0 +1,100 @@
+"""Moving least squares wherever a point may lie: nodes near a surface, and others around the whole cube.
+
+Where the points are not known beforehand, shape functions are computed when asked, for all pairs of a point and a node.
+Neither the functions nor their gradients are written out: what they do to vectors are products of two matrices (weights
+of the nodes, and their slopes) with a few columns. Nodes on the cube reach far, so that every point has enough of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn.functional import pad
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.geometry.kernels import KERNELS, Kernel
+
+CUBE_RADIUS = 1.6
+"""Support of the nodes on a cube of half side 1: with three inside each edge, every point of the cube has enough."""
+
+
+def cube_nodes(per_edge: int = 3) -> Float[Floats, "K 3"]:
+    """The vertices of the cube from -1 to 1, and so many evenly spread nodes inside each of its edges."""
+    ticks = np.linspace(-1, 1, per_edge + 2)
+    lattice = np.array(list(product(ticks, repeat=3)))
+    return lattice[(np.abs(lattice) == 1).sum(1) >= 2]
+
+
+@dataclass(frozen=True, eq=False)
+class SpaceField:
+    """Shape functions of K nodes at P points of each of B shapes: `fields.shape_functions.build_field` on the fly.
+
+    With p(q) = [1, q], M(x) = sum_i w_i p_i p_i^T and a = M^-1 p(x), a function is w_i a . p_i.
+    """
+
+    points: Float[torch.Tensor, "B P 3"]
+    nodes: Float[torch.Tensor, "K 3"]
+    weight: Float[torch.Tensor, "B P K"]
+    slope: Float[torch.Tensor, "B P K"]  # dw/dx = slope (x - q)
+    along: Float[torch.Tensor, "B P 4"]  # a
+    change: Float[torch.Tensor, "B P 3 4"] | None  # da/dx_k; None where no gradient was asked for
+
+    @classmethod
+    def at(
+        cls,
+        points: Float[torch.Tensor, "B P 3"],
+        nodes: Float[torch.Tensor, "K 3"],
+        radii: Float[torch.Tensor, " K"],
+        kernel: Kernel,
+        gradient: bool = True,
+    ) -> SpaceField:
+        """The functions at some points, each of which must have four non-coplanar nodes in reach."""
+        x, q, r = points.flatten(0, 1), nodes.to(points), radii.to(points)
+        square = torch.addmm(x.square().sum(1, keepdim=True) + q.square().sum(1), x, q.T, alpha=-2)
+        weight, slope = KERNELS[kernel](square.clamp_min(0).sqrt(), r)
+        one = pad(q, (1, 0), value=1.0)  # p
+        two = _outer(one, one)
+        moment = (weight @ two).unflatten(1, (4, 4))
+        inverse = torch.linalg.inv(moment.double()).to(points)  # its condition takes half the digits
+        along = _times(inverse, pad(x, (1, 0), value=1.0))
+        change = None
+        if gradient:  # dM/dx_k = x_k S_0 - S_k, with S_j = sum_i slope_i p_j p p^T
+            tilted = _times((slope @ _outer(one, two)).unflatten(1, (4, 4, 4)), along[:, None])
+            change = inverse[:, 1:] - (x[:, :, None] * tilted[:, :1] - tilted[:, 1:]) @ inverse
+        B = len(points)
+        split: Any = [None if each is None else each.unflatten(0, (B, -1)) for each in (weight, slope, along, change)]
+        return cls(points, q, *split)
+
+    def displacement(self, vectors: Float[torch.Tensor, "B K 3"]) -> Float[torch.Tensor, "B P 3"]:
+        """sum_i phi_i v_i at every point."""
+        return _rows(self.along, self._carried(vectors))
+
+    def jacobian(self, vectors: Float[torch.Tensor, "B K 3"]) -> Float[torch.Tensor, "B P 3 3"]:
+        """du_a / dx_k of the displacement u."""
+        assert self.change is not None
+        one = pad(self.nodes, (1, 0), value=1.0)
+        steep = self.slope @ _outer(_outer(one, one).expand(len(vectors), -1, -1), vectors)
+        steep = _rows(self.along[..., None, :], steep.unflatten(2, (4, 4, 3)))  # sum_i slope_i [1, q_i] a . p_i v_i
+        columns = self.change @ self._carried(vectors) + self.points[..., None] * steep[..., :1, :] - steep[..., 1:, :]
+        return columns.transpose(-1, -2)
+
+    def _carried(self, vectors: torch.Tensor) -> Float[torch.Tensor, "B P 4 3"]:
+        """sum_i w_i p_i v_i^T."""
+        one = pad(self.nodes, (1, 0), value=1.0).expand(len(vectors), -1, -1)
+        return (self.weight @ _outer(one, vectors)).unflatten(2, (4, 3))
+
+
+def _outer(a: Float[torch.Tensor, "*K M"], b: Float[torch.Tensor, "*K N"]) -> Float[torch.Tensor, "*K MN"]:
+    return (a[..., :, None] * b[..., None, :]).flatten(-2)
+
+
+def _times(matrix: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def _rows(vector: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
+    return (vector[..., None, :] @ matrix)[..., 0, :]

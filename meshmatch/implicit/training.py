@@ -1,0 +1,108 @@
+"""Training of implicit models: a folder of shapes that stand alike becomes one deformed template, with a code for each."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from meshmatch.errors import OptionError
+from meshmatch.implicit.card import IMPLICIT, ImplicitCard, write_implicit_card
+from meshmatch.implicit.network import ImplicitConfig, ImplicitNetwork
+from meshmatch.implicit.objective import ImplicitBatch, ImplicitLoss
+from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
+from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
+from meshmatch.models.card import check_name
+from meshmatch.models.checkpoint import save_weights
+from meshmatch.models.registry import WEIGHTS
+from meshmatch.outputs import make_folder
+from meshmatch.shapes.sampling import farthest_points
+from meshmatch.training.loop import StepReport, TrainConfig, Trainer
+from meshmatch.training.train import CHECKPOINT, CardFacts
+
+_POINTS = 512  # of a shape in a step
+TRAINING = TrainConfig(
+    steps=1500, shapes=6, warm_up=50, decay=0.7, weight_decay=0.0, average=0.99, workers=0, loss=ImplicitLoss()
+)
+"""How an implicit model is trained unless said otherwise."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImplicitDataset(torch.utils.data.Dataset):
+    """Batch s of the samples depends on the seed and s alone."""
+
+    samples: ImplicitSamples
+    config: TrainConfig
+
+    def __getitem__(self, step: int) -> ImplicitBatch:
+        rng = np.random.default_rng([self.config.seed, step])
+        S, N, _ = self.samples.rows.shape
+        shape = rng.permutation(S)[: self.config.shapes]
+        half = rng.integers(N // 2, size=(2, len(shape), _POINTS // 2))
+        rows = self.samples.rows[shape[:, None], np.concatenate([half[0], half[1] + N // 2], 1)]
+        return ImplicitBatch(torch.from_numpy(shape), torch.from_numpy(rows))
+
+
+def build_implicit(samples: ImplicitSamples, config: ImplicitConfig, seed: int) -> ImplicitNetwork:
+    """An untrained network: nodes spread over the surfaces of all shapes, and on the cube with a larger radius."""
+    rng = np.random.default_rng(seed)
+    surface = samples.rows[:, : samples.rows.shape[1] // 2, :3].reshape(-1, 3).astype(np.float64)
+    some = surface[rng.choice(len(surface), min(20_000, len(surface)), replace=False)]
+    near, far = some[farthest_points(some, min(config.nodes, len(some)))], cube_nodes()
+    radii = torch.tensor([config.radius] * len(near) + [CUBE_RADIUS] * len(far))
+    torch.manual_seed(seed)
+    return ImplicitNetwork(config, len(samples.names), torch.from_numpy(np.concatenate([near, far])).float(), radii)
+
+
+def train_implicit(
+    output: str | Path,
+    shapes: str | Path | ImplicitSamples,
+    *,
+    config: ImplicitConfig | None = None,
+    training: TrainConfig = TRAINING,
+    facts: CardFacts | None = None,
+    resume: bool = True,
+    report: Callable[[StepReport], None] | None = None,
+) -> Path:
+    """Learn a folder of shapes as one deformed template (`ImplicitModel`), or go on from the checkpoint, exactly.
+
+    ``shapes`` is a folder of watertight meshes, clouds or .npz samples (docs/formats.md) that stand alike; they are centred
+    and scaled, not turned. ``ImplicitConfig(field="pointwise")`` chooses DIF-Net's deformation, "mls" (the default) that of
+    control nodes. Returns the folder ``output``, with ``weights.safetensors`` and last ``implicit.json``.
+
+    `InputError` for shapes that cannot be learned from; `OptionError` for a training in bfloat16; `ModelError` for a
+    checkpoint of another training; `OutputError` if the folder cannot be written.
+    """
+    output, checkpoint = Path(output), Path(output) / CHECKPOINT
+    facts, config = facts or CardFacts(), config or ImplicitConfig()
+    name = check_name(facts.name or output.resolve().name)
+    if training.bf16:
+        raise OptionError("implicit models are not trained in bfloat16", "leave out --bf16")
+    make_folder(checkpoint.parent)
+    data, folder = "samples", "shapes"
+    if not isinstance(shapes, ImplicitSamples):
+        folder = Path(shapes).resolve().name
+        shapes = read_implicit_samples(shapes, training.seed)
+        data = f"{len(shapes.names)} shapes of {folder}"
+    network = build_implicit(shapes, config, training.seed)
+    trainer = Trainer(network, None, replace(training, shapes=min(training.shapes, len(shapes.names))))
+    if resume and checkpoint.is_file():
+        trainer.load(checkpoint)
+    trainer.run(ImplicitDataset(shapes, trainer.config), checkpoint, report)
+    trainer.close()
+    if trainer.rank == 0:
+        (output / IMPLICIT).unlink(missing_ok=True)
+        digest = save_weights(trainer.averaged_state(), output / WEIGHTS, storage="float32")
+        card = ImplicitCard(
+            name=name, category=facts.category or folder, network=asdict(config), shapes=list(shapes.names),
+            frames=[[frame.scale, *frame.center.tolist()] for frame in shapes.frames], data=facts.data or data,
+            licence=facts.licence, recipe=asdict(training), seed=training.seed, steps=trainer.step,
+            training_minutes=round(trainer.seconds / 60, 1), weights_sha256=digest,
+            created=datetime.date.today().isoformat(),
+        )  # fmt: skip
+        write_implicit_card(card, output)
+    return output

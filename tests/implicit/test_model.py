@@ -1,0 +1,158 @@
+"""Models come back as they were, or not at all; their surfaces are closed, and their maps go through the template."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("skimage", reason="scikit-image is of the extra `implicit`")
+
+from meshmatch.errors import MeshmatchError, ModelError, OptionError
+from meshmatch.geometry.triangles import is_watertight
+from meshmatch.implicit.card import IMPLICIT, is_implicit, read_implicit_card
+from meshmatch.implicit.codes import fit_implicit, nearest_code
+from meshmatch.implicit.model import ImplicitModel, load_implicit
+from meshmatch.models.registry import WEIGHTS
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Shape
+from tests.implicit.boxes import box, box_sdf
+
+
+@pytest.fixture(scope="module")
+def model(learned: Path) -> ImplicitModel:
+    return load_implicit(learned)
+
+
+def sides(shape: Shape) -> np.ndarray:
+    return np.ptp(shape.verts, axis=0)
+
+
+def test_surfaces_are_closed_and_in_the_files_frame(model: ImplicitModel, folder: Path) -> None:
+    truth = load_shape(folder / "box1.ply")
+    found = model.surface(model.known("box1"), resolution=32)
+    assert is_watertight(found.faces)
+    corners = found.verts[found.faces]
+    assert (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() > 0  # outwards
+    assert np.abs(found.bounds - truth.bounds).max() < 0.25 * truth.diagonal
+    half_way = model.surface(model.blend(model.known("box0"), model.known("box1"), 0.5), 32)
+    assert is_watertight(half_way.faces)
+    with pytest.raises(OptionError, match="no shape"):
+        model.known("nobody")
+    with pytest.raises(OptionError, match="even"):
+        model.surface(model.known("box0"), resolution=33)
+
+
+def test_a_blend_ends_at_both_shapes(model: ImplicitModel) -> None:
+    a, b = model.known("box0"), model.known("box2")
+    for time, end in ((0, a), (1, b)):
+        found = model.blend(a, b, time)
+        assert np.allclose(found.code, end.code)
+        assert found.frame.scale == pytest.approx(end.frame.scale)
+        assert np.allclose(found.frame.center, end.frame.center)
+
+
+def test_maps_go_through_the_template(model: ImplicitModel, folder: Path) -> None:
+    a, b = (load_shape(folder / f"box{k}.ply") for k in (0, 1))
+    one, other = model.known("box0"), model.known("box1")
+    found = model.match(one, other, a, b)
+    assert (found.source_vertices, found.target_vertices) == (a.V, b.V)
+    same = model.match(one, one, a, a)
+    assert np.array_equal(same.index, np.arange(a.V))
+    assert same.confidence.min() == 1
+    assert np.array_equal(np.sign(b.verts[found.index]), np.sign(a.verts))  # corner to corner
+
+
+def test_an_unseen_shape_finds_its_code(model: ImplicitModel, tmp_path: Path) -> None:
+    half = np.array([0.8, 0.35, 0.6])
+    moved = Shape(3 * box(half).verts + 5, box(half).faces, "unseen")
+    first = fit_implicit(model, moved, steps=1)
+    found = fit_implicit(model, moved, steps=120)
+    assert found.residual < min(0.8 * first.residual, 3)
+    assert np.abs(sides(model.surface(found, 32)) / sides(moved) - 1).max() < 0.3
+    again = fit_implicit(model, moved, steps=120)
+    assert np.array_equal(found.code, again.code)
+    assert (first.verdict == "good") == (not first.reasons)
+    # the same from given distances
+    points = np.random.default_rng(0).uniform(-1.3, 1.3, (20_000, 3))
+    np.savez(tmp_path / "unseen.npz", points=points, distances=box_sdf(points, half))
+    given = fit_implicit(model, tmp_path / "unseen.npz", steps=120)
+    assert given.residual < 3
+    with pytest.raises(OptionError, match="steps"):
+        fit_implicit(model, moved, steps=0)
+
+
+def test_a_descent_begins_with_the_nearest_shape_of_the_training(model: ImplicitModel, folder: Path) -> None:
+    import torch
+
+    drawn = sample_surface(load_shape(folder / "box2.ply"), 400, np.random.default_rng(0)).points
+    rows = np.column_stack([model.known("box2").frame.apply(drawn), np.zeros((400, 4))])
+    found = nearest_code(model, torch.from_numpy(rows.astype(np.float32)))
+    assert torch.equal(found, model.known("box2").code)
+
+
+def test_models_come_back_as_they_were(learned: Path) -> None:
+    a, b = load_implicit(learned), load_implicit(learned)
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    assert np.array_equal(a.distance(points, a.known("box0").code)[0], b.distance(points, b.known("box0").code)[0])
+    assert is_implicit(learned)
+    card = read_implicit_card(learned)
+    assert card.shapes == ["box0", "box1", "box2", "box3"]
+    assert card.steps == 120
+
+
+def damaged(learned: Path, folder: Path, change: dict[str, object]) -> Path:
+    folder.mkdir()
+    card = json.loads((learned / IMPLICIT).read_text())
+    card["network"] |= change.pop("network", {})
+    (folder / IMPLICIT).write_text(json.dumps(card | change))
+    (folder / WEIGHTS).write_bytes((learned / WEIGHTS).read_bytes())
+    return folder
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"schema": 2},
+        {"unheard": 1},
+        {"steps": "many"},
+        {"name": "../up"},
+        {"shapes": ["box0"]},
+        {"shapes": ["a", "a", "a", "a"]},
+        {"frames": [[0, 0, 0, 0]] * 4},
+        {"frames": [["x"]] * 4},
+        {"frames": 7},
+        {"weights_sha256": 64 * "0"},
+        {"network": {"width": 10**9}},
+        {"network": {"width": -1}},
+        {"network": {"code": "8"}},
+        {"network": {"code": 9}},
+        {"network": {"unheard": 1}},
+        {"network": {"field": "pointwise"}},
+        {"network": {"frequency": "fast"}},
+        {"network": {"kernel": "unknown"}},
+        {"network": {"field": "unknown"}},
+    ],
+    ids=str,
+)
+def test_hostile_cards_are_told_in_a_line(learned: Path, tmp_path: Path, change: dict[str, object]) -> None:
+    with pytest.raises(ModelError) as caught:
+        load_implicit(damaged(learned, tmp_path / "bad", dict(change)))
+    assert caught.value.hint
+
+
+def test_hostile_files_are_told_in_a_line(learned: Path, tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="no implicit model"):
+        load_implicit(tmp_path)
+    bad = damaged(learned, tmp_path / "bad", {})
+    for content in (b"", b"{", b"[" * 100_000, b"\x00" * 100, b"[]", b"1" * 2_000_000):
+        (bad / IMPLICIT).write_bytes(content)
+        with pytest.raises(ModelError):
+            load_implicit(bad)
+    weights = (learned / WEIGHTS).read_bytes()
+    for content in (b"", weights[:-10], weights[:100]):
+        (bad / WEIGHTS).write_bytes(content)
+        (bad / IMPLICIT).write_bytes((learned / IMPLICIT).read_bytes())
+        with pytest.raises(MeshmatchError):
+            load_implicit(bad)
