@@ -4,7 +4,9 @@ Training again from another seed moves errors by as much as many choices do, and
 of two errors is therefore said to be there only where it is carried
 
 - by seeds: the 95 % interval of the difference of their means (Welch's, of at least two trainings each) leaves out 0;
-- on a set, by its pairs too: so does the 95 % interval of a paired bootstrap over pairs.
+- by what was measured on too: so does the 95 % interval of a paired bootstrap over a set's pairs, or over held-out bodies.
+
+Verdicts tell the hull of both intervals of each difference.
 
 Refinements of the same networks are compared seed by seed; a single network by its pairs alone. Costs, which are medians
 of many iterations side by side, are compared as they are.
@@ -34,13 +36,14 @@ _RESAMPLES, _LEVEL = 4000, 0.95
 class Claim:
     """A statement, the numbers that it is about from the one that should be least to the largest, and what became of it.
 
-    ``where`` is empty, a set, or "held out".
+    ``where`` is empty, a set, or "held out"; ``intervals`` are of every difference of neighbours, None where there is none.
     """
 
     words: str
     numbers: tuple[float, ...]
     outcome: Outcome
     where: str = ""
+    intervals: tuple[tuple[float, float] | None, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -48,12 +51,14 @@ class Claim:
         if self.outcome == "not measured":
             return self.outcome
         numbers = ", ".join(f"{value:.2f}" for value in self.numbers)
+        if known := [f"{low:+.2f} to {high:+.2f}" for low, high in filter(None, self.intervals)]:
+            numbers += f"; differences {', '.join(known)}"
         return f"{'DOES NOT HOLD' if self.outcome == 'does not hold' else self.outcome} ({numbers})"
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Mean errors of the trainings of one choice; on a set, the error of every pair by each of them (else none)."""
+    """Mean errors of the trainings of one choice; the error of every pair, or body, by each of them (or none)."""
 
     seeds: Sequence[float]
     pairs: Sequence[Sequence[float]] = ()
@@ -83,24 +88,30 @@ def seeds_interval(a: Sequence[float], b: Sequence[float], paired: bool) -> tupl
 
 
 def pairs_interval(a: Float[Floats, " P"], b: Float[Floats, " P"]) -> tuple[float, float]:
-    """95 % interval of the mean of b less that of a, by resampling pairs."""
+    """95 % interval of the mean of b less that of a, by resampling pairs (or bodies)."""
     off = b - a
     draws = np.random.default_rng(0).integers(0, len(off), (_RESAMPLES, len(off)))
     low, high = np.quantile(off[draws].mean(1), [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
     return float(low), float(high)
 
 
-def order(a: Sample, b: Sample, paired: bool = False) -> int:
-    """1 if b's error is carried to be larger than a's, -1 if it is to be smaller, 0 if neither is."""
+def difference(a: Sample, b: Sample, paired: bool = False) -> tuple[float, float] | None:
+    """The hull of the 95 % intervals of b's error less a's, by seeds and by pairs; None where there are too few seeds."""
     intervals = [seeds_interval(a.seeds, b.seeds, paired)]
     if a.pairs and b.pairs:
         intervals.append(pairs_interval(np.mean(a.pairs, axis=0), np.mean(b.pairs, axis=0)))
         if intervals[0] is None and paired:
             intervals = intervals[1:]
-    if any(each is None for each in intervals):
-        return 0
-    signs = {int(np.sign(low)) if np.sign(low) == np.sign(high) else 0 for low, high in filter(None, intervals)}
-    return signs.pop() if len(signs) == 1 else 0
+    known = [each for each in intervals if each is not None]
+    if len(known) < len(intervals):
+        return None
+    return min(low for low, _ in known), max(high for _, high in known)
+
+
+def order(a: Sample, b: Sample, paired: bool = False) -> int:
+    """1 if b's error is carried to be larger than a's, -1 if it is to be smaller, 0 if neither is."""
+    found = difference(a, b, paired)
+    return 0 if found is None or np.sign(found[0]) != np.sign(found[1]) else int(np.sign(found[0]))
 
 
 def rising(where: str, words: str, samples: Sequence[Sample], paired: bool = False) -> Claim:
@@ -112,12 +123,12 @@ def rising(where: str, words: str, samples: Sequence[Sample], paired: bool = Fal
     outcome: Outcome = (
         "does not hold" if -1 in signs else "holds" if all(sign == 1 for sign in signs) else "not told apart"
     )
-    return Claim(words, numbers, outcome, where)
+    return Claim(words, numbers, outcome, where, tuple(difference(a, b, paired) for a, b in pairwise(samples)))
 
 
 def sample(known: Known, run: Run, where: str) -> Sample:
     """What is known of a run on the held-out shapes or a set."""
-    return Sample(known.error(run, where), [] if where == HELD_OUT else known.pairs(run, where))
+    return Sample(known.error(run, where), known.pairs(run, where))
 
 
 def claims(known: Known, sets: Sequence[str]) -> list[Claim]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, stdev
 from typing import Any
 
 import numpy as np
@@ -20,11 +20,11 @@ _AXIS = "mean error, cm (1.9 square meters of skin)"
 
 
 def number(values: Sequence[float]) -> str:
-    """A mean, and half of what several seeds lie apart; a dash for what was not measured."""
+    """A mean, and the standard deviation of several seeds; a dash for what was not measured."""
     if not values:
         return "-"
     words = f"{fmean(values):.2f}"
-    return words if len(values) == 1 else f"{words} ± {(max(values) - min(values)) / 2:.2f}"
+    return words if len(values) == 1 else f"{words} ± {stdev(values):.2f}"
 
 
 def errors_table(view: View, known: Known, sets: Sequence[str], budget: str) -> Table:
@@ -137,8 +137,8 @@ def _draw_lines(view: View, known: Known, sets: Sequence[str], path: Path) -> bo
         there = [(float(row.words[0]), known.error(row.run, where)) for row in view.rows]
         there = [(at, errors) for at, errors in there if errors]
         if there:
-            half = [(max(errors) - min(errors)) / 2 for _, errors in there]
-            lines[where] = Line([at for at, _ in there], [fmean(errors) for _, errors in there], half)
+            off = [stdev(errors) if len(errors) > 1 else 0.0 for _, errors in there]
+            lines[where] = Line([at for at, _ in there], [fmean(errors) for _, errors in there], off)
     if lines:
         ticks = [float(row.words[0]) for row in view.rows]
         draw_lines([Chart(view.heads[0], lines, ticks, True)], path, _AXIS)

@@ -17,6 +17,7 @@ from torch import Tensor
 from meshmatch.arrays import Float
 from meshmatch.errors import TemplateError
 from meshmatch.experiments.ablation_views import BASE, Run
+from meshmatch.experiments.human_bodies import diameter
 from meshmatch.models.layers import BasisEncoder, PointEncoder
 from meshmatch.models.network import NetworkConfig
 from meshmatch.templates.make import NodeConfig, Strategy, choose_nodes
@@ -31,8 +32,9 @@ from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import build_dataset, build_deformer
 
 Preset = Literal["small", "default", "paper"]
+Unit = Literal["diameter", "sphere"]
 SPHERE = 0.65
-"""The paper's unit, the radius of a sphere around the body, in units of sqrt(area)."""
+"""The radius of a sphere around the body, in units of sqrt(area): the other reading of the paper's radii."""
 SCANS = 4
 """How often each shape is scanned."""
 HELD_OUT_SHAPES = 64
@@ -68,12 +70,18 @@ class Setting:
         Shapes that `meshmatch prepare` made ready; None for generated bodies.
     identities : int
         Of generated bodies.
+    unit : {"diameter", "sphere"}
+        Of a run's radius: the template's diameter, as the captions of the paper's tables say; or `SPHERE`.
+    batch : int, optional
+        Shapes of a step; None for the recipe's.
     """
 
     preset: Preset = "small"
     folder: str | None = None
     identities: int = 1024
     threads: int = 1
+    unit: Unit = "diameter"
+    batch: int | None = None
 
     def recipe(self, run: Run) -> Recipe:
         """The preset's recipe with the run's choices; constraints that it does not have weigh nothing.
@@ -93,7 +101,7 @@ class Setting:
         train = replace(
             chosen.train,
             loss=loss,
-            shapes=chosen.train.shapes * chosen.train.scans_per_shape,
+            shapes=self.batch or chosen.train.shapes * chosen.train.scans_per_shape,
             scans_per_shape=1,
             workers=0,
             threads=self.threads,
@@ -114,11 +122,16 @@ class Setting:
         TemplateError
             Nodes of this number and radius do not carry it.
         """
-        return _with_nodes(self.resting(run.pose), run.nodes, run.radius * SPHERE, run.strategy)[0]
+        return self._chosen(run)[0]
 
     def rule(self, run: Run) -> Strategy:
         """By which rule its nodes are chosen: its own, or none ("uniform") where that one leaves too few."""
-        return _with_nodes(self.resting(run.pose), run.nodes, run.radius * SPHERE, run.strategy)[1]
+        return self._chosen(run)[1]
+
+    def _chosen(self, run: Run) -> tuple[Template, Strategy]:
+        template = self.resting(run.pose)
+        unit = SPHERE if self.unit == "sphere" else diameter(template.shape)
+        return _with_nodes(template, run.nodes, run.radius * unit, run.strategy)
 
     def resting(self, pose: str) -> Template:
         """The template in a pose, with the nodes that it came with; a folder has one pose."""

@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from meshmatch.arrays import Float
 from meshmatch.experiments.ablation_setting import Pool, Setting, pool_of
 from meshmatch.experiments.ablation_views import Run
 from meshmatch.fields.field import Field
@@ -24,6 +25,7 @@ from meshmatch.models.layers import BasisEncoder
 from meshmatch.models.registry import CARD, WEIGHTS, read_card
 from meshmatch.outputs import make_folder
 from meshmatch.threads import set_threads
+from meshmatch.training.datasets import Batch
 from meshmatch.training.loop import Trainer
 from meshmatch.training.losses import LossPoints, held_out_error
 from meshmatch.training.train import CardFacts, build_dataset, build_deformer, build_loss_points, export
@@ -41,8 +43,8 @@ def train_run(run: Run, setting: Setting, folder: Path, *, minutes: float = 0.0,
     Returns
     -------
     dict
-        ``steps``, ``seconds`` (of ``clock``), ``held_out_cm`` (the network alone), ``nodes``, ``rule``, ``model``
-        (what tells its weights from others).
+        ``steps``, ``seconds`` (of ``clock``), ``held_out_cm`` (the network alone), ``bodies_cm`` (of each body),
+        ``nodes``, ``rule``, ``model`` (what tells its weights from others).
     """
     set_threads(setting.threads)
     template, recipe = setting.template(run), setting.recipe(run)
@@ -64,7 +66,9 @@ def train_run(run: Run, setting: Setting, folder: Path, *, minutes: float = 0.0,
     trainer.seconds = spent
     trainer.config = recipe.train
     model.load_state_dict(trainer.averaged_state())
-    held_out = held_out_error(model, pool.held_out, points.to(trainer.device))
+    loss_points = points.to(trainer.device)
+    held_out = held_out_error(model, pool.held_out, loss_points)
+    bodies = CM_PER_UNIT * body_errors(model, pool.held_out, loss_points)
     make_folder(folder)
     category = "human" if setting.folder is None else Path(setting.folder).name
     facts = CardFacts("run", category, f"{run.shapes} shapes, scanned beforehand", licence="")
@@ -75,10 +79,22 @@ def train_run(run: Run, setting: Setting, folder: Path, *, minutes: float = 0.0,
         "clock": "processor" if on_cpu else "wall",
         "device": str(trainer.device),
         "held_out_cm": round(held_out * CM_PER_UNIT, 4),
+        "bodies_cm": bodies.round(decimals=3).tolist(),
         "nodes": template.K,
         "rule": setting.rule(run),
         "model": read_card(folder / CARD).weights_sha256,
     }
+
+
+@torch.no_grad()
+def body_errors(model: Deformer, batch: Batch, points: LossPoints) -> Float[torch.Tensor, " B"]:
+    """Mean distance of the template's points from their places on each body (units of sqrt(area)), float64."""
+    was = model.training
+    model.eval()
+    batch = batch.to(points.positions.device)
+    off = points.moved(model(batch.points)) - batch.targets
+    model.train(was)
+    return off.double().norm(dim=-1).mean(1).cpu()
 
 
 def _wait(trainer: Trainer) -> None:
@@ -158,6 +174,22 @@ def timed(setting: Setting, runs: Sequence[Run], rounds: int) -> dict[str, dict[
         }
         for run in runs
     }
+
+
+def planned(setting: Setting, runs: Sequence[Run], steps: int, rounds: int = 2) -> list[dict[str, Any]]:
+    """What training the runs for so many steps takes, by what an iteration costs: rows with ``field``, ``constraint``,
+    ``nodes``, ``runs``, ``cpu_ms`` of a step and ``minutes`` in all. Scans and errors come on top."""
+    alike: dict[Run, int] = {}
+    for run in runs:
+        kind = Run(run.field, run.constraint, run.nodes)
+        alike[kind] = alike.get(kind, 0) + 1
+    rows = []
+    for kind, count in alike.items():
+        cost = timed(setting, [kind], rounds)[kind.name]["cpu_ms"]
+        minutes = round(count * steps * cost / 60_000, 2)
+        words = {"field": kind.field, "constraint": kind.constraint, "nodes": kind.nodes, "runs": count}
+        rows.append({**words, "cpu_ms": cost, "minutes": minutes})
+    return rows
 
 
 def memory(setting: Setting, run: Run, iterations: int = 3) -> dict[str, Any]:

@@ -254,7 +254,11 @@ class Known:
         return [record for record in records if record is not None]
 
     def pairs(self, run: Run, where: str, method: str = "code") -> list[list[float]]:
-        """Errors in cm of every pair of a set, by a run and its repetitions; of those alone that kept them."""
+        """Errors in cm of every pair of a set, or of every held-out body, by a run and its repetitions; of those alone
+        that kept them."""
         alike = sorted((each for each in self.trained if replace(each, seed=0) == run), key=lambda r: r.seed)
-        kept = [self.errors.get((each, where, method), {}).get("pair_cm") for each in alike]
+        if where == HELD_OUT:
+            kept = [self.trained[each].get("bodies_cm") for each in alike]
+        else:
+            kept = [self.errors.get((each, where, method), {}).get("pair_cm") for each in alike]
         return [each for each in kept if each]

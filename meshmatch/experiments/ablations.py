@@ -3,8 +3,9 @@
 Tables 4 (representations and constraints: errors and cost), 5 (regularisers), 6 (nodes and radius, kernel), 7 (how nodes
 are chosen); figures 6 (refinement), 8 (template pose), 9 (training shapes), 10 (supervised points). All are views of one
 set of runs. Each run is trained once, from the beginning, and measured on shapes that it has not seen and on pairs of the
-benchmark's sets. Representations and constraints, which cost differently, have the same minutes (of the processor; with a
-GPU on the clock); all other runs take as many steps as the base does in them.
+benchmark's sets. All runs take the same number of --steps. With --minutes, apart, representations and constraints, which
+cost differently, have the same time instead (of the processor; with a GPU on the clock), and all other runs take as many
+steps as the base does in it. --plan says beforehand what the trainings will take.
 
 What is measured lies in the output folder and is not measured again, so that a stopped command goes on with what is
 missing; --show measures nothing and shows what is there. The tables say the budget. Errors are in cm at 1.9 m2 of skin:
@@ -40,14 +41,16 @@ from meshmatch.experiments.ablation_errors import (
     subject,
 )
 from meshmatch.experiments.ablation_results import draw_views, tables
-from meshmatch.experiments.ablation_setting import Preset, Setting
-from meshmatch.experiments.ablation_training import is_trained, memory, timed, train_run
+from meshmatch.experiments.ablation_setting import SPHERE, Preset, Setting, Unit
+from meshmatch.experiments.ablation_training import is_trained, memory, planned, timed, train_run
 from meshmatch.experiments.ablation_views import BASE, CODED, VIEWS, Known, Run, all_runs, by_time, methods_of
 from meshmatch.experiments.sets import ALL_SETS, CLOUD_SET, BenchSet, load_set
 from meshmatch.geometry.frames import Frame
 from meshmatch.models.registry import find_model
 from meshmatch.outputs import replace_on_success
 
+PLAN_COLUMNS = {"field": "field", "constraint": "constraint", "nodes": "nodes:d", "runs": "runs:d"}
+PLAN_COLUMNS |= {"CPU ms a step": "cpu_ms:.1f", "CPU min in all": "minutes:.1f"}
 BODIES = 5
 """How many bodies figure 6 is measured on."""
 
@@ -59,11 +62,13 @@ class Kept:
     folder: Path
     setting: Setting
     measure: Measure
-    minutes: float
+    steps: int
+    minutes: float | None
     model: str
     benches: Sequence[BenchSet]
     cache: Path | None
     show: bool
+    methods: Sequence[str] = METHODS
 
     def asked(self, run: Run, **more: Any) -> dict[str, Any]:
         """The choices that a run's file belongs to."""
@@ -86,8 +91,8 @@ class Kept:
 
     def train(self, run: Run) -> dict[str, Any] | None:
         """How its training went; {"skipped": why} where nodes cannot be laid."""
-        budget: dict[str, Any] = {"minutes": self.minutes}
-        if not by_time(run):
+        budget: dict[str, Any] = {"steps": self.steps} if self.minutes is None else {"minutes": self.minutes}
+        if self.minutes is not None and not by_time(run):
             base = self.train(BASE)
             budget = {"steps": 0 if base is None else int(base["steps"])}
 
@@ -116,7 +121,7 @@ class Kept:
         found: dict[tuple[Run, str, str], dict[str, Any]] = {}
         for bench in self.benches if "skipped" not in trained else ():
             kept = {how: runner.recall(*self._error(run, bench.name, how, trained)) for how in METHODS}
-            missing = [how for how in methods_of(run) if kept[how] is None]
+            missing = [how for how in methods_of(run) if kept[how] is None and how in self.methods]
             if missing and not self.show:
                 folder = self.folder / run.name
                 if not is_trained(folder / "model", trained):
@@ -184,24 +189,35 @@ class Kept:
         return self.answer(self.folder / "figure6.json", asked, measured)
 
     def known(self, runs: Sequence[Run], views: Sequence[str], rounds: int) -> Known:
-        """What is there, after measuring what is missing; no runs are trained in 0 minutes."""
+        """What is there, after measuring what is missing; no runs are trained in 0 minutes or steps."""
         trained: dict[Run, dict[str, Any]] = {}
         errors: dict[tuple[Run, str, str], dict[str, Any]] = {}
-        for run in runs if self.minutes else ():
+        for run in runs if self.trains else ():
             if (found := self.train(run)) is not None:
                 trained[run] = found
                 errors |= self.errors(run, found)
         times, grown = self.cost(rounds) if "table4" in views and rounds else ({}, {})
         return Known(trained, errors, times, grown, self.descent(trained) if "figure6" in views else None)
 
+    @property
+    def trains(self) -> bool:
+        """Whether there is a budget to train in."""
+        return bool(self.steps if self.minutes is None else self.minutes)
+
     def budget(self, known: Known) -> str:
         """What the numbers cost, in words."""
-        clocks = {record["clock"] for record in known.trained.values() if "clock" in record}
-        words = [f"{self.minutes:g} {'CPU ' if clocks == {'processor'} else ''}min of training a run"]
-        steps = known.trained.get(BASE, {}).get("steps")
-        if steps and not all(by_time(run) for run in known.trained):
-            words[0] += f" or the base's {steps} steps"
-        words += [f"preset {self.setting.preset}", f"{self.measure.code_steps} steps on the code"]
+        words = [f"{self.steps} steps of every run"]
+        if self.minutes is not None:
+            clocks = {record["clock"] for record in known.trained.values() if "clock" in record}
+            words = [f"{self.minutes:g} {'CPU ' if clocks == {'processor'} else ''}min of training a run"]
+            steps = known.trained.get(BASE, {}).get("steps")
+            if steps and not all(by_time(run) for run in known.trained):
+                words[0] += f" or the base's {steps} steps"
+        if self.setting.batch:
+            words.append(f"batches of {self.setting.batch}")
+        unit = "the template's diameter" if self.setting.unit == "diameter" else f"{SPHERE} sqrt(area)"
+        words += [f"radii in units of {unit}", f"preset {self.setting.preset}"]
+        words += [f"{self.measure.code_steps} steps on the code"]
         words += [f"the pairs of {self.measure.shapes} shapes of a set", f"{self.setting.threads} threads"]
         return ", ".join(words)
 
@@ -223,14 +239,18 @@ def claims_table(found: Sequence[Claim]) -> Any:
 def main(
     output: Annotated[Path, Option(help="folder of what is measured")],
     views: Annotated[str, Option(help=f"of {', '.join(VIEWS)}")] = ",".join(VIEWS),
-    minutes: Annotated[float, Option(min=0, help="of training a run; 0: table 4's cost alone")] = 2.0,
+    steps: Annotated[int, Option(min=0, help="of training a run; 0: table 4's cost alone")] = 300,
+    minutes: Annotated[float | None, Option(min=0, help="of training instead: equal time, see above")] = None,
     seeds: Annotated[int, Option(min=1, help="trainings of each run of the views that are repeated")] = 1,
     repeated: Annotated[str, Option(help="which views these are; may be empty")] = "table4",
     rounds: Annotated[int, Option(min=0, help="iterations of table 4's runs under the clock")] = 5,
     sets: Annotated[str, Option(help="on which errors are measured; may be empty")] = f"shrec19,{CLOUD_SET}",
     shapes: Annotated[int, Option(min=2, help="of each set, whose pairs are measured")] = 6,
     code_steps: Annotated[int, Option(min=1, help="of the search over codes")] = 100,
+    methods: Annotated[str, Option(help="refinements, where a view asks for them")] = ",".join(METHODS),
     preset: Annotated[Preset, Option(help="of the training")] = "small",
+    batch: Annotated[int | None, Option(min=1, help="shapes of a step; by default the preset's")] = None,
+    unit: Annotated[Unit, Option(help="of the radii: the template's diameter, or 0.65 sqrt(area)")] = "diameter",
     folder: Annotated[str | None, Option(help="prepared shapes to learn from, not generated bodies")] = None,
     identities: Annotated[int, Option(min=1, help="of generated bodies")] = 1024,
     threads: runner.Threads = 1,
@@ -239,14 +259,19 @@ def main(
     cache: runner.Cache = None,
     markdown: Annotated[Path | None, Option(help="write the tables again, for docs/results.md")] = None,
     pictures: Annotated[Path | None, Option(help="folder of the figures; by default the output")] = None,
+    plan: Annotated[bool, Option("--plan", help="train nothing, say what the trainings take")] = False,
     show: Annotated[bool, Option("--show", help="measure nothing, show what is there")] = False,
 ) -> runner.Report:
     names = [name for name in VIEWS if name in runner.names_of(views, VIEWS, "view")]
     runs = all_runs(names, seeds, runner.names_of(repeated, VIEWS, "view"))
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
-    setting = Setting(preset, folder, identities, threads)
+    setting = Setting(preset, folder, identities, threads, unit, batch)
+    if plan:
+        rows = planned(setting, runs, steps)
+        return runner.Report({"plan": rows}, [runner.table(f"{steps} steps of every run", rows, PLAN_COLUMNS)])
     measure = Measure(shapes=shapes, code_steps=code_steps)
-    kept = Kept(output, setting, measure, minutes, model, benches, cache, show)
+    wanted = runner.names_of(methods, METHODS, "method")
+    kept = Kept(output, setting, measure, steps, minutes, model, benches, cache, show, wanted)
     known = kept.known(runs, names, rounds)
     budget, where = kept.budget(known), [bench.name for bench in benches]
     found = claims(known, where)
@@ -255,7 +280,7 @@ def main(
         with replace_on_success(markdown) as temporary:
             temporary.write_text("\n".join(runner.as_markdown(each) for each in drawn), encoding="utf-8")
     notes = [f"Budget: {budget}"]
-    if minutes and (missing := [run.name for run in runs if run not in known.trained]):
+    if kept.trains and (missing := [run.name for run in runs if run not in known.trained]):
         notes.append(f"Not measured: {', '.join(missing)}")
     notes += [f"wrote {path}" for path in draw_views(known, names, where, pictures or output)]
     record = {

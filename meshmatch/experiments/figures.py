@@ -118,7 +118,8 @@ def main(
     figures: Annotated[str, Option(help=f"of {', '.join(FIGURES)}")] = ",".join(FIGURES),
     pictures: Annotated[Path, Option(help="folder of paper-figure-N.png")] = Path("docs/images"),
     output: Annotated[Path | None, Option(help="folder of trained runs; by default none are used")] = None,
-    minutes: Annotated[float, Option(min=0.01, help="of training a run")] = 1.0,
+    train_steps: Annotated[int, Option(min=1, help="of training a run")] = 300,
+    batch: Annotated[int | None, Option(min=1, help="shapes of a step of training a run")] = None,
     method: Annotated[str, Option(help=f"refinement of a run's fits, of {', '.join(METHODS)}")] = "code",
     code_steps: Annotated[int, Option(min=1, help="of the search over codes")] = 60,
     supervised: Annotated[int, Option(min=4, help="template points with a known place, without a network")] = 300,
@@ -135,7 +136,7 @@ def main(
     kept = None
     if output is not None:
         measure = Measure(code_steps=code_steps)
-        kept = Kept(output, Setting(threads=threads), measure, minutes, "human", [], None, False)
+        kept = Kept(output, Setting(threads=threads, batch=batch), measure, train_steps, None, "human", [], None, False)
     found: dict[str, list[dict[str, Any]]] = {}
     notes = []
     body = unseen_bodies(template, 1, seed=seed)[0] if {"4", "5"} & set(wanted) else np.empty((0, 3))

@@ -110,13 +110,17 @@ def human_template(rig: Rig, pose: str, config: NodeConfig, low: tuple[Int[Ints,
     return replace(made, pose=pose, source=SOURCE, licence=LICENCE)
 
 
+def diameter(shape: Shape) -> float:
+    """Of the sphere around the middle of a shape's bounding box that holds it: the unit of the paper's radii."""
+    middle = 0.5 * (shape.verts.min(0) + shape.verts.max(0))
+    return 2 * float(np.linalg.norm(shape.verts - middle, axis=1).max())
+
+
 def with_paper_nodes(template: Template) -> Template:
     """A human template with the paper's 300 nodes, chosen by body parts; each has a radius of a fifth of the diameter of
     the sphere around the template's bounding box's middle, as the captions of its tables say. Named after their number.
     """
-    verts = template.shape.verts
-    middle = 0.5 * (verts.min(0) + verts.max(0))
-    radius = round(0.2 * 2 * float(np.linalg.norm(verts - middle, axis=1).max()), 2)
+    radius = round(0.2 * diameter(template.shape), 2)
     nodes = choose_nodes(template.shape, NodeConfig("parts", 300, radius), template.labels)
     return replace(template, name=f"{template.name}-{len(nodes)}", nodes=nodes, radius=radius)
 

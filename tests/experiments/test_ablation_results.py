@@ -76,6 +76,24 @@ def test_pairs_must_carry_an_order_too() -> None:
     assert low == 0.0 and 1.0 < high <= 2.0
 
 
+def test_bodies_must_carry_an_order_of_held_out_errors() -> None:
+    """Seeds agree, but one body in four decides: what holds must hold by bodies too. A verdict tells the interval."""
+    wide = replace(BASE, pose="I")
+    words = "held out: template pose T < I"
+    found = known(twice({BASE: 1.0, wide: 2.0}))
+    for run in found.trained:
+        bodies = [1.0] * 4 if run.pose == "T" else [0.0, 0.0, 0.0, 8.0]
+        found.trained[run]["bodies_cm"] = bodies  # type: ignore[index]
+    assert verdicts(found)[words] == "not told apart"
+    for run in found.trained:
+        found.trained[run]["bodies_cm"] = [1.0 + (run.pose == "I")] * 4  # type: ignore[index]
+    assert verdicts(found)[words] == "holds"
+    claim = next(each for each in claims(found, SETS) if each.words == "template pose T < I")
+    low, high = claim.intervals[0] or (0.0, 0.0)
+    assert low < 1.0 < high
+    assert f"; differences {low:+.2f} to {high:+.2f}" in claim.verdict
+
+
 def test_refinements_are_ordered_on_sets() -> None:
     words = "scape: refined with regularisers < by Chamfer alone < not at all"
     again = replace(BASE, seed=1)
@@ -107,7 +125,7 @@ def test_seeds_are_joined() -> None:
     found = known({BASE: 2.0, replace(BASE, seed=1): 3.0, replace(BASE, pose="A", seed=1): 9.0})
     assert found.error(BASE, "held out") == [2.0, 3.0]
     assert found.error(replace(BASE, pose="A"), "held out") == [9.0]
-    assert number([2.0, 3.0]) == "2.50 ± 0.50"
+    assert number([2.0, 3.0]) == "2.50 ± 0.71"
     assert number([2.0]) == "2.00"
     assert number([]) == "-"
 

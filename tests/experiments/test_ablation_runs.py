@@ -3,6 +3,7 @@
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -11,10 +12,20 @@ from torch.utils.flop_counter import flop_registry
 from meshmatch.errors import TemplateError
 from meshmatch.experiments import ablation_training
 from meshmatch.experiments.ablation_setting import SCANS, Setting, pool_of
-from meshmatch.experiments.ablation_training import built, fewer, is_trained, memory, new_network, timed, train_run
+from meshmatch.experiments.ablation_training import (
+    built,
+    fewer,
+    is_trained,
+    memory,
+    new_network,
+    planned,
+    timed,
+    train_run,
+)
 from meshmatch.experiments.ablation_views import BASE, CODED, CONSTRAINTS, TABLE4, VIEWS, Run, all_runs, methods_of
 from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.models.registry import load_model
+from meshmatch.templates.template import read_template
 from meshmatch.training.train import build_loss_points
 from tests.experiments.egg_runs import make_small, prepare_eggs
 
@@ -83,10 +94,11 @@ def test_cells_differ_in_representation_and_constraints_alone() -> None:
 
 @pytest.mark.slow
 def test_where_a_rule_leaves_too_few_nodes_all_are_taken(prepared: Path) -> None:
-    setting = Setting()
+    setting = Setting(unit="sphere")
     assert setting.rule(BASE) == "parts"
     assert setting.template(BASE).K == 300
     assert setting.template(BASE).radius == pytest.approx(0.13)
+    assert Setting().template(BASE).radius == pytest.approx(read_template("human-T-300").radius, abs=0.005)
     wide = replace(BASE, nodes=100, radius=0.5)
     assert setting.rule(wide) == "uniform"
     assert setting.template(wide).K == 100
@@ -151,6 +163,8 @@ def test_a_cell_is_trained_into_a_model(
     assert found["seconds"] >= 0.3
     assert 0 < found["held_out_cm"] < 200
     assert (found["nodes"], found["rule"]) == (300, "parts")
+    assert np.mean(found["bodies_cm"]) == pytest.approx(found["held_out_cm"], abs=1e-3)
+    assert len(found["bodies_cm"]) == len(small.held_out.targets)
     model = load_model(tmp_path / "model")
     assert model.network.config.field == run.field
     assert model.card.steps == found["steps"]
@@ -194,6 +208,23 @@ def test_cells_take_turns(setting: Setting) -> None:
     assert set(found) == {"base", "field-rbf", "field-pointwise"}
     for record in found.values():
         assert record["rounds"] == 2 and record["ms"] > 0 and record["cpu_ms"] > 0
+
+
+def test_a_plan_multiplies_the_cost_of_an_iteration(setting: Setting) -> None:
+    """Runs that cost alike are one row, whatever their seeds and rules."""
+    runs = [BASE, replace(BASE, seed=1), replace(BASE, strategy="uniform"), CODED]
+    rows = planned(setting, runs, 600, rounds=1)
+    assert [(row["field"], row["constraint"], row["runs"]) for row in rows] == [
+        ("mls", "vol+arap+Z", 3),
+        ("pointwise", "none", 1),
+    ]
+    for row in rows:
+        assert row["minutes"] == pytest.approx(row["runs"] * row["cpu_ms"] / 100, abs=0.006)
+
+
+def test_a_step_has_the_batch_that_is_asked_for() -> None:
+    assert Setting(batch=5).recipe(BASE).train.shapes == 5
+    assert Setting().recipe(BASE).train.shapes == 32
 
 
 def test_a_cell_without_constraints_has_no_terms_of_them(setting: Setting) -> None:

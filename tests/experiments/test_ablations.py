@@ -82,7 +82,8 @@ def test_a_run_is_tables_figures_and_a_line_and_goes_on(
     assert set(record["runs"]) == {"base", "supervised-100", "supervised-50"}
     steps = record["runs"]["base"]["steps"]
     assert record["runs"]["supervised-100"]["steps"] == steps
-    assert f"0.0005 CPU min of training a run or the base's {steps} steps, preset small, 2 steps" in out
+    assert f"0.0005 CPU min of training a run or the base's {steps} steps, radii in units of" in out
+    assert "preset small, 2 steps on the code" in out
     assert {"base scape chamfer", "base scape none", "supervised-50 faust code"} <= record["errors"].keys()
     assert (output / "figure-10.png").is_file()
 
@@ -103,6 +104,26 @@ def test_a_run_is_tables_figures_and_a_line_and_goes_on(
     assert "has lost its model" in said(capsys)
     assert main([*words, "--minutes", "0.0004"]) == 1  # runs of another budget
     assert "other choices (minutes)" in said(capsys)
+    assert main([word for word in words if word not in ("--minutes", "0.0005")]) == 1  # equal steps are another
+    assert "other choices (minutes, steps)" in said(capsys)
+
+
+@pytest.mark.slow
+def test_every_run_has_the_steps(
+    places: Path, tmp_path: Path, calls: dict[str, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Table 4 too: its fields learn for as many steps, and nothing is said of minutes; of refinements, those asked for."""
+    words = ["--output", str(tmp_path), "--folder", str(places / "prepared"), "--model", str(places / "egg")]
+    words += ["--data", str(places / "bench"), "--sets", "scape", "--shapes", "2", "--code-steps", "1"]
+    words += ["--steps", "3", "--batch", "2", "--rounds", "0", "--views", "table4"]
+    assert main([*words, "--plan"]) == 0
+    assert sum(row["runs"] for row in line(capsys)[1]["plan"]) == 9
+    assert calls["train_run"] == 0
+    assert main([*words, "--methods", "code"]) == 0
+    out, record = line(capsys)
+    assert {run["steps"] for run in record["runs"].values()} == {3} and len(record["runs"]) == 9
+    assert "Budget: 3 steps of every run, batches of 2, radii in units of the template's diameter" in out
+    assert {key.rsplit(" ", 1)[1] for key in record["errors"]} == {"code"}
 
 
 def test_table_4_has_costs_without_training(
