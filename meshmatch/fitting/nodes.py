@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.fit_config import NodeRefineConfig
 from meshmatch.fitting.system import NodeSystem
-from meshmatch.geometry.oriented import PAIR_WEIGHT, OrientedPoints, with_normals
+from meshmatch.geometry.oriented import PAIR_WEIGHT, OrientedPoints, feature_tree, with_normals
 from meshmatch.geometry.triangles import vertex_areas
 
 _NEWTON_STEPS = 20  # at most: five are the rule, and convergence is quadratic
@@ -122,23 +122,24 @@ def _nearest_pairs(
     moved, normals = surface.points, surface.normals
     features = with_normals(moved, normals, PAIR_WEIGHT)
     to_samples = samples.pair_tree.query(features)[1]
+    partner, partner_normal = samples.points.take(to_samples, 0), samples.normals.take(to_samples, 0)
     area = vertex_areas(moved, system.faces)
-    forward = area / area.sum() * robust_weight(moved - samples.points[to_samples], scale)
-    forward *= (normals * samples.normals[to_samples]).sum(1) > config.normal_cosine
+    forward = area / area.sum() * robust_weight(moved - partner, scale)
+    forward *= _row_sums(normals * partner_normal) > config.normal_cosine
     if one_sided:
-        forward *= np.linalg.norm(moved - samples.points[to_samples], axis=1) < 3 * scale
+        forward *= np.linalg.norm(moved - partner, axis=1) < 3 * scale
 
     some = samples.thinned(config.back_points)
-    to_template = cKDTree(features).query(with_normals(some.points, some.normals, PAIR_WEIGHT))[1]
-    back = robust_weight(moved[to_template] - some.points, scale) / len(some.points)
-    back *= (normals[to_template] * some.normals).sum(1) > config.normal_cosine
+    to_template = feature_tree(features).query(with_normals(some.points, some.normals, PAIR_WEIGHT))[1]
+    back = robust_weight(moved.take(to_template, 0) - some.points, scale) / len(some.points)
+    back *= _row_sums(normals.take(to_template, 0) * some.normals) > config.normal_cosine
     if samples.weights is not None and some.weights is not None:
         forward *= samples.weights[to_samples]
         back *= some.weights
 
     at = np.concatenate([np.arange(len(moved)), to_template])
-    point = np.concatenate([samples.points[to_samples], some.points])
-    normal = np.concatenate([samples.normals[to_samples], some.normals])
+    point = np.concatenate([partner, some.points])
+    normal = np.concatenate([partner_normal, some.normals])
     weight = 0.5 * np.concatenate([forward, back])
     return _summed(at, point, normal, weight, config.point_share, len(moved))
 
@@ -181,7 +182,7 @@ def _summed(
     """Sum w (n n^T + share I) and its product with the point, per template vertex."""
     x, y, z = normal.T
     entries = np.stack([x * x + share, x * y, x * z, y * y + share, y * z, z * z + share], 1) * weight[:, None]
-    along = (normal * point).sum(1, keepdims=True)
+    along = _row_sums(normal * point)[:, None]
     pull = weight[:, None] * (normal * along + share * point)
     return _sums(at, entries, V), _sums(at, pull, V)
 
@@ -200,4 +201,9 @@ def add_landmarks(terms: Terms, landmarks: Landmarks, weight: float) -> None:
 
 def robust_weight(offset: Float[Floats, "N 3"], scale: float) -> Float[Floats, " N"]:
     """Geman and McClure's weight of offsets."""
-    return 1.0 / np.square(1.0 + np.square(offset).sum(1) / scale**2)
+    return 1.0 / np.square(1.0 + _row_sums(np.square(offset)) / scale**2)
+
+
+def _row_sums(rows: Float[Floats, "N 3"]) -> Float[Floats, " N"]:
+    """A quarter of the time of ``rows.sum(1)``, and the same bits."""
+    return rows[:, 0] + rows[:, 1] + rows[:, 2]

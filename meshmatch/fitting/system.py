@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.triangles import triangle_vectors
 from meshmatch.models.trained import TrainedModel, once_per_model
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
@@ -91,8 +92,7 @@ class NodeSystem:
 
     def normals(self, moved: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
         """Area-weighted unit vertex normals of moved vertices."""
-        a, b, c = (moved[self.faces[:, k]] for k in range(3))
-        summed = self._incidence @ np.cross(b - a, c - a)
+        summed = self._incidence @ triangle_vectors(moved, self.faces)
         return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20)
 
     def solve(

@@ -41,12 +41,12 @@ class OrientedPoints:
     @cached_property
     def tree(self) -> cKDTree:
         """Over the features."""
-        return cKDTree(self.features)
+        return feature_tree(self.features)
 
     @cached_property
     def pair_tree(self) -> cKDTree:
         """The same, normals counting less (`PAIR_WEIGHT`)."""
-        return cKDTree(with_normals(self.points, self.normals, PAIR_WEIGHT))
+        return feature_tree(with_normals(self.points, self.normals, PAIR_WEIGHT))
 
     def to_local(self, pose: RigidPose) -> OrientedPoints:
         """The same samples in the local coordinates of a pose."""
@@ -108,6 +108,11 @@ def with_normals(
     return np.concatenate([points, weight * normals], 1)
 
 
+def feature_tree(features: Float[Floats, "P D"]) -> cKDTree:
+    """A tree for some thousands of queries: halves of the space rather than of the points are built in half the time."""
+    return cKDTree(features, leafsize=32, balanced_tree=False)
+
+
 def quick_tree(points: Float[Floats32, "P D"]) -> cKDTree:
-    """A tree that is asked a few times only: built quickly rather than balanced."""
-    return cKDTree(points, balanced_tree=False, compact_nodes=False)
+    """A tree that is asked a few times only, by points far and near: built quickly rather than balanced."""
+    return cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False)

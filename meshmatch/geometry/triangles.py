@@ -43,7 +43,7 @@ def unit(vectors: Float[Floats, "N D"]) -> Float[Floats, "N D"]:
 
 def triangle_vectors(verts: Float[NDArray[Any], "V 3"], faces: Int[NDArray[Any], "F 3"]) -> Float[Floats, "F 3"]:
     """Normal of each triangle by the right-hand rule, twice its area long."""
-    a, b, c = (verts[faces[:, k]] for k in range(3))
+    a, b, c = (verts.take(faces[:, k], 0) for k in range(3))
     return cross_product(b - a, c - a)
 
 
@@ -83,7 +83,7 @@ def interpolate(
 
     For points on a mesh, ``corners`` is ``faces[face]`` and ``weights`` are barycentric.
     """
-    return blend(values[corners], weights)
+    return blend(values.take(corners, 0), weights)  # much faster than an index
 
 
 def blend(values: Float[Floats, "N K D"], weights: Float[NDArray[Any], "N K"]) -> Float[Floats, "N D"]:
@@ -96,7 +96,7 @@ def closest_on_triangles(
 ) -> Float[Floats, "N 3"]:
     """Barycentric weights of the point of triangle (a, b, c)[n] that is closest to points[n].
 
-    The plane's foot where it lies inside, else the closest point of the nearest edge.
+    The plane's foot where it lies inside, else the closest point of the edges beyond which the foot lies: one or two.
     """
     ab, ac, ap = b - a, c - a, points - a
     d00, d01, d11 = dot(ab, ab), dot(ab, ac), dot(ac, ac)
@@ -105,23 +105,23 @@ def closest_on_triangles(
     scale = np.maximum(area, 1e-300)
     v = (d11 * d20 - d01 * d21) / scale
     w = (d00 * d21 - d01 * d20) / scale
-    inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (area > 1e-14 * d00 * d11)
-    result = np.stack([1 - v - w, v, w], 1)
-    out = np.flatnonzero(~inside)
-    if len(out):
-        corners, asked = (a[out], b[out], c[out]), points[out]
-        best = np.full(len(out), np.inf)
-        for i, j in ((0, 1), (1, 2), (2, 0)):
-            along = corners[j] - corners[i]
-            t = dot(asked - corners[i], along) / np.maximum(dot(along, along), 1e-300)
-            t = np.clip(t, 0, 1)
-            squared = squared_lengths(corners[i] + t[:, None] * along - asked)
-            closer = squared < best
-            best = np.where(closer, squared, best)
-            rows = out[closer]
-            result[rows] = 0.0
-            result[rows, i] = 1 - t[closer]
-            result[rows, j] = t[closer]
+    result = np.empty((len(points), 3))
+    result[:, 0], result[:, 1], result[:, 2] = 1 - v - w, v, w
+    flat = ~(area > 1e-14 * d00 * d11)
+    best = np.full(len(points), np.inf)
+    for i, j, beyond in ((0, 1, w < 0), (1, 2, v + w > 1), (2, 0, v < 0)):
+        rows = np.flatnonzero(beyond | flat)
+        start, asked = (a, b, c)[i].take(rows, 0), points.take(rows, 0)
+        along = (a, b, c)[j].take(rows, 0) - start
+        t = dot(asked - start, along) / np.maximum(dot(along, along), 1e-300)
+        t = np.clip(t, 0, 1)
+        squared = squared_lengths(start + t[:, None] * along - asked)
+        closer = np.flatnonzero(squared < best[rows])
+        rows, t = rows[closer], t[closer]
+        best[rows] = squared[closer]
+        result[rows] = 0.0
+        result[rows, i] = 1 - t
+        result[rows, j] = t
     return result
 
 
@@ -246,8 +246,8 @@ def edge_lengths(points: Float[Floats, "V 3"], edges: Int[NDArray[Any], "E 2"]) 
     length = np.empty(len(edges))
     for low in range(0, len(edges), _CHUNK):
         part = slice(low, low + _CHUNK)
-        apart = points[edges[part, 0]] - points[edges[part, 1]]
-        length[part] = np.sqrt(np.einsum("ni,ni->n", apart, apart))
+        apart = points.take(edges[part, 0], 0) - points.take(edges[part, 1], 0)
+        length[part] = np.sqrt(squared_lengths(apart))
     return length
 
 

@@ -23,8 +23,8 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Ints32
 from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.oriented import feature_tree
 from meshmatch.geometry.triangles import (
-    blend,
     closest_on_triangles,
     edge_lengths,
     interpolate,
@@ -102,12 +102,12 @@ class Surface:
     ) -> None:
         self.verts, self.faces = verts, faces
         # the faces at every vertex, one vertex after the other
-        self._around = np.argsort(faces.reshape(-1), kind="stable")
-        self._around //= 3
-        self._start = np.concatenate([[0], np.cumsum(np.bincount(faces.reshape(-1), minlength=len(verts)))])
+        corners = np.ones(faces.size, np.int8), faces.reshape(-1), np.arange(0, faces.size + 1, 3)
+        at_vertices = csr_matrix(corners, (len(faces), len(verts))).tocsc()
+        self._around, self._start = (array.astype(np.int64) for array in (at_vertices.indices, at_vertices.indptr))
         self._used = np.flatnonzero(np.diff(self._start)) if len(faces) else np.arange(len(verts))
         features = _features(verts, normals, resting)
-        self._tree = cKDTree(features if len(self._used) == len(verts) else features[self._used])
+        self._tree = feature_tree(features if len(self._used) == len(verts) else features[self._used])
 
     def query(
         self,
@@ -138,16 +138,16 @@ class Surface:
 
     def _on_faces(self, points: Floats, vertex: Ints) -> tuple[Ints, Floats, Floats]:
         """The closest of the faces around each vertex (N,), its weights (N, 3) and the distance (N,)."""
-        counts = self._start[vertex + 1] - self._start[vertex]
+        counts = (self._start[1:] - self._start[:-1]).take(vertex)
         first = np.cumsum(counts) - counts
-        within = np.arange(counts.sum()) - np.repeat(first, counts)
-        face = self._around[np.repeat(self._start[vertex], counts) + within]
-        corners = self.verts[self.faces[face]]  # N 3 3
-        asked = np.repeat(points, counts, axis=0)
-        weights = closest_on_triangles(asked, corners[:, 0], corners[:, 1], corners[:, 2])
-        squared = squared_lengths(blend(corners, weights) - asked)
+        query = np.repeat(np.arange(len(vertex)), counts)
+        face = self._around.take(np.arange(len(query)) + (self._start.take(vertex) - first).take(query))
+        a, b, c = (self.verts.take(corner.take(face), 0) for corner in self.faces.T)
+        asked = points.take(query, 0)
+        weights = closest_on_triangles(asked, a, b, c)
+        squared = squared_lengths(interpolate(self.verts, self.faces.take(face, 0), weights) - asked)
         # The first of the nearest of each query's faces.
-        nearest = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, first), counts))
+        nearest = np.flatnonzero(squared == np.minimum.reduceat(squared, first).take(query))
         best = nearest[np.searchsorted(nearest, first)]
         return face[best], weights[best], np.sqrt(squared[best])
 

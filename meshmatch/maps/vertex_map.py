@@ -275,8 +275,10 @@ def check_faces(face: Int[Ints, " V_source"], target_faces: int, label: str) -> 
 
 def corners_of(faces: Int[Ints, "F 3"] | None, face: Int[Ints, " N"], vertex: Int[Ints, " N"]) -> Int[Ints, "N 3"]:
     """Corners of faces (N,); where the face is -1, three times the vertex itself."""
-    corners = np.repeat(vertex[:, None], 3, axis=1)
     inside = face >= 0
+    if faces is not None and inside.all():
+        return faces.take(face, 0)
+    corners = np.repeat(vertex[:, None], 3, axis=1)
     if faces is not None:
         corners[inside] = faces[face[inside]]
     return corners

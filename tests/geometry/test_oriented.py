@@ -1,10 +1,21 @@
 """Points with normals: moved, thinned, turned to face as others do."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.geometry.frames import Frame, RigidPose
-from meshmatch.geometry.oriented import NORMAL_WEIGHT, OrientedPoints, nearest_unsigned, with_normals
+from meshmatch.geometry.oriented import (
+    NORMAL_WEIGHT,
+    OrientedPoints,
+    feature_tree,
+    nearest_unsigned,
+    quick_tree,
+    with_normals,
+)
 from meshmatch.geometry.triangles import edge_lengths, is_discontinuous, unit
 
 
@@ -68,3 +79,15 @@ def test_normals_without_a_sign_are_compared_both_ways() -> None:
     assert np.array_equal(turned, both[1][0] < both[0][0]) and 50 < turned.sum() < 450
     assert np.array_equal(index, np.where(turned, both[1][1], both[0][1])) and (index == tree.n).any()
     assert [len(each) for each in nearest_unsigned(tree, points[:0], normals[:0], 0.2)] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("plant", [quick_tree, feature_tree])
+def test_trees_that_are_built_quickly_find_the_nearest(plant: Callable[..., Any]) -> None:
+    """Also among points that are unevenly spread, and of which many are the same."""
+    rng = np.random.default_rng(2)
+    points = np.concatenate([rng.normal(size=(300, 3)), 1e-3 * rng.normal(size=(300, 3)), np.zeros((200, 3))])
+    asked = np.concatenate([rng.normal(size=(200, 3)), 1e-3 * rng.normal(size=(200, 3))])
+    every = np.linalg.norm(points[None] - asked[:, None], axis=2)
+    distance, index = plant(points).query(asked)
+    assert np.allclose(distance, every.min(1))
+    assert np.allclose(every[np.arange(len(asked)), index], distance)

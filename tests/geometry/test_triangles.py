@@ -7,6 +7,7 @@ from meshmatch.geometry.triangles import (
     blend,
     closest_on_triangles,
     cross_product,
+    dot,
     interpolate,
     squared_lengths,
     triangle_areas,
@@ -61,3 +62,23 @@ def test_no_point_of_the_triangle_is_closer(flat: bool) -> None:
     tried = rng.dirichlet(np.ones(3), 500)
     nearest = np.linalg.norm(np.einsum("tk,nkd->ntd", tried, corners) - points[:, None], axis=2).min(1)
     assert (distance <= nearest + 1e-9).all()
+
+
+def test_one_or_two_edges_are_enough() -> None:
+    """Of sharp and obtuse triangles too, the closest point is that of the plane or the best of all three edges."""
+    rng = np.random.default_rng(5)
+    corners = rng.normal(size=(4000, 3, 3)) * 10.0 ** rng.uniform(-3, 0, (4000, 1, 3))
+    points = corners.mean(1) + rng.normal(size=(4000, 3)) * 10.0 ** rng.uniform(-3, 0.5, (4000, 1))
+    distance = np.linalg.norm(blend(corners, closest_on_triangles(points, *corners.swapaxes(0, 1))) - points, axis=1)
+    edges = []
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        along = corners[:, j] - corners[:, i]
+        t = np.clip(dot(points - corners[:, i], along) / dot(along, along), 0, 1)
+        edges.append(np.linalg.norm(corners[:, i] + t[:, None] * along - points, axis=1))
+    best = np.min(edges, axis=0)
+    on_edges = distance > best - 1e-9
+    assert 0.5 < on_edges.mean() < 0.99
+    assert (distance <= best + 1e-9).all()
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    height = np.abs(dot(points - corners[:, 0], normal)) / np.linalg.norm(normal, axis=1)
+    assert np.allclose(distance[~on_edges], height[~on_edges], atol=1e-8)

@@ -18,6 +18,15 @@ def test_closest_points_of_a_fine_mesh_are_exact() -> None:
     assert np.allclose(found.values(ball.faces, ball.verts), feet)
 
 
+def test_a_vertex_without_a_face_is_no_closest_point() -> None:
+    ball = icosphere(1)
+    verts, faces = np.concatenate([[[9.0, 9, 9]], ball.verts, [[2.0, 0, 0]]]), ball.faces + 1
+    found = Surface(verts, faces, np.zeros_like(verts)).query(np.array([[2.0, 0, 0]]), np.zeros((1, 3)))
+    assert found.distance == np.linalg.norm(found.values(faces, verts) - [2, 0, 0])
+    assert np.allclose(found.distance, brute_force(np.array([[2.0, 0, 0]]), ball.verts, ball.faces)[0])
+    assert 0 < found.vertex[0] < len(verts) - 1
+
+
 def test_a_thin_wall_has_two_sides() -> None:
     """Points in the wall, nearer to the side below: those that face up belong to the side above."""
     sheet = grid(10, 10, 0.1)
