@@ -107,7 +107,7 @@ def subject(bench: BenchSet, name: str, frame: Frame, measure: Measure, cache: P
     """A shape whose core frame is known, sampled, with its landmarks and the distances from them."""
     shape, landmarks = bench.seen(name), bench.landmarks(name)
     chosen = np.array(spread(range(len(landmarks)), measure.landmarks))
-    distances = TruthDistances(bench.shape(name), landmarks, cache).of(chosen)
+    distances = TruthDistances(bench.shape(name), landmarks[chosen], cache).of(np.arange(len(chosen)))
     scan = sampled(validated(shape).shape, frame, measure)
     return Subject(name, frame, scan, shape.verts[landmarks[chosen]], cKDTree(shape.verts), distances)
 
