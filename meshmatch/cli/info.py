@@ -88,7 +88,10 @@ def _template(file: Path) -> Json:
     template = load_template(file)
     sizes = {"vertices": template.shape.V, "faces": template.shape.F}
     sizes |= {"dense_vertices": template.dense.V, "dense_faces": template.dense.F, "nodes": template.K}
-    about = {"radius": template.radius, "parts": list(template.label_names)}
+    about: Json = {"radius": template.reach}
+    if not isinstance(template.radius, float):
+        about["smallest_radius"] = float(template.radius.min())
+    about["parts"] = list(template.label_names)
     about |= {name: getattr(template, name) for name in ("pose", "source", "licence", "hash")}
     return {"kind": "template", "name": template.name} | sizes | about
 

@@ -49,6 +49,12 @@ class PrepareOptions:
     labels: Path | None = optional("FILE", "The part of every vertex of a single shape: one number a line, from 0.")
     nodes: int = Option(320, min=4, max=10_000, help="Number of control nodes.")
     radius: float = Option(0.13, min=1e-6, help="Support radius of a node, in units of sqrt(surface area).")
+    grow_radii: bool = Option(
+        False,
+        "--grow-radii",
+        help="Where vertices have too few nodes in reach, widen the nodes around them, each to a radius of its own. "
+        "Default: add nodes, or take a milder strategy.",
+    )
     faces: int = Option(10_000, min=100, help="Triangles of the low resolution.")
     decimate: Literal["fast", "meshlab"] = Option(
         "fast",
@@ -81,7 +87,7 @@ def prepare(
 
     console = Console(quiet)
     parts = None if how.labels is None else load_points(how.labels)
-    nodes = NodeConfig(how.strategy, how.nodes, how.radius, seed=how.seed)
+    nodes = NodeConfig(how.strategy, how.nodes, how.radius, seed=how.seed, grow=how.grow_radii)
     config = PrepareConfig(nodes, how.faces, how.decimate, how.template, how.align, how.scale, how.landmarks, parts)
     with console.progress() as progress:
         made = prepare_shapes(shapes, output, config, progress)

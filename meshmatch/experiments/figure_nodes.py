@@ -188,4 +188,4 @@ def stages(template: Template, config: NodeConfig) -> tuple[list[Panel], dict[st
 
 def config_of(template: Template, nodes: int = 300, radius: float | None = None) -> NodeConfig:
     """The configuration that a template's nodes are chosen with here: its own radius, or another."""
-    return replace(NodeConfig(), K=nodes, radius=template.radius if radius is None else radius)
+    return replace(NodeConfig(), K=nodes, radius=template.reach if radius is None else radius)

@@ -7,8 +7,9 @@ Matching* (NeurIPS 2022), supplement:
     Phi_i  = p(x)^T M(x)^-1 w_i(x) p(q_i),    p(x) = [1, x, y, z]^T
     M(x)   = sum_i w_i(x) p(q_i) p(q_i)^T
 
-The basis is evaluated in coordinates that are centred on x and scaled by the support radius: the functions are the same
-(they do not depend on the affine frame of the basis), and the 4 x 4 moment matrices stay well conditioned.
+The basis is evaluated in coordinates that are centred on x and scaled by the support radius (the largest there, where
+nodes have radii of their own): the functions are the same (they do not depend on the affine frame of the basis), and the
+4 x 4 moment matrices stay well conditioned.
 
 Radial basis functions, the multiquadric that the paper compares with:
 
@@ -29,7 +30,7 @@ from scipy.sparse import csr_matrix
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import TemplateError
-from meshmatch.geometry.kernels import KERNELS, MINIMUM_EIGENVALUE, Kernel, support_pairs
+from meshmatch.geometry.kernels import KERNELS, MINIMUM_EIGENVALUE, Kernel, support_pairs, support_scale
 
 FieldName = Literal["mls", "rbf", "pointwise"]
 FIELDS: tuple[FieldName, ...] = get_args(FieldName)
@@ -69,7 +70,11 @@ class ShapeFunctions:
 
 
 def shape_functions(
-    name: FieldName, points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radius: float, kernel: Kernel
+    name: FieldName,
+    points: Float[Floats, "P 3"],
+    nodes: Float[Floats, "K 3"],
+    radius: float | Float[Floats, " K"],
+    kernel: Kernel,
 ) -> ShapeFunctions:
     """A representation that has nodes, on fixed points of the template's frame; radial basis functions take all nodes.
 
@@ -84,9 +89,9 @@ def build_field(
 ) -> ShapeFunctions:
     """Evaluate moving least squares and their gradient on fixed points: sparse, computed in float64.
 
-    Points, nodes and the nodes' support radius are in one unit and frame. The kernel is the model's: vectors learned
-    with one mean something else with another. `TemplateError` names the points that have fewer than four non-coplanar
-    nodes in reach.
+    Points, nodes and the nodes' support radius (of all, or of each) are in one unit and frame. The kernel is the model's:
+    vectors learned with one mean something else with another. `TemplateError` names the points that have fewer than four
+    non-coplanar nodes in reach.
     """
     points, nodes = np.asarray(points, np.float64), np.asarray(nodes, np.float64)
     P, K = len(points), len(nodes)
@@ -97,8 +102,8 @@ def build_field(
     weight, slope = KERNELS[kernel](np.linalg.norm(offset, axis=1), radii[of])
     slope_vector = slope[:, None] * offset  # dw/dx
 
-    scale = float(radii.mean())
-    basis = np.concatenate([np.ones((len(at), 1)), -offset / scale], 1)  # p(q_i) seen from x
+    scale = support_scale(at, of, radii, P)[at]
+    basis = np.concatenate([np.ones((len(at), 1)), -offset / scale[:, None]], 1)  # p(q_i) seen from x
     outer = (basis[:, :, None] * basis[:, None, :]).reshape(-1, 16)
     moment = (sums @ (weight[:, None] * outer)).reshape(P, 4, 4)
     _check_support(moment)

@@ -48,6 +48,18 @@ def support_pairs(
     return row[order].astype(np.int64), column[order].astype(np.int64)
 
 
+def support_scale(
+    row: Int[Ints, " N"], column: Int[Ints, " N"], radii: Float[Floats, " K"], P: int
+) -> Float[Floats, " P"]:
+    """In what length offsets from each of P points are measured: the largest radius of a node that reaches it, so that
+    moment matrices are as well conditioned among wide nodes as among narrow ones."""
+    if radii.min() == radii.max():
+        return np.full(P, radii.mean())
+    scale = np.zeros(P)
+    np.maximum.at(scale, row, radii[column])
+    return np.where(scale > 0, scale, radii.mean())
+
+
 def poorly_supported(
     points: Float[Floats, "P 3"],
     nodes: Float[Floats, "K 3"],
@@ -59,7 +71,8 @@ def poorly_supported(
     row, column = support_pairs(points, nodes, radii)
     offset = points[row] - nodes[column]
     weight = KERNELS[kernel](np.linalg.norm(offset, axis=1), radii[column])[0]
-    basis = np.concatenate([np.ones((len(row), 1)), -offset / radii.mean()], 1)
+    scale = support_scale(row, column, radii, len(points))
+    basis = np.concatenate([np.ones((len(row), 1)), -offset / scale[row, None]], 1)
     moment = np.zeros((len(points), 4, 4))
     np.add.at(moment, row, weight[:, None, None] * basis[:, :, None] * basis[:, None, :])
     trace = np.trace(moment, axis1=1, axis2=2)

@@ -66,7 +66,7 @@ class ModelCard:
     template: str
     template_hash: str  # of the template that the weights belong to
     network: dict[str, Any]  # its sizes and choices
-    field: dict[str, Any]  # of the deformation: kernel (str), radius (sqrt-area units), nodes (K)
+    field: dict[str, Any]  # of the deformation: kernel (str), radius (the largest, sqrt-area units), nodes (K)
     data: str  # what it was trained on
     licence: str  # under which terms the weights may be used
     recipe: dict[str, Any]  # all settings of the training

@@ -76,7 +76,11 @@ class Deformer(nn.Module):
         return len(self.nodes)
 
     def field(
-        self, points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radius: float, kernel: Kernel
+        self,
+        points: Float[Floats, "P 3"],
+        nodes: Float[Floats, "K 3"],
+        radius: float | Float[Floats, " K"],
+        kernel: Kernel,
     ) -> PointField:
         """The field that reads this network's rows, on points of the template's frame.
 

@@ -35,6 +35,7 @@ STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 # is left without nodes, the next share is tried. Set by hand.
 _GEODESIC_SHARES = (0.2, 0.3, 0.45, 1.0)
 _FUNCTIONS = 4  # eigenvectors that tell clusters apart, as in the paper
+_GROWN, _GROWTH, _MAX_GROWTHS = 6, 1.05, 120  # nodes that grow around a vertex, by how much at a time, and how often
 _MAX_PAIRED = 8000  # vertices, evenly spread, whose pairs the geodesic rule looks at
 
 
@@ -43,8 +44,9 @@ class NodeConfig:
     """How nodes are chosen. Lengths in units of sqrt(surface area).
 
     radius 0.13 is the paper's 0.2 in the unit sphere for a standing body. Candidates lie up to ``depth`` below the
-    surface; ``spectral`` begins with so many ``clusters``. `OptionError` for an unknown strategy, fewer than 4 nodes, or
-    a length or count that is not positive.
+    surface; ``spectral`` begins with so many ``clusters``. ``grow``: vertices that lack nodes widen those around them
+    (the supplement's other way, section 3.3) instead of getting more, or a milder strategy. `OptionError` for an unknown
+    strategy, fewer than 4 nodes, or a length or count that is not positive.
     """
 
     strategy: Strategy = "parts"
@@ -53,6 +55,7 @@ class NodeConfig:
     depth: float = 0.03
     clusters: int = 24
     seed: int = 0
+    grow: bool = False
 
     def __post_init__(self) -> None:
         if self.strategy not in STRATEGIES:
@@ -113,17 +116,32 @@ def make_template(
         raise TemplateError(f"{shape.name} has a label below 0: {parts.min()}", "count parts from 0")
     in_core = np.ones(shape.V, bool) if core is None else np.isin(np.arange(shape.V), core)
     dense = small if shape.is_cloud else Shape(frame.apply(shape.verts), shape.faces, name)
-    nodes = choose_nodes(small, config, None if labels is None else parts[keep], noisy=shape.is_cloud)
+    laid = lay_nodes(small, config, None if labels is None else parts[keep], noisy=shape.is_cloud)
     words = tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1))
     core = np.flatnonzero(in_core[keep])
-    return Template(name, small, dense, nodes, config.radius, parts[keep], words, core)
+    return Template(name, small, dense, laid.nodes, laid.radius, parts[keep], words, core)
+
+
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """Nodes, their support radius (one, or each its own), and which share of the candidates the strategy refuses."""
+
+    nodes: Float[Floats, "K 3"]
+    radius: float | Float[Floats, " K"]
+    refused: float
 
 
 def choose_nodes(
     shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None, noisy: bool = False
 ) -> Float[Floats, "K 3"]:
-    """Nodes such that every vertex of a mesh in the template frame has four non-coplanar ones in reach: ``config.K``,
-    or more where vertices that farthest points leave short need them.
+    """The nodes of `lay_nodes`."""
+    return lay_nodes(shape, config, labels, noisy).nodes
+
+
+def lay_nodes(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None, noisy: bool = False) -> Laid:
+    """Nodes such that every vertex of a mesh in the template frame has four non-coplanar ones in reach: ``config.K`` (with
+    ``config.grow`` exactly, if there are as many candidates), or more where vertices that farthest points leave short
+    need them.
 
     Strategy ``parts`` needs `labels`, the body parts. `noisy` candidates are the surface's points plus Gaussian noise of
     ``config.depth``, as suits the mesh of a cloud, whose inside is uncertain. `TemplateError` names the vertices that
@@ -133,15 +151,20 @@ def choose_nodes(
         raise OptionError("node strategy 'parts' needs part labels", "use --strategy spectral or geodesic")
     samples, candidates = _candidates(shape, config, noisy)
     failure: TemplateError | None = None
+    refused: float | None = None
     for allowed in _allowed(shape, config, candidates, labels, samples):
         chosen = candidates[allowed]
+        if refused is None:  # by the strategy itself; what follows are milder ones
+            refused = 1 - float(allowed.mean())
         if len(chosen) < 4:
             problem = f"strategy {config.strategy!r} rejects all nodes: each moves vertices that do not belong together"
             failure = TemplateError(problem, "use a smaller radius or another strategy")
             continue
         nodes = chosen[farthest_points(chosen, min(config.K, len(chosen)))]
         try:
-            return _complete(shape, config, nodes, chosen)
+            if config.grow:
+                return Laid(nodes, grown_radii(shape.verts, nodes, config.radius), refused)
+            return Laid(_complete(shape, config, nodes, chosen), config.radius, refused)
         except TemplateError as error:
             failure = error
     assert failure is not None
@@ -155,6 +178,24 @@ def _candidates(shape: Shape, config: NodeConfig, noisy: bool) -> tuple[Samples,
     if noisy:
         return samples, samples.points + config.depth * rng.standard_normal(samples.points.shape)
     return samples, samples.points - samples.normals * rng.uniform(0, config.depth, (len(samples.points), 1))
+
+
+def grown_radii(
+    points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radius: float
+) -> float | Float[Floats, " K"]:
+    """Radii that begin at ``radius``, of which those of the nodes nearest to points without four non-coplanar nodes in
+    reach grow until there are none; one number where none has to. `TemplateError` if all nodes lie in a plane.
+    """
+    radii = np.full(len(nodes), radius)
+    around = cKDTree(nodes)
+    for _ in range(_MAX_GROWTHS):
+        bad = poorly_supported(points, nodes, radii)
+        if not len(bad):
+            return radius if radii.max() == radius else radii
+        near = np.unique(around.query(points[bad], k=min(_GROWN, len(nodes)))[1])
+        radii[near] *= _GROWTH
+    problem = f"{len(bad)} vertices have no four non-coplanar nodes, however wide their radii are"
+    raise TemplateError(problem, "use more nodes or another strategy")
 
 
 def _complete(
@@ -184,10 +225,9 @@ def _allowed(
         yield np.ones(len(candidates), bool)
         return
     own = shape.faces[samples.face, samples.barycentric.argmax(1)]
-    touched = cKDTree(shape.verts).query_ball_point(candidates, config.radius)
     if config.strategy == "parts":
         assert labels is not None
-        yield _parts_allowed(shape, labels, touched, own)
+        yield _parts_allowed(shape, labels, candidates, own, config.radius)
     elif config.strategy == "geodesic":
         for share in _GEODESIC_SHARES:
             yield _geodesic_allowed(shape, config.radius, candidates, share)
@@ -195,19 +235,26 @@ def _allowed(
         clusters = config.clusters
         while True:
             parts = spectral_clusters(shape, clusters, np.random.default_rng(config.seed))
-            yield _parts_allowed(shape, parts, touched, own)
+            yield _parts_allowed(shape, parts, candidates, own, config.radius)
             if clusters <= 2:
                 return
             clusters = clusters * 4 // 5
 
 
-def _parts_allowed(shape: Shape, parts: Int[Ints, " V"], touched: list, own: Int[Ints, " N"]) -> Bool[Bools, " N"]:
+def _parts_allowed(
+    shape: Shape, parts: Int[Ints, " V"], candidates: Float[Floats, "N 3"], own: Int[Ints, " N"], radius: float
+) -> Bool[Bools, " N"]:
     """Drop candidates that touch a part which does not border on their own."""
     count = int(parts.max()) + 1
     joined = np.eye(count, dtype=bool)
     joined[parts[shape.faces], parts[shape.faces[:, [1, 2, 0]]]] = True
     joined |= joined.T
-    return np.array([joined[parts[at], np.unique(parts[hits])].all() for at, hits in zip(own, touched, strict=True)])
+    allowed = np.ones(len(candidates), bool)
+    for part in np.unique(parts).tolist():
+        foreign = np.flatnonzero(~joined[parts[own], part])
+        nearest = cKDTree(shape.verts[parts == part]).query(candidates[foreign])[0]
+        allowed[foreign[nearest <= radius]] = False
+    return allowed
 
 
 def _geodesic_allowed(shape: Shape, radius: float, candidates: Float[Floats, "N 3"], share: float) -> Bool[Bools, " N"]:
@@ -218,11 +265,13 @@ def _geodesic_allowed(shape: Shape, radius: float, candidates: Float[Floats, "N 
     limit = share * far[np.isfinite(far)].max()
     blocks = (dijkstra(graph, indices=some[at : at + 200], limit=limit) for at in range(0, len(some), 200))
     near = np.concatenate([np.isfinite(block[:, some]) for block in blocks])
-    touched = cKDTree(shape.verts[some]).query_ball_point(candidates, radius)
-    # A few of the vertices tell most candidates apart before all pairs are looked at.
-    return np.array(
-        [near[np.ix_(hits[:: len(hits) // 8 + 1], hits)].all() and near[np.ix_(hits, hits)].all() for hits in touched]
-    )
+    tree, allowed = cKDTree(shape.verts[some]), []
+    for at in range(0, len(candidates), 1000):  # what wide nodes touch is long
+        for hits in tree.query_ball_point(candidates[at : at + 1000], radius):
+            # A few of the vertices tell most candidates apart before all pairs are looked at.
+            few = near[np.ix_(hits[:: len(hits) // 8 + 1], hits)].all()
+            allowed.append(bool(few and near[np.ix_(hits, hits)].all()))
+    return np.array(allowed)
 
 
 def edge_graph(shape: Shape) -> coo_matrix:

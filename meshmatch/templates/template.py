@@ -25,7 +25,8 @@ from meshmatch.templates.location import bundled_folder
 
 Scale = Literal["area", "sphere"]
 SCALES: tuple[Scale, ...] = get_args(Scale)
-SCHEMA = 1
+SCHEMA = 2
+_ONE_RADIUS = 1  # the schema of bundles whose nodes share one radius, which is in the words; later ones have an array
 _ARRAYS = ("verts", "faces", "dense_verts", "dense_faces", "nodes", "labels", "core")
 
 
@@ -43,7 +44,7 @@ class Template:
     shape: Shape  # low resolution mesh: what fitting moves; V vertices
     dense: Shape  # high resolution mesh of the same surface, for `register` and pictures
     nodes: Float[Floats, "K 3"]
-    radius: float  # of support, of every node
+    radius: float | Float[Floats, " K"]  # of support: of every node, or of each where they differ
     labels: Int[Ints, " V"]  # part of each vertex, an index into `label_names`
     label_names: tuple[str, ...]
     core: Int[Ints, " C"]
@@ -60,12 +61,20 @@ class Template:
             raise TemplateError(f"template {self.name}: a label has no name")
         if len(self.core) < 3 or self.core.min() < 0 or self.core.max() >= self.shape.V:
             raise TemplateError(f"template {self.name}: the core needs at least three valid vertices")
-        if not self.radius > 0:
-            raise TemplateError(f"template {self.name}: the radius must be positive")
+        radii = np.asarray(self.radius, np.float64)
+        if not (radii > 0).all() or not np.isfinite(radii).all() or radii.shape not in ((), (self.K,)):
+            raise TemplateError(f"template {self.name}: the radius must be positive, one number or one for each node")
+        if radii.min() == radii.max():  # one radius is one number, however it was given: its hash must not differ
+            object.__setattr__(self, "radius", float(radii.min()))
 
     @property
     def K(self) -> int:
         return len(self.nodes)
+
+    @property
+    def reach(self) -> float:
+        """The largest radius of a node."""
+        return float(np.max(self.radius))
 
     @cached_property
     def hash(self) -> str:
@@ -73,7 +82,7 @@ class Template:
         change neither what node vectors mean nor which fits go together.
         """
         digest = hashlib.sha256()
-        for array in (self.shape.verts, self.shape.faces, self.nodes, np.array([self.radius]), self.core):
+        for array in (self.shape.verts, self.shape.faces, self.nodes, np.atleast_1d(self.radius), self.core):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()[:16]
 
@@ -85,8 +94,13 @@ def save_template(template: Template, path: str | Path) -> None:
     arrays: dict[str, np.ndarray] = {name: values.astype(np.int32) for name, values in whole.items()}
     arrays |= {"verts": template.shape.verts, "nodes": template.nodes}
     arrays["dense_verts"] = template.dense.verts.astype(np.float32)
-    keys = ("name", "radius", "label_names", "pose", "source", "licence", "hash")
-    words = {"schema": SCHEMA, **{key: getattr(template, key) for key in keys}}
+    keys = ("name", "label_names", "pose", "source", "licence", "hash")
+    words = {key: getattr(template, key) for key in keys}
+    if isinstance(template.radius, float):
+        words |= {"schema": _ONE_RADIUS, "radius": template.radius}
+    else:
+        words |= {"schema": SCHEMA}
+        arrays["radii"] = template.radius
     save_arrays(path, arrays, {"template": json.dumps(words)})
 
 
@@ -104,13 +118,17 @@ def load_template(path: str | Path) -> Template:
     try:
         with safe_open(str(path), framework="np") as file:
             words = json.loads((file.metadata() or {})["template"])
-            if set(file.keys()) != set(_ARRAYS) or not isinstance(words, dict):
+            if not isinstance(words, dict):
+                raise KeyError("words")
+            schema = words.get("schema")
+            expected = {*_ARRAYS, "radii"} if schema == SCHEMA else set(_ARRAYS)
+            if schema in (_ONE_RADIUS, SCHEMA) and set(file.keys()) != expected:
                 raise KeyError("arrays")
-            arrays = {name: file.get_tensor(name) for name in _ARRAYS}
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
     except (SafetensorError, KeyError, ValueError, OSError, RecursionError) as error:
         raise TemplateError(f"{path.name} is not a template bundle", "make one with `meshmatch prepare`") from error
-    if words.get("schema") != SCHEMA:
-        raise TemplateError(f"{path.name} has template schema {words.get('schema')}, not {SCHEMA}", "update meshmatch")
+    if schema not in (_ONE_RADIUS, SCHEMA):
+        raise TemplateError(f"{path.name} has template schema {schema}, not at most {SCHEMA}", "update meshmatch")
     try:
         name = str(words["name"])
         template = Template(
@@ -118,7 +136,7 @@ def load_template(path: str | Path) -> Template:
             shape=Shape(arrays["verts"].astype(np.float64), arrays["faces"].astype(np.int64), name),
             dense=Shape(arrays["dense_verts"].astype(np.float64), arrays["dense_faces"].astype(np.int64), name),
             nodes=arrays["nodes"].astype(np.float64),
-            radius=float(words["radius"]),
+            radius=arrays["radii"].astype(np.float64) if schema == SCHEMA else float(words["radius"]),
             labels=arrays["labels"].astype(np.int64),
             label_names=tuple(words["label_names"]),
             core=arrays["core"].astype(np.int64),

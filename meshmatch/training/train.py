@@ -209,7 +209,7 @@ def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, f
     card = ModelCard(
         name=facts.name, category=facts.category, template=template.name, template_hash=template.hash,
         network=recipe.network.to_dict(),
-        field={"kernel": recipe.kernel, "radius": template.radius, "nodes": template.K},
+        field={"kernel": recipe.kernel, "radius": template.reach, "nodes": template.K},
         data=facts.data, licence=facts.licence, recipe=settings, seed=recipe.train.seed, steps=trainer.step,
         training_minutes=round(trainer.seconds / 60, 1), metrics={"validation": {"distance": round(score, 5)}},
         weights_sha256=digest, created=datetime.date.today().isoformat(), stiffness=facts.stiffness, **frame,

@@ -76,6 +76,16 @@ def test_one_shape_becomes_a_template(
     assert np.array_equal(panel.points, template.nodes)
 
 
+def test_radii_grow_instead_of_nodes(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
+    words = ("prepare", two[0], "--strategy", "uniform", "--nodes", "40", "--radius", "0.15", "--json", "-o")
+    assert made(run(*words, tmp_path / "more"))["nodes"] > 40
+    assert made(run(*words, tmp_path / "grown", "--grow-radii"))["nodes"] == 40
+    template = load_template(tmp_path / "grown" / "template.safetensors")
+    assert isinstance(template.radius, np.ndarray) and template.radius.min() >= 0.15
+    record = made(run("info", tmp_path / "grown" / "template.safetensors", "--json"))
+    assert record["radius"] == template.reach > record["smallest_radius"] >= 0.15
+
+
 def test_the_nodes_are_drawn(run: Run, two: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     monkeypatch.setattr("meshmatch.render.picture.HEIGHT", 240)

@@ -7,7 +7,7 @@ import torch
 from meshmatch.errors import TemplateError
 from meshmatch.fields.field import Field, arap_energy, determinant, volume_energy
 from meshmatch.fields.shape_functions import build_field
-from meshmatch.geometry.kernels import KERNELS
+from meshmatch.geometry.kernels import KERNELS, poorly_supported
 
 
 def weight(x, q, r, kernel):
@@ -17,15 +17,16 @@ def weight(x, q, r, kernel):
     return (1 - d / r) ** 3 if kernel == "cubic" else (1 - d**2 / r**2) ** 3
 
 
-def textbook_phi(x, nodes, r, kernel):
+def textbook_phi(x, nodes, radii, kernel):
     """Phi_i = p(x)^T M^-1 w_i p(q_i), written as the formula reads, in the global basis."""
 
     def p(y):
         return np.array([1.0, *y])
 
-    M = sum(weight(x, q, r, kernel) * np.outer(p(q), p(q)) for q in nodes)
+    held = list(zip(nodes, np.broadcast_to(radii, len(nodes)), strict=True))
+    M = sum(weight(x, q, r, kernel) * np.outer(p(q), p(q)) for q, r in held)
     left = p(x) @ np.linalg.inv(M)
-    return np.array([left @ (weight(x, q, r, kernel) * p(q)) for q in nodes])
+    return np.array([left @ (weight(x, q, r, kernel) * p(q)) for q, r in held])
 
 
 def textbook_gradient(x, nodes, r, kernel, h=1e-6):
@@ -44,14 +45,16 @@ def cloud():
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_shape_functions_and_gradient_equal_the_textbook(cloud, kernel):
+@pytest.mark.parametrize("radius", [0.7, np.linspace(0.4, 1.3, 150)], ids=["one", "each"])
+def test_shape_functions_and_gradient_equal_the_textbook(cloud, kernel, radius):
+    """Of nodes that share a radius, and of nodes with their own."""
     points, nodes = cloud
-    field = Field.of(build_field(points, nodes, 0.7, kernel))
+    field = Field.of(build_field(points, nodes, radius, kernel))
     phi = field.phi.to_dense().numpy()
     gradient = field.gradient.to_dense().numpy().reshape(len(points), 3, -1)
     for n, x in enumerate(points):
-        assert np.allclose(phi[n], textbook_phi(x, nodes, 0.7, kernel), atol=1e-5)
-        assert np.allclose(gradient[n], textbook_gradient(x, nodes, 0.7, kernel), atol=2e-4)
+        assert np.allclose(phi[n], textbook_phi(x, nodes, radius, kernel), atol=1e-5)
+        assert np.allclose(gradient[n], textbook_gradient(x, nodes, radius, kernel), atol=2e-4)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -125,3 +128,15 @@ def test_coplanar_nodes_are_not_enough():
     flat = np.random.default_rng(0).uniform(-1, 1, (100, 3)) * [1, 1, 0]
     with pytest.raises(TemplateError, match="non-coplanar"):
         Field.of(build_field(np.zeros((1, 3)), flat, 0.8, "smooth"))
+
+
+def test_wide_nodes_among_narrow_ones_are_as_well_conditioned():
+    """Far from the narrow nodes a point sees wide ones alone; in the narrow ones' unit it would seem unsupported."""
+    rng = np.random.default_rng(3)
+    nodes = np.concatenate([rng.normal(0, 0.01, (200, 3)), rng.normal(5, 0.5, (40, 3))])
+    radii = np.repeat([0.005, 2.0], [200, 40])
+    points = np.full((1, 3), 5.0)
+    assert poorly_supported(points, nodes, radii).tolist() == []
+    both = build_field(points, nodes, radii, "smooth").phi.toarray()
+    wide = build_field(points, nodes[200:], 2.0, "smooth").phi.toarray()
+    assert np.allclose(both[:, 200:], wide, atol=1e-6) and not both[:, :200].any()

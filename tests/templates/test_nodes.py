@@ -1,16 +1,29 @@
 """Control nodes: whatever the strategy, every vertex has four non-coplanar ones in reach, or an error names it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError, TemplateError
+from meshmatch.fields.shape_functions import build_field
 from meshmatch.geometry.kernels import poorly_supported, support_pairs
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates import make
 from meshmatch.templates.location import bundled_folder
-from meshmatch.templates.make import STRATEGIES, NodeConfig, Strategy, choose_nodes, edge_graph, spectral_clusters
+from meshmatch.templates.make import (
+    STRATEGIES,
+    NodeConfig,
+    Strategy,
+    choose_nodes,
+    edge_graph,
+    grown_radii,
+    lay_nodes,
+    spectral_clusters,
+)
 from meshmatch.templates.template import Template, load_template
 
 
@@ -207,6 +220,42 @@ def test_missing_vertices_are_completed(ring: Shape) -> None:
     assert 40 < len(nodes) < 200
     assert badly_held(ring.verts, nodes, 0.2) == []
     assert len(choose_nodes(ring, NodeConfig(strategy="uniform", K=200, radius=0.3))) == 200
+
+
+def test_radii_grow_where_vertices_lack_nodes(ring: Shape) -> None:
+    """Nodes stay as they are; no vertex is left, and the nodes that had no need to grow have not."""
+    config = NodeConfig(strategy="uniform", K=40, radius=0.19, grow=True)
+    laid = lay_nodes(ring, config)
+    assert len(laid.nodes) == 40
+    assert isinstance(laid.radius, np.ndarray)
+    assert laid.radius.min() == 0.19 and 0.19 < laid.radius.max() < 0.3
+    assert len(badly_held(ring.verts, laid.nodes, 0.19)) > 0
+    assert not len(poorly_supported(ring.verts, laid.nodes, laid.radius))
+    build_field(ring.verts, laid.nodes, laid.radius, "smooth")
+    # a field of the first radii is refused, and one step less of growth is too little somewhere
+    smaller = np.maximum(0.19, laid.radius / 1.05)
+    assert len(poorly_supported(ring.verts, laid.nodes, smaller))
+    enough = lay_nodes(ring, replace(config, K=200, radius=0.3))
+    assert enough.radius == 0.3
+    assert np.array_equal(enough.nodes, choose_nodes(ring, replace(config, K=200, radius=0.3, grow=False)))
+
+
+def test_radii_grow_under_the_strategy_itself() -> None:
+    """Where a strategy would become milder, growing keeps to it: all nodes are among those that it allows."""
+    fold, config = two_plates(0.2), NodeConfig(strategy="geodesic", K=60, radius=0.18, depth=0.08)
+    samples, candidates = make._candidates(fold, config, noisy=False)
+    allowed = next(make._allowed(fold, config, candidates, None, samples))
+    laid = lay_nodes(fold, replace(config, grow=True))
+    assert cKDTree(candidates[allowed]).query(laid.nodes)[0].max() == 0
+    assert laid.refused == pytest.approx(1 - allowed.mean())
+    assert 0.5 < laid.refused < 0.9
+    assert isinstance(laid.radius, np.ndarray)
+
+
+def test_nodes_in_a_plane_cannot_grow_into_space() -> None:
+    flat = np.concatenate([np.random.default_rng(0).random((30, 2)), np.zeros((30, 1))], 1)
+    with pytest.raises(TemplateError, match="however wide"):
+        grown_radii(flat[:5], flat, 0.1)
 
 
 @pytest.mark.parametrize(

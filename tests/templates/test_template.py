@@ -6,14 +6,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from meshmatch.errors import TemplateError
 from meshmatch.geometry.triangles import unit
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, low_mesh, make_template
-from meshmatch.templates.template import Template, load_template, save_template
+from meshmatch.templates.template import Template, load_template, read_template, save_template
 
+HASHES = {
+    "human-A": "d91cee1d88d8f8db",
+    "human-I": "b8cd6a11c4286c82",
+    "human-T": "c91d3177ea53fad4",
+    "human-T-300": "d36184158b055c6d",
+}
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.3)
 
 
@@ -80,6 +87,43 @@ def test_written_bundle_comes_back(ball: Template, tmp_path: Path) -> None:
     assert np.allclose(found.dense.verts, ball.dense.verts, atol=1e-7)
 
 
+def test_nodes_may_have_radii_of_their_own(ball: Template, tmp_path: Path) -> None:
+    radii = np.linspace(0.3, 0.4, ball.K)
+    own = replace(ball, radius=radii)
+    assert own.reach == 0.4 and ball.reach == 0.3
+    assert own.hash != ball.hash != replace(ball, radius=radii[::-1].copy()).hash
+    save_template(own, tmp_path / "own.safetensors")
+    found = load_template(tmp_path / "own.safetensors")
+    assert np.array_equal(found.radius, radii) and found.hash == own.hash
+    # one radius is one, however it is given
+    same = replace(ball, radius=np.full(ball.K, 0.3))
+    assert same.radius == 0.3 and same.hash == ball.hash
+
+
+def test_a_bundle_of_one_radius_is_what_it_was(ball: Template, tmp_path: Path) -> None:
+    """Older versions read it, and bundles that are out there have the hashes that their models know."""
+    save_template(ball, tmp_path / "ball.safetensors")
+    with safe_open(str(tmp_path / "ball.safetensors"), framework="np") as file:
+        words = json.loads(file.metadata()["template"])
+        assert set(file.keys()) == {"verts", "faces", "dense_verts", "dense_faces", "nodes", "labels", "core"}
+    assert (words["schema"], words["radius"]) == (1, 0.3)
+    assert {name: read_template(name).hash for name in HASHES} == HASHES
+
+
+def test_a_damaged_bundle_of_radii_is_refused(ball: Template, tmp_path: Path) -> None:
+    path = tmp_path / "own.safetensors"
+    for arrays, drop, words, told in (
+        ({"radii": np.linspace(0.3, 0.41, ball.K)}, "", {}, "does not match its hash"),
+        ({"radii": np.linspace(0.3, 0.4, ball.K - 1)}, "", {}, "one for each node"),
+        ({}, "radii", {}, "not a template bundle"),
+        ({}, "", {"schema": 1, "radius": 0.3}, "not a template bundle"),
+    ):
+        save_template(replace(ball, radius=np.linspace(0.3, 0.4, ball.K)), path)
+        rewrite(path, arrays, words, drop)
+        with pytest.raises(TemplateError, match=told):
+            load_template(path)
+
+
 def test_the_hash_is_of_what_a_model_depends_on(ball: Template) -> None:
     shape = ball.shape
     moved = Shape(shape.verts + 1e-9, shape.faces, shape.name)
@@ -115,6 +159,9 @@ def _nan(array: np.ndarray) -> np.ndarray:
         (lambda t: {"core": t.core + t.shape.V}, "core"),
         (lambda t: {"radius": 0.0}, "radius"),
         (lambda t: {"radius": float("nan")}, "radius"),
+        (lambda t: {"radius": np.full(t.K - 1, 0.3)}, "radius"),
+        (lambda t: {"radius": np.linspace(0.0, 0.3, t.K)}, "radius"),
+        (lambda t: {"radius": _nan(np.linspace(0.2, 0.3, t.K))}, "radius"),
     ],
 )
 def test_an_impossible_template_is_refused(ball: Template, change, told: str) -> None:
@@ -124,8 +171,6 @@ def test_an_impossible_template_is_refused(ball: Template, change, told: str) ->
 
 def rewrite(path: Path, arrays: dict | None = None, words: dict | None = None, drop: str = "") -> None:
     """Damage a bundle, its container kept whole."""
-    from safetensors import safe_open
-
     with safe_open(str(path), framework="np") as file:
         header = json.loads(file.metadata()["template"])
     held = load_file(path) | (arrays or {})
@@ -138,7 +183,7 @@ def rewrite(path: Path, arrays: dict | None = None, words: dict | None = None, d
 @pytest.mark.parametrize(
     ("how", "told"),
     [
-        ({"words": {"schema": 2}}, "schema 2, not 1"),
+        ({"words": {"schema": 3}}, "schema 3, not at most 2"),
         ({"words": {"hash": "0" * 16}}, "does not match its hash"),
         ({"words": {"radius": 0.4}}, "does not match its hash"),
         ({"words": {"radius": "wide"}}, "not a template bundle"),

@@ -9,6 +9,9 @@ import torch
 
 from meshmatch.errors import InputError, OptionError, OutputError, TemplateError
 from meshmatch.experiments import human_bodies
+from meshmatch.fields.shape_functions import build_field
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.models.registry import load_model, verify_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import save_shape
@@ -44,6 +47,30 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     nodes = NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)
     prepare(root / "in", root / "out", PrepareConfig(nodes))
     return root / "out"
+
+
+def test_nodes_with_radii_of_their_own_are_learned_and_fitted(prepared: Path, tmp_path: Path) -> None:
+    """From the folder through training, the model's file and card to the shape functions of a fit."""
+    template = egg_template()
+    nodes = NodeConfig(strategy="uniform", K=24, radius=0.2, depth=0.05, grow=True)
+    prepare(prepared.parent / "in", tmp_path / "few", PrepareConfig(nodes))
+    own = read_template(tmp_path / "few" / "template.safetensors")
+    assert isinstance(own.radius, np.ndarray) and own.K == 24
+    model = load_model(trained(tmp_path / "few", tmp_path / "model"))
+    assert model.template.hash == own.hash
+    assert model.card.field["radius"] == own.reach == own.radius.max()
+    vectors = 0.05 * np.random.default_rng(0).standard_normal((24, 3))
+    functions = model.field(own.shape.verts)
+    wanted = build_field(own.shape.verts, own.nodes, own.radius, "smooth")
+    assert np.array_equal(functions.displaced(vectors), wanted.displaced(vectors))
+    one = build_field(own.shape.verts, own.nodes, own.reach, "smooth")
+    assert not np.allclose(one.displaced(vectors), wanted.displaced(vectors), atol=1e-3)
+    points = 0.2 * np.random.default_rng(1).standard_normal((50, 3))
+    drawn = model.network(torch.from_numpy(points).float()[None])[0].detach().numpy()
+    assert np.allclose(model.inference.predict([points])[0], drawn, atol=1e-4)
+    other = Shape(template.shape.verts * [1, 1.1, 1], template.shape.faces)
+    fit = Fitter(model, FitConfig(samples=300, coarse_samples=60, careful=1, partial="no")).fit(other)
+    assert np.isfinite(fit.residual)
 
 
 def egg_source(prepared: Path, template: Template) -> Source:
