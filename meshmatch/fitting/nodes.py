@@ -9,6 +9,8 @@ cannot see.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.spatial import cKDTree
@@ -180,16 +182,17 @@ def _summed(
     V: int,
 ) -> Terms:
     """Sum w (n n^T + share I) and its product with the point, per template vertex."""
-    x, y, z = normal.T
-    entries = np.stack([x * x + share, x * y, x * z, y * y + share, y * z, z * z + share], 1) * weight[:, None]
-    along = _row_sums(normal * point)[:, None]
-    pull = weight[:, None] * (normal * along + share * point)
-    return _sums(at, entries, V), _sums(at, pull, V)
+    axes, places = np.ascontiguousarray(normal.T), np.ascontiguousarray(point.T)
+    x, y, z = axes
+    entries = x * x + share, x * y, x * z, y * y + share, y * z, z * z + share
+    along = _row_sums(normal * point)
+    pulls = (axis * along + share * place for axis, place in zip(axes, places, strict=True))
+    return _sums(at, (entry * weight for entry in entries), V), _sums(at, (weight * pull for pull in pulls), V)
 
 
-def _sums(at: Int[Ints, " N"], rows: Float[Floats, "N D"], V: int) -> Float[Floats, "V D"]:
-    """Sums of the rows at each vertex."""
-    return np.stack([np.bincount(at, column, V) for column in rows.T], 1).astype(np.float64, copy=False)
+def _sums(at: Int[Ints, " N"], columns: Iterable[Float[Floats, " N"]], V: int) -> Float[Floats, "V D"]:
+    """Sums at each vertex of D columns."""
+    return np.stack([np.bincount(at, column, V) for column in columns], 1).astype(np.float64, copy=False)
 
 
 def add_landmarks(terms: Terms, landmarks: Landmarks, weight: float) -> None:

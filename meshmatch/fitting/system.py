@@ -114,10 +114,8 @@ class NodeSystem:
         normal = np.zeros((3 * self.K, self._band + 1))
         normal.reshape(-1)[self._place] = blocks[:, _BLOCK]
         normal[:, 0] += damping
-        full = np.empty((len(weights), 3))
-        full[:, 0] = (weights[:, [0, 1, 2]] * self.verts).sum(1)
-        full[:, 1] = (weights[:, [1, 3, 4]] * self.verts).sum(1)
-        full[:, 2] = (weights[:, [2, 4, 5]] * self.verts).sum(1)
+        (xx, xy, xz, yy, yz, zz), (x, y, z) = weights.T, self.verts.T
+        full = np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], 1)
         right = self.phi.T @ (pulls - full)
         wanted = (targets - np.eye(3)).transpose(0, 2, 1).reshape(-1, 3)
         right += strain * (self.slopes.T @ wanted) + damping * current

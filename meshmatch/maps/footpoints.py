@@ -43,7 +43,7 @@ NORMAL_WEIGHT = 0.02
 # How much a distance on the resting template counts compared with one in space. Set by hand.
 RESTING_WEIGHT = 0.4
 # Queries at a time: what belongs to them then stays in the processor's cache.
-_CHUNK = 8192
+_CHUNK = 2048
 _ROUNDS = 3
 # The share of a cloud's points that are neighbours of one where noise is 1 % of the diagonal; and the least and the
 # largest number of them. Set by hand on noisy scans of bodies.
@@ -269,16 +269,15 @@ def surrounding_values(
     graph = csr_matrix((np.ones(len(start)), (start, end)), (len(near), len(near)))
     rows = np.flatnonzero(unknown[near])
     part = (graph + graph.T).tocsr()[rows]
-    filled = np.where(unknown[near, None], 0.0, values[near])
-    known = (~unknown[near]).astype(float)
+    # values and, in the last column, whether they are known; zeros where they are not
+    state = np.where(unknown[near, None], 0.0, np.column_stack([values[near], np.ones(len(near))]))
     for _ in range(_STEPS):
-        total = part @ (known[:, None] * np.column_stack([filled, known]))
+        total = part @ state
         weight = total[:, -1:]
-        filled[rows] = np.where(weight > 0, total[:, :-1] / np.maximum(weight, 1e-12), filled[rows])
-        known[rows] = weight[:, 0] > 0
-    filled[rows[known[rows] == 0]] = np.nan
+        state[rows] = np.where(weight > 0, total / np.maximum(weight, 1e-12), state[rows])
+    filled = np.where(state[rows, -1:] > 0, state[rows, :-1], np.nan)
     every = values.copy()
-    every[near[rows]] = filled[rows]
+    every[near[rows]] = filled
     return every
 
 
