@@ -49,7 +49,7 @@ def as_model(model: TrainedModel | str | Path) -> TrainedModel:
         return _loaded(folder.resolve(), changed)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=8)
 def _loaded(folder: Path, changed: int) -> TrainedModel:
     from meshmatch.models.registry import load_model
 

@@ -20,6 +20,7 @@ from meshmatch.fitting.blend import WAYS, Blend, Deviation, Way
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.footpoints import Surface, SurfaceBinding, in_core_frame
+from meshmatch.models.registry import AUTO
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
 from meshmatch.progress import ProgressCallback
@@ -102,7 +103,7 @@ def interpolate(
     frames: int = 9,
     *,
     options: InterpolationOptions | None = None,
-    model: str | Path | TrainedModel = "human",
+    model: str | Path | TrainedModel = AUTO,
     config: FitConfig | Sequence[FitConfig] | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,

@@ -20,6 +20,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, check_landmarks, fits_with_landmarks, landmark_places
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.registry import AUTO
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
@@ -34,12 +35,12 @@ LandmarkPairs = tuple[ArrayLike, ArrayLike]
 class Matcher:
     """One model, for many shapes: fit each of them once, then map between any two of the fits.
 
-    ``model`` is a name in the registry, a model folder, or what `load_model` returned; ``config`` says how all shapes
-    are fitted. ``threads`` is how many shapes are fitted beside each other, each on one thread of the numerical
-    libraries; 2 by default. A thread that no shape needs helps the others' fits, whose results it does not change. The
-    libraries have one thread for one shape alone too, and more if they are asked for, which may change the last bits.
-    Afterwards they have their threads back. ``progress`` is called with the stage, the name of the shape and the share of
-    the stage that is done (0..1).
+    ``model`` is a name in the registry, a model folder, or what `load_model` returned; with "auto" the first shapes decide
+    which of the installed models it is. ``config`` says how all shapes are fitted. ``threads`` is how many shapes are
+    fitted beside each other, each on one thread of the numerical libraries; 2 by default. A thread that no shape needs
+    helps the others' fits, whose results it does not change. The libraries have one thread for one shape alone too, and
+    more if they are asked for, which may change the last bits. Afterwards they have their threads back. ``progress`` is
+    called with the stage, the name of the shape and the share of the stage that is done (0..1).
 
     >>> matcher = meshmatch.Matcher("human")
     >>> fits = [matcher.fit(path) for path in paths]
@@ -50,17 +51,26 @@ class Matcher:
 
     def __init__(
         self,
-        model: str | Path | TrainedModel = "human",
+        model: str | Path | TrainedModel = AUTO,
         config: FitConfig | None = None,
         threads: int | None = None,
         progress: ProgressCallback | None = None,
     ) -> None:
-        self.model = as_model(model)
+        self._auto = model == AUTO if isinstance(model, str) else False
+        self._model = None if self._auto else as_model(model)
+        self._choosing = threading.Lock()
         self.config = FitConfig() if config is None else config
         check_config(self.config)
         self.threads = checked_threads(threads)
         self._asked_threads = threads or 1
         self.progress = progress
+
+    @property
+    def model(self) -> TrainedModel:
+        """The model; `OptionError` before the first shapes have decided."""
+        if self._model is None:
+            raise OptionError("no model is chosen yet: the first shape decides", "fit a shape first, or name the model")
+        return self._model
 
     def fit(self, shape: ShapeLike, config: FitConfig | None = None) -> Fit:
         """Fit the model's template to one shape, with a config for this shape alone, such as its own up axis.
@@ -75,7 +85,10 @@ class Matcher:
         There is one config for all shapes, or one for each. Errors as `fit`.
         """
         clean = [validated(shape) for shape in as_shapes(shapes)]
-        return self._fit_all(clean, self._configs(config, len(clean)))
+        configs = self._configs(config, len(clean))
+        kinds = self._choose(clean, configs)
+        fits = self._fit_all(clean, configs)
+        return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kinds, fits, strict=True)]
 
     def dense(self, fit: Fit) -> Shape:
         """The template in its full resolution on the shape of a fit, in the frame and unit of its file."""
@@ -110,6 +123,7 @@ class Matcher:
         began = time.monotonic()
         clean = [validated(as_shape(source, "source")), validated(as_shape(target, "target"))]
         configs = self._configs(config, 2)
+        kinds = self._choose(clean, configs)
         if landmarks is not None:
             for each in configs:
                 if not each.moves_nodes:
@@ -127,8 +141,18 @@ class Matcher:
             before = fits[0], fits[1]
             agreed = self._agreed(before, configs[0], known)
             found = map_of_fits(agreed, before, self.threads)
-        notes = tuple(dict.fromkeys((*fits[0].notes, *fits[1].notes)))
+        notes = tuple(dict.fromkeys((*(words for kind in kinds for words in kind), *fits[0].notes, *fits[1].notes)))
         return MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads)
+
+    def _choose(self, clean: Sequence[Repaired], configs: Sequence[FitConfig]) -> list[tuple[str, ...]]:
+        """Let the shapes decide on the model, if nobody did; what is to be said of each."""
+        if not self._auto:
+            return [()] * len(clean)
+        from meshmatch.api.kinds import choose_model
+
+        with self._choosing, thread_limit(1), one_of(threading.Semaphore(self.threads)):
+            self._model, words = choose_model(clean, configs, self._model)
+        return [(each,) for each in words]
 
     def _configs(self, config: FitConfig | Sequence[FitConfig] | None, count: int) -> list[FitConfig]:
         config = self.config if config is None else config
@@ -200,7 +224,7 @@ def match(
     source: ShapeLike,
     target: ShapeLike,
     *,
-    model: str | Path | TrainedModel = "human",
+    model: str | Path | TrainedModel = AUTO,
     config: FitConfig | Sequence[FitConfig] | None = None,
     landmarks: LandmarkPairs | None = None,
     threads: int | None = None,
@@ -222,7 +246,7 @@ def match(
 def register(
     shape: ShapeLike,
     *,
-    model: str | Path | TrainedModel = "human",
+    model: str | Path | TrainedModel = AUTO,
     config: FitConfig | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,

@@ -11,7 +11,7 @@ from meshmatch.cli import words
 from meshmatch.cli.options import FitOptions, RunOptions, check_outputs, grouped, optional, output_option
 from meshmatch.cli.words import Console, Json, print_json
 from meshmatch.errors import OptionError
-from meshmatch.models.registry import locate_model
+from meshmatch.models.registry import check_model
 from meshmatch.outputs import folder_on_success, replace_on_success
 
 
@@ -71,7 +71,7 @@ def interpolate(
     console = Console(run.quiet)
     # What cannot be written, a mistyped model and broken files are told before the long work.
     with (replace_on_success if suffix else folder_on_success)(output) as temporary:
-        locate_model(how.model)
+        check_model(how.model)
         shapes = [meshmatch.load_shape(file) for file in files]
         with console.progress() as report:
             result = interpolation.interpolate(
@@ -97,7 +97,9 @@ def interpolate(
         console.say(f"drew {sequence.plot}: how well each shape keeps volume and distances")
     if run.json:
         chosen = {"mesh": sequence.mesh, "blend": sequence.blend}
-        print_json({"output": output, "plot": sequence.plot} | _record(result, files) | chosen | how.record)
+        print_json(
+            {"output": output, "plot": sequence.plot} | _record(result, files) | chosen | how.record(result.fits[0])
+        )
 
 
 def _draw_strip(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) -> None:

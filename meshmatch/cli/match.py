@@ -10,7 +10,7 @@ from meshmatch.cli import options, words
 from meshmatch.cli.options import FitOptions, PairOptions, RunOptions, check_outputs, grouped, optional, output_option
 from meshmatch.cli.words import Console, print_json, print_rows
 from meshmatch.errors import OptionError
-from meshmatch.models.registry import locate_model
+from meshmatch.models.registry import check_model
 from meshmatch.outputs import replace_on_success
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def match(
     console, names = Console(run.quiet), words.names_of([source, target])
     # What cannot be written, a mistyped model and broken files are told before the long work.
     with replace_on_success(output) as temporary:
-        locate_model(how.model)
+        check_model(how.model)
         shapes = meshmatch.load_shape(source), meshmatch.load_shape(target)
         result = how.match(*shapes, run, console)
         found = result.map
@@ -63,7 +63,12 @@ def match(
         fits = [words.fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)]
         about = {"direction": DIRECTION, "confidence_mean": float(found.confidence.mean()), "notes": result.notes}
         about |= {"fits": fits, "seconds": round(result.seconds, 3)}
-        print_json({"output": output, "picture": picture} | words.map_record(found, names) | about | how.record)
+        print_json(
+            {"output": output, "picture": picture}
+            | words.map_record(found, names)
+            | about
+            | how.record(result.source_fit)
+        )
 
 
 @grouped
@@ -90,7 +95,7 @@ def register(
     check_outputs([shape], output, picture=picture)
     console = Console(run.quiet)
     with replace_on_success(output) as temporary:
-        locate_model(how.model)
+        check_model(how.model)
         loaded = meshmatch.load_shape(shape)
         matcher = meshmatch.Matcher(how.model, how.configs()[0], run.threads)
         with console.progress() as matcher.progress:
@@ -103,14 +108,14 @@ def register(
 
         compose_fit(loaded, fitted, fit.frame.rotation).render(picture)
     console.say(*fit.notes)
-    console.say(f"fitted the template of {how.model} to {loaded.name}: {words.fit_words(fit)}")
+    console.say(f"fitted the template of {fit.model} to {loaded.name}: {words.fit_words(fit)}")
     words.tell_verdict(console, fit.verdict, fit.reasons)
     console.say(f"wrote {output}: {fitted.V} vertices, {fitted.F} faces ({fit.seconds:.1f} s)")
     if picture is not None:
         console.say(f"drew {picture}: the template over the shape, and their distance")
     if run.json:
         record = {"output": output, "picture": picture, "vertices": fitted.V, "faces": fitted.F, "dense": dense}
-        print_json(record | how.record | words.fit_record(loaded.name, fit) | {"notes": list(fit.notes)})
+        print_json(record | how.record(fit) | words.fit_record(loaded.name, fit) | {"notes": list(fit.notes)})
 
 
 def evaluate(

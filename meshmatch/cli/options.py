@@ -20,6 +20,7 @@ from typer import Argument, Option
 import meshmatch
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit_config import Refine
+from meshmatch.models.registry import AUTO
 from meshmatch.outputs import replace_on_success
 
 if TYPE_CHECKING:
@@ -139,7 +140,12 @@ def load_truth(
 class FitOptions:
     """How a template is fitted."""
 
-    model: str = Option("human", metavar="NAME", help="Model: a name (see `meshmatch models list`) or a model folder.")
+    model: str = Option(
+        AUTO,
+        metavar="NAME",
+        help="Model: a name (see `meshmatch models list`), a model folder, or auto: of the installed ones, that of the "
+        "shape's kind.",
+    )
     refine: Refine = Option(
         "nodes",
         help="Refinement of the fit. nodes: Gauss-Newton on the nodes; latent: search over the network's codes; "
@@ -181,10 +187,10 @@ class FitOptions:
         plain = FitConfig(refine=self.refine, seed=self.seed, partial=partial, device=self.device)
         return tuple(replace(plain, up=up, front=front) for up, front in self.axes)
 
-    @property
-    def record(self) -> dict[str, str | int]:
-        """For --json."""
-        return {"model": self.model, "refine": self.refine, "seed": self.seed}
+    def record(self, fit: meshmatch.Fit) -> dict[str, str | int]:
+        """For --json; a fit knows which model was chosen."""
+        model = fit.model if self.model == AUTO else self.model
+        return {"model": model, "refine": self.refine, "seed": self.seed}
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from meshmatch.cli import words
 from meshmatch.cli.options import PAIRS_HELP, PairOptions, RunOptions, check_outputs
 from meshmatch.cli.words import Console, Json, print_json
 from meshmatch.errors import OptionError
-from meshmatch.models.registry import locate_model
+from meshmatch.models.registry import check_model
 from meshmatch.outputs import replace_on_success
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class Transfer:
         with ExitStack() as claims:  # the first is renamed last: it names the others
             temporary = [claims.enter_context(replace_on_success(file)) for file in files]
             if self.options.map is None:
-                locate_model(self.options.model)  # a mistyped name is told before the long work
+                check_model(self.options.model)  # a mistyped name is told before the long work
             yield temporary
 
     def __call__(self, source: meshmatch.Shape, target: meshmatch.Shape) -> MapPair:
@@ -134,5 +134,8 @@ class Transfer:
         record["map"] = self.options.map
         record["confidence_mean"] = confidence
         if maps.match is not None:
-            record |= self.options.record | {"notes": list(maps.match.notes), "seconds": round(maps.match.seconds, 3)}
+            record |= self.options.record(maps.match.source_fit) | {
+                "notes": list(maps.match.notes),
+                "seconds": round(maps.match.seconds, 3),
+            }
         print_json(record)

@@ -60,6 +60,7 @@ class Fit:
     partial : the shape was taken for a part; the residual is from the shape to the template only
     repaired : the shape itself, with the way back to the vertices of its file
     notes : what was changed in the shape before fitting, and which choices were replaced
+    model : name of the model
     """
 
     template_hash: str
@@ -79,6 +80,7 @@ class Fit:
     partial: bool = False
     repaired: Repaired | None = None
     notes: tuple[str, ...] = ()
+    model: str = ""
 
     @cached_property
     def vertex_distance(self) -> Floats:

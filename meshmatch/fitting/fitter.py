@@ -75,12 +75,19 @@ def _may_be_part(whole: Registration, refinement: Refinement) -> bool:
         return task.config.partial == "yes"
     if not refinement.tries_parts:
         return False
-    if not task.shape.is_cloud:
-        if boundary_length(task.shape) < _OPEN * np.sqrt(task.shape.area):
-            return False
-        if whole.candidate.residual > FAIR_RESIDUAL:  # that of a cloud says how sparse and noisy it is
-            return True
+    if not may_show_part(task.shape, task.config):
+        return False
+    # the residual of a cloud says how sparse and noisy it is
+    if not task.shape.is_cloud and whole.candidate.residual > FAIR_RESIDUAL:
+        return True
     return empty_share(whole.local, whole.surface.points) > _EMPTY
+
+
+def may_show_part(shape: Shape, config: FitConfig) -> bool:
+    """Whether a shape could be a part of a whole: said so, a cloud, or a mesh with a long boundary."""
+    if config.partial != "auto":
+        return config.partial == "yes"
+    return shape.is_cloud or boundary_length(shape) >= _OPEN * np.sqrt(shape.area)
 
 
 def _as_fit(found: Registration, partial: bool, began: float) -> Fit:
@@ -102,6 +109,7 @@ def _as_fit(found: Registration, partial: bool, began: float) -> Fit:
         seconds=time.monotonic() - began,
         seed=task.config.seed,
         partial=partial,
+        model=task.model.card.name,
     )
 
 

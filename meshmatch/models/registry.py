@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 CARD, WEIGHTS, TEMPLATE = "card.json", "weights.safetensors", "template.safetensors"
 HOME_VARIABLE = "MESHMATCH_HOME"
+AUTO = "auto"
+"""In place of a model's name: the shapes decide which of the installed models fits them."""
 _REPLACED = ".replaced"  # the end of the hidden name of a model that is being replaced
 
 
@@ -85,6 +87,12 @@ def locate_model(name: str | Path) -> Path:
         raise
 
 
+def check_model(name: str | Path) -> None:
+    """`ModelError` if a model is neither ``auto`` nor the name or the folder of one."""
+    if name != AUTO:
+        locate_model(name)
+
+
 def find_model(name: str | Path) -> tuple[Path, ModelCard]:
     """Folder and card of a model that is safe to load: headers are bounded, the weights have the card's hash.
 
@@ -142,6 +150,8 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
     if not os.path.isdir(source):
         raise ModelError(f"there is no folder {str(source)[:200]}", "a model is a folder with a card.json")
     card = read_card(source / CARD)
+    if card.name == AUTO:
+        raise ModelError(f"no model can be called {AUTO}", "change the name on its card")
     for file in (TEMPLATE, WEIGHTS):
         read_header(source / file)  # before a huge file is copied
     if (built_in_folder() / card.name).exists():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from meshmatch.api import matching
+from meshmatch.api.inputs import as_model
 from meshmatch.api.results import MatchResult
 from meshmatch.cli import main
 from meshmatch.fitting.fit import Fit
@@ -62,7 +63,7 @@ def fake_fit(shape: Shape, verdict: str = "good", reasons: tuple[str, ...] = (),
     """A fit that nobody made: of two triangles."""
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     rest: dict[str, Any] = {"frame": Frame(2.0, np.eye(3), np.array([10.0, 0, 0])), "front": "-z", "residual": 0.0123}
-    rest |= {"template_hash": "0" * 16, "verts": shape.verts, "verdict": verdict, "reasons": reasons}
+    rest |= {"template_hash": "0" * 16, "model": "human", "verts": shape.verts, "verdict": verdict, "reasons": reasons}
     return some_fit(corners, np.array([[0, 1, 2], [0, 2, 3]]), seconds=1.0, **(rest | other))
 
 
@@ -92,6 +93,7 @@ class FakeMatching:
 
     def fit_all(self, matcher: matching.Matcher, shapes: Any, config: Any = None) -> list[Fit]:
         (shape,) = shapes
+        matcher._model = matcher._model or as_model("human")
         self.called = {"shape": shape, "config": matcher.config, "threads": matcher.threads}
         if matcher.progress is not None:
             matcher.progress("orientation", "a.ply", 0.5)

@@ -51,7 +51,7 @@ def test_match_defaults(run: Run, two: tuple[Path, Path], stub: FakeMatching) ->
     run("match", *two, "-o", two[0].with_name("map.npy"))
     called = dict(stub.called)
     del called["progress"]
-    rest = {"model": "human", "landmarks": None, "threads": 2, "config": (FitConfig(), FitConfig())}
+    rest = {"model": "auto", "landmarks": None, "threads": 2, "config": (FitConfig(), FitConfig())}
     assert called == rest | {"source": "a.ply", "target": "b.ply"}
 
 
@@ -338,7 +338,7 @@ def test_register_in_full_resolution(
     model = TrainedModel(small_card(), template, network)  # type: ignore[arg-type]
     monkeypatch.setattr(matching, "as_model", lambda name: model)
     output = two[0].with_name("fitted.ply")
-    answer = run("register", two[0], "-o", output, "--dense", "--json")
+    answer = run("register", two[0], "-o", output, "--dense", "--json", "--model", "human")
     assert (answer.status, json.loads(answer.out)["vertices"]) == (0, 642)
     fitted = load_shape(output)
     assert np.allclose(fitted.verts, 2.0 * (sphere.verts + np.array([0, 0, 5])) + np.array([10, 0, 0]), atol=1e-5)

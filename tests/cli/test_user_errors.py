@@ -126,7 +126,7 @@ def test_a_few_bad_vertices_are_no_error(run: Run, two: tuple[Path, Path], tmp_p
     save_shape(tmp_path / "nan.ply", Shape(verts, faces, "nan", None, bad))
     assert load_shape(tmp_path / "nan.ply").invalid is not None
     with pytest.raises(AssertionError, match="a fit began"):
-        run("register", tmp_path / "nan.ply", "-o", tmp_path / "fitted.ply")
+        run("register", tmp_path / "nan.ply", "-o", tmp_path / "fitted.ply", "--model", "human")
 
 
 def test_a_mistyped_file_is_guessed(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:

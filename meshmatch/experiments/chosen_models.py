@@ -1,0 +1,108 @@
+"""Of what kind `--model auto` takes every shape of the benchmark, and things that are of none.
+
+Bodies and animals have a model; hearts, furniture and plain solids have none and must be refused. Clouds with noise, and
+sparse ones with outliers, are bodies too; where a cloud cannot be told alone it takes the kind of the shape that it is
+matched with ("unsure" here). *Reading* is the mean distance of the shape and a model's unrefined template (units of
+sqrt(area)).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import trimesh
+from typer import Option
+
+from meshmatch.api.inputs import validated
+from meshmatch.api.kinds import installed_models, kinds_of, read_kinds
+from meshmatch.errors import InputError
+from meshmatch.experiments import runner
+from meshmatch.experiments.sets import CLOUD_SET, SET_NAMES, load_set
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.kind import KNOWN
+from meshmatch.shapes.files import as_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import thread_limit
+
+FOLDERS = {"faust_scans": "human", "animal": "quadruped", "heart": "", "chair": "", "table": "", "plane": ""}
+"""Folders of meshes, and their kind; empty: none."""
+SETS = (*SET_NAMES, CLOUD_SET, "outliers", *FOLDERS, "solids")
+COLUMNS = {
+    **{
+        "set": "set",
+        "shapes": "shapes:d",
+        "of kind": "kind",
+        "right": "right:d",
+        "unsure": "unsure:d",
+        "wrong": "wrong:d",
+    },
+    **{"own reading, at most": "own:.4f", "others', at least": "others:.4f"},
+}
+
+
+def shapes_of(name: str, data: Path) -> Iterator[Shape]:
+    """The shapes of a set as a method gets them."""
+    if name in (*SET_NAMES, CLOUD_SET):
+        bench = load_set(name, data)
+        yield from (bench.seen(shape) for shape in bench.shapes)
+    elif name == "outliers":
+        yield from (as_shape(np.asarray(points, float)) for points in np.load(data / "faust_outliers.npy"))
+    elif name == "solids":
+        solids = {
+            "box": trimesh.creation.box().subdivide().subdivide().subdivide(),
+            "ball": trimesh.creation.icosphere(4),
+            "ring": trimesh.creation.torus(1.0, 0.3),
+            "rod": trimesh.creation.cylinder(0.2, 2.0).subdivide().subdivide(),
+            "capsule": trimesh.creation.capsule(2.0, 0.3),
+        }
+        yield from (Shape(solid.vertices, solid.faces, word) for word, solid in solids.items())
+    else:
+        yield from (as_shape(file) for file in sorted((data / name).glob("*.ply")))
+
+
+def row_of(name: str, shapes: list[Shape]) -> dict[str, Any]:
+    """How many of a set's shapes are taken for what they are; the highest reading of their kind, the lowest of others."""
+    wanted = FOLDERS.get(name, "" if name == "solids" else "human")
+    models, config = installed_models(), [FitConfig()]
+    right, unsure, wrong, own, others = 0, 0, list[str](), 0.0, np.inf
+    for shape in runner.track(shapes, name):
+        clean = [validated(shape).shape]
+        with thread_limit(1):
+            readings = read_kinds(models, clean, config)
+        for model, reading in zip(models, readings[:, 0], strict=True):
+            if model.card.category == wanted:
+                own = max(own, float(reading))
+            else:
+                others = min(others, float(reading))
+        try:
+            (kind,) = kinds_of(models, readings, clean, config)
+        except InputError:
+            kind = ""
+        right += kind == wanted
+        unsure += kind is None
+        if kind not in (wanted, None):
+            wrong.append(f"{shape.name}: {kind or 'none'}")
+    record = {"set": name, "kind": wanted or "none", "shapes": len(shapes), "right": right, "unsure": unsure}
+    return record | {"wrong": len(wrong), "own": own or None, "others": others, "which": wrong}
+
+
+@runner.command
+def main(
+    data: runner.Data = runner.DATA,
+    sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
+    limit_shapes: Annotated[int | None, Option(min=1, help="of each set, evenly spread")] = None,
+) -> runner.Report:
+    rows = []
+    for name in runner.names_of(sets, SETS, "set"):
+        rows.append(row_of(name, runner.spread(list(shapes_of(name, data)), limit_shapes)))
+    notes = [f"wrong: {word}" for row in rows for word in row["which"]]
+    record = {"known": KNOWN, "models": [model.card.name for model in installed_models()], "rows": rows}
+    return runner.Report(record, [runner.table("The kind of every shape", rows, COLUMNS)], notes)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,153 @@
+"""`model="auto"`: the shapes decide, by readings of every installed model."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import meshmatch
+from meshmatch.api import kinds
+from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.matching import Matcher
+from meshmatch.errors import InputError, ModelError, OptionError
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.models import registry
+from meshmatch.models.trained import TrainedModel
+from meshmatch.shapes.shape import Shape
+
+SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
+CONFIG = FitConfig()
+
+
+def ball(name: str, *, opened: bool = False) -> Shape:
+    """A closed surface, or half of one."""
+    mesh = trimesh.creation.icosphere(3)
+    faces = mesh.faces[mesh.triangles_center[:, 2] > 0] if opened else mesh.faces
+    return Shape(mesh.vertices, faces, name)
+
+
+def cloud(name: str) -> Shape:
+    return Shape(ball(name).verts, np.empty((0, 3), np.int64), name)
+
+
+@pytest.fixture
+def models(monkeypatch: pytest.MonkeyPatch) -> list[TrainedModel]:
+    """Two humans and an animal; what they read of a shape is in its name: "dog 9 9 2" for hundredths."""
+    human, animal = as_model("human"), as_model("quadruped")
+    twin = TrainedModel(replace(human.card, name="twin"), human.template, human.inference)
+    known = [human, twin, animal]
+
+    def read(models: list[TrainedModel], shapes: list[Shape], configs: Any) -> np.ndarray:
+        return np.array([[float(word) / 100 for word in shape.name.split()[1:]] for shape in shapes]).T[: len(models)]
+
+    monkeypatch.setattr(kinds, "installed_models", lambda: list(known))
+    monkeypatch.setattr(kinds, "read_kinds", read)
+    return known
+
+
+def choose(*shapes: Shape, settled: TrainedModel | None = None) -> tuple[str, list[str]]:
+    found, words = kinds.choose_model([validated(shape) for shape in shapes], [CONFIG] * len(shapes), settled)
+    return found.card.name, words
+
+
+@pytest.mark.usefixtures("models")
+def test_the_model_that_reads_all_shapes_best_is_chosen() -> None:
+    assert choose(ball("man 3 4 6"), ball("boy 3 4 6")) == ("human", ["man 3 4 6: human", "boy 3 4 6: human"])
+    assert choose(ball("man 3 2 6"), ball("boy 3 3.5 6"))[0] == "twin"  # by the sum
+    assert choose(ball("dog 6 6 4")) == ("quadruped", ["dog 6 6 4: quadruped"])
+
+
+@pytest.mark.usefixtures("models")
+def test_two_kinds_are_refused_by_name() -> None:
+    with pytest.raises(InputError, match=r"man 3 4 6: human; dog 6 6 4: quadruped") as caught:
+        choose(ball("man 3 4 6"), ball("dog 6 6 4"))
+    assert "--model" in caught.value.hint
+    # also where a model of one kind reads both low
+    with pytest.raises(InputError, match="two kinds"):
+        choose(ball("man 3 4 4.5"), ball("dog 6 6 4"))
+
+
+def test_later_shapes_are_of_the_kind_before(models: list[TrainedModel]) -> None:
+    assert choose(ball("boy 4 3 6"), settled=models[0])[0] == "human"
+    with pytest.raises(InputError, match="the shapes before: human; dog 6 6 4: quadruped"):
+        choose(ball("dog 6 6 4"), settled=models[0])
+
+
+@pytest.mark.usefixtures("models")
+def test_a_complete_shape_of_no_kind_is_refused() -> None:
+    with pytest.raises(InputError, match=r"chair 7 7 6 is of no kind .*: human, quadruped"):
+        choose(ball("man 3 4 6"), ball("chair 7 7 6"))
+
+
+@pytest.mark.usefixtures("models")
+@pytest.mark.parametrize("unsure", [cloud("half 7 7 6"), ball("half 7 7 6", opened=True)])
+def test_what_may_be_a_part_takes_the_other_shapes_kind(unsure: Shape) -> None:
+    for shapes in ((unsure, ball("man 3 4 6")), (ball("man 3 4 6"), unsure)):
+        name, words = choose(*shapes)
+        assert name == "human"
+        assert words[shapes.index(unsure)].startswith("half 7 7 6 may be a part, or a rough cloud: taken for human")
+    assert choose(unsure)[0] == "quadruped"  # alone, what reads it best
+
+
+def test_samples_are_told_apart() -> None:
+    names = "climber", "dancer", "calf", "fox"
+    shapes = [validated(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape for name in names]
+    models = [as_model("human"), as_model("quadruped")]
+    found = kinds.read_kinds(models, shapes, [CONFIG] * 4)
+    assert (found[0, :2] < 0.042).all() and (found[1, :2] > 0.05).all()
+    assert (found[1, 2:] < 0.046).all() and (found[0, 2:] > 0.05).all()
+    assert kinds.kinds_of(models, found, shapes, [CONFIG] * 4) == ["human", "human", "quadruped", "quadruped"]
+    # the same turned and scaled: a reading knows no up
+    turned = Shape(7 * shapes[2].verts[:, [2, 0, 1]], shapes[2].faces, "turned")
+    (again,) = kinds.read_kinds(models[1:], [turned], [CONFIG])
+    assert abs(again[0] - found[1, 2]) < 0.004
+
+
+def test_a_ring_is_of_no_kind() -> None:
+    ring = trimesh.creation.torus(1.0, 0.3)
+    with pytest.raises(InputError, match="ring is of no kind"):
+        meshmatch.register(Shape(ring.vertices, ring.faces, "ring"))
+
+
+@pytest.mark.usefixtures("models")
+def test_a_matcher_decides_with_its_first_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    matcher = Matcher()
+    with pytest.raises(OptionError, match="no model is chosen yet"):
+        _ = matcher.model
+    monkeypatch.setattr(matcher, "_fit_all", lambda clean, configs: [_Fit() for _ in clean])
+    (fit,) = matcher.fit_all([ball("dog 6 6 4")])
+    assert fit.notes == ("dog 6 6 4: quadruped", "of the fit")
+    assert matcher.model.card.name == "quadruped"
+    with pytest.raises(InputError, match="the shapes before: quadruped; man 3 4 6: human"):
+        matcher.fit(ball("man 3 4 6"))
+    assert Matcher("human").model.card.name == "human"
+
+
+@dataclass(frozen=True)
+class _Fit:
+    notes: tuple[str, ...] = ("of the fit",)
+
+
+def test_damaged_models_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(registry.HOME_VARIABLE, str(tmp_path))
+    (tmp_path / "models" / "broken").mkdir(parents=True)
+    assert [model.card.name for model in kinds.installed_models()] == ["human", "quadruped"]
+    monkeypatch.setattr(kinds, "list_models", lambda: ())
+    with pytest.raises(ModelError, match="no model is installed"):
+        kinds.installed_models()
+
+
+def test_no_model_can_be_called_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(registry.HOME_VARIABLE, str(tmp_path / "home"))
+    folder = tmp_path / "auto"
+    folder.mkdir()
+    source = registry.built_in_folder() / "human"
+    for file in source.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    card = folder / "card.json"
+    card.write_text(card.read_text().replace('"name": "human"', '"name": "auto"', 1))
+    with pytest.raises(ModelError, match="no model can be called auto"):
+        registry.add_model(folder)
