@@ -35,6 +35,12 @@ if TYPE_CHECKING:
     from meshmatch.fitting.fit import Fit as Fit
     from meshmatch.fitting.fit_config import FitConfig as FitConfig
     from meshmatch.geometry.frames import Frame as Frame
+    from meshmatch.implicit.codes import fit_implicit as fit_implicit
+    from meshmatch.implicit.model import ImplicitFit as ImplicitFit
+    from meshmatch.implicit.model import ImplicitModel as ImplicitModel
+    from meshmatch.implicit.model import load_implicit as load_implicit
+    from meshmatch.implicit.sequence import implicit_sequence as implicit_sequence
+    from meshmatch.implicit.training import train_implicit as train_implicit
     from meshmatch.maps.files import load_map as load_map
     from meshmatch.maps.files import save_map as save_map
     from meshmatch.maps.vertex_map import VertexMap as VertexMap
@@ -52,6 +58,8 @@ _HOMES = {
     "Fit": "meshmatch.fitting.fit",
     "FitConfig": "meshmatch.fitting.fit_config",
     "Frame": "meshmatch.geometry.frames",
+    "ImplicitFit": "meshmatch.implicit.model",
+    "ImplicitModel": "meshmatch.implicit.model",
     "Interpolation": "meshmatch.api.interpolation",
     "InterpolationOptions": "meshmatch.api.interpolation",
     "MatchResult": "meshmatch.api.results",
@@ -63,7 +71,10 @@ _HOMES = {
     "VertexMap": "meshmatch.maps.vertex_map",
     "evaluate": "meshmatch.api.results",
     "find_maps": "meshmatch.api.transfer",
+    "fit_implicit": "meshmatch.implicit.codes",
+    "implicit_sequence": "meshmatch.implicit.sequence",
     "interpolate": "meshmatch.api.interpolation",
+    "load_implicit": "meshmatch.implicit.model",
     "load_map": "meshmatch.maps.files",
     "load_model": "meshmatch.models.registry",
     "load_shape": "meshmatch.shapes.files",
@@ -74,6 +85,7 @@ _HOMES = {
     "save_map": "meshmatch.maps.files",
     "save_shape": "meshmatch.shapes.files",
     "train": "meshmatch.training.train",
+    "train_implicit": "meshmatch.implicit.training",
     "transfer_colors": "meshmatch.api.transfer",
     "transfer_labels": "meshmatch.api.transfer",
     "transfer_landmarks": "meshmatch.api.transfer",
@@ -93,7 +105,8 @@ def __getattr__(name: str) -> object:
 
     from meshmatch.errors import needs
 
-    with needs("torch", "train"):
+    extra = "implicit" if _HOMES[name].startswith("meshmatch.implicit") else "train"
+    with needs("torch", extra):
         value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value  # next time without this function
     return value

@@ -8,11 +8,13 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import words
-from meshmatch.cli.options import FitOptions, RunOptions, check_outputs, grouped, optional, output_option
+from meshmatch.cli.options import FitOptions, RunOptions, check_outputs, grouped, optional, output_option, refuse_given
 from meshmatch.cli.words import Console, Json, print_json
-from meshmatch.errors import OptionError
+from meshmatch.errors import OptionError, needs
+from meshmatch.implicit.card import is_implicit
 from meshmatch.models.registry import check_model
 from meshmatch.outputs import folder_on_success, replace_on_success
+from meshmatch.threads import thread_limit
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,9 @@ class SequenceOptions:
         "auto",
         help="Position, orientation and size of the shapes. files: from those of A's file to those of B's; "
         "source: all as A; auto: files, unless the files seem to have different units.",
+    )
+    resolution: int = Option(
+        64, min=8, max=512, help="Cells along each side of the cube, of an implicit model's surfaces; an even number."
     )
     format: Literal["ply", "obj", "off", "glb"] = Option("ply", help="Format of the files in a folder.")
     plot: Path | None = optional("FILE", "Plot how well each shape keeps volume and distances: .png, .svg or .pdf.")
@@ -55,6 +60,7 @@ def interpolate(
 
     The model's template is fitted to each, and its poses are blended; A's own mesh moves along. Time 0 is A as it is in
     its file, and at time 1 A's mesh lies on B. Shapes given with --through are passed at even times in between.
+    An implicit model blends codes instead, and each shape is a surface of its own.
     """
     from meshmatch.api import interpolation
 
@@ -68,6 +74,9 @@ def interpolate(
     options = interpolation.InterpolationOptions(
         sequence.start, sequence.stop, sequence.mesh, sequence.blend, sequence.place
     )
+    if is_implicit(how.model):
+        _interpolate_implicit(source, target, output, sequence, how, run)
+        return
     console = Console(run.quiet)
     # What cannot be written, a mistyped model and broken files are told before the long work.
     with (replace_on_success if suffix else folder_on_success)(output) as temporary:
@@ -100,6 +109,45 @@ def interpolate(
         print_json(
             {"output": output, "plot": sequence.plot} | _record(result, files) | chosen | how.record(result.fits[0])
         )
+
+
+def _interpolate_implicit(
+    source: Path, target: Path, output: Path, sequence: SequenceOptions, how: FitOptions, run: RunOptions
+) -> None:
+    """By the codes of an implicit model: each shape has a surface of its own."""
+    refuse_given(how, ("model", "seed"), "an implicit model")
+    refuse_given(sequence, ("frames", "start", "stop", "format", "resolution"), "an implicit model")
+    strip = not output.is_dir() and output.suffix.lower() == ".png"
+    if not strip and output.suffix and not output.is_dir():
+        hint = "give a name without a suffix for a folder, or one that ends in .png"
+        raise OptionError(f"{output.name}: surfaces of an implicit model share no vertices, as a page needs", hint)
+    with needs("torch", "implicit"):
+        from meshmatch.implicit.sequence import implicit_sequence, save_implicit_sequence
+    console = Console(run.quiet)
+    written = replace_on_success if strip else folder_on_success
+    with written(output) as temporary, thread_limit(1):  # tensors are small
+        with console.progress() as progress:
+            result = implicit_sequence(
+                how.model, source, target, sequence.frames, times=(sequence.start, sequence.stop),
+                resolution=sequence.resolution, seed=how.seed, progress=progress,
+            )  # fmt: skip
+        for fit in result.fits:
+            words.refuse_poor(run.strict, fit.verdict, fit.reasons)
+        if strip:
+            from meshmatch.render.figures import Panel
+            from meshmatch.render.picture import render_shapes
+
+            pairs = zip(result.times, result.shapes, strict=True)
+            render_shapes([Panel(shape, label=f"{time:.3g}") for time, shape in pairs], temporary)
+        else:
+            save_implicit_sequence(temporary, result, sequence.format)
+    for file, fit in zip((source, target), result.fits, strict=True):
+        words.tell_verdict(console, fit.verdict, fit.reasons, f"the fit of {file.name}")
+    console.say(f"wrote {output}: {sequence.frames} surfaces, from time {sequence.start:g} to {sequence.stop:g}")
+    if run.json:
+        residuals = {"residuals": [round(fit.residual, 4) for fit in result.fits], "times": result.times}
+        counts = {"vertices": [shape.V for shape in result.shapes], "model": how.model, "seed": how.seed}
+        print_json({"output": output} | residuals | counts)
 
 
 def _draw_strip(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) -> None:

@@ -7,11 +7,22 @@ from typer import Argument, Option
 
 import meshmatch
 from meshmatch.cli import options, words
-from meshmatch.cli.options import FitOptions, PairOptions, RunOptions, check_outputs, grouped, optional, output_option
+from meshmatch.cli.options import (
+    FitOptions,
+    PairOptions,
+    RunOptions,
+    check_outputs,
+    grouped,
+    optional,
+    output_option,
+    refuse_given,
+)
 from meshmatch.cli.words import Console, print_json, print_rows
-from meshmatch.errors import OptionError
+from meshmatch.errors import OptionError, needs
+from meshmatch.implicit.card import is_implicit
 from meshmatch.models.registry import check_model
 from meshmatch.outputs import replace_on_success
+from meshmatch.threads import thread_limit
 
 if TYPE_CHECKING:
     from meshmatch.maps.evaluate import Evaluation
@@ -38,6 +49,9 @@ def match(
     how.check()
     check_suffix(output)
     check_outputs([source, target, how.known_pairs], output, picture=picture)
+    if is_implicit(how.model):
+        _match_implicit(source, target, output, how, run, picture)
+        return
     console, names = Console(run.quiet), words.names_of([source, target])
     # What cannot be written, a mistyped model and broken files are told before the long work.
     with replace_on_success(output) as temporary:
@@ -69,6 +83,38 @@ def match(
             | about
             | how.record(result.source_fit)
         )
+
+
+def _match_implicit(
+    source: Path, target: Path, output: Path, how: PairOptions, run: RunOptions, picture: Path | None
+) -> None:
+    """Through the template of an implicit model; both shapes must stand as those of its training did."""
+    refuse_given(how, ("model", "seed"), "an implicit model")
+    with needs("torch", "implicit"):
+        from meshmatch.implicit.codes import fit_implicit
+        from meshmatch.implicit.model import load_implicit
+    console, names = Console(run.quiet), words.names_of([source, target])
+    with replace_on_success(output) as temporary, thread_limit(1):  # tensors are small
+        model = load_implicit(how.model)
+        shapes = meshmatch.load_shape(source), meshmatch.load_shape(target)
+        with console.progress() as progress:
+            a, b = (fit_implicit(model, shape, seed=how.seed, progress=progress) for shape in shapes)
+        found = model.match(a, b, *shapes)
+        words.refuse_poor(run.strict, found.verdict, found.reasons)
+        meshmatch.save_map(temporary, found)
+    if picture is not None:
+        from meshmatch.render.compose import compose_match
+
+        compose_match(*shapes, found).named(names).render(picture)
+    words.tell_verdict(console, found.verdict, found.reasons)
+    console.say(
+        f"wrote {output}: for each of the {found.source_vertices} vertices of {names[0]} its vertex of {names[1]}"
+    )
+    if picture is not None:
+        console.say(f"drew {picture}: corresponding points in one color")
+    if run.json:
+        residuals = {"residuals": [round(fit.residual, 4) for fit in (a, b)], "model": how.model, "seed": how.seed}
+        print_json({"output": output, "picture": picture} | words.map_record(found, names) | residuals)
 
 
 @grouped

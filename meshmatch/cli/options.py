@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
@@ -68,6 +68,15 @@ def check_axes(up: Axis | None, front: Axis | None) -> None:
     """Refuse up and front along one axis (`OptionError`)."""
     if up is not None and front is not None and up[-1] == front[-1]:
         raise OptionError(f"up ({up}) and front ({front}) lie along one axis", "choose two different axes")
+
+
+def refuse_given(group: Any, allowed: Container[str], what: str) -> None:
+    """Refuse options of a group that are not as by default and not allowed (`OptionError`)."""
+    for each in fields(group):
+        default = getattr(each.default, "default", each.default)
+        if each.name not in allowed and getattr(group, each.name) != default:
+            said = getattr(each.default, "param_decls", None) or (f"--{each.name.replace('_', '-')}",)
+            raise OptionError(f"{said[0].split('/')[0]} does not go with {what}", "leave it out")
 
 
 def check_truth(truth: Path | None, points: tuple[Path, Path] | None) -> bool:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from typer import Argument, Option
 
 from meshmatch.cli.options import Json, Quiet, Seed, Threads, check_writable, grouped, optional, output_option
+from meshmatch.cli.train_implicit import draw_reports, train_shapes
 from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import needs
 from meshmatch.models.card import read_card
@@ -124,6 +125,12 @@ class TrainOptions:
         "Learn from a folder that `meshmatch prepare` made, with its template. Default: generated human bodies "
         "(needs the extra `train`).",
     )
+    implicit: bool = Option(
+        False,
+        "--implicit",
+        help="Learn the signed distances of a folder of watertight meshes, clouds or .npz samples that stand alike, such as "
+        "chairs: a model for `match` and `interpolate` (needs the extra `implicit`). --field: mls or pointwise.",
+    )
     unsupervised: bool = Option(
         False,
         "--unsupervised",
@@ -194,6 +201,9 @@ def train(
         from meshmatch.training.recipes import recipe_for
 
     set_threads(how.threads)
+    if how.implicit:
+        train_shapes(output, how, json, Console(quiet))
+        return
     if how.picture is not None:
         from meshmatch.render.charts import check_chart
 
@@ -236,21 +246,8 @@ def train(
             progress=progress, report=report,
         )  # fmt: skip
     if first:
-        _picture(console, how.picture, reports)
+        draw_reports(console, how.picture, reports)
         _summary(console, output, recipe.train.steps, how.picture, json)
-
-
-def _picture(console: Console, picture: Path | None, reports: "list[StepReport]") -> None:
-    if picture is not None and not reports:
-        console.say(f"{picture} was not drawn: the run ended before its first report")
-    elif picture is not None:
-        from meshmatch.render.charts import draw_losses
-
-        names = dict.fromkeys(name for now in reports for name in now.terms)
-        terms = {name: [now.terms.get(name, float("nan")) for now in reports] for name in names}
-        known = {now.step: now.validation for now in reports if now.validation is not None}
-        draw_losses(picture, [now.step for now in reports], terms, known)
-        console.say(f"drew {picture}: the losses over the steps")
 
 
 def _summary(console: Console, output: Path, steps: int, picture: Path | None, json: bool) -> None:

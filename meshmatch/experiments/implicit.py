@@ -36,7 +36,7 @@ from meshmatch.experiments import runner
 from meshmatch.experiments.furniture import KINDS, furniture
 from meshmatch.fields.field import arap_energy, volume_energy
 from meshmatch.implicit.card import IMPLICIT
-from meshmatch.implicit.model import Coded, ImplicitModel, load_implicit
+from meshmatch.implicit.model import ImplicitFit, ImplicitModel, load_implicit
 from meshmatch.implicit.network import ImplicitConfig
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
 from meshmatch.implicit.training import TRAINING, ImplicitDataset, build_implicit, train_implicit
@@ -75,7 +75,7 @@ def trained(folder: Path, samples: ImplicitSamples, config: ImplicitConfig, trai
     return load_implicit(folder)
 
 
-def learned(model: ImplicitModel, number: int) -> Coded:
+def learned(model: ImplicitModel, number: int) -> ImplicitFit:
     """A shape of the training."""
     return model.known(model.card.shapes[number])
 
@@ -180,7 +180,7 @@ def pairs_of(shapes: int, count: int, seed: int) -> list[tuple[int, int]]:
     return [tuple(rng.choice(shapes, 2, replace=False).tolist()) for _ in range(count)]
 
 
-def moved_colors(model: ImplicitModel, coded: Coded, shape: Shape) -> Floats:
+def moved_colors(model: ImplicitModel, coded: ImplicitFit, shape: Shape) -> Floats:
     """How far the deformation moves each vertex: white is not at all, dark red far."""
     points = np.clip(coded.frame.apply(shape.verts), -1, 1)
     far = np.clip(np.linalg.norm(model.to_template(shape.verts, coded) - points, axis=1) / _MOVED, 0, 1)[:, None]

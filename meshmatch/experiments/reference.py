@@ -40,6 +40,9 @@ API = {
     ),
     "Sequences, pictures and pages": ("interpolate", "InterpolationOptions", "Interpolation", "picture", "view"),
     "Own categories": ("prepare", "train"),
+    "Implicit surfaces": (
+        *("train_implicit", "load_implicit", "fit_implicit", "implicit_sequence", "ImplicitModel", "ImplicitFit"),
+    ),
 }
 
 

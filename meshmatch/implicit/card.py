@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,7 @@ class ImplicitCard:
 
 def is_implicit(folder: str | Path) -> bool:
     """Whether a folder holds an implicit model."""
-    return (Path(folder) / IMPLICIT).is_file()
+    return os.path.isfile(os.path.join(os.path.expanduser(folder), IMPLICIT))
 
 
 def write_implicit_card(card: ImplicitCard, folder: Path) -> None:

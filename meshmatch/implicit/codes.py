@@ -13,7 +13,7 @@ import torch
 
 from meshmatch.arrays import Float
 from meshmatch.errors import OptionError
-from meshmatch.implicit.model import Coded, ImplicitModel, percent_of_side
+from meshmatch.implicit.model import ImplicitFit, ImplicitModel, percent_of_side
 from meshmatch.implicit.objective import ImplicitLoss
 from meshmatch.implicit.samples import samples_of
 from meshmatch.progress import ProgressCallback
@@ -25,7 +25,7 @@ _RATE = 1e-2
 
 def fit_implicit(
     model: ImplicitModel, shape: ShapeLike, *, steps: int = 200, seed: int = 0, progress: ProgressCallback | None = None
-) -> Coded:
+) -> ImplicitFit:
     """The code of a shape, so that the model's surface is the shape's.
 
     ``shape`` is a mesh, a cloud, or the path of one or of `.npz` samples (docs/formats.md); it must stand as the shapes of
@@ -59,7 +59,7 @@ def fit_implicit(
     with torch.no_grad():
         on = rows[:half]
         away = network.distance(on[None, :, :3], code[None])[0][0] - on[:, 3]
-    return Coded(name, code.detach(), frame, percent_of_side(float(away.abs().mean())))
+    return ImplicitFit(name, code.detach(), frame, percent_of_side(float(away.abs().mean())))
 
 
 @torch.no_grad()

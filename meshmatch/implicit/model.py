@@ -33,7 +33,7 @@ _MOST = {"code": 1024, "width": 2048, "depth": 16, "inner": 512}  # that a card 
 
 
 @dataclass(frozen=True, eq=False)
-class Coded:
+class ImplicitFit:
     """A shape as a model has it: a code, and the way from its file into the cube from -1 to 1.
 
     ``residual`` is the mean distance that the model gives points of its surface, % of the longest side; NaN if not known.
@@ -73,7 +73,7 @@ class ImplicitModel:
     card: ImplicitCard
     network: ImplicitNetwork
 
-    def known(self, name: str) -> Coded:
+    def known(self, name: str) -> ImplicitFit:
         """A shape of the training by its name; `OptionError` if there was none of that name."""
         names = self.card.shapes
         if name not in names:
@@ -81,14 +81,14 @@ class ImplicitModel:
             raise OptionError(f"the model knows no shape {name!r}", f"its {len(names)} shapes: {some}, ...")
         number = names.index(name)
         scale, *center = self.card.frames[number]
-        return Coded(name, self.network.codes[number].detach(), Frame(scale, np.eye(3), np.array(center)))
+        return ImplicitFit(name, self.network.codes[number].detach(), Frame(scale, np.eye(3), np.array(center)))
 
-    def blend(self, a: Coded, b: Coded, time: float) -> Coded:
+    def blend(self, a: ImplicitFit, b: ImplicitFit, time: float) -> ImplicitFit:
         """The shape on the way from one to another: at time 0 the first, at 1 the last; before and beyond too."""
         scale = a.frame.scale ** (1 - time) * b.frame.scale**time
         center = (1 - time) * a.frame.center + time * b.frame.center
         code = (1 - time) * a.code + time * b.code
-        return Coded(f"{a.name}-{b.name}-{time:g}", code, Frame(scale, np.eye(3), center))
+        return ImplicitFit(f"{a.name}-{b.name}-{time:g}", code, Frame(scale, np.eye(3), center))
 
     @torch.no_grad()
     def distance(
@@ -100,11 +100,11 @@ class ImplicitModel:
         values, places = (torch.cat(each, 1)[0].double().numpy() for each in zip(*found, strict=True))
         return values, places
 
-    def to_template(self, points: Float[Floats, "P 3"], shape: Coded) -> Float[Floats, "P 3"]:
+    def to_template(self, points: Float[Floats, "P 3"], shape: ImplicitFit) -> Float[Floats, "P 3"]:
         """Where points of a shape's file (its vertices, say) lie on the template."""
         return self.distance(np.clip(shape.frame.apply(points), -1, 1), shape.code)[1]
 
-    def match(self, a: Coded, b: Coded, source: Shape, target: Shape) -> VertexMap:
+    def match(self, a: ImplicitFit, b: ImplicitFit, source: Shape, target: Shape) -> VertexMap:
         """Each vertex of ``source``, which is ``a``, to that of ``target``, which is ``b``, nearest to it on the template.
 
         Confidence falls with the distance there; the verdict is the worse of the two.
@@ -116,7 +116,7 @@ class ImplicitModel:
         reasons = (*a.reasons, *b.reasons)
         return VertexMap.between(source, target, index, confidence=trust, verdict=verdict, reasons=reasons)
 
-    def surface(self, shape: Coded, resolution: int = 64) -> Shape:
+    def surface(self, shape: ImplicitFit, resolution: int = 64) -> Shape:
         """The surface of a shape by marching cubes, in the file's frame.
 
         ``resolution`` (even) is the number of cells along each side of the cube. `OptionError` for a resolution that is odd
@@ -125,8 +125,7 @@ class ImplicitModel:
         with needs("skimage", "implicit"):
             from skimage.measure import marching_cubes
 
-        if not 8 <= resolution <= 512 or resolution % 2:
-            raise OptionError(f"resolution must be even, from 8 to 512, not {resolution}")
+        check_resolution(resolution)
         step, ticks = 2 / resolution, np.linspace(-1, 1, resolution // 2 + 1, dtype=np.float64)
         points: Floats = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
         coarse = self.distance(points, shape.code)[0].reshape([len(ticks)] * 3)
@@ -139,6 +138,12 @@ class ImplicitModel:
             raise ModelError(f"the model has no surface for {shape.name}", "train it longer")
         verts, faces, _, _ = marching_cubes(values, 0.0, allow_degenerate=False)
         return Shape(shape.frame.undo((verts - 1) * step - 1), faces.astype(np.int64), shape.name)
+
+
+def check_resolution(resolution: int) -> None:
+    """`OptionError` if marching cubes cannot have so many cells along a side."""
+    if not 8 <= resolution <= 512 or resolution % 2:
+        raise OptionError(f"resolution must be even, from 8 to 512, not {resolution}")
 
 
 def percent_of_side(distance: float) -> float:

@@ -27,6 +27,8 @@ from meshmatch.geometry.kernels import Kernel
 from meshmatch.implicit.space import SpaceField
 
 Deformation = Literal["mls", "pointwise"]
+# Of decoded vectors: without it the correction, which learns faster, explains what the deformation should.
+_GAIN = 5.0
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,7 @@ class ReducedDeformation(nn.Module):
         self.nodes, self.radii = nn.Buffer(nodes), nn.Buffer(radii)
         last = nn.Linear(128, 3 * len(nodes))
         last.weight.data.mul_(0.01)  # as above
+        last.bias.data.zero_()
         self.decoder = nn.Sequential(nn.Linear(config.code, 128), nn.ReLU(), last)
         self.network = HyperNetwork(config, 1)
 
@@ -145,7 +148,7 @@ class ReducedDeformation(nn.Module):
 
     def vectors(self, code: Float[torch.Tensor, "B D"]) -> Float[torch.Tensor, "B K 3"]:
         """Where the nodes go, relative to where they are."""
-        return self.decoder(code).unflatten(1, (-1, 3))
+        return _GAIN * self.decoder(code).unflatten(1, (-1, 3))
 
     def forward(self, points: torch.Tensor, code: torch.Tensor, slopes: bool = True) -> tuple[torch.Tensor, ...]:
         """u and c at points (B, P, 3); with ``slopes`` also their gradients."""

@@ -1,0 +1,157 @@
+"""`train --implicit`, and `interpolate` and `match` with such a model: a folder of boxes, from files to files."""
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("skimage", reason="scikit-image is of the extra `implicit`")
+
+import meshmatch
+from meshmatch.cli import main
+from meshmatch.geometry.triangles import is_watertight
+from meshmatch.implicit import training
+from meshmatch.implicit.card import IMPLICIT, is_implicit, read_implicit_card
+from meshmatch.implicit.codes import fit_implicit
+from meshmatch.implicit.training import train_implicit
+from meshmatch.training.train import CHECKPOINT
+from tests.implicit.boxes import TRAIN, box, boxes, config
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("boxes")
+    boxes(made, 3)
+    return made
+
+
+@pytest.fixture(scope="module")
+def model(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    how = replace(TRAIN, steps=120, rate=3e-3, average=0.9)
+    return train_implicit(tmp_path_factory.mktemp("model"), folder, config=config("mls"), training=how)
+
+
+@pytest.mark.parametrize("field", ["mls", "pointwise"])
+def test_a_folder_becomes_a_model_and_goes_on(folder: Path, tmp_path: Path, capsys: Capture, field: str) -> None:
+    words = ["train", "--implicit", "--shapes", str(folder), "-o", str(tmp_path / "model"), "--json"]
+    words += ["--field", field, "--arap", "0.004", "--category", "box", "--licence", "CC0", "--steps"]
+    assert main([*words, "1"]) == 0
+    heard = capsys.readouterr()
+    assert json.loads(heard.out)["steps"] == 1
+    card = read_implicit_card(tmp_path / "model")
+    assert (card.category, card.licence, card.shapes) == ("box", "CC0", ["box0", "box1", "box2"])
+    assert card.network["field"] == field
+    assert card.recipe["loss"]["arap"] == 0.004
+    assert (tmp_path / "model" / CHECKPOINT).is_file()
+    assert not [path for path in (tmp_path / "model").rglob("*") if path.suffix in (".pt", ".pkl", ".pth")]
+    assert main([*words, "2"]) == 0
+    heard = capsys.readouterr()
+    assert json.loads(heard.out)["steps"] == 2
+    assert "going on" in heard.err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--field", "rbf"], "mls or pointwise"),
+        (["--unsupervised"], "--unsupervised does not go"),
+        (["--preset", "paper"], "--preset does not go"),
+        (["--bf16"], "--bf16 does not go"),
+    ],
+)
+def test_what_does_not_go_with_it_is_told(
+    folder: Path, tmp_path: Path, capsys: Capture, words: list[str], said: str
+) -> None:
+    output = tmp_path / "model"
+    assert main(["train", "--implicit", "--shapes", str(folder), "-o", str(output), *words]) == 1
+    assert said in capsys.readouterr().err
+    assert not (output / IMPLICIT).exists()
+
+
+def test_a_folder_is_needed(tmp_path: Path, capsys: Capture) -> None:
+    assert main(["train", "--implicit", "-o", str(tmp_path / "model")]) == 1
+    assert "needs --shapes" in capsys.readouterr().err
+
+
+def test_surfaces_between_two_files(model: Path, folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    a, b = (meshmatch.load_shape(folder / f"box{k}.ply") for k in (0, 1))
+    far = meshmatch.Shape(10 + 2 * b.verts, b.faces)  # another place and unit
+    meshmatch.save_shape(tmp_path / "far.ply", far)
+    files = [str(folder / "box0.ply"), str(tmp_path / "far.ply")]
+    words = ["interpolate", *files, "--model", str(model), "-n", "3", "--resolution", "32", "--json"]
+    assert main([*words, "-o", str(tmp_path / "way")]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["times"] == [0, 0.5, 1]
+    assert max(record["residuals"]) < 4
+    frames = json.loads((tmp_path / "way" / "frames.json").read_text())["frames"]
+    shapes = [meshmatch.load_shape(tmp_path / "way" / frame["file"]) for frame in frames]
+    assert [shape.V for shape in shapes] == record["vertices"]
+    assert all(is_watertight(shape.faces) for shape in shapes)
+    for shape, truth in ((shapes[0], a), (shapes[2], far)):
+        assert np.abs(shape.bounds - truth.bounds).max() < 0.3 * truth.diagonal
+    assert a.bounds.mean() < shapes[1].bounds.mean() < far.bounds.mean()
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Codes after a few steps."""
+    monkeypatch.setattr("meshmatch.implicit.sequence.fit_implicit", partial(fit_implicit, steps=5))
+
+
+@pytest.mark.usefixtures("short")
+def test_surfaces_in_a_row(model: Path, folder: Path, tmp_path: Path) -> None:
+    files = [str(folder / f"box{k}.ply") for k in (0, 1)]
+    words = ["interpolate", *files, "--model", str(model), "-n", "2", "--resolution", "16"]
+    assert main([*words, "-o", str(tmp_path / "row.png")]) == 0
+    assert (tmp_path / "row.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_map_through_the_template(model: Path, folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    half = np.array([0.8, 0.35, 0.6])
+    meshmatch.save_shape(tmp_path / "unseen.ply", box(half))
+    files = [str(tmp_path / "unseen.ply"), str(folder / "box1.ply")]
+    output = tmp_path / "map.npz"
+    assert main(["match", *files, "--model", str(model), "-o", str(output), "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["source_vertices"] == 8
+    shapes = [meshmatch.load_shape(file) for file in files]
+    found = meshmatch.load_map(output, *shapes)
+    assert found.verdict == record["verdict"]
+    assert np.array_equal(np.sign(shapes[1].verts[found.index]), np.sign(shapes[0].verts))  # corner to corner
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["match", "-o", "map.npz", "--up", "y"], "--up does not go with an implicit model"),
+        (["match", "-o", "map.npz", "--landmarks", "pairs.txt"], "--landmarks does not go"),
+        (["interpolate", "-o", "way", "--mesh", "template"], "--mesh does not go"),
+        (["interpolate", "-o", "way.html"], "share no vertices"),
+        (["interpolate", "-o", "way", "--resolution", "33"], "must be even"),
+    ],
+)
+def test_options_that_mean_nothing_there_are_refused(
+    model: Path, folder: Path, tmp_path: Path, capsys: Capture, words: list[str], said: str
+) -> None:
+    verb, dash, name, *rest = words
+    files = [str(folder / f"box{k}.ply") for k in (0, 1)]
+    assert main([verb, *files, "--model", str(model), dash, str(tmp_path / name), *rest]) == 1
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / name).exists()
+
+
+@pytest.mark.usefixtures("short")
+def test_the_library_does_the_same(model: Path, folder: Path) -> None:
+    loaded = meshmatch.load_implicit(model)
+    result = meshmatch.implicit_sequence(loaded, folder / "box0.ply", folder / "box1.ply", 2, resolution=16)
+    assert [fit.name for fit in result.fits] == ["box0.ply", "box1.ply"]
+    with pytest.raises(meshmatch.MeshmatchError, match="no sequence"):
+        meshmatch.implicit_sequence(loaded, folder / "box0.ply", folder / "box1.ply", 1)
+    assert is_implicit(model)
+    assert not is_implicit(folder)
+    assert training.TRAINING.steps > 1
