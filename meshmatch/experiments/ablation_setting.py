@@ -152,7 +152,7 @@ def _resting(folder: str | None, pose: str) -> Template:
     return read_template(f"human-{pose}" if folder is None else Path(folder) / "template.safetensors")
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _with_nodes(template: Template, K: int, radius: float, strategy: Strategy) -> tuple[Template, Strategy]:
     for rule in dict.fromkeys((strategy, "uniform")):
         try:
