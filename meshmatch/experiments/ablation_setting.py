@@ -20,7 +20,7 @@ from meshmatch.experiments.ablation_views import BASE, Run
 from meshmatch.experiments.human_bodies import diameter
 from meshmatch.models.layers import BasisEncoder, PointEncoder
 from meshmatch.models.network import NetworkConfig
-from meshmatch.templates.make import NodeConfig, Strategy, choose_nodes
+from meshmatch.templates.make import NodeConfig, Strategy, lay_nodes
 from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import Template, read_template
 from meshmatch.training.bodies import human_source
@@ -115,7 +115,8 @@ class Setting:
         return 200 if self.preset == "small" else 400
 
     def template(self, run: Run) -> Template:
-        """The template with the run's nodes, chosen by its `rule`.
+        """The template with the run's nodes, chosen by its `rule`: as many as it says, their radii grown where vertices
+        lack some.
 
         Raises
         ------
@@ -156,8 +157,8 @@ def _resting(folder: str | None, pose: str) -> Template:
 def _with_nodes(template: Template, K: int, radius: float, strategy: Strategy) -> tuple[Template, Strategy]:
     for rule in dict.fromkeys((strategy, "uniform")):
         try:
-            nodes = choose_nodes(template.shape, NodeConfig(rule, K, radius), template.labels)
-            return replace(template, nodes=nodes, radius=radius), rule
+            laid = lay_nodes(template.shape, NodeConfig(rule, K, radius, grow=True), template.labels)
+            return replace(template, nodes=laid.nodes, radius=laid.radius), rule
         except TemplateError:
             if rule == "uniform":
                 raise

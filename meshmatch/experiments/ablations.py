@@ -243,6 +243,7 @@ def main(
     minutes: Annotated[float | None, Option(min=0, help="of training instead: equal time, see above")] = None,
     seeds: Annotated[int, Option(min=1, help="trainings of each run of the views that are repeated")] = 1,
     repeated: Annotated[str, Option(help="which views these are; may be empty")] = "table4",
+    without: Annotated[str, Option(help="leave out runs whose names have one of these words, such as pointwise")] = "",
     rounds: Annotated[int, Option(min=0, help="iterations of table 4's runs under the clock")] = 5,
     sets: Annotated[str, Option(help="on which errors are measured; may be empty")] = f"shrec19,{CLOUD_SET}",
     shapes: Annotated[int, Option(min=2, help="of each set, whose pairs are measured")] = 6,
@@ -264,6 +265,7 @@ def main(
 ) -> runner.Report:
     names = [name for name in VIEWS if name in runner.names_of(views, VIEWS, "view")]
     runs = all_runs(names, seeds, runner.names_of(repeated, VIEWS, "view"))
+    runs = [run for run in runs if not any(word in run.name for word in without.split(",") if word)]
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
     setting = Setting(preset, folder, identities, threads, unit, batch)
     if plan:

@@ -35,7 +35,11 @@ STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 # is left without nodes, the next share is tried. Set by hand.
 _GEODESIC_SHARES = (0.2, 0.3, 0.45, 1.0)
 _FUNCTIONS = 4  # eigenvectors that tell clusters apart, as in the paper
-_GROWN, _GROWTH, _MAX_GROWTHS = 6, 1.05, 120  # nodes that grow around a vertex, by how much at a time, and how often
+_GROWN, _GROWTH, _MAX_GROWTHS = (
+    6,
+    1.05,
+    15,
+)  # nodes that grow around a vertex, by how much at a time, how often: twofold
 _MAX_PAIRED = 8000  # vertices, evenly spread, whose pairs the geodesic rule looks at
 
 
@@ -129,6 +133,7 @@ class Laid:
     nodes: Float[Floats, "K 3"]
     radius: float | Float[Floats, " K"]
     refused: float
+    milder: int = 0  # how many milder rules than the strategy itself had to be tried
 
 
 def choose_nodes(
@@ -152,7 +157,7 @@ def lay_nodes(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None =
     samples, candidates = _candidates(shape, config, noisy)
     failure: TemplateError | None = None
     refused: float | None = None
-    for allowed in _allowed(shape, config, candidates, labels, samples):
+    for milder, allowed in enumerate(_allowed(shape, config, candidates, labels, samples)):
         chosen = candidates[allowed]
         if refused is None:  # by the strategy itself; what follows are milder ones
             refused = 1 - float(allowed.mean())
@@ -163,8 +168,8 @@ def lay_nodes(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None =
         nodes = chosen[farthest_points(chosen, min(config.K, len(chosen)))]
         try:
             if config.grow:
-                return Laid(nodes, grown_radii(shape.verts, nodes, config.radius), refused)
-            return Laid(_complete(shape, config, nodes, chosen), config.radius, refused)
+                return Laid(nodes, grown_radii(shape.verts, nodes, config.radius), refused, milder)
+            return Laid(_complete(shape, config, nodes, chosen), config.radius, refused, milder)
         except TemplateError as error:
             failure = error
     assert failure is not None
@@ -184,7 +189,7 @@ def grown_radii(
     points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radius: float
 ) -> float | Float[Floats, " K"]:
     """Radii that begin at ``radius``, of which those of the nodes nearest to points without four non-coplanar nodes in
-    reach grow until there are none; one number where none has to. `TemplateError` if all nodes lie in a plane.
+    reach grow until there are none, at most twofold; one number where none has to. `TemplateError` where that is too little.
     """
     radii = np.full(len(nodes), radius)
     around = cKDTree(nodes)
@@ -194,8 +199,8 @@ def grown_radii(
             return radius if radii.max() == radius else radii
         near = np.unique(around.query(points[bad], k=min(_GROWN, len(nodes)))[1])
         radii[near] *= _GROWTH
-    problem = f"{len(bad)} vertices have no four non-coplanar nodes, however wide their radii are"
-    raise TemplateError(problem, "use more nodes or another strategy")
+    problem = f"{len(bad)} vertices have fewer than four non-coplanar nodes within twice {radius:g}"
+    raise TemplateError(problem, "use more nodes, a larger radius or another strategy")
 
 
 def _complete(
