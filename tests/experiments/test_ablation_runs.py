@@ -99,6 +99,9 @@ def test_where_a_rule_leaves_too_few_nodes_all_are_taken(prepared: Path) -> None
     assert setting.template(BASE).K == 300
     assert setting.template(BASE).radius == pytest.approx(0.13)
     assert Setting().template(BASE).radius == pytest.approx(read_template("human-T-300").radius, abs=0.005)
+    arms_down = replace(BASE, pose="A")  # the rule leaves vertices short there: radii grow, the rule stays
+    assert Setting().rule(arms_down) == "parts"
+    assert Setting().template(arms_down).K == 300 and isinstance(Setting().template(arms_down).radius, np.ndarray)
     wide = replace(BASE, nodes=100, radius=0.5)
     assert setting.rule(wide) == "uniform"
     assert setting.template(wide).K == 100

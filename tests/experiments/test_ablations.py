@@ -118,6 +118,8 @@ def test_every_run_has_the_steps(
     words += ["--steps", "3", "--batch", "2", "--rounds", "0", "--views", "table4"]
     assert main([*words, "--plan"]) == 0
     assert sum(row["runs"] for row in line(capsys)[1]["plan"]) == 9
+    assert main([*words, "--plan", "--without", "rbf,pointwise"]) == 0
+    assert [(row["field"], row["runs"]) for row in line(capsys)[1]["plan"]] == [("mls", 1)] * 3
     assert calls["train_run"] == 0
     assert main([*words, "--methods", "code"]) == 0
     out, record = line(capsys)
