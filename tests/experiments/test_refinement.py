@@ -53,7 +53,7 @@ def subjects(model: TrainedModel) -> list[Subject]:
 
 def test_both_start_from_the_network_and_the_paper_lowers_its_own_energy(subjects: list[Subject]) -> None:
     for subject in subjects:
-        network, code, nodes = (subject.answers[name] for name in METHODS)
+        network, code, nodes = (subject.answers[name] for name in ("network", "code", "nodes"))
         assert np.array_equal(network.vectors, subject.fit.vectors)
         assert code.energy < network.energy
         for answer in (code, nodes):
@@ -134,10 +134,15 @@ def test_the_command_on_bodies_and_a_set(
     assert record["steps"] == {"nodes": 10, "code": 3}
     rows = record["rows"]
     assert [(row["set"], row["method"]) for row in rows] == [(n, m) for n in ("bodies", "scape") for m in METHODS]
-    for code, nodes in ((rows[1], rows[2]), (rows[4], rows[5])):
+    for first in (0, len(METHODS)):
+        code, *steps = rows[first + 1 : first + len(METHODS)]
+        nodes, racing = steps[-1], [row["error_cm"] <= code["error_cm"] for row in steps]
+        assert [row.get("race") == "equal error" for row in steps] == [
+            won and not any(racing[:k]) for k, won in enumerate(racing)
+        ]
         assert nodes["times_as_fast"] == pytest.approx(code["cpu"] / nodes["cpu"])
         assert nodes["met"] == (nodes["times_as_fast"] >= 50 and nodes["error_cm"] < code["error_cm"])
-    assert all(name in "".join(lines[:-1]) for name in ("bodies", "scape", *METHODS))
+    assert all(name in "".join(lines[:-1]) for name in ("bodies", "scape", "network", "code", "nodes"))
 
 
 def test_shapes_are_spread_over_a_set_that_has_pairs_of_them(model: TrainedModel, tmp_path: Path) -> None:
