@@ -29,7 +29,11 @@ def number(values: Sequence[float]) -> str:
 
 def errors_table(view: View, known: Known, sets: Sequence[str], budget: str) -> Table:
     """Steps, held-out error, mean and median on each set beside the paper's mean, and after refining nodes."""
-    columns = {head: head for head in view.heads} | {"steps": "steps:>", "held out": "held out:>"}
+    columns = {head: head for head in view.heads}
+    rules = {row.run.strategy for row in view.rows}
+    if len(rules) > 1 and known.refused:
+        columns["rule refuses"] = "refused:.1%"
+    columns |= {"steps": "steps:>", "held out": "held out:>"}
     for name in sets:
         columns |= {name: f"{name}:>", f"{name} median": f"{name} median:>"}
         if name in PAPER_SETS and any(row.paper for row in view.rows):
@@ -41,6 +45,7 @@ def errors_table(view: View, known: Known, sets: Sequence[str], budget: str) -> 
         run, record = each.run, known.trained.get(each.run, {})
         words = [word.format(rule=record.get("rule", run.strategy)) for word in each.words]
         row: dict[str, Any] = dict(zip(view.heads, words, strict=True))
+        row["refused"] = known.refused.get(run.name)
         rows.append(row)
         if "skipped" in record:
             row["steps"] = "cannot be"

@@ -20,7 +20,7 @@ from meshmatch.experiments.ablation_views import BASE, Run
 from meshmatch.experiments.human_bodies import diameter
 from meshmatch.models.layers import BasisEncoder, PointEncoder
 from meshmatch.models.network import NetworkConfig
-from meshmatch.templates.make import NodeConfig, Strategy, lay_nodes
+from meshmatch.templates.make import NodeConfig, Strategy, judged, lay_nodes
 from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import Template, read_template
 from meshmatch.training.bodies import human_source
@@ -129,10 +129,17 @@ class Setting:
         """By which rule its nodes are chosen: its own, or none ("uniform") where that one leaves too few."""
         return self._chosen(run)[1]
 
+    def refused(self, run: Run) -> float:
+        """Which share of the candidates for nodes its rule refuses."""
+        template, radius = self.resting(run.pose), self._radius(run)
+        config = NodeConfig(run.strategy, run.nodes, radius)
+        return 1 - float(judged(template.shape, config, template.labels)[2].mean())
+
+    def _radius(self, run: Run) -> float:
+        return run.radius * (SPHERE if self.unit == "sphere" else diameter(self.resting(run.pose).shape))
+
     def _chosen(self, run: Run) -> tuple[Template, Strategy]:
-        template = self.resting(run.pose)
-        unit = SPHERE if self.unit == "sphere" else diameter(template.shape)
-        return _with_nodes(template, run.nodes, run.radius * unit, run.strategy)
+        return _with_nodes(self.resting(run.pose), run.nodes, self._radius(run), run.strategy)
 
     def resting(self, pose: str) -> Template:
         """The template in a pose, with the nodes that it came with; a folder has one pose."""

@@ -7,7 +7,7 @@ most of which differ from `BASE` in one thing.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from meshmatch.fields.shape_functions import FIELDS, FieldName
@@ -232,6 +232,7 @@ class Known:
     trained : {run: record}
     errors : {(run, set, method): record}
     times, memory : {name of a run: record}
+    refused : {name of a run: share of the candidates that its rule refuses}
     descent : what `meshmatch.experiments.ablation_errors.descend` found, if it was measured
     """
 
@@ -240,6 +241,7 @@ class Known:
     times: Mapping[str, Mapping[str, Any]]
     memory: Mapping[str, Mapping[str, Any]]
     descent: Mapping[str, Any] | None = None
+    refused: Mapping[str, float] = field(default_factory=dict)
 
     def error(self, run: Run, where: str, method: str = "code", what: str = "mean_cm") -> list[float]:
         """Errors in cm of a run and its repetitions with other seeds; ``where`` is a set, or `HELD_OUT`.

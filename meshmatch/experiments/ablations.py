@@ -188,6 +188,19 @@ class Kept:
 
         return self.answer(self.folder / "figure6.json", asked, measured)
 
+    def _refused(self, run: Run) -> dict[str, Any]:
+        return {**self.here(), "refused": self.setting.refused(run)}
+
+    def refused(self) -> dict[str, float]:
+        """By name of table 7's runs, the share of candidates that their rules refuse."""
+        shares = {}
+        for run in VIEWS["table7"].runs:
+            path = self.folder / run.name / "refused.json"
+            found = self.answer(path, self.asked(run), partial(self._refused, run))
+            if found is not None:
+                shares[run.name] = float(found["refused"])
+        return shares
+
     def known(self, runs: Sequence[Run], views: Sequence[str], rounds: int) -> Known:
         """What is there, after measuring what is missing; no runs are trained in 0 minutes or steps."""
         trained: dict[Run, dict[str, Any]] = {}
@@ -197,7 +210,8 @@ class Kept:
                 trained[run] = found
                 errors |= self.errors(run, found)
         times, grown = self.cost(rounds) if "table4" in views and rounds else ({}, {})
-        return Known(trained, errors, times, grown, self.descent(trained) if "figure6" in views else None)
+        descent = self.descent(trained) if "figure6" in views else None
+        return Known(trained, errors, times, grown, descent, self.refused() if "table7" in views else {})
 
     @property
     def trains(self) -> bool:

@@ -14,33 +14,23 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.render.figures import Panel
 from meshmatch.render.scales import CLAY
 from meshmatch.shapes.colors import label_colors
-from meshmatch.shapes.sampling import farthest_points, sample_surface
+from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import NodeConfig, choose_nodes, edge_graph, spectral_clusters
+from meshmatch.templates.make import STRATEGIES, NodeConfig, choose_nodes, edge_graph, judged, spectral_clusters
 from meshmatch.templates.template import Template
 
 KEPT, REFUSED, NODE = (0.20, 0.55, 0.80), (0.85, 0.15, 0.12), (0.86, 0.30, 0.12)
 COLUMNS = {"template": "template", "radius": "radius:.2f", "candidates": "candidates:d"}
-COLUMNS |= {"refused by parts": "parts:.1%", "spectral": "spectral:.1%", "from own vertex": "geodesic:.1%"}
-SHARE = 0.2  # of the diameter along the surface
+COLUMNS |= {"refused by parts": "parts:.1%", "spectral": "spectral:.1%", "geodesic": "geodesic:.1%"}
+SHARE = 0.2  # of the diameter along the surface, by which the third panel is coloured
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Where nodes may be: points below the surface, the vertex each is next to, and which vertices each would move."""
+    """Where nodes may be: points below the surface, and the vertex each is next to."""
 
     points: Float[Floats, "N 3"]
     own: Int[Ints, " N"]
-    touched: list[list[int]]
-
-
-def candidates_of(shape: Shape, config: NodeConfig) -> Candidates:
-    """The candidates of `meshmatch.templates.make.choose_nodes`."""
-    rng = np.random.default_rng(config.seed)
-    samples = sample_surface(shape, 30 * config.K, rng)
-    points = samples.points - samples.normals * rng.uniform(0, config.depth, (len(samples.points), 1))
-    own = shape.faces[samples.face, samples.barycentric.argmax(1)]
-    return Candidates(points, own, list(cKDTree(shape.verts).query_ball_point(points, config.radius)))
 
 
 def bordering(shape: Shape, parts: Int[Ints, " V"]) -> Bool[Bools, "P P"]:
@@ -50,42 +40,16 @@ def bordering(shape: Shape, parts: Int[Ints, " V"]) -> Bool[Bools, "P P"]:
     return np.asarray(joined | joined.T)
 
 
-def across_parts(shape: Shape, parts: Int[Ints, " V"], found: Candidates) -> Bool[Bools, " N"]:
-    """Candidates that touch a part which has no border with their own."""
-    joined = bordering(shape, parts)
-    return np.array(
-        [
-            not joined[parts[own], np.unique(parts[hits])].all()
-            for own, hits in zip(found.own, found.touched, strict=True)
-        ]
-    )
-
-
-def far_along(shape: Shape, found: Candidates, share: float = SHARE) -> Bool[Bools, " N"]:
-    """Candidates that touch a vertex further from their own, along the surface, than a share of the diameter.
-
-    `meshmatch.templates.make` compares all pairs of the vertices that a node would move, which refuses more.
-    """
-    graph = edge_graph(shape)
-    ends = dijkstra(graph, indices=farthest_points(shape.verts, 40))
-    limit = share * ends[np.isfinite(ends)].max()
-    owners, place = np.unique(found.own, return_inverse=True)
-    reach = dijkstra(graph, indices=owners, limit=limit)
-    return np.array([not np.isfinite(reach[at, hits]).all() for at, hits in zip(place, found.touched, strict=True)])
-
-
 @cache
 def refused(template: Template, config: NodeConfig) -> tuple[Candidates, dict[str, Bool[Bools, " N"]], Int[Ints, " V"]]:
     """Candidates of a template, which of them each rule refuses, and its spectral clusters."""
     shape = template.shape
-    found = candidates_of(shape, config)
     clusters = spectral_clusters(shape, config.clusters, np.random.default_rng(config.seed))
-    rules = {
-        "parts": across_parts(shape, template.labels, found),
-        "spectral": across_parts(shape, clusters, found),
-        "geodesic": far_along(shape, found),
-    }
-    return found, rules, clusters
+    rules: dict[str, Bool[Bools, " N"]] = {}
+    for rule in STRATEGIES:
+        points, own, kept = judged(shape, replace(config, strategy=rule), template.labels)
+        rules[rule] = ~kept
+    return Candidates(points, own), rules, clusters
 
 
 def refusals(template: Template, config: NodeConfig) -> dict[str, Any]:
@@ -95,23 +59,28 @@ def refusals(template: Template, config: NodeConfig) -> dict[str, Any]:
     return {"template": template.name, "radius": config.radius, "candidates": len(found.points), **shares}
 
 
-def worst_candidate(template: Template, found: Candidates, bad: Bool[Bools, " N"]) -> int:
-    """The refused candidate that would move most vertices of parts that have no border with its own part."""
+def worst_candidate(
+    template: Template, found: Candidates, bad: Bool[Bools, " N"], radius: float
+) -> tuple[int, Int[Ints, " M"]]:
+    """The refused candidate that would move most vertices of parts that have no border with its own part, and all that
+    it would move."""
     shape, labels = template.shape, template.labels
-    joined = bordering(shape, labels)
+    joined, tree = bordering(shape, labels), cKDTree(shape.verts)
     strangers = np.zeros(len(bad), np.int64)
     for k in np.flatnonzero(bad).tolist():
-        strangers[k] = (~joined[labels[found.own[k]], labels[found.touched[k]]]).sum()
-    return int(strangers.argmax())
+        touched = tree.query_ball_point(found.points[k], radius)
+        strangers[k] = (~joined[labels[found.own[k]], labels[touched]]).sum()
+    worst = int(strangers.argmax())
+    return worst, np.array(tree.query_ball_point(found.points[worst], radius))
 
 
 def segmentations(template: Template, config: NodeConfig) -> tuple[list[Panel], dict[str, Any]]:
     """Parts, spectral clusters, how far one vertex is along the surface, and a candidate that would move two parts."""
     shape = template.shape
     found, rules, clusters = refused(template, config)
-    bad = worst_candidate(template, found, rules["parts"])
+    bad, touched = worst_candidate(template, found, rules["parts"], config.radius)
     moved = np.zeros(shape.V, bool)
-    moved[found.touched[bad]] = True
+    moved[touched] = True
     colors = np.where(moved[:, None], label_colors(template.labels), CLAY)
     graph = edge_graph(shape)
     distance = dijkstra(graph, indices=found.own[bad])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, get_args
 
 import numpy as np
@@ -176,6 +177,15 @@ def lay_nodes(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None =
     raise failure
 
 
+def judged(
+    shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None
+) -> tuple[Float[Floats, "N 3"], Int[Ints, " N"], Bool[Bools, " N"]]:
+    """Where nodes of a mesh may be, the vertex that each place is next to, and which places the strategy itself keeps."""
+    samples, candidates = _candidates(shape, config, noisy=False)
+    own = shape.faces[samples.face, samples.barycentric.argmax(1)]
+    return candidates, own, next(_allowed(shape, config, candidates, labels, samples))
+
+
 def _candidates(shape: Shape, config: NodeConfig, noisy: bool) -> tuple[Samples, Float[Floats, "N 3"]]:
     """Samples of the surface, and where nodes may be: below them, or around them."""
     rng = np.random.default_rng(config.seed)
@@ -264,19 +274,24 @@ def _parts_allowed(
 
 def _geodesic_allowed(shape: Shape, radius: float, candidates: Float[Floats, "N 3"], share: float) -> Bool[Bools, " N"]:
     """Drop candidates that touch two vertices further apart than a share of the diameter, both along the surface."""
+    some, near = _near_pairs(shape, share)
+    tree, allowed = cKDTree(shape.verts[some]), np.zeros(len(candidates), bool)
+    for k, place in enumerate(candidates):  # one by one, for what wide nodes touch is long
+        hits = tree.query_ball_point(place, radius)
+        # A few of the vertices tell most candidates apart before all pairs are looked at.
+        allowed[k] = near[np.ix_(hits[:: len(hits) // 8 + 1], hits)].all() and near[np.ix_(hits, hits)].all()
+    return allowed
+
+
+@lru_cache(maxsize=2)
+def _near_pairs(shape: Shape, share: float) -> tuple[Int[Ints, " S"], Bool[Bools, "S S"]]:
+    """Vertices spread over a shape, and which of them lie within a share of the diameter, along the surface."""
     graph = edge_graph(shape)
     some = farthest_points(shape.verts, min(shape.V, _MAX_PAIRED))
     far = dijkstra(graph, indices=some[:40])
     limit = share * far[np.isfinite(far)].max()
     blocks = (dijkstra(graph, indices=some[at : at + 200], limit=limit) for at in range(0, len(some), 200))
-    near = np.concatenate([np.isfinite(block[:, some]) for block in blocks])
-    tree, allowed = cKDTree(shape.verts[some]), []
-    for at in range(0, len(candidates), 1000):  # what wide nodes touch is long
-        for hits in tree.query_ball_point(candidates[at : at + 1000], radius):
-            # A few of the vertices tell most candidates apart before all pairs are looked at.
-            few = near[np.ix_(hits[:: len(hits) // 8 + 1], hits)].all()
-            allowed.append(bool(few and near[np.ix_(hits, hits)].all()))
-    return np.array(allowed)
+    return some, np.concatenate([np.isfinite(block[:, some]) for block in blocks])
 
 
 def edge_graph(shape: Shape) -> coo_matrix:

@@ -121,6 +121,15 @@ def test_costs_are_told_by_their_ratios() -> None:
     assert held["with vol+arap+Z an iteration of pointwise takes at least 3 times as long as one of mls"] == "holds"
 
 
+def test_table_7_says_what_each_rule_refuses() -> None:
+    uniform = replace(BASE, strategy="uniform")
+    found = replace(known({BASE: 2.0, uniform: 3.0}), refused={BASE.name: 0.758, uniform.name: 0.0})
+    drawn = {view: as_markdown(tables(found, [view], [], "")[0]) for view in ("table7", "table5")}
+    assert "| nodes by | template | rule refuses | steps |" in drawn["table7"]
+    assert "| parts | T | 75.8 % | 7 | 2.00 |" in drawn["table7"] and "| uniform | T | 0.0 % | 7 |" in drawn["table7"]
+    assert "refuses" not in drawn["table5"]
+
+
 def test_seeds_are_joined() -> None:
     found = known({BASE: 2.0, replace(BASE, seed=1): 3.0, replace(BASE, pose="A", seed=1): 9.0})
     assert found.error(BASE, "held out") == [2.0, 3.0]

@@ -7,18 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 from meshmatch.experiments import figure_fields
 from meshmatch.experiments.figure_direct import Direct, direct_fits, fitted, in_template_frame
 from meshmatch.experiments.figure_fields import PULL, change, pull, pulled_by, pulled_nodes, volume
-from meshmatch.experiments.figure_nodes import across_parts, candidates_of, config_of, far_along, refused
+from meshmatch.experiments.figure_nodes import config_of, refusals, refused, worst_candidate
 from meshmatch.experiments.figures import main, stacked
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.make import choose_nodes
+from meshmatch.templates.make import choose_nodes, edge_graph
 from meshmatch.templates.template import Template, read_template
 
 
@@ -71,12 +73,32 @@ def test_a_pull_by_every_field(template: Template, monkeypatch: pytest.MonkeyPat
 def test_the_rules_refuse_what_the_choice_of_nodes_refuses(template: Template) -> None:
     config = config_of(template, 100, 0.2)
     found, rules, _ = refused(template, config)
-    assert np.array_equal(rules["parts"], across_parts(template.shape, template.labels, found))
     kept = found.points[~rules["parts"]]
     first = kept[farthest_points(kept, config.K)]
     assert choose_nodes(template.shape, config, template.labels)[: config.K] == pytest.approx(first)
-    assert 0 < rules["geodesic"].mean() < far_along(template.shape, found, 0.1).mean()
-    assert len(candidates_of(template.shape, config).points) == 30 * config.K
+    assert len(found.points) == len(found.own) == 30 * config.K
+    assert not rules["uniform"].any()
+    row = refusals(template, config)
+    assert row["geodesic"] == pytest.approx(rules["geodesic"].mean()) and 0 < row["geodesic"] < 1
+    # by pairs: what keeps within a fifth of the diameter of its own vertex may still join two points further apart
+    graph = edge_graph(template.shape)
+    ends = dijkstra(graph, indices=farthest_points(template.shape.verts, 40))
+    limit = 0.2 * ends[np.isfinite(ends)].max()
+    tree = cKDTree(template.shape.verts)
+    for k in [*np.flatnonzero(rules["geodesic"])[:3], *np.flatnonzero(~rules["geodesic"])[:3]]:
+        touched = tree.query_ball_point(found.points[k], 0.2)
+        apart = dijkstra(graph, indices=touched)[:, touched].max()
+        assert (apart > limit) == rules["geodesic"][k]
+
+
+def test_the_worst_candidate_moves_strangers(template: Template) -> None:
+    config = config_of(template, 20, 0.25)
+    found, rules, _ = refused(template, config)
+    worst, moved = worst_candidate(template, found, rules["parts"], 0.25)
+    assert rules["parts"][worst]
+    far = np.linalg.norm(template.shape.verts - found.points[worst], axis=1)
+    assert np.array_equal(np.sort(moved), np.flatnonzero(far <= 0.25))
+    assert len(np.unique(template.labels[moved])) > 2
 
 
 def test_rows_of_panels_are_stacked(cube: Shape, tmp_path: Path) -> None:
