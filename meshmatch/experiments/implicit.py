@@ -5,7 +5,8 @@ For each kind both learn the same shapes with the same template, correction, los
 also between codes) which are cheap for it. Measured on the shapes of the training, whose parts are known:
 
 reconstruction: Chamfer distance (both ways, mean, % of the longest side) and IoU of the insides;
-labels: part IoU where each point of one shape takes the part of the nearest point of another on the template;
+labels: part IoU where each point of one shape takes the part of the nearest point of another on the template, by position
+alone and with normals;
 interpolation: how far the surface's motion is from even, |f(t+h) - 2 f(t) + f(t-h)| on the surface at t (% of the longest
 side), its part of the motion |f(t+h) - f(t-h)| / 2; how far volume is from going evenly (%); pieces that a surface has;
 mean volume and rigidity energies of the deformation on the surfaces; CPU seconds of a training step.
@@ -36,7 +37,7 @@ from meshmatch.experiments import runner
 from meshmatch.experiments.furniture import KINDS, furniture
 from meshmatch.fields.field import arap_energy, volume_energy
 from meshmatch.implicit.card import IMPLICIT
-from meshmatch.implicit.model import ImplicitFit, ImplicitModel, load_implicit
+from meshmatch.implicit.model import ImplicitFit, ImplicitModel, load_implicit, nearest_on_template
 from meshmatch.implicit.network import ImplicitConfig
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
 from meshmatch.implicit.training import TRAINING, ImplicitDataset, build_implicit, train_implicit
@@ -110,22 +111,25 @@ def part_iou(truth: Ints, found: Ints, parts: list[int]) -> float:
 
 
 def label_transfer(model: ImplicitModel, kind: str, pairs: list[tuple[int, int]], seed: int) -> dict[str, float]:
-    """Part IoU through the template, of the parts that both shapes have; also where nothing is deformed."""
+    """Part IoU through the template, of the parts that both shapes have: by position, with normals too as `match` does, and
+    by position where nothing is deformed.
+    """
     found = []
     for pair in pairs:
-        sampled = [furniture(kind, seed, k).sample(_POINTS, np.random.default_rng(k)) for k in pair]
-        (a, _, labels), (b, _, truth) = sampled
+        (a, m, labels), (b, n, truth) = (
+            furniture(kind, seed, k).sample(_POINTS, np.random.default_rng(k)) for k in pair
+        )
         common = np.intersect1d(labels, truth).tolist()
-        known, asked = labels[np.isin(labels, common)], np.isin(truth, common)
+        known, asked = np.isin(labels, common), np.isin(truth, common)
         shapes = [learned(model, k) for k in pair]
         places = [model.to_template(points, shape) for points, shape in zip((a, b), shapes, strict=True)]
         cubes = [shape.frame.apply(points) for points, shape in zip((a, b), shapes, strict=True)]
         row = []
-        for from_a, from_b in (places, cubes):
-            index = cKDTree(from_a[np.isin(labels, common)]).query(from_b[asked])[1]
-            row.append(part_iou(truth[asked], known[index], common))
+        for (from_a, from_b), share in ((places, 0), (places, 1), (cubes, 0)):
+            index = nearest_on_template(from_b[asked], from_a[known], share * n[asked], share * m[known])
+            row.append(part_iou(truth[asked], labels[known][index], common))
         found.append(row)
-    return dict(zip(("label_iou", "undeformed_iou"), np.mean(found, 0).tolist(), strict=True))
+    return dict(zip(("label_iou", "facing_iou", "undeformed_iou"), np.mean(found, 0).tolist(), strict=True))
 
 
 def volume(shape: Shape) -> float:
@@ -253,7 +257,12 @@ def main(
         draw(picture, models, pairs_of(shapes, compared, seed + 1)[0])
     columns = {
         **{"kind": "kind", "deformation": "method", "Chamfer %": "chamfer:.3f", "IoU": "iou:.3f"},
-        **{"label IoU": "label_iou:.3f", "undeformed": "undeformed_iou:.3f", "bend %": "bend:.3f"},
+        **{
+            "label IoU": "label_iou:.3f",
+            "with normals": "facing_iou:.3f",
+            "undeformed": "undeformed_iou:.3f",
+            "bend %": "bend:.3f",
+        },
         **{"of motion": "bend_share:.3f", "volume %": "volume_change:.2f", "pieces": "pieces:.1f"},
         **{"(det F-1)^2": "volume_energy:.3f", "|F'F-I|": "arap_energy:.3f", "s/step": "seconds:.3f"},
     }

@@ -12,7 +12,7 @@ from meshmatch.errors import MeshmatchError, ModelError, OptionError
 from meshmatch.geometry.triangles import is_watertight
 from meshmatch.implicit.card import IMPLICIT, is_implicit, read_implicit_card
 from meshmatch.implicit.codes import fit_implicit, nearest_code
-from meshmatch.implicit.model import ImplicitModel, load_implicit
+from meshmatch.implicit.model import ImplicitModel, load_implicit, nearest_on_template
 from meshmatch.models.registry import WEIGHTS
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
@@ -62,6 +62,14 @@ def test_maps_go_through_the_template(model: ImplicitModel, folder: Path) -> Non
     assert np.array_equal(same.index, np.arange(a.V))
     assert same.confidence.min() == 1
     assert np.array_equal(np.sign(b.verts[found.index]), np.sign(a.verts))  # corner to corner
+
+
+def test_normals_tell_the_sides_of_a_board() -> None:
+    """Nearer on the template, but facing the other way."""
+    down, up = np.array([[0, -1.0, 0]]), np.array([[0, 1.0, 0]])
+    source, target = np.array([[0, 0.02, 0]]), np.array([[0, 0.03, 0], [0, 0.0, 0]])
+    assert nearest_on_template(source, target, 0 * up, np.zeros((2, 3))) == [0]
+    assert nearest_on_template(source, target, down, np.concatenate([up, down])) == [1]
 
 
 def test_an_unseen_shape_finds_its_code(model: ImplicitModel, tmp_path: Path) -> None:
