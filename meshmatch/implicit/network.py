@@ -34,7 +34,7 @@ _GAIN = 5.0
 @dataclass(frozen=True)
 class ImplicitConfig:
     """Sizes: of codes, of the template's network, and of the networks that a code makes (``inner``); nodes near surfaces,
-    their radius (the cube's half side is 1), and the frequency that sines begin with.
+    their radius in mean distances to the next node, and the frequency that sines begin with.
     """
 
     field: Deformation = "mls"
@@ -43,7 +43,7 @@ class ImplicitConfig:
     depth: int = 3
     inner: int = 48
     nodes: int = 240
-    radius: float = 0.4
+    reach: float = 1.7
     frequency: float = 15.0
     kernel: Kernel = "smooth"
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError
 from meshmatch.implicit.card import IMPLICIT, ImplicitCard, write_implicit_card
@@ -53,7 +54,8 @@ def build_implicit(samples: ImplicitSamples, config: ImplicitConfig, seed: int) 
     surface = samples.rows[:, : samples.rows.shape[1] // 2, :3].reshape(-1, 3).astype(np.float64)
     some = surface[rng.choice(len(surface), min(20_000, len(surface)), replace=False)]
     near, far = some[farthest_points(some, min(config.nodes, len(some)))], cube_nodes()
-    radii = torch.tensor([config.radius] * len(near) + [CUBE_RADIUS] * len(far))
+    apart = float(cKDTree(near).query(near, 2)[0][:, 1].mean()) if len(near) > 1 else 0.0
+    radii = torch.tensor([min(config.reach * apart, CUBE_RADIUS)] * len(near) + [CUBE_RADIUS] * len(far))
     torch.manual_seed(seed)
     return ImplicitNetwork(config, len(samples.names), torch.from_numpy(np.concatenate([near, far])).float(), radii)
 
