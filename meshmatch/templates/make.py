@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, UInt8, UInts8
 from meshmatch.errors import OptionError, TemplateError
 from meshmatch.geometry.kernels import poorly_supported
 from meshmatch.shapes.decimate import Quality, decimate
@@ -278,20 +278,19 @@ def _geodesic_allowed(shape: Shape, radius: float, candidates: Float[Floats, "N 
     tree, allowed = cKDTree(shape.verts[some]), np.zeros(len(candidates), bool)
     for k, place in enumerate(candidates):  # one by one, for what wide nodes touch is long
         hits = tree.query_ball_point(place, radius)
-        # A few of the vertices tell most candidates apart before all pairs are looked at.
-        allowed[k] = near[np.ix_(hits[:: len(hits) // 8 + 1], hits)].all() and near[np.ix_(hits, hits)].all()
+        allowed[k] = np.unpackbits(np.bitwise_and.reduce(near[hits], axis=0))[hits].all()
     return allowed
 
 
 @lru_cache(maxsize=2)
-def _near_pairs(shape: Shape, share: float) -> tuple[Int[Ints, " S"], Bool[Bools, "S S"]]:
-    """Vertices spread over a shape, and which of them lie within a share of the diameter, along the surface."""
+def _near_pairs(shape: Shape, share: float) -> tuple[Int[Ints, " S"], UInt8[UInts8, "S bytes"]]:
+    """Vertices spread over a shape, and which of them lie within a share of the diameter, along the surface: as bits."""
     graph = edge_graph(shape)
     some = farthest_points(shape.verts, min(shape.V, _MAX_PAIRED))
     far = dijkstra(graph, indices=some[:40])
     limit = share * far[np.isfinite(far)].max()
     blocks = (dijkstra(graph, indices=some[at : at + 200], limit=limit) for at in range(0, len(some), 200))
-    return some, np.concatenate([np.isfinite(block[:, some]) for block in blocks])
+    return some, np.concatenate([np.packbits(np.isfinite(block[:, some]), axis=1) for block in blocks])
 
 
 def edge_graph(shape: Shape) -> coo_matrix:
