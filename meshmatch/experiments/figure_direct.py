@@ -15,15 +15,13 @@ import numpy as np
 import torch
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.experiments.figure_fields import SCALE, Drawn, change, volume
+from meshmatch.experiments.figure_fields import SCALE, Drawn, change, template_frame, volume
 from meshmatch.fields.field import Field, PointField, PointwiseField, pack
 from meshmatch.fields.shape_functions import FieldName, has_nodes, shape_functions
-from meshmatch.geometry.frames import kabsch
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.layers import PointDecoder
 from meshmatch.render.figures import Panel
-from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
@@ -57,9 +55,7 @@ class Direct:
 
 def in_template_frame(template: Template, body: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
     """A body on the template's vertices at area 1, turned so that its core lies on the template's."""
-    frame = sqrt_area_frame(Shape(body, template.shape.faces, "body"))
-    pose = kabsch(template.shape.verts[template.core], frame.apply(body)[template.core])
-    return frame.compose(pose.frame).apply(body)
+    return template_frame(template, body).apply(body)
 
 
 def fitted(

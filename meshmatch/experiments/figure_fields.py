@@ -19,12 +19,14 @@ from meshmatch.experiments.ablation_errors import Measure, begin_body, refined, 
 from meshmatch.experiments.ablation_views import BASE, Run
 from meshmatch.fields.shape_functions import FIELDS, FieldName, has_nodes, shape_functions
 from meshmatch.fitting.system import node_system
+from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.layers import PointDecoder
 from meshmatch.models.trained import TrainedModel
 from meshmatch.render.figures import Panel
 from meshmatch.render.scales import Scale
+from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 
@@ -140,6 +142,13 @@ def pull(template: Template, kernel: Kernel, seed: int) -> Drawn:
     return Drawn(panels, rows)
 
 
+def template_frame(template: Template, body: Float[Floats, "V 3"]) -> Frame:
+    """From a body on the template's vertices to area 1, its core on the template's."""
+    frame = sqrt_area_frame(Shape(body, template.shape.faces, "body"))
+    pose = kabsch(template.shape.verts[template.core], frame.apply(body)[template.core])
+    return frame.compose(pose.frame)
+
+
 def fits(
     models: Mapping[Run, TrainedModel], names: Sequence[str], body: Float[Floats, "V 3"], method: str, measure: Measure
 ) -> Drawn:
@@ -148,8 +157,10 @@ def fits(
     ``method`` is of `meshmatch.experiments.ablation_errors.METHODS`. The change is beside the true body's triangles, the
     error the mean distance of the template's vertices from where they belong; both at 1.9 m2 of skin.
     """
-    faces = next(iter(models.values())).template.shape.faces
-    panels, rows = [Panel(Shape(body, faces, "body"), None, "the body")], []
+    template = next(iter(models.values())).template
+    faces, upright = template.shape.faces, template_frame(template, body)
+    panels = [Panel(Shape(upright.apply(body), faces, "body"), None, "the body", rotation=np.eye(3))]
+    rows = []
     size = np.sqrt(areas(body, faces).sum())
     for name, (run, model) in zip(names, models.items(), strict=True):
         start = begin_body(model, body, measure)
@@ -159,5 +170,6 @@ def fits(
         off = float(np.linalg.norm(verts - body, axis=1).mean() / size * CM_PER_UNIT)
         numbers |= {"volume": volume(verts, faces) / volume(body, faces) - 1, "error_cm": off}
         rows.append({"what": name, **numbers})
-        panels.append(Panel(Shape(verts, faces, name), label=name, face_colors=SCALE.colors(found)))
+        stands, colors = Shape(upright.apply(verts), faces, name), SCALE.colors(found)
+        panels.append(Panel(stands, label=name, face_colors=colors, rotation=np.eye(3)))
     return Drawn(panels, rows)

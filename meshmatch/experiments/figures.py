@@ -6,8 +6,8 @@
 - 7: what the rules for nodes look at, a node that they refuse, and the three stages of choosing.
 
 By default fields are fitted to the body themselves (`meshmatch.experiments.figure_direct`), without a network. With
---output, by runs of the ablations (`meshmatch.experiments.ablations`) with the same choices: they are trained where the
-folder lacks them, so that a stopped command goes on, and the ablations' own folder will do.
+--output, the fits are by runs of the ablations (`meshmatch.experiments.ablations`) with the same choices: they are trained
+where the folder lacks them, so that a stopped command goes on, and the ablations' own folder will do.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def figure_7(nodes: int, radius: float | None, path: Path) -> dict[str, list[dic
 @runner.command
 def main(
     figures: Annotated[str, Option(help=f"of {', '.join(FIGURES)}")] = ",".join(FIGURES),
-    pictures: Annotated[Path, Option(help="folder of paper-figure-N.png")] = Path("docs/images"),
+    pictures: Annotated[Path, Option(help="folder of paper-figure-N.png, or -N-trained.png")] = Path("docs/images"),
     output: Annotated[Path | None, Option(help="folder of trained runs; by default none are used")] = None,
     train_steps: Annotated[int, Option(min=1, help="of training a run")] = 300,
     batch: Annotated[int | None, Option(min=1, help="shapes of a step of training a run")] = None,
@@ -141,14 +141,15 @@ def main(
     notes = []
     body = unseen_bodies(template, 1, seed=seed)[0] if {"4", "5"} & set(wanted) else np.empty((0, 3))
     for name in wanted:
-        path = pictures / f"paper-figure-{name}.png"
+        learned = kept is not None and name != "7"
+        path = pictures / f"paper-figure-{name}{'-trained' if learned else ''}.png"
         if name == "7":
             found |= figure_7(nodes, radius, path)
         else:
             below = drawn_fits(name, body, kept, method, how)
             found[f"fits {name}"] = below.rows
             rows = [(below.panels, replace(_FRONT, legend=SCALE))]
-            if name == "4":
+            if name == "4" and not learned:
                 above = pull(template, "smooth", 0)
                 found["pull"] = above.rows
                 rows = [(above.panels, _FRONT), *rows]

@@ -11,8 +11,10 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from meshmatch.experiments import figure_fields
+from meshmatch.experiments.ablation_errors import Measure
+from meshmatch.experiments.ablation_views import BASE
 from meshmatch.experiments.figure_direct import Direct, direct_fits, fitted, in_template_frame
-from meshmatch.experiments.figure_fields import PULL, change, pull, pulled_by, pulled_nodes, volume
+from meshmatch.experiments.figure_fields import PULL, change, fits, pull, pulled_by, pulled_nodes, volume
 from meshmatch.experiments.figure_nodes import config_of, refusals, refused, worst_candidate
 from meshmatch.experiments.figures import main, stacked
 from meshmatch.maps.evaluate import CM_PER_UNIT
@@ -22,6 +24,7 @@ from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import choose_nodes, edge_graph
 from meshmatch.templates.template import Template, read_template
+from tests.fitting.eggs import egg_model
 
 
 @pytest.fixture(scope="module")
@@ -131,3 +134,15 @@ def test_a_field_is_fitted_without_a_network(template: Template) -> None:
     assert stiff["error_cm"] != free["error_cm"]
     moved = fitted("pointwise", "vol", template, bent, replace(how, steps=2))
     assert moved.shape == bent.shape
+
+
+def test_fits_of_runs_stand_as_the_body_does() -> None:
+    """Every panel is turned as the body is, whatever the file's frame: a fit that nearly lies is not drawn on its head."""
+    model = egg_model()
+    body = 3 * model.template.shape.verts @ np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]]) + 7  # upside down, elsewhere
+    drawn = fits({BASE: model}, ["egg"], body, "none", Measure(samples=300))
+    first, second = drawn.panels
+    assert first.shape.verts == pytest.approx(model.template.shape.verts, abs=1e-6)
+    assert np.array_equal(first.rotation, np.eye(3)) and np.array_equal(second.rotation, np.eye(3))
+    assert np.linalg.norm(second.shape.verts - first.shape.verts, axis=1).mean() < 0.5
+    assert drawn.rows[0]["error_cm"] > 0
