@@ -136,16 +136,18 @@ def _draw_bars(view: View, known: Known, sets: Sequence[str], path: Path) -> boo
 
 
 def _draw_lines(view: View, known: Known, sets: Sequence[str], path: Path) -> bool:
-    """A line for the held-out bodies and each set."""
+    """A line of each method for the held-out bodies and each set."""
     lines = {}
     for where in (HELD_OUT, *sets):
-        there = [(float(row.words[0]), known.error(row.run, where)) for row in view.rows]
-        there = [(at, errors) for at, errors in there if errors]
-        if there:
-            off = [stdev(errors) if len(errors) > 1 else 0.0 for _, errors in there]
-            lines[where] = Line([at for at, _ in there], [fmean(errors) for _, errors in there], off)
+        for method in dict.fromkeys(row.words[-1] for row in view.rows):
+            there = [(float(row.words[0]), known.error(row.run, where)) for row in view.rows if row.words[-1] == method]
+            there = [(at, errors) for at, errors in there if errors]
+            if there:
+                off = [stdev(errors) if len(errors) > 1 else 0.0 for _, errors in there]
+                points = [at for at, _ in there], [fmean(errors) for _, errors in there]
+                lines[f"{method}, {where}"] = Line(*points, off)
     if lines:
-        ticks = [float(row.words[0]) for row in view.rows]
+        ticks = sorted({float(row.words[0]) for row in view.rows})
         draw_lines([Chart(view.heads[0], lines, ticks, True)], path, _AXIS)
     return bool(lines)
 

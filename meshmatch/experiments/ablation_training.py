@@ -18,7 +18,7 @@ import torch
 from meshmatch.arrays import Float
 from meshmatch.experiments.ablation_setting import Pool, Setting, pool_of
 from meshmatch.experiments.ablation_views import Run
-from meshmatch.fields.field import Field
+from meshmatch.fields.field import Field, PointField, PointwiseField
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.layers import BasisEncoder
@@ -114,12 +114,15 @@ def new_network(run: Run, setting: Setting, pool: Pool) -> Deformer:
 
 
 def fewer(points: LossPoints, supervised: int) -> LossPoints:
-    """The first loss points alone, of a linear field; regularised where all would be."""
+    """The first loss points alone; regularised where all would be."""
     if supervised >= len(points.positions):
         return points
-    field = points.field
-    assert isinstance(field, Field)
-    return LossPoints(points.positions[:supervised], Field(field.phi[:supervised], field.gradient))
+    field: PointField = points.field
+    if isinstance(field, PointwiseField):
+        field = replace(field, points=field.points[:supervised])
+    else:
+        field = Field(field.phi[:supervised], field.gradient)
+    return LossPoints(points.positions[:supervised], field)
 
 
 def is_trained(folder: Path, found: dict[str, Any]) -> bool:

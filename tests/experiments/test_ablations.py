@@ -72,7 +72,18 @@ def test_a_run_is_tables_figures_and_a_line_and_goes_on(
     output = tmp_path / "out"
     words = ["--output", str(output), "--folder", str(places / "prepared"), "--model", str(places / "egg")]
     words += ["--data", str(places / "bench"), "--cache", str(tmp_path / "cache"), "--sets", "scape,faust"]
-    words += ["--minutes", "0.0005", "--code-steps", "2", "--shapes", "2", "--views", "figure10"]
+    words += [
+        "--minutes",
+        "0.0005",
+        "--code-steps",
+        "2",
+        "--shapes",
+        "2",
+        "--views",
+        "figure10",
+        "--without",
+        "pointwise",
+    ]
     assert main([*words, "--show"]) == 0
     out, record = line(capsys)
     assert "Not measured: base, supervised-50, supervised-100" in out
