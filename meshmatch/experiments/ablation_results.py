@@ -38,7 +38,7 @@ def errors_table(view: View, known: Known, sets: Sequence[str], budget: str) -> 
         columns |= {name: f"{name}:>", f"{name} median": f"{name} median:>"}
         if name in PAPER_SETS and any(row.paper for row in view.rows):
             columns[f"{name} paper"] = f"{name} paper:.1f"
-        if view.nodes:
+        if view.nodes and any(known.error(row.run, name, "nodes") for row in view.rows):
             columns[f"{name} nodes"] = f"{name} nodes:>"
     rows = []
     for each in view.rows:

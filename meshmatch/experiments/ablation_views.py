@@ -189,6 +189,8 @@ CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
         "with vol+arap+Z: mls < rbf < pointwise",
         tuple(replace(BASE, field=each) for each in ("mls", "rbf", "pointwise")),
     ),
+    ("of it: mls < pointwise", (BASE, replace(BASE, field="pointwise"))),
+    ("without constraints: pointwise < mls", (CODED, replace(BASE, constraint="none"))),
     ("mls: vol+arap+Z < vol+arap < none", tuple(replace(BASE, constraint=each) for each in reversed(TABLE4))),
     ("mls: both regularisers < none", (replace(BASE, constraint="vol+arap"), replace(BASE, constraint="none"))),
     (
@@ -196,6 +198,7 @@ CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
         tuple(replace(BASE, field="pointwise", constraint=each) for each in TABLE4[1:]),
     ),
     ("nodes by parts < uniform nodes (T)", (BASE, replace(BASE, strategy="uniform"))),
+    ("nodes by parts < uniform nodes (A)", (replace(BASE, pose="A"), replace(BASE, strategy="uniform", pose="A"))),
     ("template pose T < I", (BASE, replace(BASE, pose="I"))),
     (
         "more shapes are better: 2000 < 1000 < 500 < 250",
