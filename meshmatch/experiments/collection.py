@@ -49,14 +49,15 @@ class CollectionConfig:
     radius: float = 0.085
     faces: int = 10_000  # of a template
     samples: int = 16_000  # of a shape
-    steps: int = 12
+    steps: int = 24
     strain_first: float = 1e-3
-    strain_last: float = 1e-5
+    strain_last: float = 1e-6
     scale_first: float = 0.1  # of the robust weight
     scale_last: float = 0.02
-    point_share: float = 0.1
+    point_share: float = 0.01
+    pair_normals: float = 0.012  # of normals in the search for pairs
     back_points: int = 8000
-    near: int = 12  # strain points, itself included, whose gradients are averaged
+    near: int = 5  # strain points, itself included, whose gradients are averaged
     damping: float = 1e-6
     seed: int = 0
 
@@ -96,7 +97,9 @@ def fit(system: NodeSystem, samples: OrientedPoints, config: CollectionConfig) -
     rows = np.repeat(np.arange(len(places)), config.near)
     mean = csr_matrix((np.full(near.size, 1 / config.near), (rows, near.reshape(-1))), (len(places),) * 2)
     vectors = np.zeros((system.K, 3))
-    pairing = NodeRefineConfig(point_share=config.point_share, back_points=config.back_points)
+    pairing = NodeRefineConfig(
+        point_share=config.point_share, pair_normals=config.pair_normals, back_points=config.back_points
+    )
     for step in range(config.steps):
         t = step / max(config.steps - 1, 1)
         strain = geometric_between(config.strain_first, config.strain_last, t)

@@ -19,9 +19,9 @@ from scipy.linalg import solveh_banded
 from scipy.spatial import cKDTree
 
 from meshmatch.experiments import runner
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_config import FitConfig, NodeRefineConfig
 from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.geometry.oriented import PAIR_WEIGHT, with_normals
+from meshmatch.geometry.oriented import with_normals
 from meshmatch.models.inference import NodeNetwork
 from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel
@@ -95,7 +95,8 @@ def pair_search(model: TrainedModel, system: NodeSystem) -> Kernel:
     rng = np.random.default_rng(0)
     samples = sample_surface(model.template.shape, config.samples, rng)
     surface = system.surface(0.02 * rng.standard_normal((system.K, 3)))
-    here, there = (with_normals(each.points, each.normals, PAIR_WEIGHT) for each in (surface, samples))
+    weight = NodeRefineConfig().pair_normals
+    here, there = (with_normals(each.points, each.normals, weight) for each in (surface, samples))
     some, tree = there[:: len(there) // config.nodes.back_points], cKDTree(there)
     D, V, S, B = here.shape[1], len(here), len(there), len(some)
 

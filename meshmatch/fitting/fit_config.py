@@ -38,6 +38,9 @@ class NodeRefineConfig:
     scale_first: float = 0.1  # the same of the scale of the robust weight
     scale_last: float = 0.03
     point_share: float = 0.3  # how much a pair pulls along the surface, against 1 across it
+    # How far a normal that points the other way (2 units) pushes a neighbour away: little, for sheets are apart by then, and
+    # a normal that bends a little more must not drag its point along the surface.
+    pair_normals: float = 0.06
     normal_cosine: float = 0.2  # pairs whose normals differ more do not count
     back_points: int = 4000  # about how many samples look for their template vertex
     damping: float = 1e-4  # weight of the present node vectors, for those that nothing else holds

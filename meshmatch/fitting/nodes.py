@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.fit_config import NodeRefineConfig
 from meshmatch.fitting.system import NodeSystem
-from meshmatch.geometry.oriented import PAIR_WEIGHT, OrientedPoints, feature_tree, with_normals
+from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_normals
 from meshmatch.geometry.triangles import vertex_areas
 
 _NEWTON_STEPS = 20  # at most: five are the rule, and convergence is quadratic
@@ -122,8 +122,8 @@ def _nearest_pairs(
 ) -> Terms:
     """Pairs of what is nearest and faces the same way, in both directions, each with half of the weight."""
     moved, normals = surface.points, surface.normals
-    features = with_normals(moved, normals, PAIR_WEIGHT)
-    to_samples = samples.pair_tree.query(features)[1]
+    features = with_normals(moved, normals, config.pair_normals)
+    to_samples = samples.pair_tree(config.pair_normals).query(features)[1]
     partner, partner_normal = samples.points.take(to_samples, 0), samples.normals.take(to_samples, 0)
     area = vertex_areas(moved, system.faces)
     forward = area / area.sum() * robust_weight(moved - partner, scale)
@@ -132,7 +132,7 @@ def _nearest_pairs(
         forward *= np.linalg.norm(moved - partner, axis=1) < 3 * scale
 
     some = samples.thinned(config.back_points)
-    to_template = feature_tree(features).query(with_normals(some.points, some.normals, PAIR_WEIGHT))[1]
+    to_template = feature_tree(features).query(with_normals(some.points, some.normals, config.pair_normals))[1]
     back = robust_weight(moved.take(to_template, 0) - some.points, scale) / len(some.points)
     back *= _row_sums(normals.take(to_template, 0) * some.normals) > config.normal_cosine
     if samples.weights is not None and some.weights is not None:

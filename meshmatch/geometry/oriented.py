@@ -14,9 +14,6 @@ from meshmatch.geometry.frames import Frame, RigidPose
 
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area). Set by hand.
 NORMAL_WEIGHT = 0.15
-# The same where points are paired for refinement: sheets are apart by then, and a normal that bends a little more must
-# not drag its point along the surface.
-PAIR_WEIGHT = 0.06
 # Points that far from a reference learn nothing from it about their normals.
 _REACH = 0.5
 _GROUPS = 16  # of points whose nearest neighbours are about equally far
@@ -44,9 +41,14 @@ class OrientedPoints:
         return feature_tree(self.features)
 
     @cached_property
-    def pair_tree(self) -> cKDTree:
-        """The same, normals counting less (`PAIR_WEIGHT`)."""
-        return feature_tree(with_normals(self.points, self.normals, PAIR_WEIGHT))
+    def _trees(self) -> dict[float, cKDTree]:
+        return {}
+
+    def pair_tree(self, weight: float) -> cKDTree:
+        """The same, normals counting so much; built once for a weight."""
+        if weight not in self._trees:
+            self._trees[weight] = feature_tree(with_normals(self.points, self.normals, weight))
+        return self._trees[weight]
 
     def to_local(self, pose: RigidPose) -> OrientedPoints:
         """The same samples in the local coordinates of a pose."""

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.fitting.network_fit import two_way_residual
 from meshmatch.fitting.nodes import NodeRefineConfig, nearest_rotations, pair_terms, refine_nodes, robust_weight
 from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.geometry.oriented import PAIR_WEIGHT, OrientedPoints, with_normals
+from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
@@ -72,15 +72,16 @@ def test_nearest_rotations_are_those_of_singular_values() -> None:
     assert np.allclose(found @ found.transpose(0, 2, 1), np.eye(3)) and np.allclose(np.linalg.det(found), 1)
 
 
-def test_pairs_are_those_of_a_plain_loop(system: NodeSystem) -> None:
+@pytest.mark.parametrize("weight", [CONFIG.pair_normals, 1.5])
+def test_pairs_are_those_of_a_plain_loop(system: NodeSystem, weight: float) -> None:
     scan = scan_of(Shape(1.1 * system.verts + 0.02, system.faces), 60)
-    config = replace(CONFIG, back_points=20)
+    config = replace(CONFIG, back_points=20, pair_normals=weight)
     vectors = np.zeros((system.K, 3))
     weights, pulls = pair_terms(system, scan, vectors, 0.08, config)
 
     normals = system.normals(system.verts)
-    seen = with_normals(system.verts, normals, PAIR_WEIGHT)
-    there = with_normals(scan.points, scan.normals, PAIR_WEIGHT)
+    seen = with_normals(system.verts, normals, weight)
+    there = with_normals(scan.points, scan.normals, weight)
     area = vertex_areas(system.verts, system.faces)
     pairs = []
     for v in range(len(seen)):
@@ -90,12 +91,12 @@ def test_pairs_are_those_of_a_plain_loop(system: NodeSystem) -> None:
         v = int(np.square(seen - there[p]).sum(1).argmin())
         pairs.append((v, p, 1 / 20))
     H, s = np.zeros((len(seen), 3, 3)), np.zeros((len(seen), 3))
-    for v, p, weight in pairs:
+    for v, p, share in pairs:
         n, point = scan.normals[p], scan.points[p]
         if normals[v] @ n > config.normal_cosine:
             offset = system.verts[v] - point
-            weight *= 0.5 / (1 + offset @ offset / 0.08**2) ** 2
-            term = weight * (np.outer(n, n) + config.point_share * np.eye(3))
+            share *= 0.5 / (1 + offset @ offset / 0.08**2) ** 2
+            term = share * (np.outer(n, n) + config.point_share * np.eye(3))
             H[v] += term
             s[v] += term @ point
     assert np.allclose(weights, H.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
