@@ -42,6 +42,17 @@ def mean_overlap(found: Int[Ints, " V"], truth: Int[Ints, " V"], area: Float[Flo
     return float(np.mean(shares))
 
 
+def category_overlap(found: Int[Ints, " V"], truth: Int[Ints, " V"], parts: int) -> float:
+    """Intersection over union of labels with true ones; the mean over all ``parts`` of a category, as ShapeNet's protocol
+    counts: a part that is neither true nor found counts 1, one that is found and not true 0."""
+    shares = []
+    for part in range(parts):
+        ours, theirs = found == part, truth == part
+        either = (ours | theirs).sum()
+        shares.append((ours & theirs).sum() / either if either else 1.0)
+    return float(np.mean(shares))
+
+
 def table_legs(shape: Shape, keypoints: Int[Ints, " N"]) -> Int[Ints, " V"]:
     """Which leg of a table a vertex belongs to, from 0, and -1 elsewhere: pieces of what lies below the top."""
     top, foot = (shape.verts[keypoints[list(rows)]].mean(0) for rows in (_TOPS, _FEET))

@@ -107,6 +107,14 @@ def test_overlap_of_parts_by_hand() -> None:
     assert (parts[ball.verts[:, 2] > 0.01] == 1).all()
 
 
+def test_overlap_of_all_parts_of_a_category_by_hand() -> None:
+    """ShapeNet's: 1 for what is neither there nor found, 0 for what is found and not there."""
+    truth, found = np.array([0, 0, 1, 1]), np.array([0, 1, 1, 1])
+    assert keypoint_parts.category_overlap(found, truth, 2) == pytest.approx((1 / 2 + 2 / 3) / 2)
+    assert keypoint_parts.category_overlap(found, truth, 3) == pytest.approx((1 / 2 + 2 / 3 + 1) / 3)
+    assert keypoint_parts.category_overlap(np.array([0, 2, 1, 1]), truth, 3) == pytest.approx((1 / 2 + 1 + 0) / 3)
+
+
 def legged(count: int) -> tuple[Shape, np.ndarray]:
     """A plate of vertices at height 0 with strips of 22 vertices down to -1; its keypoints as a table's."""
     parts = [np.array([[x, y, 0.0] for x in range(4) for y in range(4)])]
