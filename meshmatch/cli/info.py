@@ -32,7 +32,7 @@ def info(
         return
     rows = []
     for key, value in record.items():
-        values = value if key in ("repair", "reasons") else [value]  # a line each
+        values = value if key in ("repair", "reasons", "meshes") else [value]  # a line each
         shown = [_shown(item) for item in values] or ["nothing to do" if key == "repair" else "none"]
         rows += [(key.replace("_", " ") if n == 0 else "", text) for n, text in enumerate(shown)]
     print_rows(rows)
@@ -50,7 +50,7 @@ def _is_list(file: Path) -> bool:
 
 def _shape(file: Path) -> Json:
     from meshmatch.geometry.triangles import face_parts
-    from meshmatch.shapes.files import load_shape
+    from meshmatch.shapes.files import load_shape, mesh_names
     from meshmatch.shapes.normalise import guess_unit, long_axis
     from meshmatch.shapes.repair import repair
 
@@ -64,6 +64,8 @@ def _shape(file: Path) -> Json:
         # of the repaired mesh: the seams of texture and the corners of an stl are joined
         parts = {"parts": int(face_parts(clean.shape.faces, clean.shape.V).max()) + 1}
     about: Json = {"kind": "point cloud" if shape.is_cloud else "mesh", "vertices": shape.V, "faces": shape.F}
+    if names := mesh_names(file):
+        about["meshes"] = [f"{name} ({count:,} vertices)" for name, count in names.items()]
     about |= {"size": size, "area": shape.area, "colors": shape.colors is not None}
     usual = {"longest_along": long_axis(clean.shape), "unit_if_a_person": guess_unit(clean.shape)}
     repaired = {"repaired_vertices": clean.shape.V, "repaired_faces": clean.shape.F}

@@ -56,7 +56,7 @@ def match(
     # What cannot be written, a mistyped model and broken files are told before the long work.
     with replace_on_success(output) as temporary:
         check_model(how.model)
-        shapes = meshmatch.load_shape(source), meshmatch.load_shape(target)
+        shapes = how.load(source), how.load(target)
         result = how.match(*shapes, run, console)
         found = result.map
         words.refuse_poor(run.strict, found.verdict, found.reasons)
@@ -142,7 +142,7 @@ def register(
     console = Console(run.quiet)
     with replace_on_success(output) as temporary:
         check_model(how.model)
-        loaded = meshmatch.load_shape(shape)
+        loaded = how.load(shape)
         matcher = meshmatch.Matcher(how.model, how.configs()[0], run.threads)
         with console.progress() as matcher.progress:
             fit = matcher.fit(loaded)

@@ -155,6 +155,17 @@ class FitOptions:
         help="Model: a name (see `meshmatch models list`), a model folder, or auto: of the installed ones, that of the "
         "shape's kind.",
     )
+    only: list[str] | None = Option(
+        None,
+        metavar="NAME",
+        help="Of a glb or gltf file, fit only the meshes of this name, which may hold * and ?; more than once. See "
+        "`meshmatch info FILE` for the names.",
+    )
+    without: list[str] | None = Option(
+        None,
+        metavar="NAME",
+        help="Or all meshes but these: weapons, capes. Their vertices are matched like the nearest.",
+    )
     refine: Refine = Option(
         "nodes",
         help="Refinement of the fit. nodes: Gauss-Newton on the nodes; latent: search over the network's codes; "
@@ -182,6 +193,10 @@ class FitOptions:
     def axes(self) -> tuple[tuple[Axis | None, Axis | None], ...]:
         """Up and front of all shapes, or of each."""
         return ((self.up, self.front),)
+
+    def load(self, path: Path) -> meshmatch.Shape:
+        """A shape; of a scene that has meshes of the chosen names, with weight on these alone."""
+        return meshmatch.load_shape(path, only=self.only or (), without=self.without or ())
 
     def check(self) -> None:
         """Refuse up and front along one axis (`OptionError`), before anything is loaded."""
@@ -237,7 +252,7 @@ class PairOptions(FitOptions):
     @property
     def given(self) -> list[str]:
         """The options that only matching can obey, as far as they were given."""
-        names = ["up", "front", "source_up", "source_front", "target_up", "target_front", "partial"]
+        names = ["up", "front", "source_up", "source_front", "target_up", "target_front", "partial", "only", "without"]
         found = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is not None]
         return [*found, *(["--landmarks"] if self.known_pairs is not None else [])]
 

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import as_path, plain_text, replace_on_success
 from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, plain, ply
@@ -37,14 +40,19 @@ SUFFIXES = tuple(_FORMATS)
 _HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
 
 
-def load_shape(path: str | Path) -> Shape:
+def load_shape(path: str | Path, *, only: Sequence[str] = (), without: Sequence[str] = ()) -> Shape:
     """Read a mesh or a point cloud as it is: all vertices, in file order, in the file's frame and unit.
 
     A vertex whose position is not a number is kept in its place and marked in `Shape.invalid`; its `verts` row is then
     the centroid of the others. The scene of a glb or gltf is one shape: its meshes one after the other, each where the
     scene puts it. An stl has no shared vertices: every corner of every triangle is a vertex, 3 F of them.
 
-    `InputError`: the file is missing, empty, cut short, of an unknown kind, or holds no usable vertex.
+    Of a scene's meshes ``only`` those of these names, or all ``without`` those, are to be trusted: the vertices of the
+    others have weight 0, so that no fit looks at them, and keep their places. A name is that of a mesh or its node, and may
+    hold ``*`` and ``?``; upper and lower case count the same.
+
+    `InputError`: the file is missing, empty, cut short, of an unknown kind, or holds no usable vertex; or no mesh of it has
+    a name that is given.
     """
     path = existing(as_path(path), suffixes=SUFFIXES)
     suffix = path.suffix.lower()
@@ -54,7 +62,45 @@ def load_shape(path: str | Path) -> Shape:
     data = read_bytes(path)
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
         raw = _FORMATS[suffix][0](path, data)
-    return Shape.with_invalid(raw.verts, raw.faces, plain_text(path.name), raw.colors)
+    shape = Shape.with_invalid(raw.verts, raw.faces, plain_text(path.name), raw.colors)
+    if not only and not without:
+        return shape
+    return replace(shape, weights=_chosen(shape.name, raw, only, without))
+
+
+def mesh_names(path: str | Path) -> dict[str, int]:
+    """Names of a scene's meshes, as ``only`` and ``without`` of `load_shape` know them, and how many vertices each has; none
+    for formats without names. Errors are those of `load_shape`.
+    """
+    path = existing(as_path(path), suffixes=SUFFIXES)
+    if path.suffix.lower() not in (".glb", ".gltf"):
+        return {}
+    found: dict[str, int] = {}
+    for names, count in gltf.read(path, read_bytes(path)).meshes:
+        label = names[0] if names else "(no name)"
+        found[label] = found.get(label, 0) + count
+    return found
+
+
+def _chosen(name: str, raw: Raw, only: Sequence[str], without: Sequence[str]) -> Float[Floats, " V"]:
+    """1 for the vertices of the meshes that are to be trusted, 0 for all others."""
+    if not raw.meshes:
+        raise InputError(f"{name} names no meshes to choose from", "meshes of .glb and .gltf files have names")
+
+    def has(names: tuple[str, ...], pattern: str) -> bool:
+        return any(fnmatchcase(each.lower(), pattern.lower()) for each in names)
+
+    for pattern in (*only, *without):
+        if not any(has(names, pattern) for names, _ in raw.meshes):
+            known = ", ".join(dict.fromkeys(names[0] for names, _ in raw.meshes if names))
+            raise InputError(f"no mesh of {name} is called {pattern[:80]!r}", f"there are: {known[:200] or 'none'}")
+    kept = [
+        (not only or any(has(names, each) for each in only)) and not any(has(names, each) for each in without)
+        for names, _ in raw.meshes
+    ]
+    if not any(kept):
+        raise InputError(f"no mesh of {name} is left", "choose fewer meshes to leave out")
+    return np.repeat(np.array(kept, float), [count for _, count in raw.meshes])
 
 
 def check_suffix(path: Path) -> str:

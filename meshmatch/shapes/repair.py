@@ -18,6 +18,8 @@ from meshmatch.shapes.cloud import outlier_points
 from meshmatch.shapes.faces import duplicate_faces, find_parts, flat_faces, seams, turn_faces
 from meshmatch.shapes.shape import Shape
 
+_NOT_TRUSTED = "of weight 0 left out"
+
 
 @dataclass(frozen=True, eq=False)
 class Repaired:
@@ -52,14 +54,14 @@ class Repaired:
 def repair(shape: Shape) -> Repaired:
     """Drop what is broken, merge what is double, and say so.
 
-    In this order: vertices without a position and the faces that touch them; vertices at exactly the same position are
-    merged if they lie on an open edge (texture seams of obj and glTF files, every corner of an stl; two layers that
-    merely touch stay apart); faces without area; faces that occur twice (both of them, where they are a flap of no
-    volume on a closed surface); outlier parts (see `meshmatch.shapes.faces.OUTLIER_SHARE`; unless together they are
-    more than a tenth of the surface: then the shape is made of small parts, and only those far from the rest are
-    outliers); vertices that no face uses. Then faces are turned so that neighbours agree and the shape is not inside
-    out. Open and non-manifold edges are counted, not mended. Of a cloud: points without a position, double ones, and
-    outliers far from all others.
+    In this order: vertices without a position and the faces that touch them; faces, or points, of weight 0; vertices
+    at exactly the same position are merged if they lie on an open edge (texture seams of obj and glTF files, every
+    corner of an stl; two layers that merely touch stay apart); faces without area; faces that occur twice (both of
+    them, where they are a flap of no volume on a closed surface); outlier parts (see
+    `meshmatch.shapes.faces.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the shape
+    is made of small parts, and only those far from the rest are outliers); vertices that no face uses. Then faces are
+    turned so that neighbours agree and the shape is not inside out. Open and non-manifold edges are counted, not
+    mended. Of a cloud: points without a position, double ones, and outliers far from all others.
 
     `InputError` if nothing is left: no face of a mesh has any area.
     """
@@ -75,6 +77,9 @@ def _repair_cloud(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     twin = np.where(valid, same_rows(shape.verts), np.arange(shape.V))
     kept = valid & (twin == np.arange(shape.V))
     _note(notes, int(valid.sum() - kept.sum()), "point", "merged with another at the same position")
+    if shape.weights is not None:
+        _note(notes, int((kept & (shape.weights == 0)).sum()), "point", _NOT_TRUSTED)
+        kept &= shape.weights > 0
     chosen = np.flatnonzero(kept)
     outlier = outlier_points(shape.verts[chosen])
     _note(notes, int(outlier.sum()), "outlier point", "far from all others dropped")
@@ -85,6 +90,10 @@ def _repair_cloud(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
 def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     bad = np.asarray((~valid)[shape.faces].any(axis=1))
     _note(notes, int(bad.sum()), "face", "at such vertices dropped")
+    if shape.weights is not None:
+        ignored = ~bad & ~(shape.weights > 0)[shape.faces].any(axis=1)
+        _note(notes, int(ignored.sum()), "face", _NOT_TRUSTED)
+        bad |= ignored
     faces, cross, which = _without(bad, shape.faces, shape.face_vectors, np.arange(shape.F))
     twin = np.where(valid, seams(shape.verts, faces), np.arange(shape.V))
     doubles = int((twin != np.arange(shape.V)).sum())

@@ -40,6 +40,7 @@ class Raw:
     verts: Float[Floats, "V 3"]
     faces: Int[Ints, "F 3"]
     colors: Float[Floats, "V 4"] | None = None
+    meshes: tuple[tuple[tuple[str, ...], int], ...] = ()  # of a scene, in order: names (of node and mesh), vertices
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
+from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, damaged
 from meshmatch.shapes.input_files import beside, read_bytes
@@ -89,6 +90,7 @@ class Document:
         verts: list[Floats] = []
         faces: list[Ints] = [NO_FACES]
         colors: list[Floats | None] = []
+        meshes: list[tuple[tuple[str, ...], int]] = []
         total = seen = 0
         for node, primitive in self.primitives():
             total += self.count(primitive["attributes"]["POSITION"])
@@ -103,13 +105,20 @@ class Document:
             faces.append(triangles + seen)
             verts.append(own)
             colors.append(self.colors(primitive))
+            meshes.append((self._names(node), len(own)))
             seen += len(own)
         if not verts:
             raise InputError(f"{self.name} holds no triangles and no points", "is there a mesh in its scene?")
         painted = joined_colors(colors, [len(own) for own in verts])
         if painted is not None:
             painted[:, :3] = to_srgb(painted[:, :3])
-        return Raw(np.vstack(verts), np.vstack(faces), painted)
+        return Raw(np.vstack(verts), np.vstack(faces), painted, tuple(meshes))
+
+    def _names(self, number: int) -> tuple[str, ...]:
+        """What a node and its mesh are called."""
+        node = self.nodes[number]
+        found = node.get("name"), self.json["meshes"][node["mesh"]].get("name")
+        return tuple(dict.fromkeys(plain_text(name) for name in found if isinstance(name, str) and name))
 
     def primitives(self) -> Iterator[tuple[int, dict[str, Any]]]:
         """Node and primitive of all that is drawn but lines, in the order of `scene`."""
