@@ -33,9 +33,11 @@ def kind_samples(shape: Shape, seed: int = 0) -> OrientedPoints:
 def read_kind(model: TrainedModel, shape: Shape, samples: OrientedPoints, config: FitConfig) -> float:
     """Mean distance both ways, normals included, of a shape and the model's unrefined template (units of sqrt(area)).
 
-    ``samples`` are `kind_samples` of the shape; the axes and the seed of ``config`` count.
+    ``samples`` are `kind_samples` of the shape; of ``config`` the seed and the device count. A shape is of its kind whatever
+    axes its user names, so all orientations are tried.
     """
-    config, rng = replace(config, copies=16, hypotheses=3), np.random.default_rng(config.seed)
+    config = replace(config, up=None, front=None, copies=16, hypotheses=3)
+    rng = np.random.default_rng(config.seed)
     placed = samples.in_frame(scan_frame(model, without_outliers(shape)))
     thin, predictor = placed.first(_THIN), Predictor.of(model, rng, config.device)
     starts = [(thin, pose) for pose in frames_to_try(model, thin, config)]

@@ -107,6 +107,6 @@ def test_shapes_that_cannot_be_fitted(cube: Shape, dancer: Shape) -> None:
 
 
 def test_what_is_no_body_is_called_poor(torus: Shape) -> None:
-    fit = register(torus, config=FitConfig(variants=0, finalists=1, careful=1))
+    fit = register(torus, model="human", config=FitConfig(variants=0, finalists=1, careful=1))
     assert fit.verdict == "poor"
     assert fit.reasons
