@@ -47,7 +47,7 @@ def transfer_color(
     transfer = Transfer(source, target, output, maps, run, picture)
     (vertex_files.check_color_suffix if values is None else vertex_files.check_values_suffix)(output)
     with transfer.outputs(values) as (temporary,):
-        a, b = maps.load(source), maps.load(target)
+        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
         given = None if values is None else vertex_files.load_values(values, a)
         here = vertex_files.light_of(a) if given is None else given.numbers
         columns = 1 if here.ndim == 1 else here.shape[1]
@@ -105,7 +105,7 @@ def transfer_labels(
     rule = rules.rule(rules.blank)
     check_labels_suffix(output)
     with transfer.outputs(labels) as (temporary,):
-        a, b = maps.load(source), maps.load(target)
+        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
         given = load_labels(labels, a, on)
         result = meshmatch.transfer_labels(a, b, given, transfer, to=to, rule=rule)
         found = result.data
@@ -152,7 +152,7 @@ def transfer_weights(
     rule = meshmatch.ConfidenceRule(min_confidence, fill)
     check_weights_suffix(output)
     with transfer.outputs(weights) as (temporary,):
-        a, b = maps.load(source), maps.load(target)
+        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
         if weights is None and source.suffix.lower() not in (".glb", ".gltf"):
             raise InputError(f"{a.name} has no skin weights", "give them in a file: --weights weights.npz")
         given = load_weights(weights or source, a)
@@ -205,7 +205,7 @@ def transfer_landmarks(
     console = transfer.console
     check_landmarks_suffix(output)
     with transfer.outputs(landmarks) as (temporary,):
-        a, b = maps.load(source), maps.load(target)
+        a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
         given, furthest = load_landmarks(landmarks, a)
         if furthest > _FAR * a.diagonal:
             console.warn(

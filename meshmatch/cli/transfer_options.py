@@ -90,6 +90,8 @@ class Transfer:
         """The maps, from the file or by matching; judged if --strict was given."""
 
         def matched(a: meshmatch.Shape, b: meshmatch.Shape) -> meshmatch.MatchResult:
+            if self.options.only or self.options.without:  # a fit's weights, no attribute to carry
+                a, b = self.options.load(self.source), self.options.load(self.target)
             return self.options.match(a, b, self.run, self.console)
 
         maps = meshmatch.find_maps(source, target, self.options.map or matched)

@@ -66,7 +66,7 @@ def transfer_texture(
         size, texture.samples, texture.padding, rules.min_confidence, rules.fill, blank, run.threads
     )
     textured_files.check_textured(output, _COLORS)
-    a, b = maps.load(source), maps.load(target)
+    a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
     painted = b.is_cloud or output.suffix.lower() in _COLORS
     if painted and uv == "keep":
         hint = "leave out --uv keep" if b.is_cloud else "end the output in .glb or .obj for a texture"

@@ -1,7 +1,6 @@
 """Of what kind a shape is, read coarsely: how near a model's network alone brings its template to the shape.
 
-A reading costs a tenth of a fit. It takes the shape for complete: of a part, and of a sparse or noisy cloud, a high one says
-little.
+A reading takes the shape for complete: of a part, and of a sparse or noisy cloud, a high one says little.
 """
 
 from __future__ import annotations

@@ -15,16 +15,9 @@ from meshmatch.implicit.training import train_implicit
 from meshmatch.models.registry import WEIGHTS
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.training.loop import StepReport
-from tests.implicit.boxes import TRAIN, box, boxes, config
+from tests.implicit.boxes import TRAIN, box, config
 
 BOTH = pytest.mark.parametrize("deformation", ["mls", "pointwise"])
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("boxes")
-    boxes(made)
-    return made
 
 
 @pytest.fixture(scope="module")

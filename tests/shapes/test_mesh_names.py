@@ -105,3 +105,9 @@ def test_the_command_line_hands_the_names_on(knight: Path, tmp_path: Path, capsy
     ]
     assert main(words) == 1
     assert "--without is for matching" in capsys.readouterr().err
+
+
+def test_the_viewer_chooses_meshes_too(knight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "page.html"
+    assert main(["view", str(knight), str(knight), "--only", "lance", "-o", str(page)]) == 1
+    assert "called 'lance'" in capsys.readouterr().err and not page.exists()
