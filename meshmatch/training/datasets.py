@@ -6,7 +6,6 @@ are smoothly deformed, a little turned, scaled and roughened.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -17,6 +16,7 @@ from torch import Tensor
 from meshmatch.arrays import Float, Floats, Int
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
+from meshmatch.generators.generator import Source
 from meshmatch.models.layers import BasisEncoder, PointEncoder
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.training import scans
@@ -28,9 +28,6 @@ _PLAIN = 0.25  # of the shapes are not deformed; this and `DEFORM` are set by ha
 _SIDE = 4  # nodes of the lattice along each axis; this and the reach are set by hand
 _REACH = 1.9  # of a lattice node, in spacings
 _MAX_POINTS = 400_000  # for which a lattice is kept ready; with more shapes there is no need to deform them
-
-# Draws shapes with the template's connectivity: (count, generator) -> vertices (count, V, 3), any unit.
-Source = Callable[[int, torch.Generator], Float[Tensor, "N V 3"]]
 
 
 def registered_source(shapes: Float[Tensor, "N V 3"]) -> Source:

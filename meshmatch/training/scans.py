@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from meshmatch.arrays import Float, Int
-from meshmatch.training.rotations import DEGREE, rotation_from_vector
+from meshmatch.generators.rotations import DEGREE, rotation_from_vector
 
 
 @dataclass(frozen=True)

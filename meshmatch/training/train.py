@@ -20,6 +20,8 @@ from meshmatch.arrays import Float, Int, Ints
 from meshmatch.errors import InputError, OptionError, TemplateError
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
+from meshmatch.generators.bodies import Bodies, human_source
+from meshmatch.generators.generator import Source
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.card import ModelCard, check_name, write_card
 from meshmatch.models.checkpoint import save_weights
@@ -32,15 +34,7 @@ from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.prepared_folder import ShapeSamples, frame_of, read_registered, read_samples
 from meshmatch.templates.template import Template, read_template, save_template, template_radius
-from meshmatch.training.bodies import Bodies, human_source
-from meshmatch.training.datasets import (
-    BatchDataset,
-    CloudDataset,
-    Source,
-    build_lattice,
-    deformed_source,
-    registered_source,
-)
+from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattice, deformed_source, registered_source
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
 from meshmatch.training.recipes import Recipe, recipe_for

@@ -3,13 +3,14 @@
 import numpy as np
 import torch
 
+from meshmatch.generators.generator import Source
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.network import NetworkConfig
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
 from meshmatch.templates.template import Template
-from meshmatch.training.datasets import BatchDataset, Source
+from meshmatch.training.datasets import BatchDataset
 from meshmatch.training.losses import LossPoints
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import build_dataset, build_deformer, build_loss_points

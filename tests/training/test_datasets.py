@@ -8,15 +8,15 @@ import torch
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import TemplateError
+from meshmatch.generators.bodies import sample_bodies
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.layers import BasisEncoder
 from meshmatch.templates.template import Template
-from meshmatch.training.bodies import sample_bodies
 from meshmatch.training.datasets import Batch, BatchDataset, registered_source, step_generator
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import anchor_vertices, build_dataset, fill_basis, loss_vertices
+from tests.generators.stick import stick_figure
 from tests.training.small import UPRIGHT, egg_template, small_data, small_network
-from tests.training.stick import stick_figure
 
 CLEAN = replace(UPRIGHT, upright=False, points=400)
 

@@ -12,6 +12,9 @@ from meshmatch.experiments import human_bodies
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
+from meshmatch.generators import bodies
+from meshmatch.generators import rig as rigs
+from meshmatch.generators.generator import Source
 from meshmatch.models.registry import load_model, verify_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import save_shape
@@ -20,16 +23,14 @@ from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import Template, read_template, save_template
-from meshmatch.training import bodies
-from meshmatch.training import rig as rigs
-from meshmatch.training.datasets import Source, registered_source
+from meshmatch.training.datasets import registered_source
 from meshmatch.training.loop import StepReport, TrainConfig
 from meshmatch.training.losses import CorrespondenceLoss
 from meshmatch.training.recipes import Recipe, default, paper, recipe_for
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import CardFacts, train, train_model
+from tests.generators.stick import stick_figure
 from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, egg_template, small_data, small_network
-from tests.training.stick import stick_figure
 
 SMALL = Recipe(NETWORK, TrainConfig(steps=4, shapes=4, scans_per_shape=1, workers=0, warm_up=1), SCAN, "smooth")
 

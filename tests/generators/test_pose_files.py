@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from meshmatch.errors import InputError, OptionError
+from meshmatch.generators import bodies, pose_files
+from meshmatch.generators.bodies import sample_bodies
+from meshmatch.generators.pose_files import GivenPoses, load_poses
+from meshmatch.generators.rig import Rig, forward_kinematics
 from meshmatch.shapes import input_files
-from meshmatch.training import bodies, pose_files
-from meshmatch.training.bodies import sample_bodies
-from meshmatch.training.pose_files import GivenPoses, load_poses
-from meshmatch.training.rig import Rig, forward_kinematics
+from tests.generators.stick import stick_figure
 from tests.training.small import egg_template
-from tests.training.stick import stick_figure
 
 JOINTS = ("lowerarm01.L", "head", "root")
 VECTORS = np.array([[[0.1, 0.2, -0.3], [0, 0.5, 0], [0, 0, 0]], [[0, 0, 0], [0, -1, 0.25], [0, 3.1, 0]]])
@@ -84,7 +84,7 @@ def test_a_parent_acts_after_its_child(rig: Rig) -> None:
     vectors = np.array([[[0.4, 0, 0], [0, 0.9, 0]]])
     poses = GivenPoses(("lowerarm01.R", "upperarm01.R"), vectors, share=1.0)
     rotations = torch.eye(3).repeat(1, len(rig.names), 1, 1)
-    from meshmatch.training.rotations import rotation_from_vector
+    from meshmatch.generators.rotations import rotation_from_vector
 
     for name, vector in zip(poses.joints, vectors[0], strict=True):
         rotations[0, rig.joint(name)] = rotation_from_vector(torch.from_numpy(vector)).float()

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.experiments import quadruped_rig, quadrupeds
-from meshmatch.experiments.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig
-from meshmatch.experiments.quadrupeds import KINDS, TRAITS, draw_angles, draw_traits, make_animal, resting_animal
+from meshmatch.experiments.quadrupeds import main
+from meshmatch.generators import quadruped_rig, quadrupeds
+from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig
+from meshmatch.generators.quadrupeds import KINDS, TRAITS, draw_angles, draw_traits, make_animal, resting_animal
 from meshmatch.geometry.triangles import is_watertight
 from meshmatch.shapes.files import load_shape
 
@@ -155,14 +156,14 @@ def test_the_command_writes_registered_animals(
     assets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--assets", str(assets), "--count", "3", "--seed", "5"]
-    assert quadrupeds.main([str(tmp_path / "a"), *words]) == 0
+    assert main([str(tmp_path / "a"), *words]) == 0
     assert '"animals": 3' in capsys.readouterr().out
     files = sorted((tmp_path / "a").glob("*"))
     assert [file.name for file in files] == ["0-rest.ply", *(f"animal-0000{k}.ply" for k in range(3))]
     shapes = [load_shape(file) for file in files]
     assert all(np.array_equal(shape.faces, shapes[0].faces) for shape in shapes)
     assert is_watertight(shapes[0].faces)
-    assert quadrupeds.main([str(tmp_path / "b"), *words]) == 0
+    assert main([str(tmp_path / "b"), *words]) == 0
     assert [file.read_bytes() for file in sorted((tmp_path / "b").glob("*"))] == [file.read_bytes() for file in files]
 
 
@@ -180,7 +181,7 @@ def test_missing_and_damaged_files_are_errors(
         with pytest.raises(InputError, match="of MuJoCo"):
             load_rig(tmp_path)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert quadrupeds.main([str(tmp_path / "out")]) == 1
+    assert main([str(tmp_path / "out")]) == 1
     assert "--assets" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from meshmatch.training.rig import Rig
+from meshmatch.generators.rig import Rig
 
 _TRUNK = [
     ("root", "", (0.0, 0.95, 0.0)),

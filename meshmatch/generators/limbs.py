@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 
-from meshmatch.training.rotations import DEGREE
+from meshmatch.generators.rotations import DEGREE
 
 
 class Draw:

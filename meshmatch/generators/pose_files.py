@@ -21,9 +21,9 @@ from torch import Tensor
 
 from meshmatch.arrays import Float, Floats32
 from meshmatch.errors import InputError, OptionError
+from meshmatch.generators.rig import Rig, forward_kinematics
+from meshmatch.generators.rotations import rotation_from_vector
 from meshmatch.shapes.input_files import read_npz
-from meshmatch.training.rig import Rig, forward_kinematics
-from meshmatch.training.rotations import rotation_from_vector
 
 MAX_BYTES = 60_000_000
 """A larger file is refused before it is read."""

@@ -1,7 +1,7 @@
 """Endless generated human bodies: identity, pose, linear blend skinning.
 
 Random poses stay inside anatomical joint limits, and those in which the body would run into itself are rejected. Angles
-follow the clinical convention (flexion, abduction, twist; see `meshmatch.training.limbs`). Rotations are expressed in the
+follow the clinical convention (flexion, abduction, twist; see `meshmatch.generators.limbs`). Rotations are expressed in the
 axes of the rest pose (y up, facing +z, left at +x) about the rest joints.
 """
 
@@ -19,13 +19,13 @@ from torch.nn.functional import normalize as unit
 
 from meshmatch.arrays import Float
 from meshmatch.errors import OptionError
+from meshmatch.generators.generator import Source
+from meshmatch.generators.limbs import FOLDED, Draw, Limbs, draw_arms, draw_limbs, mirrored, with_legs
+from meshmatch.generators.pose_files import GivenPoses
+from meshmatch.generators.rig import Rig, cached_rig, forward_kinematics, penetration, skin
+from meshmatch.generators.rotations import DEGREE, rotation_between, rotation_from_vector
 from meshmatch.progress import Progress
 from meshmatch.templates.template import Template
-from meshmatch.training.datasets import Source
-from meshmatch.training.limbs import FOLDED, Draw, Limbs, draw_arms, draw_limbs, mirrored, with_legs
-from meshmatch.training.pose_files import GivenPoses
-from meshmatch.training.rig import Rig, cached_rig, forward_kinematics, penetration, skin
-from meshmatch.training.rotations import DEGREE, rotation_between, rotation_from_vector
 
 
 @dataclass(frozen=True)

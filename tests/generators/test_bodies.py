@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import OptionError
 from meshmatch.experiments.human_bodies import Still, body_parts, human_template, standing_body, still_pose
-from meshmatch.training.bodies import draw_identities, sample_bodies, sample_free_pose, sample_pose
-from meshmatch.training.limbs import FOLDED, Draw, draw_arms, draw_limbs, mirrored, with_legs
-from meshmatch.training.rig import Rig, build_rig, forward_kinematics, load_rig, penetration, save_rig, skin
-from meshmatch.training.rotations import rotation_between, rotation_from_vector
-from tests.training.stick import stick_figure
+from meshmatch.generators.bodies import draw_identities, sample_bodies, sample_free_pose, sample_pose
+from meshmatch.generators.limbs import FOLDED, Draw, draw_arms, draw_limbs, mirrored, with_legs
+from meshmatch.generators.rig import Rig, build_rig, forward_kinematics, load_rig, penetration, save_rig, skin
+from meshmatch.generators.rotations import rotation_between, rotation_from_vector
+from tests.generators.stick import stick_figure
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_the_freest_of_several_poses_is_kept(rig: Rig) -> None:
 def test_the_first_free_pose_wins_and_else_the_least_bad(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     heads = rig.heads[:1].repeat(3, 1, 1)
     depths = torch.tensor([[0.0, 0.5, 0.3], [0.0, 0.01, 0.2], [0.0, 0.0, 0.4]])  # try, body
-    monkeypatch.setattr("meshmatch.training.bodies.penetration", lambda *_: depths.flatten())
+    monkeypatch.setattr("meshmatch.generators.bodies.penetration", lambda *_: depths.flatten())
     world, _ = sample_free_pose(rig, heads, seeded(), tries=3)
     every = forward_kinematics(rig, heads.repeat(3, 1, 1), sample_pose(rig, heads.repeat(3, 1, 1), seeded()))[0]
     picked = [int((every == body).flatten(1).all(1).nonzero()[0]) for body in world]

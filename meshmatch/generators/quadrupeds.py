@@ -1,0 +1,288 @@
+"""Four-legged animals for training, made from the free dog of dm_control: registered watertight meshes, seeded.
+
+All have the same vertices and triangles (left and right exchange exactly), face +z and stand along y. An animal mixes
+the proportions of two kinds (dog, cat, cow, horse, hippo, bear, sheep, deer) and varies them; its bones are scaled along
+and across and turned within the limits of their joints; it stands, walks, runs, sits, lies, crouches, jumps or grazes,
+with its mouth open or closed; manes, bushy tails and fleeces are pushed out of the skin. The meshes are under the licence
+of the dog, Apache-2.0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, ramp, skinned, smooth_step
+from meshmatch.geometry.triangles import vertex_normals
+
+# Proportions against the dog's, 1 (or 0) where they are the same.
+TRAITS = {
+    # name: the spread of its logarithm, or, where the dog has 0, its own spread
+    "leg": 0.13, "thick": 0.15, "cannon": 0.12, "wide": 0.1, "tall": 0.08, "long": 0.09, "belly": 0.2, "hump": 0.25,
+    "neck": 0.15, "neck_thick": 0.1, "neck_down": 12.0, "head": 0.1, "snout": 0.18, "snout_wide": 0.12,
+    "snout_deep": 0.1, "muzzle": 0.1, "ear": 0.22, "ear_out": 0.25, "tail": 0.25, "tail_thick": 0.2, "bush": 0.3,
+    "tuft": 0.2, "mane": 0.18, "fleece": 0.08, "hoof": 0.12, "straight": 0.25,
+}  # fmt: skip
+_NONE = {"belly", "hump", "neck_down", "muzzle", "ear_out", "bush", "tuft", "mane", "fleece", "hoof", "straight"}
+KINDS: dict[str, dict[str, float]] = {
+    "dog": {"ear": 0.7, "tail": 0.8, "tail_thick": 1.3, "belly": 0.1},
+    "wolf": {"wide": 1.1, "neck": 0.9, "neck_thick": 1.3, "neck_down": 20, "ear": 0.65, "tail": 0.75, "bush": 1.0,
+             "mane": 0.3, "snout_wide": 1.1, "tail_thick": 1.5, "belly": 0.2},
+    "cat": {"leg": 0.9, "thick": 1.3, "wide": 1.1, "long": 1.1, "belly": 0.35, "neck": 0.7, "neck_thick": 1.3,
+            "neck_down": 30, "head": 1.05, "snout": 0.45, "snout_wide": 1.25, "snout_deep": 1.1, "ear": 0.4,
+            "ear_out": 0.3, "tail": 1.15, "tail_thick": 1.5, "tuft": 0.3},
+    "lion": {"leg": 0.9, "thick": 1.55, "wide": 1.2, "tall": 1.05, "long": 1.08, "belly": 0.4, "neck": 0.65,
+             "neck_thick": 1.6, "neck_down": 30, "head": 1.25, "snout": 0.6, "snout_wide": 1.4, "snout_deep": 1.2,
+             "ear": 0.35, "ear_out": 0.3, "tail": 1.05, "tail_thick": 1.5, "tuft": 0.7, "mane": 0.7},
+    "cow": {"leg": 0.95, "thick": 1.25, "cannon": 1.5, "wide": 1.5, "tall": 1.25, "long": 1.25, "belly": 0.65,
+            "hump": 0.2, "neck": 0.75, "neck_thick": 1.35, "neck_down": 40, "head": 1.15, "snout": 1.25,
+            "snout_wide": 1.2, "snout_deep": 1.15, "muzzle": 0.2, "ear": 0.6, "ear_out": 1.0, "tail": 0.95,
+            "tail_thick": 1.2, "tuft": 0.5, "hoof": 1.0, "straight": 0.6},
+    "horse": {"leg": 1.1, "thick": 1.15, "cannon": 1.6, "wide": 1.35, "tall": 1.2, "long": 1.05, "belly": 0.5,
+              "hump": 0.1, "neck": 1.15, "neck_thick": 1.5, "neck_down": 10, "head": 1.15, "snout": 1.6,
+              "snout_wide": 1.05, "snout_deep": 1.2, "ear": 0.45, "tail": 0.7, "tail_thick": 1.8, "bush": 0.7,
+              "mane": 0.3, "hoof": 1.0, "straight": 0.7},
+    "deer": {"leg": 1.1, "thick": 0.95, "cannon": 1.6, "wide": 1.15, "long": 1.0, "belly": 0.5, "neck": 1.15,
+             "neck_down": 5, "head": 1.0, "snout": 1.15, "snout_wide": 0.95, "ear": 0.75, "ear_out": 0.5,
+             "tail": 0.25, "tail_thick": 1.5, "hoof": 0.9, "straight": 0.5},
+    "hippo": {"leg": 0.8, "thick": 1.8, "cannon": 0.9, "wide": 2.0, "tall": 1.6, "long": 1.3, "belly": 0.9,
+              "neck": 0.5, "neck_thick": 2.0, "neck_down": 45, "head": 1.4, "snout": 1.7, "snout_wide": 1.8,
+              "snout_deep": 1.4, "muzzle": 0.6, "ear": 0.22, "ear_out": 0.3, "tail": 0.3, "tail_thick": 1.4,
+              "hoof": 0.6, "straight": 0.8},
+    "bear": {"leg": 0.88, "thick": 2.0, "cannon": 0.7, "wide": 1.6, "tall": 1.3, "long": 1.05, "belly": 0.65,
+             "hump": 0.4, "neck": 0.65, "neck_thick": 1.8, "neck_down": 40, "head": 1.2, "snout": 0.8,
+             "snout_wide": 1.1, "ear": 0.3, "ear_out": 0.4, "tail": 0.15, "tail_thick": 1.8, "mane": 0.3,
+             "fleece": 0.2, "straight": 0.7},
+    "sheep": {"leg": 0.75, "thick": 1.15, "cannon": 1.2, "wide": 1.45, "tall": 1.2, "long": 1.1, "belly": 0.65,
+              "neck": 0.65, "neck_thick": 1.4, "neck_down": 25, "head": 1.05, "snout": 0.95, "ear": 0.5,
+              "ear_out": 1.0, "tail": 0.35, "tail_thick": 2.0, "mane": 0.3, "fleece": 0.7, "hoof": 0.9,
+              "straight": 0.6},
+    "pig": {"leg": 0.7, "thick": 1.35, "wide": 1.55, "tall": 1.25, "long": 1.15, "belly": 0.8, "neck": 0.45,
+            "neck_thick": 1.8, "neck_down": 40, "head": 1.25, "snout": 1.2, "snout_wide": 1.1, "snout_deep": 1.2,
+            "ear": 0.6, "ear_out": 0.5, "tail": 0.3, "hoof": 0.8, "straight": 0.6},
+}  # fmt: skip
+# Beginnings of the names of a group's bones.
+_TRUNK, _LIMBS = ("torso", "L_", "pelvis"), ("upper_leg", "scapula", "upper_arm")
+_SOFT = (*_TRUNK, *_LIMBS, "lower", "foot", "hand", "Ca_1", "Ca_2", "Ca_3", "Ca_4", "Ca_5")
+_NOISE = {"trunk": 1.2, "tail": 3.0, "neck": 3.0, "jaw": 0.5, "knee": 4.0, "elbow": 4.0, "pelvis": 3.0}  # others: 5
+# How often each is drawn.
+POSES = {"stand": 0.12, "walk": 0.24, "run": 0.16, "gallop": 0.14, "sit": 0.09, "lie": 0.09, "crouch": 0.08,
+         "jump": 0.08}  # fmt: skip
+# Swing of the legs, and how far the right ones and the hind ones are behind in their steps.
+_GAITS = {"stand": (5.0, np.pi, 0.0), "walk": (18.0, np.pi, 0.5 * np.pi), "run": (28.0, np.pi, 0.0),
+          "gallop": (38.0, 0.35, np.pi)}  # fmt: skip
+# Bends of hind and fore legs that stand still.
+_STILL: dict[str, tuple[dict[str, float], dict[str, float]]] = {
+    "sit": ({"hip": -52, "knee": 82, "hock": -45, "toe": 8}, {"shoulder": 22, "scapula": 12}),
+    "lie": ({"hip": -58, "knee": 98, "hock": -92, "toe": 15}, {"scapula": 10, "shoulder": 38, "elbow": -98, "wrist": 5}),
+    "crouch": ({"hip": -30, "knee": 55, "hock": -48, "toe": 10}, {"shoulder": 28, "elbow": -58, "wrist": 20}),
+    "jump": ({"hip": 25, "knee": -20, "hock": 22, "toe": 20}, {"shoulder": -25, "elbow": -60, "wrist": 70}),
+}  # fmt: skip
+_FOLDED = {"elbow": -85.0, "wrist": 120.0}  # instead, of forelegs that lie under the body
+
+
+def draw_traits(rng: np.random.Generator) -> dict[str, float]:
+    """Proportions between those of two kinds, varied."""
+    first, second = rng.choice(list(KINDS), 2)
+    share = rng.beta(0.45, 0.45)
+    found = {}
+    for name, spread in TRAITS.items():
+        plain = 1.0 if name not in _NONE else 0.0
+        a, b = (KINDS[kind].get(name, plain) for kind in (first, second))
+        if name in _NONE:
+            found[name] = share * a + (1 - share) * b + spread * rng.normal()
+        else:
+            found[name] = float(np.exp(share * np.log(a) + (1 - share) * np.log(b) + spread * rng.normal()))
+    for name in ("bush", "tuft", "mane", "fleece", "muzzle", "hump"):
+        found[name] = max(found[name], 0.0)
+    if rng.uniform() < 0.35:  # tails are as they like
+        found["tail"] = rng.uniform(0.5, 1.3)
+    if rng.uniform() < 0.2:
+        found["bush"] = rng.uniform(0.4, 1.5)
+    return found | {"shoulder": found["tall"]}
+
+
+def morphed(rig: AnimalRig, traits: dict[str, float]) -> Float[Floats, "V 3"]:
+    """The rest shape with another snout, other ears and another belly, before bones are scaled."""
+    verts = rig.verts.copy()
+    head = rig.share("skull", "jaw")
+    # The snout grows forward from the eyes.
+    along = head * ramp(verts[:, 2], 0.345, 0.385)
+    front = head * smooth_step(verts[:, 2], 0.35, 0.43)
+    end = head * smooth_step(verts[:, 2], 0.40, 0.46)
+    verts[:, 2] += (traits["snout"] - 1) * along
+    verts[:, 0] *= 1 + (traits["snout_wide"] - 1) * front + traits["muzzle"] * end
+    verts[:, 1] += (traits["snout_deep"] - 1 + 0.5 * traits["muzzle"] * end) * front * (verts[:, 1] - 0.645)
+    for side in (1.0, -1.0):
+        root, tip = np.array([side * 0.05, 0.715, 0.293]), np.array([side * 0.091, 0.806, 0.298])
+        axis = (tip - root) / np.linalg.norm(tip - root)
+        off = verts - root
+        t = np.where((side * off[:, 0] > -0.02) & (head > 0.5) & (off[:, 2] < 0.025), off @ axis, -1.0)
+        across = off - np.outer(t, axis)
+        here = smooth_step(t, 0.005, 0.045)
+        size = max(traits["ear"], 0.12)
+        moved = verts + np.outer((size - 1) * ramp(t, 0.005, 0.045), axis)
+        moved += (here * (size**0.6 - 1))[:, None] * across
+        turn = Rotation.from_euler("z", -side * 70 * traits["ear_out"], degrees=True).as_matrix()
+        turned = (moved - root) @ turn.T + root
+        verts = np.where((t > 0)[:, None], moved + here[:, None] * (turned - moved), verts)
+    trunk = rig.smoothed(rig.share(*_TRUNK) + 0.7 * rig.share(*_LIMBS), 12)
+    x, y, z = verts.T
+    waist = trunk * np.exp(-(((z + 0.16) / 0.14) ** 2)) * traits["belly"]
+    verts[:, 1] -= 0.085 / traits["tall"] * waist * np.clip((0.47 - y) / 0.08, 0, 1)
+    verts[:, 0] += 0.035 / traits["wide"] * waist * np.clip(x / 0.05, -1, 1)
+    verts[:, 1] += 0.06 * traits["hump"] * trunk * np.exp(-(((z - 0.13) / 0.07) ** 2)) * smooth_step(y, 0.45, 0.56)
+    return verts
+
+
+def scales(rig: AnimalRig, traits: dict[str, float], rng: np.random.Generator) -> Float[Floats, "B 3 3"]:
+    """How every bone is stretched along and across; girth goes over from bone to bone."""
+    groups = [group_of(name) for name in rig.names]
+    drawn = np.exp(0.07 * rng.normal(size=(len(LIMITS), 2)))
+    length, girth = (dict(zip(LIMITS, column, strict=True)) for column in drawn.T)
+    for group in ("hip", "knee", "hock", "shoulder", "elbow", "wrist"):
+        length[group] *= traits["leg"]
+        girth[group] *= traits["thick"]
+    for group in ("hock", "wrist"):
+        length[group] *= traits["cannon"]
+    for group in ("toe", "finger"):
+        length[group] *= float(np.sqrt(traits["thick"])) * (1 - 0.25 * np.clip(traits["hoof"], 0, 1))
+        girth[group] *= traits["thick"] * (1 - 0.1 * np.clip(traits["hoof"], 0, 1))
+    length["scapula"] *= traits["shoulder"]
+    length["neck"] *= traits["neck"]
+    girth["neck"] *= traits["neck_thick"]
+    length["tail"] *= traits["tail"]
+    girth["tail"] *= traits["tail_thick"]
+    body = np.array([traits["wide"], traits["tall"], traits["long"]])
+    across = float(np.sqrt(body[0] * body[1]))
+    tails = sum(group == "tail" for group in groups)
+    result = np.zeros((len(groups), 3, 3))
+    for bone, group in enumerate(groups):
+        thick = girth[group]
+        if group in ("trunk", "pelvis", "skull", "jaw"):
+            result[bone] = np.diag(body) if group in ("trunk", "pelvis") else traits["head"] * np.eye(3)
+            continue
+        number = int(rig.names[bone].split("_")[1]) if group in ("neck", "tail") else 0
+        if group == "neck":  # from the trunk's girth to the head's
+            share = (7 - number) / 6
+            thick = np.interp(share, [0, 0.35, 1], [across, 0.5 * (thick + across), traits["head"]])
+        elif group == "tail":
+            thick = np.interp(number / tails, [0, 0.2, 1], [0.5 * (across + thick), thick, thick])
+        elif group in ("hip", "shoulder", "scapula"):
+            thick = 0.5 * (thick + across)
+        axis = rig.axis(bone, groups)
+        result[bone] = thick * np.eye(3) + (length[group] - thick) * np.outer(axis, axis)
+    return result
+
+
+def draw_angles(rig: AnimalRig, traits: dict[str, float], rng: np.random.Generator) -> Float[Floats, "B 3"]:
+    """Degrees by which every bone is turned about x, y and z: a pose, varied, within the joints' `LIMITS`."""
+    kind = str(rng.choice(list(POSES), p=list(POSES.values())))
+    angles = {name: np.zeros(3) for name in rig.names}
+    groups = {name: group_of(name) for name in rig.names}
+
+    def add(group: str, bend: float, side: str = "", share: float = 1.0) -> None:
+        for name in rig.names:
+            if groups[name] == group and name.endswith(side):
+                angles[name][0] += share * bend
+
+    swing, lead, gap = _GAITS.get(kind, (0.0, np.pi, 0.0))
+    swing = swing * rng.uniform(0.7, 1.2)
+    phase = rng.uniform(0, 2 * np.pi)
+    lead, gap = lead + rng.normal(0, 0.25), gap + rng.normal(0, 0.3)
+    for side, late in (("_L", 0.0), ("_R", lead)):
+        for hind in (True, False):
+            at = phase + late + (gap if hind else np.pi)
+            back, lift = swing * np.cos(at), 1.6 * swing * max(np.sin(at), 0.0)
+            if kind in _STILL:
+                chain = _STILL[kind][0 if hind else 1]
+            elif hind:
+                chain = {"hip": back - 0.3 * lift, "knee": lift, "hock": -0.8 * lift, "toe": 0.4 * lift}
+            else:
+                chain = {"scapula": 0.3 * back, "shoulder": 0.7 * back, "elbow": -lift, "wrist": 1.2 * lift}
+            if kind == "lie" and not hind and rng.uniform() < 0.4:
+                chain = chain | _FOLDED
+            share = rng.uniform(0.75, 1.1) * np.clip(1.35 / traits["thick"], 0.5, 1)
+            for group, bend in chain.items():
+                add(group, bend, side, share)
+    add("pelvis", {"sit": -25.0, "lie": -10.0, "gallop": -10 * np.cos(phase)}.get(kind, 0.0))
+    add("trunk", {"sit": -2.0, "gallop": -2.5 * np.cos(phase)}.get(kind, 0.0))
+    straight = np.clip(traits["straight"], -0.5, 1.2)
+    stance = {"knee": -22 * straight, "hock": 20 * straight, "hip": -5 * straight}
+    for group, bend in (stance | {"toe": 48 * traits["hoof"], "finger": 40 * traits["hoof"]}).items():
+        add(group, bend)
+    carriage = rng.choice(["normal", "down", "up", "side"], p=[0.5, 0.2, 0.1, 0.2])
+    bow = {"down": rng.uniform(45, 100), "up": rng.uniform(-65, -15)}.get(carriage, 0.0)
+    bow = traits["neck_down"] + bow + 10 * rng.normal()
+    turn = rng.normal() * {"side": 45.0}.get(carriage, 12.0)
+    number = {group: sum(each == group for each in groups.values()) for group in ("neck", "tail")}
+    curl, sway = rng.uniform([-70, -80], [75, 100]), rng.normal(size=2) * [25, 45]
+    for name in rig.names:
+        if groups[name] == "neck":
+            angles[name][:2] += np.array([bow, turn]) / number["neck"]
+        elif groups[name] == "tail":
+            first = int(name.split("_")[1]) <= 5
+            angles[name][:2] += np.array([curl[1 - first], sway[1 - first]]) / (5 if first else number["tail"] - 5)
+    add("skull", -rng.uniform(0.4, 0.9) * (traits["neck_down"] if carriage == "down" else bow))
+    wide = 0.25 + 0.3 * min(traits["muzzle"], 1.0)  # as hippos like to
+    gape = rng.choice([rng.uniform(-34, -28), rng.uniform(-28, -8), rng.uniform(-8, 65)], p=[0.8 - wide, 0.2, wide])
+    add("jaw", gape)
+    add("skull", -max(gape, 0.0) * rng.uniform(0.1, 1.1))
+    found = np.zeros((len(rig.names), 3))
+    bias = rng.normal(size=3) * [1.0, 2.8, 1.5]  # of the whole back
+    for bone, name in enumerate(rig.names):
+        group = groups[name]
+        noise = _NOISE.get(group, 5.0) * rng.normal(size=3) * [1, 0.6, 0.8]
+        low, high = np.transpose(LIMITS[group])
+        found[bone] = np.clip(angles[name] + noise + bias * (group == "trunk"), low, high)
+    found[rig.parents < 0] = 0
+    return found
+
+
+def with_fur(rig: AnimalRig, verts: Float[Floats, "V 3"], traits: dict[str, float]) -> Float[Floats, "V 3"]:
+    """A mane, a bushy or tufted tail and a fleece pushed out along smooth normals."""
+    along = np.array([int(name[3:]) if name.startswith("Ca_") else 0 for name in rig.names])
+    tail = rig.share("Ca_")
+    t = rig.weights @ along / np.maximum(tail, 1e-9) / max(along.max(), 1)
+    amount = tail * (0.055 * traits["bush"] * np.sin(np.pi * np.clip(t, 0, 1) ** 0.8))
+    amount += tail * 0.025 * traits["tuft"] * np.exp(-(((t - 0.9) / 0.07) ** 2))
+    amount += 0.05 * traits["mane"] * (rig.share("C_") + rig.share("torso") * smooth_step(rig.verts[:, 2], 0.08, 0.2))
+    amount += 0.035 * traits["fleece"] * (rig.share(*_TRUNK, "C_") + 0.6 * rig.share(*_LIMBS))
+    amount = rig.smoothed(amount, 8)
+    return verts + amount[:, None] * rig.smoothed(vertex_normals(verts, rig.faces), 4)
+
+
+def make_animal(rig: AnimalRig, seed: int, number: int) -> Float[Floats, "V 3"]:
+    """One animal, the same for the same seed and number, about as large as a dog."""
+    rng = np.random.default_rng([seed, number])
+    traits = draw_traits(rng)
+    posed = skinned(rig, morphed(rig, traits), scales(rig, traits, rng), draw_angles(rig, traits, rng))
+    posed = with_fur(rig, posed, traits)
+    # Hooves have no toes, and thick limbs no creases.
+    soft = rig.share("toe", "finger") * np.clip(traits["hoof"] + rng.uniform(0, 0.6), 0, 1)
+    heavy = np.clip(1.5 * (traits["thick"] * np.sqrt(traits["wide"]) - 1.2), 0, 1)
+    soft += heavy * rig.smoothed(rig.share(*_SOFT), 3)
+    posed += np.clip(soft, 0, 1)[:, None] * (rig.smoothed(posed, 10) - posed)
+    centers = posed[rng.integers(len(posed), size=12)]
+    reach = rng.uniform(0.08, 0.25, 12)
+    near = np.exp(-np.square(np.linalg.norm(posed[:, None] - centers, axis=2) / reach))
+    return posed + near @ rng.normal(0, 0.007, (12, 3))
+
+
+def resting_animal(rig: AnimalRig) -> Float[Floats, "V 3"]:
+    """The symmetric animal that becomes the template: of middling proportions, its mouth a little open."""
+    traits = {name: float(name not in _NONE) for name in TRAITS}
+    traits |= {"leg": 0.85, "thick": 1.3, "wide": 1.25, "tall": 1.1, "belly": 0.5, "neck_thick": 1.25, "ear": 0.6,
+               "ear_out": 0.3, "tail_thick": 1.6, "neck": 0.85, "straight": 0.3, "shoulder": 1.0}  # fmt: skip
+    angles = np.zeros((len(rig.names), 3))
+    for bone, name in enumerate(rig.names):
+        angles[bone, 0] = {"jaw": -14.0, "neck": 3.0, "skull": -12.0}.get(group_of(name), 0.0)
+    return skinned(rig, morphed(rig, traits), scales(rig, traits, np.random.default_rng(0)), angles)
+
+
+def body_parts(rig: AnimalRig) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
+    """Part of every vertex, by the bone that carries it most: labels and their names, sides apart."""
+    sides = {"_L": "left ", "_R": "right "}
+    names, label = np.unique([sides.get(name[-2:], "") + group_of(name) for name in rig.names], return_inverse=True)
+    return label[rig.weights.argmax(1)].astype(np.int64), tuple(names.tolist())
