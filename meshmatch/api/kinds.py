@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -37,7 +37,11 @@ def installed_models() -> list[TrainedModel]:
 def read_kinds(
     models: Sequence[TrainedModel], shapes: Sequence[Shape], configs: Sequence[FitConfig]
 ) -> Float[Floats, "M S"]:
-    """`read_kind` of every repaired shape by every model; infinite where a model cannot see a shape."""
+    """`read_kind` of repaired shapes by models; infinite where a model cannot see a shape, or was not asked.
+
+    Every model is asked about the first shape. Those of its kind are asked about the others first, and the rest only where
+    they do not know them.
+    """
     samples = beside(kind_samples, shapes, [config.seed for config in configs])
 
     def reading(model: TrainedModel, number: int) -> float:
@@ -46,8 +50,20 @@ def read_kinds(
         except MeshmatchError:
             return np.inf
 
-    asked = [(model, number) for model in models for number in range(len(shapes))]
-    return np.reshape(beside(reading, *zip(*asked, strict=True)), (len(models), len(shapes)))
+    found = np.full((len(models), len(shapes)), np.inf)
+
+    def ask(rows: Iterable[int], numbers: Iterable[int]) -> None:
+        at = [(row, number) for row in rows for number in numbers]
+        for place, value in zip(at, beside(lambda at: reading(models[at[0]], at[1]), at), strict=True):
+            found[place] = value
+
+    every, others = range(len(models)), range(1, len(shapes))
+    ask(every, [0])
+    kind = models[int(found[:, 0].argmin())].card.category
+    same = [row for row in every if models[row].card.category == kind and found[:, 0].min() <= KNOWN]
+    ask(same, others)
+    ask([row for row in every if row not in same], [number for number in others if found[:, number].min() > KNOWN])
+    return found
 
 
 def choose_model(

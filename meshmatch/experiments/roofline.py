@@ -115,7 +115,7 @@ def pair_search(model: TrainedModel, system: NodeSystem) -> Kernel:
 
 def assembly(system: NodeSystem) -> Kernel:
     """The products of node pairs, each times the six numbers of a weight."""
-    products, weights = system._pairs, np.random.default_rng(0).random((len(system.verts), 6))
+    products, weights = system.equations.pairs, np.random.default_rng(0).random((len(system.verts), 6))
     operations = 6 * _MULTIPLY_ADD * products.nnz
     moved = products.data.nbytes + products.indices.nbytes + weights.nbytes + 8 * 6 * products.shape[0]
     return Kernel(f"assembly, {products.nnz} products", operations, moved, 8, lambda: products @ weights)
@@ -123,7 +123,7 @@ def assembly(system: NodeSystem) -> Kernel:
 
 def band_solve(system: NodeSystem) -> Kernel:
     """Cholesky in the band of all unknowns, and both triangles solved."""
-    n, w = 3 * system.K, system._band
+    n, w = 3 * system.K, system.equations.band
     matrix = np.random.default_rng(0).standard_normal((w + 1, n))
     matrix[0] = 4 * w
     operations = (n - w) * w**2 + w**3 / 3 + 4 * n * w

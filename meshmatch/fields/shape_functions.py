@@ -23,6 +23,7 @@ that their matrices are dense; a rigid motion of the nodes is rigid nearly, not 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -48,12 +49,23 @@ def has_nodes(name: FieldName) -> bool:
 class ShapeFunctions:
     """Shape functions of K nodes on P fixed points.
 
-    ``phi`` (P, K) and ``gradient`` (3 P, K) are float32, sparse (CSR) or dense. With moving least squares each row of
-    ``phi`` sums to one. Row 3 p + k of ``gradient`` is the derivative at point p along axis k (1 / length).
+    ``phi`` (P, K) and ``gradient`` (3 P, K), made when it is asked for, are float32, sparse (CSR) or dense. With moving
+    least squares each row of ``phi`` sums to one. Row 3 p + k of ``gradient`` is the derivative at point p along axis k
+    (1 / length).
     """
 
     phi: Any
-    gradient: Any
+    slopes: Any  # the gradient, or a function that gives its rows at some points
+
+    @cached_property
+    def gradient(self) -> Any:
+        return self.slopes(np.arange(self.phi.shape[0])) if callable(self.slopes) else self.slopes
+
+    def gradient_at(self, at: Int[Ints, " N"]) -> Any:
+        """The rows (3 N, K) of ``gradient`` at some of the points: of moving least squares, no others are computed."""
+        if callable(self.slopes):
+            return self.slopes(at)
+        return self.slopes[(3 * at[:, None] + np.arange(3)).reshape(-1)]
 
     @property
     def K(self) -> int:
@@ -93,37 +105,74 @@ def build_field(
     vectors learned with one mean something else with another. `TemplateError` names the points that have fewer than four
     non-coplanar nodes in reach.
     """
-    points, nodes = np.asarray(points, np.float64), np.asarray(nodes, np.float64)
-    P, K = len(points), len(nodes)
-    radii = np.broadcast_to(np.asarray(radius, np.float64), (K,))
-    at, of = support_pairs(points, nodes, radii)  # sorted by point
-    sums = csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))), (P, len(at)))  # over the nodes of each point
-    offset = points[at] - nodes[of]
-    weight, slope = KERNELS[kernel](np.linalg.norm(offset, axis=1), radii[of])
-    slope_vector = slope[:, None] * offset  # dw/dx
+    points, nodes = np.array(points, np.float64), np.array(nodes, np.float64)
+    radii = np.broadcast_to(np.array(radius, np.float64), (len(nodes),))
+    fit = _LocalFits.of(points, nodes, radii, kernel)
+    phi = (fit.weight * fit.along).astype(np.float32)
+    values = csr_matrix((phi, (fit.at, fit.of_node)), (len(points), len(nodes)))
+    return ShapeFunctions(values, lambda some: _slopes(points[some], nodes, radii, kernel))
 
-    scale = support_scale(at, of, radii, P)[at]
-    basis = np.concatenate([np.ones((len(at), 1)), -offset / scale[:, None]], 1)  # p(q_i) seen from x
-    outer = (basis[:, :, None] * basis[:, None, :]).reshape(-1, 16)
-    moment = (sums @ (weight[:, None] * outer)).reshape(P, 4, 4)
-    _check_support(moment)
-    inverse = np.linalg.inv(moment)
-    constant = inverse[:, 0]  # p(x)^T M^-1 with p(x) = [1, 0, 0, 0]
-    along = (constant[at] * basis).sum(1)
-    phi = weight * along
-    solved = (inverse[at] @ basis[..., None])[..., 0]  # M^-1 p(q_i)
+
+@dataclass(frozen=True, eq=False)
+class _LocalFits:
+    """The least squares of P points: N pairs of a point (``at``) and a node that reaches it, sorted by point."""
+
+    at: Int[Ints, " N"]
+    of_node: Int[Ints, " N"]
+    offset: Float[Floats, "N 3"]
+    weight: Float[Floats, " N"]
+    slope: Float[Floats, " N"]  # (dw/dd) / d
+    scale: Float[Floats, " N"]
+    basis: Float[Floats, "N 4"]  # p(q_i) seen from x
+    inverse: Float[Floats, "P 4 4"]  # of the moment matrices
+
+    @classmethod
+    def of(
+        cls, points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radii: Float[Floats, " K"], kernel: Kernel
+    ) -> _LocalFits:
+        at, of_node = support_pairs(points, nodes, radii)
+        offset = points[at] - nodes[of_node]
+        weight, slope = KERNELS[kernel](np.linalg.norm(offset, axis=1), radii[of_node])
+        scale = support_scale(at, of_node, radii, len(points))[at]
+        basis = np.concatenate([np.ones((len(at), 1)), -offset / scale[:, None]], 1)
+        moment = _summed(at, len(points)) @ (weight[:, None] * _outer(basis))
+        _check_support(moment.reshape(-1, 4, 4))
+        return cls(at, of_node, offset, weight, slope, scale, basis, np.linalg.inv(moment.reshape(-1, 4, 4)))
+
+    @property
+    def along(self) -> Float[Floats, " N"]:
+        """p(x)^T M^-1 p(q_i) with p(x) = [1, 0, 0, 0]."""
+        return (self.inverse[:, 0][self.at] * self.basis).sum(1)
+
+
+def _summed(at: Int[Ints, " N"], P: int) -> Any:
+    """The matrix (P, N) that sums over the nodes of each point."""
+    return csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))), (P, len(at)))
+
+
+def _outer(basis: Float[Floats, "N 4"]) -> Float[Floats, "N 16"]:
+    return (basis[:, :, None] * basis[:, None, :]).reshape(-1, 16)
+
+
+def _slopes(
+    points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radii: Float[Floats, " K"], kernel: Kernel
+) -> Any:
+    """The gradient of moving least squares (3 P, K)."""
+    fit = _LocalFits.of(points, nodes, radii, kernel)
+    at, weight, inverse, P = fit.at, fit.weight, fit.inverse, len(points)
+    sums, outer, along, constant = _summed(at, P), _outer(fit.basis), fit.along, inverse[:, 0]
+    slope_vector = fit.slope[:, None] * fit.offset  # dw/dx
+    solved = (inverse[at] @ fit.basis[..., None])[..., 0]  # M^-1 p(q_i)
     gradient = np.empty((len(at), 3))
     for k in range(3):
         moment_slope = (sums @ (slope_vector[:, k, None] * outer)).reshape(P, 4, 4)
         left = (constant[:, None] @ moment_slope)[:, 0]  # p^T M^-1 dM
         gradient[:, k] = (
-            weight * solved[:, k + 1] / scale - weight * (left[at] * solved).sum(1) + slope_vector[:, k] * along
+            weight * solved[:, k + 1] / fit.scale - weight * (left[at] * solved).sum(1) + slope_vector[:, k] * along
         )
-    values = csr_matrix((phi.astype(np.float32), (at, of)), (P, K))
     rows = 3 * at[:, None] + np.arange(3)
-    columns = np.broadcast_to(of[:, None], rows.shape)
-    slopes = csr_matrix((gradient.astype(np.float32).ravel(), (rows.ravel(), columns.ravel())), (3 * P, K))
-    return ShapeFunctions(values, slopes)
+    columns = np.broadcast_to(fit.of_node[:, None], rows.shape)
+    return csr_matrix((gradient.astype(np.float32).ravel(), (rows.ravel(), columns.ravel())), (3 * P, len(nodes)))
 
 
 def _check_support(moment: Float[Floats, "P 4 4"]) -> None:

@@ -38,7 +38,7 @@ def read_kind(model: TrainedModel, shape: Shape, samples: OrientedPoints, config
     config = replace(config, up=None, front=None, copies=16, hypotheses=3)
     rng = np.random.default_rng(config.seed)
     placed = samples.in_frame(scan_frame(model, without_outliers(shape)))
-    thin, predictor = placed.first(_THIN), Predictor.of(model, rng, config.device)
+    thin, predictor = placed.first(_THIN), Predictor.of(model, rng, config.device, mirrored=False)
     starts = [(thin, pose) for pose in frames_to_try(model, thin, config)]
     best = best_first(predictor.fit_all(starts, rounds=1, draws=1))[0]
     return predictor.fit(placed, best.pose, draws=1).residual

@@ -100,14 +100,14 @@ def mirror_of(model: TrainedModel) -> Mirror | None:
         return None
     here = node_system(model).field
     assert isinstance(here, ShapeFunctions) and isinstance(there, ShapeFunctions)
-    phi, across = _dense(here.phi), _dense(there.phi)
-    square = phi.T @ phi
+    phi, across = (field.phi.astype(np.float64) for field in (here, there))
+    square = _dense(phi.T @ phi)
     square += _RIDGE * np.trace(square) / len(square) * np.eye(len(square))
-    return Mirror(np.asarray(np.linalg.solve(square, phi.T @ across), np.float64))
+    return Mirror(np.asarray(np.linalg.solve(square, _dense(phi.T @ across))))
 
 
-def _dense(phi: Any) -> Floats:
-    return np.asarray(phi if isinstance(phi, np.ndarray) else phi.toarray(), dtype=float)
+def _dense(matrix: Any) -> Floats:
+    return np.asarray(matrix if isinstance(matrix, np.ndarray) else matrix.toarray())
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +121,10 @@ class Predictor:
     rng: np.random.Generator
 
     @classmethod
-    def of(cls, model: TrainedModel, rng: np.random.Generator, device: str = "cpu") -> Predictor:
-        """The predictor of a trained model."""
-        return cls(model.on(device), node_system(model), model.template.core, mirror_of(model), rng)
+    def of(cls, model: TrainedModel, rng: np.random.Generator, device: str = "cpu", mirrored: bool = True) -> Predictor:
+        """The predictor of a trained model; the mirror takes time to build, and serves `variants` alone."""
+        mirror = mirror_of(model) if mirrored else None
+        return cls(model.on(device), node_system(model), model.template.core, mirror, rng)
 
     def fit_all(
         self,

@@ -11,6 +11,9 @@ the whole matrix.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,34 +49,38 @@ class NodeSystem:
     """
 
     phi: Any  # (V, K), sparse or dense, where the field is linear
-    slopes: Any  # (3 G, K), gradient of the shape functions at the strain points
 
     def __init__(self, shape: Shape, field: ShapeFunctions | PointwiseField, strain_points: int = 1500) -> None:
         self.verts = np.asarray(shape.verts)
         self.faces = np.asarray(shape.faces)
         self.linear = isinstance(field, ShapeFunctions)
-        self.strain_points = farthest_points(self.verts, min(strain_points, len(self.verts)))
         F = len(self.faces)  # each vertex with the faces around it
         corners = self.faces.T.reshape(-1), np.tile(np.arange(F), 3)
         self._incidence = csr_matrix((np.ones(3 * F), corners), shape=(len(self.verts), F))
         self.field = field
         if isinstance(field, ShapeFunctions):
-            self._compile(field)
+            self.K = field.K
+            self.phi = field.phi.astype(np.float64)
+        self._strained = min(strain_points, len(self.verts))
+        self._made: dict[str, Any] = {}
+        self._making = RLock()
 
-    def _compile(self, field: ShapeFunctions) -> None:
-        self.K = field.K
-        self.phi = field.phi.astype(np.float64)
-        rows = (3 * self.strain_points[:, None] + np.arange(3)).reshape(-1)
-        self.slopes = field.gradient.astype(np.float64)[rows]
-        row, column, self._pairs = _pair_products(self.phi)
-        # nodes in an order in which those that meet are near one another
-        graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (self.K, self.K))
-        self._order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(np.int64)
-        self._band, self._place = _band_places(row, column, np.argsort(self._order))
-        strain_pairs = self.slopes.T @ self.slopes
-        if not isinstance(strain_pairs, np.ndarray):
-            strain_pairs = strain_pairs.toarray()
-        self._strain_pairs = strain_pairs[row, column]
+    def _once(self, name: str, make: Callable[[], Any]) -> Any:
+        """What solving needs and moving does not is made when it is first asked for, by one thread."""
+        with self._making:
+            if name not in self._made:
+                self._made[name] = make()
+            return self._made[name]
+
+    @property
+    def strain_points(self) -> Int[Ints, " G"]:
+        return self._once("strain points", lambda: farthest_points(self.verts, self._strained))
+
+    @property
+    def equations(self) -> Equations:
+        field = self.field
+        assert isinstance(field, ShapeFunctions)
+        return self._once("equations", lambda: Equations.of(self.phi, field.gradient_at(self.strain_points)))
 
     def moved(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
         """Template vertices under node vectors, or under whatever rows the field reads."""
@@ -83,7 +90,7 @@ class NodeSystem:
         """F at the strain points, F[g, a, k] = d x'_a / d x_k."""
         if not self.linear:
             return self.field.strain(vectors, self.strain_points)
-        return (self.slopes @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3)
+        return (self.equations.slopes @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3)
 
     def surface(self, vectors: Float[Floats, "K 3"]) -> OrientedPoints:
         """Template vertices under node vectors, with their normals."""
@@ -109,21 +116,45 @@ class NodeSystem:
         ``weights`` are upper triangles of H_p in the order xx xy xz yy yz zz, ``pulls`` right-hand sides H_p s_p, and
         ``targets`` the T_g.
         """
-        blocks = self._pairs @ weights  # pairs 6
-        blocks[:, _DIAGONAL] += strain * self._strain_pairs[:, None]
-        normal = np.zeros((3 * self.K, self._band + 1))
-        normal.reshape(-1)[self._place] = blocks[:, _BLOCK]
+        fixed = self.equations
+        blocks = fixed.pairs @ weights  # pairs 6
+        blocks[:, _DIAGONAL] += strain * fixed.strain_pairs[:, None]
+        normal = np.zeros((3 * self.K, fixed.band + 1))
+        normal.reshape(-1)[fixed.place] = blocks[:, _BLOCK]
         normal[:, 0] += damping
         (xx, xy, xz, yy, yz, zz), (x, y, z) = weights.T, self.verts.T
         full = np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], 1)
         right = self.phi.T @ (pulls - full)
         wanted = (targets - np.eye(3)).transpose(0, 2, 1).reshape(-1, 3)
-        right += strain * (self.slopes.T @ wanted) + damping * current
+        right += strain * (fixed.slopes.T @ wanted) + damping * current
         solved = np.empty((self.K, 3))
-        solved[self._order] = solveh_banded(
-            normal.T, right[self._order].reshape(-1), overwrite_ab=True, lower=True, check_finite=False
+        solved[fixed.order] = solveh_banded(
+            normal.T, right[fixed.order].reshape(-1), overwrite_ab=True, lower=True, check_finite=False
         ).reshape(-1, 3)
         return solved
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """What never changes of a linear field's normal equations; strain points come to the ``slopes`` (3 G, K)."""
+
+    slopes: Any  # gradient of the shape functions at the strain points
+    pairs: Any  # (pairs, V), products Phi_pi Phi_pj of the nodes that meet somewhere
+    strain_pairs: Float[Floats, " pairs"]  # the same of slopes, summed
+    order: Int[Ints, " K"]  # of the nodes, in which those that meet are near one another
+    band: int  # half width, see `_band_places`
+    place: Int[Ints, "pairs 9"]
+
+    @classmethod
+    def of(cls, phi: Any, gradient: Any) -> Equations:
+        """For shape functions at the vertices, and their gradient at the strain points."""
+        K, slopes = phi.shape[1], gradient.astype(np.float64)
+        row, column, pairs = _pair_products(phi)
+        graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (K, K))
+        order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(np.int64)
+        met = slopes.T @ slopes
+        summed = (met if isinstance(met, np.ndarray) else met.toarray())[row, column]
+        return cls(slopes, pairs, summed, order, *_band_places(row, column, np.argsort(order)))
 
 
 @once_per_model
@@ -154,20 +185,24 @@ def _pair_products(phi: Any) -> tuple[Ints, Ints, Any]:
     if isinstance(phi, np.ndarray):
         row, column = np.triu_indices(K)
         return row, column, _EveryPair(phi, row, column)
-    start = phi.indptr[:-1]
-    # All ordered index pairs inside each row, rows side by side.
-    row = np.repeat(np.arange(V), sizes)
-    within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    first = start[row] + within // counts[row]
-    second = start[row] + within % counts[row]
-    keep = phi.indices[first] <= phi.indices[second]
-    row, first, second = row[keep], first[keep], second[keep]
-    code = phi.indices[first].astype(np.int64) * K + phi.indices[second]
+    # Vertices with equally many nodes in reach at a time: each node of a vertex with itself and with those after it.
+    phi.sort_indices()
+    rows, codes, products = [], [], []
+    for count in np.unique(counts[counts > 0]):
+        at = np.flatnonzero(counts == count)
+        first, second = np.triu_indices(count)
+        here = phi.indptr[at][:, None] + np.arange(count, dtype=np.int32)
+        nodes, values = phi.indices[here], phi.data[here]
+        codes.append((nodes[:, first] * np.int32(K) + nodes[:, second]).ravel())
+        products.append((values[:, first] * values[:, second]).ravel())
+        rows.append(np.repeat(at.astype(np.int32), len(first)))
+    code, where = np.concatenate(codes), np.concatenate(rows)
     met = np.zeros(K * K, bool)
     met[code] = True
-    pairs, place = np.flatnonzero(met), (np.cumsum(met) - 1)[code]
-    products = csr_matrix((phi.data[first] * phi.data[second], (place, row)), shape=(len(pairs), V))
-    return pairs // K, pairs % K, products
+    pairs, number = np.flatnonzero(met), np.cumsum(met, dtype=np.int32) - np.int32(1)
+    found = coo_matrix((np.concatenate(products), (number[code], where)), shape=(len(pairs), V)).tocsr()
+    found.sort_indices()
+    return pairs // K, pairs % K, found
 
 
 def _band_places(row: Ints, column: Ints, rank: Int[Ints, " K"]) -> tuple[int, Int[Ints, "pairs 9"]]:

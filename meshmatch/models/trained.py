@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from meshmatch.fields.field import PointwiseField
     from meshmatch.models.deformer import Deformer
 
-_DERIVING = threading.RLock()
 P = ParamSpec("P")
 Derived = TypeVar("Derived")
 
@@ -39,6 +38,7 @@ class TrainedModel:
     template: Template
     inference: Network
     derived: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
+    deriving: Any = field(default_factory=threading.RLock, init=False, repr=False)
 
     @classmethod
     def of(cls, card: ModelCard, template: Template, network: Deformer) -> TrainedModel:
@@ -87,7 +87,7 @@ def once_per_model(
     @wraps(derive)
     def once(model: TrainedModel, *args: P.args, **kwargs: P.kwargs) -> Derived:
         key = (derive, args, tuple(sorted(kwargs.items())))
-        with _DERIVING:
+        with model.deriving:
             if key not in model.derived:
                 model.derived[key] = derive(model, *args, **kwargs)
             return model.derived[key]

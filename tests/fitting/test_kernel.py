@@ -55,7 +55,7 @@ def test_the_least_squares_system_has_the_models_kernel(model: TrainedModel) -> 
     system = node_system(model)
     assert np.allclose(system.phi.toarray(), phi, atol=1e-6)
     rows = (3 * system.strain_points[:, None] + np.arange(3)).ravel()
-    assert np.allclose(system.slopes.toarray(), gradient[rows], atol=1e-5)
+    assert np.allclose(system.equations.slopes.toarray(), gradient[rows], atol=1e-5)
 
 
 def test_the_papers_energy_has_the_models_kernel(model: TrainedModel) -> None:

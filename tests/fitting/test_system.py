@@ -42,7 +42,7 @@ class Problem:
 
     def rows(self, system: NodeSystem) -> tuple[np.ndarray, np.ndarray]:
         """Matrix and right-hand side, a row for each residual; unknown 3 k + a is component a of node k."""
-        phi, slopes = system.phi.toarray(), system.slopes.toarray().reshape(-1, 3, system.K)
+        phi, slopes = system.phi.toarray(), system.equations.slopes.toarray().reshape(-1, 3, system.K)
         eye = np.eye(3)
         data = np.einsum("vab,vk->vakb", self.roots, phi).reshape(-1, 3 * system.K)
         offset = np.einsum("vab,vb->va", self.roots, self.places - system.verts).ravel()
@@ -76,7 +76,7 @@ def test_products_too_many_to_be_kept_are_formed_anew(
     for most, formed in ((kept, False), (kept - 1, True)):
         monkeypatch.setattr("meshmatch.fitting.system._MAX_PRODUCTS", most)
         other = NodeSystem(shape, model.field(shape.verts), strain_points=40)
-        assert isinstance(other._pairs, _EveryPair) == formed
+        assert isinstance(other.equations.pairs, _EveryPair) == formed
         assert np.allclose(problem.solve(other), problem.solve(system), atol=1e-8)
 
 
