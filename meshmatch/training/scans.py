@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from meshmatch.arrays import Float, Int
+from meshmatch.arrays import Bool, Float, Int
 from meshmatch.generators.rotations import DEGREE, rotation_from_vector
+
+_VIEWS, _CELLS = 10, 48  # of what is seen from outside: directions, and cells of a picture's side
 
 
 @dataclass(frozen=True)
@@ -18,6 +20,8 @@ class ScanConfig:
     ``holes``, ``outliers``, ``partial`` are shares of the scans: with holes; with up to 10 % outliers; seen
     from one side or cut by a plane. ``upright``: scans stand in the category's own axes, centred, turned about
     the vertical only (the paper); otherwise roughly in the core frame, where an aligner puts them.
+    ``outside`` is the share of scans that show only what is seen from outside, not what lies inside clothes or between
+    parts; ``strays`` that of scans with something else in them: a thing that is held, a base, a sheet.
     ``sphere``: shapes are scaled to the template's radius around its centroid (the paper) instead of to area 1.
     """
 
@@ -29,6 +33,8 @@ class ScanConfig:
     density: float = 0.6
     bumps: float = 0.004
     scale: float = 0.04
+    outside: float = 0.0
+    strays: float = 0.0
     upright: bool = False
     sphere: bool = False
 
@@ -117,6 +123,43 @@ def seen_share(
     kind = torch.rand(B, 1, generator=generator) / max(share, 1e-9)
     seen = torch.where(kind < 0.5, facing, (height >= plane[:, None]) | (kind >= 1))
     return torch.where(seen, 1.0, 1e-4)
+
+
+def seen_from_outside(
+    verts: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"], generator: torch.Generator
+) -> Bool[Tensor, "B F"]:
+    """Whether the middle of each face is among the foremost, as seen from one of many directions."""
+    B, cells = len(verts), _CELLS
+    centers = verts[:, faces].mean(2)
+    views = random_rotations(B * _VIEWS, generator).view(B, _VIEWS, 3, 3)
+    turned = centers[:, None] @ views.transpose(-1, -2)  # B D F 3
+    low, high = turned.amin(2, keepdim=True), turned.amax(2, keepdim=True)
+    at = ((turned - low) / (high - low).amax(-1, keepdim=True) * (cells - 1e-3)).long()
+    cell = at[..., 0] * cells + at[..., 1]
+    foremost = torch.full((B, _VIEWS, cells * cells), -torch.inf)
+    foremost.scatter_reduce_(2, cell, turned[..., 2], "amax")
+    depth = foremost.gather(2, cell) - turned[..., 2]
+    return (depth < 0.03).any(1)
+
+
+def stray_points(verts: Float[Tensor, "B V 3"], P: int, generator: torch.Generator) -> Float[Tensor, "B P 3"]:
+    """Points of a box, a rod or a sheet near each body, or of a slab that it stands on (y is up)."""
+    B = len(verts)
+    rows = torch.arange(B)
+    base = torch.rand(B, 1, generator=generator) < 0.3
+    half = 0.015 * 30 ** torch.rand(B, 3, generator=generator)  # from a stick to a shield
+    slab = torch.cat([half[:, :1], half[:, 1:2] * 0.15, half[:, :1]], 1) + torch.tensor([0.12, 0.0, 0.12])
+    half = torch.where(base, slab, half)
+    sides = torch.stack([half[:, 1] * half[:, 2], half[:, 0] * half[:, 2], half[:, 0] * half[:, 1]], 1)
+    axis = torch.multinomial(sides, P, True, generator=generator)
+    inside = 2 * torch.rand(B, P, 3, generator=generator) - 1
+    on = inside.scatter(2, axis[..., None], inside.gather(2, axis[..., None]).sign()) * half[:, None]
+    turn = torch.where(base[..., None], torch.eye(3), random_rotations(B, generator))
+    anchor = verts[rows, torch.randint(verts.shape[1], (B,), generator=generator)]
+    anchor = anchor + 0.5 * half.amin(1, keepdim=True) * torch.randn(B, 3, generator=generator)
+    lowest, middle = verts[..., 1].amin(1), verts.mean(1)
+    under = torch.stack([middle[:, 0], lowest - half[:, 1], middle[:, 2]], 1)
+    return on @ turn.transpose(1, 2) + torch.where(base, under, anchor)[:, None]
 
 
 def sample_scan(

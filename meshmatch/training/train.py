@@ -20,7 +20,8 @@ from meshmatch.arrays import Float, Int, Ints
 from meshmatch.errors import InputError, OptionError, TemplateError
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
-from meshmatch.generators.bodies import Bodies, human_source
+from meshmatch.generators.bodies import Bodies
+from meshmatch.generators.characters import people_source
 from meshmatch.generators.generator import Source
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.card import ModelCard, check_name, write_card
@@ -94,9 +95,11 @@ def train(
     source: Source | ShapeSamples
     if shapes is None:
         bodies = bodies or Bodies()
+        if bodies.characters is None:
+            bodies = replace(bodies, characters=recipe.characters)
         template = read_template(bodies.template or recipe.template)
         making = Progress(progress, "bodies").stage("making bodies (once)")
-        source = human_source(template, bodies.identities, recipe.train.seed, making, bodies.poses)
+        source = people_source(template, bodies, recipe.train.seed, making)
         category, data = "human", bodies.words
     elif bodies is not None:
         raise OptionError("poses and bodies do not go with a folder of shapes", "leave out one of the two")

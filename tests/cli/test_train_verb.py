@@ -22,10 +22,11 @@ class Recorder:
         self.bodies: tuple[Any, ...] = ()
         self.called: dict[str, Any] = {}
         self.poses: Any = None
+        self.characters: Any = None
 
-    def human_source(self, template: Any, identities: int, seed: int, progress: Any, poses: Any) -> str:
-        self.bodies = (template.name, identities, seed)
-        self.poses = poses
+    def people_source(self, template: Any, bodies: Any, seed: int, progress: Any) -> str:
+        self.bodies = (template.name, bodies.identities, seed)
+        self.poses, self.characters = bodies.poses, bodies.characters
         progress(0.5)
         return "bodies"
 
@@ -43,7 +44,7 @@ class Recorder:
 @pytest.fixture
 def stub(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     recorder = Recorder()
-    monkeypatch.setattr(training, "human_source", recorder.human_source)
+    monkeypatch.setattr(training, "people_source", recorder.people_source)
     monkeypatch.setattr(training, "train_model", recorder.train_model)
     monkeypatch.delenv("RANK", raising=False)
     return recorder
@@ -63,6 +64,19 @@ def test_defaults(run: Run, stub: Recorder, tmp_path: Path) -> None:
     assert "step 2 of 2: total 0.25, validation 0.0321 (8 s)" in answer.err
     assert f"meshmatch models add {tmp_path / 'mine'}" in answer.err
     assert "unfinished: step 2 of 13,000; the same command goes on" in answer.err
+
+
+def test_half_of_the_people_are_characters_unless_another_share_is_asked_for(
+    run: Run, stub: Recorder, tmp_path: Path
+) -> None:
+    assert run("train", "-o", tmp_path / "mine").status == 0
+    assert stub.characters == recipe_for().characters == 0.5
+    assert "50% of them characters" in stub.called["data"]
+    assert run("train", "-o", tmp_path / "naked", "--characters", 0).status == 0
+    assert stub.characters == 0
+    assert "characters" not in stub.called["data"]
+    assert run("train", "-o", tmp_path / "paper", "--preset", "paper").status == 0
+    assert stub.characters == 0
 
 
 @pytest.mark.parametrize("weight", ["volume", "arap", "blend"])

@@ -14,8 +14,10 @@ from meshmatch.training.scans import (
     random_rotations,
     rigid_fit,
     sample_scan,
+    seen_from_outside,
     seen_share,
     small_rotations,
+    stray_points,
     surface_area,
     yaw_rotations,
 )
@@ -159,3 +161,23 @@ def test_a_scan_is_a_function_of_its_seed() -> None:
     rough = ScanConfig(points=100)
     assert torch.equal(scan(rough, 5), scan(rough, 5))
     assert not torch.equal(scan(rough, 5), scan(rough, 6))
+
+
+def test_what_lies_inside_is_not_seen_from_outside() -> None:
+    ball = icosphere(5)
+    verts = torch.from_numpy(np.concatenate([ball.verts, 0.5 * ball.verts]) * 0.3).float()
+    faces = torch.from_numpy(np.concatenate([ball.faces, ball.faces + ball.V]))
+    seen = seen_from_outside(verts.expand(2, -1, -1), faces, seeded())
+    outer, inner = seen[:, : ball.F], seen[:, ball.F :]
+    assert outer.float().mean() > 0.98
+    assert inner.float().mean() < 0.02
+
+
+def test_strays_are_things_beside_the_body_or_slabs_below_it() -> None:
+    verts = torch.randn(200, 50, 3, generator=seeded(1)) * torch.tensor([0.1, 0.5, 0.1])
+    points = stray_points(verts, 300, seeded())
+    assert torch.isfinite(points).all()
+    below = (points[..., 1] <= verts[..., 1].amin(1, keepdim=True) + 1e-5).all(1)
+    assert 0.2 < below.float().mean() < 0.5
+    nearest = torch.cdist(points, verts).amin((1, 2))
+    assert (nearest < 0.6).all()

@@ -1,0 +1,134 @@
+"""The parts of a body's rig that proportions and clothes are about: which joints, which vertices, how far along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from meshmatch.arrays import Float, Int
+from meshmatch.generators.rig import Rig
+
+# Beginnings of the names of a part's joints, and the joints between which its axis runs; `SIDED` parts come twice.
+_JOINTS: dict[str, tuple[tuple[str, ...], str, str]] = {
+    "hips": (("root", "pelvis", "spine05"), "root", "spine04"),
+    "belly": (("spine04", "spine03"), "spine04", "spine02"),
+    "chest": (("spine02", "spine01", "clavicle", "shoulder01"), "spine02", "neck01"),
+    "neck": (("neck",), "neck01", "head"),
+    "head": (("head", "eye"), "neck01", "head"),
+    "upper arm": (("upperarm",), "upperarm01", "lowerarm01"),
+    "forearm": (("lowerarm",), "lowerarm01", "wrist"),
+    "hand": (("wrist", "metacarpal", "finger"), "wrist", "finger3-1"),
+    "thigh": (("upperleg",), "upperleg01", "lowerleg01"),
+    "shin": (("lowerleg",), "lowerleg01", "foot"),
+    "foot": (("foot", "toe"), "foot", "toe2-1"),
+}
+SIDED = ("upper arm", "forearm", "hand", "thigh", "shin", "foot")
+PARTS = tuple(name + side for name in _JOINTS for side in ((" L", " R") if name in SIDED else ("",)))
+ARM, LEG = ("upper arm", "forearm", "hand"), ("thigh", "shin", "foot")
+_ROUNDS = 3  # of smoothing, where a normal is asked for
+
+
+def part(name: str, side: str = "") -> int:
+    """Index of a part; of parts that come twice, with a side, L or R."""
+    return PARTS.index(f"{name} {side}".strip())
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """What does not change from body to body: made once for a rig, with :meth:`of`.
+
+    ``of_joint`` is the part of every joint, ``share`` how much every vertex belongs to each part. ``reach`` says how far
+    down an arm (column 0) or a leg (column 1) a vertex lies: 0 at the shoulder or hip, 1 at the elbow or knee, 2 at the
+    wrist or ankle, more beyond, and -1 elsewhere; ``height`` 0 at the root, 1 at the neck; ``skull`` is where a vertex lies
+    around the middle of the head, in units of the head's size (z to the face).
+    """
+
+    rig: Rig
+    of_joint: Int[Tensor, " J"]
+    share: Float[Tensor, "V P"]
+    reach: Float[Tensor, "V 2"]
+    height: Float[Tensor, " V"]
+    skull: Float[Tensor, "V 3"]
+    mean_of_neighbours: csr_array
+
+    @classmethod
+    def of(cls, rig: Rig) -> Figure:
+        """The figure of a rig, from the mean of its bodies."""
+        of_joint = torch.tensor([_part_of(name) for name in rig.names])
+        share = torch.zeros(len(rig.weights), len(PARTS)).index_add_(1, of_joint, rig.weights)
+        rest, heads = rig.rest.float().mean(0), rig.heads.mean(0)
+        reach = torch.full((len(rest), 2), -1.0)
+        for column, chain in enumerate((ARM, LEG)):
+            for side in "LR":
+                start = [part(name, side) for name in chain]
+                bones = torch.stack([_along(rig, heads, name, side, rest) for name in chain], 1)
+                here = share[:, start]
+                inside = here.sum(1) > 0.25
+                value = (here * (bones.clamp(0, None) + torch.arange(3.0))).sum(1) / here.sum(1).clamp_min(1e-9)
+                reach[inside, column] = value[inside]
+        bottom, top = heads[rig.joint("root"), 1], heads[rig.joint("neck01"), 1]
+        own = share[:, part("head")]
+        middle = (own[:, None] * rest).sum(0) / own.sum()
+        size = ((own[:, None] * (rest - middle)).square().sum(0) / own.sum()).sqrt().mean() * 3**0.5
+        height = (rest[:, 1] - bottom) / (top - bottom)
+        return cls(rig, of_joint, share, reach, height, (rest - middle) / size, _neighbours(rig))
+
+    def axes(self, heads: Float[Tensor, "B J 3"]) -> Float[Tensor, "B P 3 3"]:
+        """Rows: across, along and out of every part of resting bodies; unit vectors."""
+        found = []
+        for each in PARTS:
+            name, side = (each[:-2], each[-1]) if each[:-2] in SIDED else (each, "")
+            start, end = joints_of(self.rig, name, side)
+            along = torch.nn.functional.normalize(heads[:, end] - heads[:, start], dim=-1)
+            if name not in SIDED:
+                along = torch.tensor([0.0, 1.0, 0.0]).expand_as(along)
+            ahead = torch.tensor([0.0, 1.0, 0.0] if name == "foot" else [0.0, 0.0, 1.0]).expand_as(along)
+            across = torch.nn.functional.normalize(torch.linalg.cross(along, ahead), dim=-1)
+            found.append(torch.stack([across, along, torch.linalg.cross(across, along)], -2))
+        return torch.stack(found, 1)
+
+    def smooth(self, values: Float[Tensor, "B V C"], rounds: int) -> Float[Tensor, "B V C"]:
+        """Values so many times replaced by halfway to the mean of their neighbours."""
+        flat = values.transpose(0, 1).flatten(1).numpy()
+        for _ in range(rounds):
+            flat = 0.5 * flat + 0.5 * (self.mean_of_neighbours @ flat)
+        return torch.from_numpy(flat).unflatten(1, (len(values), -1)).transpose(0, 1)
+
+    def normals(self, verts: Float[Tensor, "B V 3"]) -> Float[Tensor, "B V 3"]:
+        """Smoothed unit normals."""
+        a, b, c = (verts[:, self.rig.faces[:, k]] for k in range(3))
+        area = torch.linalg.cross(b - a, c - a)
+        total = torch.zeros_like(verts)
+        for k in range(3):
+            total.index_add_(1, self.rig.faces[:, k], area)
+        return torch.nn.functional.normalize(self.smooth(total, _ROUNDS), dim=-1)
+
+
+def joints_of(rig: Rig, name: str, side: str = "") -> tuple[int, int]:
+    """The joints between which the axis of a part runs."""
+    _, start, end = _JOINTS[name]
+    suffix = f".{side}" if side else ""
+    return rig.joint(start + suffix), rig.joint(end + suffix)
+
+
+def _part_of(joint: str) -> int:
+    name = next(name for name, (stems, *_) in _JOINTS.items() if joint.startswith(stems))
+    return part(name, joint[-1] if name in SIDED else "")
+
+
+def _along(rig: Rig, heads: Tensor, name: str, side: str, rest: Tensor) -> Tensor:
+    start, end = (heads[k] for k in joints_of(rig, name, side))
+    return (rest - start) @ (end - start) / (end - start).square().sum()
+
+
+def _neighbours(rig: Rig) -> csr_array:
+    """Matrix that takes every vertex to the mean of its neighbours."""
+    V, faces = len(rig.weights), rig.faces
+    a, b = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
+    pairs = torch.unique(torch.cat([torch.stack([a, b]), torch.stack([b, a])], 1), dim=1)
+    count = torch.bincount(pairs[0], minlength=V).clamp_min(1)
+    values = (1.0 / count[pairs[0]].float()).numpy()
+    return csr_array((values, (pairs[0].numpy(), pairs[1].numpy())), shape=(V, V))
