@@ -26,7 +26,7 @@ from meshmatch.templates.template import Template, read_template, save_template
 from meshmatch.training.datasets import registered_source
 from meshmatch.training.loop import StepReport, TrainConfig
 from meshmatch.training.losses import CorrespondenceLoss
-from meshmatch.training.recipes import Recipe, default, paper, recipe_for
+from meshmatch.training.recipes import Recipe, default, paper, people, recipe_for
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import CardFacts, train, train_model
 from tests.generators.stick import stick_figure
@@ -187,7 +187,7 @@ def test_bodies_do_not_go_with_a_folder(prepared: Path, tmp_path: Path) -> None:
 
 def test_the_presets_are_what_they_say() -> None:
     papers, usual = recipe_for(preset="paper"), recipe_for()
-    assert (papers, usual) == (paper(), default())
+    assert (papers, usual) == (paper(), people())
     assert (papers.network.encoder, papers.network.decoder, papers.kernel) == ("point", "node", "cubic")
     assert papers.network.align_basis == papers.network.corrections == 0
     loss = papers.train.loss
@@ -200,6 +200,9 @@ def test_the_presets_are_what_they_say() -> None:
     assert papers.scan == ScanConfig(3000, 0, 0, 0, 0, 0, 0, 0, upright=True, sphere=True)
     assert usual.network.encoder == "basis"
     assert usual.scan.noise > 0
+    assert (usual.characters, papers.characters) == (0.5, 0)
+    assert usual.scan.strays > 0 < usual.scan.outside
+    assert replace(usual, scan=default().scan, characters=0.0) == default()
     with pytest.raises(OptionError, match="unknown preset 'best'") as caught:
         recipe_for(preset="best")  # type: ignore[arg-type]
     assert "paper" in caught.value.hint
