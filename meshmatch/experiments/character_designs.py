@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -44,34 +43,30 @@ class Character:
     places: Int[Ints, " V"] | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Designer:
-    """Makes characters of people that were never trained on."""
+    """Makes characters of the people of a figure."""
 
-    template: Template
+    figure: Figure
     seed: int = 0
 
-    @cached_property
-    def figure(self) -> Figure:
-        """Of 64 people drawn with another seed than the training's."""
-        return Figure.of(template_rig(self.template, 64, TRAINED_SEED + 1 + self.seed))
+    @classmethod
+    def unseen(cls, template: Template, seed: int = 0) -> Designer:
+        """With 64 people that no training of an included model drew, on a human template's vertices."""
+        return cls(Figure.of(template_rig(template, 64, TRAINED_SEED + 1 + seed)), seed)
 
     def people(self, count: int, kinds: Sequence[int], tag: str) -> list[Character]:
         """People in clothes, of these kinds of `meshmatch.generators.proportions`."""
         cast = Cast(self.figure, 1.0, kinds=tuple(float(kind in kinds) for kind in range(len(SHARES))))
         generator = torch.Generator().manual_seed(7919 * (self.seed + 1) + sum(kinds))
         clothed, naked = (layer.double().numpy() for layer in sample_layers(cast, count, generator))
-        faces = np.array(self.template.shape.faces)
+        faces, bones = self.figure.rig.faces.numpy(), self.figure.share.argmax(1).numpy()
         found = []
         for k in range(count):
             fine = trimesh.Trimesh(clothed[k], faces, process=False).subdivide()
             shape = decimate(Shape(fine.vertices, fine.faces, f"{tag}{k}"), _FACES + 500 * (k % 3))
             places = cKDTree(clothed[k]).query(shape.verts)[1]
-            found.append(
-                Character(
-                    shape, self.figure.share.argmax(1).numpy()[places], Shape(naked[k], faces, f"body {k}"), places
-                )
-            )
+            found.append(Character(shape, bones[places], Shape(naked[k], faces, f"body {k}"), places))
         return found
 
     def robots(self, count: int) -> list[Character]:
@@ -108,7 +103,7 @@ class Designer:
 
     def _soldier(self, k: int, rng: np.random.Generator) -> Character:
         skin_verts = self._posed(rng)[1]
-        faces = np.array(self.template.shape.faces)
+        faces = self.figure.rig.faces.numpy()
         normals = np.array(Shape(skin_verts, faces).vertex_normals)
         own = self.figure.share.argmax(1).numpy()
         solids: list[trimesh.Trimesh] = [trimesh.Trimesh(skin_verts, faces, process=False)]

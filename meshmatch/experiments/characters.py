@@ -131,7 +131,7 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    designer = Designer(read_template("human-T"), seed)
+    designer = Designer.unseen(read_template("human-T"), seed)
     matcher = Matcher(model, FitConfig(), threads)
     rows = [
         row_of(group, characters_of(group, count, designer, data), matcher, cache)
