@@ -11,8 +11,7 @@ from meshmatch.cli import words
 from meshmatch.cli.options import FitOptions, RunOptions, check_outputs, grouped, optional, output_option, refuse_given
 from meshmatch.cli.words import Console, Json, print_json
 from meshmatch.errors import OptionError, needs
-from meshmatch.implicit.card import is_implicit
-from meshmatch.models.registry import check_model
+from meshmatch.models.registry import check_model, implicit_folder
 from meshmatch.outputs import folder_on_success, replace_on_success
 from meshmatch.threads import thread_limit
 
@@ -74,7 +73,7 @@ def interpolate(
     options = interpolation.InterpolationOptions(
         sequence.start, sequence.stop, sequence.mesh, sequence.blend, sequence.place
     )
-    if is_implicit(how.model):
+    if implicit_folder(how.model) is not None:
         _interpolate_implicit(source, target, output, sequence, how, run)
         return
     console = Console(run.quiet)
@@ -145,9 +144,10 @@ def _interpolate_implicit(
         words.tell_verdict(console, fit.verdict, fit.reasons, f"the fit of {file.name}")
     console.say(f"wrote {output}: {sequence.frames} surfaces, from time {sequence.start:g} to {sequence.stop:g}")
     if run.json:
-        residuals = {"residuals": [round(fit.residual, 4) for fit in result.fits], "times": result.times}
+        files = source.name, target.name
+        fits = [words.implicit_record(*each) for each in zip(files, result.fits, strict=True)]
         counts = {"vertices": [shape.V for shape in result.shapes], "model": how.model, "seed": how.seed}
-        print_json({"output": output} | residuals | counts)
+        print_json({"output": output, "times": result.times, "fits": fits} | counts)
 
 
 def _draw_strip(path: Path, result: "meshmatch.Interpolation", met: dict[float, str]) -> None:

@@ -19,8 +19,7 @@ from meshmatch.cli.options import (
 )
 from meshmatch.cli.words import Console, print_json, print_rows
 from meshmatch.errors import OptionError, needs
-from meshmatch.implicit.card import is_implicit
-from meshmatch.models.registry import check_model
+from meshmatch.models.registry import check_model, implicit_folder
 from meshmatch.outputs import replace_on_success
 from meshmatch.threads import thread_limit
 
@@ -49,7 +48,7 @@ def match(
     how.check()
     check_suffix(output)
     check_outputs([source, target, how.known_pairs], output, picture=picture)
-    if is_implicit(how.model):
+    if implicit_folder(how.model) is not None:
         _match_implicit(source, target, output, how, run, picture)
         return
     console, names = Console(run.quiet), words.names_of([source, target])
@@ -113,8 +112,9 @@ def _match_implicit(
     if picture is not None:
         console.say(f"drew {picture}: corresponding points in one color")
     if run.json:
-        residuals = {"residuals": [round(fit.residual, 4) for fit in (a, b)], "model": how.model, "seed": how.seed}
-        print_json({"output": output, "picture": picture} | words.map_record(found, names) | residuals)
+        fits = {"fits": [words.implicit_record(*each) for each in zip(names, (a, b), strict=True)]}
+        about = fits | {"model": how.model, "seed": how.seed}
+        print_json({"output": output, "picture": picture} | words.map_record(found, names) | about)
 
 
 @grouped
@@ -139,6 +139,9 @@ def register(
     how.check()
     check_suffix(output)
     check_outputs([shape], output, picture=picture)
+    if implicit_folder(how.model) is not None:
+        _register_implicit(shape, output, how, run, dense, picture)
+        return
     console = Console(run.quiet)
     with replace_on_success(output) as temporary:
         check_model(how.model)
@@ -162,6 +165,39 @@ def register(
     if run.json:
         record = {"output": output, "picture": picture, "vertices": fitted.V, "faces": fitted.F, "dense": dense}
         print_json(record | how.record(fit) | words.fit_record(loaded.name, fit) | {"notes": list(fit.notes)})
+
+
+def _register_implicit(
+    shape: Path, output: Path, how: FitOptions, run: RunOptions, dense: bool, picture: Path | None
+) -> None:
+    """The template's surface of an implicit model, moved onto the shape."""
+    refuse_given(how, ("model", "seed"), "an implicit model")
+    if dense:
+        raise OptionError("--dense does not go with an implicit model", "leave it out")
+    with needs("torch", "implicit"):
+        from meshmatch.implicit.codes import fit_implicit
+        from meshmatch.implicit.model import load_implicit
+    console = Console(run.quiet)
+    with replace_on_success(output) as temporary, thread_limit(1):  # tensors are small
+        model = load_implicit(how.model)
+        loaded = meshmatch.load_shape(shape)
+        with console.progress() as progress:
+            fit = fit_implicit(model, loaded, seed=how.seed, progress=progress)
+        words.refuse_poor(run.strict, fit.verdict, fit.reasons)
+        fitted = model.register(fit)
+        meshmatch.save_shape(temporary, fitted)
+    if picture is not None:
+        from meshmatch.render.compose import compose_fit
+
+        compose_fit(loaded, fitted).render(picture)
+    console.say(f"fitted the template of {model.card.name} to {loaded.name}: {fit.verdict} fit")
+    words.tell_verdict(console, fit.verdict, fit.reasons)
+    console.say(f"wrote {output}: {fitted.V} vertices, {fitted.F} faces")
+    if picture is not None:
+        console.say(f"drew {picture}: the template over the shape, and their distance")
+    if run.json:
+        record = {"output": output, "picture": picture, "vertices": fitted.V, "faces": fitted.F}
+        print_json(record | words.implicit_record(loaded.name, fit) | {"model": how.model, "seed": how.seed})
 
 
 def evaluate(

@@ -10,6 +10,7 @@ from meshmatch.cli.words import Console, print_json, print_rows, print_text
 from meshmatch.errors import ModelError
 from meshmatch.models import card as cards
 from meshmatch.models import registry
+from meshmatch.models.implicit_card import ImplicitCard, implicit_card_to_json
 
 models = typer.Typer(
     help="List, show, add, remove and verify trained models.", no_args_is_help=True, rich_markup_mode=None
@@ -49,7 +50,8 @@ def show(name: Name) -> None:
 
     It names template, data, licence, recipe, time, errors and hashes.
     """
-    print_text(cards.card_to_json(cards.read_card(registry.locate_model(name) / registry.CARD)))
+    card = registry.read_any_card(registry.locate_model(name))
+    print_text(implicit_card_to_json(card) if isinstance(card, ImplicitCard) else cards.card_to_json(card))
 
 
 @models.command()

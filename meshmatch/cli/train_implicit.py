@@ -23,9 +23,9 @@ def train_shapes(output: Path, how: Any, json: bool, console: Console) -> None:
     if how.shapes is None or how.field == "rbf":
         raise OptionError("--implicit needs --shapes, and the field mls or pointwise", "give a folder of shapes")
     with needs("torch", "implicit"):
-        from meshmatch.implicit.card import read_implicit_card
         from meshmatch.implicit.network import ImplicitConfig
         from meshmatch.implicit.training import TRAINING, train_implicit
+        from meshmatch.models.implicit_card import read_implicit_card
         from meshmatch.training.train import CHECKPOINT, CardFacts
     if how.picture is not None:
         from meshmatch.render.charts import check_chart

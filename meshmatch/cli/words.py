@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 import threading
@@ -180,6 +181,13 @@ def tell_match(console: Console, result: meshmatch.MatchResult, names: Sequence[
     console.say(*result.notes)
     for name, fit in zip(names, (result.source_fit, result.target_fit), strict=True):
         console.say(f"{name}: {fit_words(fit)}")
+
+
+def implicit_record(name: str, fit: meshmatch.ImplicitFit) -> Json:
+    """What an implicit model found of one shape; what is not known is null."""
+    numbers = {key: getattr(fit, key) for key in ("residual", "missed", "invented")}
+    known = {key: None if math.isnan(value) else round(value, 4) for key, value in numbers.items()}
+    return {"shape": name, "verdict": fit.verdict, "reasons": list(fit.reasons)} | known
 
 
 def fit_record(name: str, fit: meshmatch.Fit) -> Json:

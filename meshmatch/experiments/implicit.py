@@ -6,13 +6,14 @@ also between codes) which are cheap for it. Measured on the shapes of the traini
 
 reconstruction: Chamfer distance (both ways, mean, % of the longest side) and IoU of the insides;
 labels: part IoU where each point of one shape takes the part of the nearest point of another on the template, by position
-alone and with normals;
+alone and with normals, over pairs of 64 of the shapes;
 interpolation: how far the surface's motion is from even, |f(t+h) - 2 f(t) + f(t-h)| on the surface at t (% of the longest
 side), its part of the motion |f(t+h) - f(t-h)| / 2; how far volume is from going evenly (%); pieces that a surface has;
 mean volume and rigidity energies of the deformation on the surfaces; CPU seconds of a training step.
 
-What is finished is kept in --work, and trainings go on from their checkpoints. --picture draws figure 12: shapes between
-two, colored by how far the deformation moves each point to the template.
+With --seeds both are trained as often on the same shapes, and a number is the mean over trainings, with its standard
+deviation. What is finished is kept in --work, and trainings go on from their checkpoints. --picture draws figure 12:
+shapes between two, colored by how far the deformation moves each point to the template.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ from meshmatch.arrays import Floats, Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.furniture import KINDS, furniture
 from meshmatch.fields.field import arap_energy, volume_energy
-from meshmatch.implicit.card import IMPLICIT
 from meshmatch.implicit.model import ImplicitFit, ImplicitModel, load_implicit, nearest_on_template
 from meshmatch.implicit.network import ImplicitConfig
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
 from meshmatch.implicit.training import TRAINING, ImplicitDataset, build_implicit, train_implicit
+from meshmatch.models.implicit_card import IMPLICIT
 from meshmatch.outputs import make_folder
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
@@ -52,6 +53,8 @@ from meshmatch.training.loop import TrainConfig, Trainer
 METHODS = {"DIF-Net": "pointwise", "reduced": "mls"}
 FRAMES = 5
 _POINTS = 2000
+_LABELLED, _PAIRS = 64, 50  # shapes whose points have labels, and pairs of them for each that is compared
+_COMPARED = ("chamfer", "label_iou", "facing_iou", "bend")
 _MOVED = 0.25  # of the cube's half side: the last color
 
 
@@ -110,23 +113,30 @@ def part_iou(truth: Ints, found: Ints, parts: list[int]) -> float:
     return float(np.mean(both))
 
 
-def label_transfer(model: ImplicitModel, kind: str, pairs: list[tuple[int, int]], seed: int) -> dict[str, float]:
+Labelled = dict[int, tuple[Floats, Floats, Ints]]
+"""Points of shapes by their numbers, with normals and parts."""
+
+
+def labelled_points(kind: str, numbers: list[int], seed: int) -> Labelled:
+    """Points of the surfaces of some shapes."""
+    return {k: furniture(kind, seed, k).sample(_POINTS, np.random.default_rng(k)) for k in numbers}
+
+
+def label_transfer(model: ImplicitModel, points: Labelled, pairs: list[tuple[int, int]]) -> dict[str, float]:
     """Part IoU through the template, of the parts that both shapes have: by position, with normals too as `match` does, and
     by position where nothing is deformed.
     """
+    shapes = {k: learned(model, k) for k in points}
+    places = {k: model.to_template(points[k][0], shapes[k]) for k in points}
+    cubes = {k: shapes[k].frame.apply(points[k][0]) for k in points}
     found = []
-    for pair in pairs:
-        (a, m, labels), (b, n, truth) = (
-            furniture(kind, seed, k).sample(_POINTS, np.random.default_rng(k)) for k in pair
-        )
+    for a, b in pairs:
+        (_, m, labels), (_, n, truth) = points[a], points[b]
         common = np.intersect1d(labels, truth).tolist()
         known, asked = np.isin(labels, common), np.isin(truth, common)
-        shapes = [learned(model, k) for k in pair]
-        places = [model.to_template(points, shape) for points, shape in zip((a, b), shapes, strict=True)]
-        cubes = [shape.frame.apply(points) for points, shape in zip((a, b), shapes, strict=True)]
         row = []
-        for (from_a, from_b), share in ((places, 0), (places, 1), (cubes, 0)):
-            index = nearest_on_template(from_b[asked], from_a[known], share * n[asked], share * m[known])
+        for at, share in ((places, 0), (places, 1), (cubes, 0)):
+            index = nearest_on_template(at[b][asked], at[a][known], share * n[asked], share * m[known])
             row.append(part_iou(truth[asked], labels[known][index], common))
         found.append(row)
     return dict(zip(("label_iou", "facing_iou", "undeformed_iou"), np.mean(found, 0).tolist(), strict=True))
@@ -178,6 +188,14 @@ def step_seconds(samples: ImplicitSamples, config: ImplicitConfig, training: Tra
     return (time.process_time() - began) / count
 
 
+def means(trainings: list[dict[str, Any]]) -> dict[str, Any]:
+    """Means over trainings, the standard deviations of those that are compared, and the numbers of each."""
+    names = [name for name in trainings[0] if name != "asked"]
+    values = {name: [float(each[name]) for each in trainings] for name in names}
+    spread = {f"{name}_sd": float(np.std(values[name], ddof=1)) for name in _COMPARED if len(trainings) > 1}
+    return {name: float(np.mean(values[name])) for name in names} | spread | {"trainings": values}
+
+
 def pairs_of(shapes: int, count: int, seed: int) -> list[tuple[int, int]]:
     """Different shapes, drawn once for all methods."""
     rng = np.random.default_rng([seed, 12])
@@ -223,50 +241,53 @@ def main(
     work: Annotated[Path, Option(help="where finished work is kept")] = Path("runs/implicit"),
     kinds: Annotated[str, Option(help=f"of {', '.join(KINDS)}")] = ",".join(KINDS),
     methods: Annotated[str, Option(help=f"of {', '.join(METHODS)}")] = ",".join(METHODS),
-    shapes: Annotated[int, Option(min=4, help="of each kind")] = 64,
+    shapes: Annotated[int, Option(min=4, help="of each kind")] = 500,
     steps: Annotated[int, Option(min=1)] = 1000,
+    seeds: Annotated[int, Option(min=1, help="trainings of each, on the same shapes")] = 1,
     compared: Annotated[int, Option(min=1, help="shapes reconstructed, and pairs of interpolations")] = 6,
     picture: Annotated[Path | None, Option(help="figure 12, a PNG")] = None,
     seed: runner.Seed = 0,
     threads: runner.Threads = 1,
 ) -> runner.Report:
-    training = replace(TRAINING, steps=steps, seed=seed, checkpoint_minutes=1.0)
     rows: list[dict[str, Any]] = []
     models: dict[tuple[str, str], ImplicitModel] = {}
     for kind in runner.names_of(kinds, KINDS, "kind"):
         samples = read_implicit_samples(prepared(work, kind, shapes, seed), seed)
+        chosen = runner.spread(range(shapes), _LABELLED)
+        points = labelled_points(kind, chosen, seed)
+        pairs = [(chosen[a], chosen[b]) for a, b in pairs_of(len(chosen), _PAIRS * compared, seed)]
         for method in runner.names_of(methods, METHODS, "method"):
-            field = METHODS[method]
-            config = ImplicitConfig(field)  # type: ignore[arg-type]
-            folder = work / f"{kind}-{field}"
-            model = models[kind, method] = trained(folder, samples, config, training)
-            asked = {"shapes": shapes, "steps": steps, "compared": compared, "seed": seed}
+            config = ImplicitConfig(METHODS[method])  # type: ignore[arg-type]
+            trainings = []
+            for number in range(seed, seed + seeds):
+                training = replace(TRAINING, steps=steps, seed=number, checkpoint_minutes=1.0)
+                folder = work / f"{kind}-{METHODS[method]}-{number}"
+                model = trained(folder, samples, config, training)
+                models.setdefault((kind, method), model)
+                asked = {"shapes": shapes, "steps": steps, "compared": compared, "seed": seed}
 
-            def measure() -> dict[str, float]:
-                runner.tell(f"measuring {kind}, {method}")  # noqa: B023
-                return {
-                    **reconstruction(model, kind, runner.spread(range(shapes), compared), seed),  # noqa: B023
-                    **label_transfer(model, kind, pairs_of(shapes, 5 * compared, seed), seed),  # noqa: B023
-                    **interpolation(model, pairs_of(shapes, compared, seed + 1)),  # noqa: B023
-                    "seconds": step_seconds(samples, config, training),  # noqa: B023
-                }
+                def measure() -> dict[str, float]:
+                    runner.tell(f"measuring {folder.name}")  # noqa: B023
+                    return {
+                        **reconstruction(model, kind, runner.spread(range(shapes), compared), seed),  # noqa: B023
+                        **label_transfer(model, points, pairs),  # noqa: B023
+                        **interpolation(model, pairs_of(shapes, compared, seed + 1)),  # noqa: B023
+                        "seconds": step_seconds(samples, config, training),  # noqa: B023
+                    }
 
-            found = runner.once(folder / "measured.json", asked, measure)
-            rows.append({"kind": kind, "method": method, **{key: found[key] for key in found if key != "asked"}})
+                trainings.append(runner.once(folder / "measured.json", asked, measure))
+            rows.append({"kind": kind, "method": method, **means(trainings)})
     if picture is not None:
         draw(picture, models, pairs_of(shapes, compared, seed + 1)[0])
     columns = {
         **{"kind": "kind", "deformation": "method", "Chamfer %": "chamfer:.3f", "IoU": "iou:.3f"},
-        **{
-            "label IoU": "label_iou:.3f",
-            "with normals": "facing_iou:.3f",
-            "undeformed": "undeformed_iou:.3f",
-            "bend %": "bend:.3f",
-        },
+        **{"label IoU": "label_iou:.3f", "±": "label_iou_sd:.3f"},
+        **{"with normals": "facing_iou:.3f", "± ": "facing_iou_sd:.3f", "undeformed": "undeformed_iou:.3f"},
+        **{"bend %": "bend:.3f", "±  ": "bend_sd:.3f"},
         **{"of motion": "bend_share:.3f", "volume %": "volume_change:.2f", "pieces": "pieces:.1f"},
         **{"(det F-1)^2": "volume_energy:.3f", "|F'F-I|": "arap_energy:.3f", "s/step": "seconds:.3f"},
     }
-    title = f"Implicit surfaces, {shapes} shapes of a kind, {steps} steps"
+    title = f"Implicit surfaces, {shapes} shapes of a kind, {steps} steps, {seeds} trainings"
     return runner.Report({"rows": rows}, [runner.table(title, rows, columns)])
 
 

@@ -6,6 +6,7 @@ whose distances fit the samples best.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from meshmatch.shapes.files import ShapeLike, as_shape
 
 _SAMPLES, _POINTS, _FEW = 8192, 1024, 512  # of the shape, in a step, and to choose where to begin
 _RATE = 1e-2
+_THIN, _ENOUGH = 0.02, 100  # nearer than this, samples are taken for the surface if there are so many
 
 
 def fit_implicit(
@@ -59,7 +61,12 @@ def fit_implicit(
     with torch.no_grad():
         on = rows[:half]
         away = network.distance(on[None, :, :3], code[None])[0][0] - on[:, 3]
-    return ImplicitFit(name, code.detach(), frame, percent_of_side(float(away.abs().mean())))
+    fit = ImplicitFit(name, code.detach(), frame, percent_of_side(float(away.abs().mean())))
+    surface = on[on[:, 3].abs() < _THIN, :3].double().numpy()
+    if len(surface) < _ENOUGH:
+        return fit
+    missed, invented = model.shares(fit, surface, seed)
+    return replace(fit, missed=missed, invented=invented)
 
 
 @torch.no_grad()

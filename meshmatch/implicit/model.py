@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
@@ -17,19 +17,24 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, ModelError, OptionError, needs
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.kernels import KERNELS
-from meshmatch.implicit.card import ImplicitCard, read_implicit_card
 from meshmatch.implicit.network import Deformation, ImplicitConfig, ImplicitNetwork
 from meshmatch.implicit.samples import FILLED
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.checkpoint import load_weights
-from meshmatch.models.registry import WEIGHTS
+from meshmatch.models.implicit_card import ImplicitCard, read_implicit_card
+from meshmatch.models.registry import WEIGHTS, check_weights, locate_model
 from meshmatch.models.tensor_file import read_header
+from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
 _AT_ONCE = 8192  # points
 _DOUBTED = 0.2  # distance on the template, in the cube, from which a match has no confidence; set by hand
 _NORMAL = 0.2  # chosen among 0.05 to 0.2 on generated furniture
 _FAIR, _POOR = 2.0, 5.0  # residuals above which a shape is so; set by hand
+_FAIR_SHARE, _POOR_SHARE = 0.03, 0.1  # shares without counterpart above which a shape is so; set by hand
+_REACH = 4.0  # % of the longest side: what is further from the other surface has no counterpart; set by hand
+_NEWTON, _ONTO, _STEP = 12, 3, 0.1  # steps back to a shape, steps onto its surface, and their longest
+_COARSE = 48  # resolution of the surface that a fit is judged by
 _MOST = {"code": 1024, "width": 2048, "depth": 16, "inner": 512}  # that a card may ask for
 
 
@@ -37,29 +42,43 @@ _MOST = {"code": 1024, "width": 2048, "depth": 16, "inner": 512}  # that a card 
 class ImplicitFit:
     """A shape as a model has it: a code, and the way from its file into the cube from -1 to 1.
 
-    ``residual`` is the mean distance that the model gives points of its surface, % of the longest side; NaN if not known.
+    ``residual`` is the mean distance that the model gives points of its surface, % of the longest side; ``missed`` the
+    share of these points that the model's surface comes nowhere near, ``invented`` the share of the model's surface that
+    is nowhere near the shape. NaN is not known.
     """
 
     name: str
     code: Float[torch.Tensor, " D"]
     frame: Frame
     residual: float = math.nan
+    missed: float = math.nan
+    invented: float = math.nan
 
     @property
     def verdict(self) -> str:
-        """Good, fair or poor by the residual."""
-        return "unknown" if math.isnan(self.residual) else ("good", "fair", "poor")[self._grade]
+        """Good, fair or poor by the residual and both shares, whichever is worst."""
+        grades = [grade for grade, _ in self._graded]
+        return ("good", "fair", "poor")[max(grades)] if grades else "unknown"
 
     @property
     def reasons(self) -> tuple[str, ...]:
         """Why it is not good."""
-        if math.isnan(self.residual) or not self._grade:
-            return ()
-        return (f"the model's surface is {self.residual:.1f} % of the longest side away from {self.name}",)
+        return tuple(words for grade, words in self._graded if grade)
 
     @property
-    def _grade(self) -> int:
-        return int(self.residual > _FAIR) + int(self.residual > _POOR)
+    def _graded(self) -> list[tuple[int, str]]:
+        """What is known, from 0 (good) to 2 (poor), in words."""
+        reach = f"over {_REACH:g} % of the longest side"
+        away = f"the model's surface is {self.residual:.1f} % of the longest side away from {self.name}"
+        missed = f"{self.missed:.0%} of {self.name} is {reach} from the model's surface"
+        invented = f"{self.invented:.0%} of the model's surface is {reach} from {self.name}"
+        shares = (_FAIR_SHARE, _POOR_SHARE)
+        found = (
+            (self.residual, _FAIR, _POOR, away),
+            (self.missed, *shares, missed),
+            (self.invented, *shares, invented),
+        )
+        return [(int(value > fair) + int(value > poor), words) for value, fair, poor, words in found if value == value]
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,22 +149,81 @@ class ImplicitModel:
         ``resolution`` (even) is the number of cells along each side of the cube. `OptionError` for a resolution that is odd
         or out of 8..512, or without scikit-image; `ModelError` where the distances enclose nothing.
         """
-        with needs("skimage", "implicit"):
-            from skimage.measure import marching_cubes
+        found = zero_surface(lambda points: self.distance(points, shape.code)[0], resolution, shape.name)
+        return Shape(shape.frame.undo(found.verts), found.faces, shape.name)
 
-        check_resolution(resolution)
-        step, ticks = 2 / resolution, np.linspace(-1, 1, resolution // 2 + 1, dtype=np.float64)
-        points: Floats = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
-        coarse = self.distance(points, shape.code)[0].reshape([len(ticks)] * 3)
-        values = zoom(coarse, (resolution + 1) / len(ticks), order=1)
-        near = np.argwhere(np.abs(values) < 2 * step * math.sqrt(3))  # elsewhere the coarse grid says enough
-        if len(near):
-            values[tuple(near.T)] = self.distance(np.asarray(near * step - 1, np.float64), shape.code)[0]
-        values = np.pad(values, 1, constant_values=1.0)  # closed where it meets the cube
-        if not values.min() < 0:
-            raise ModelError(f"the model has no surface for {shape.name}", "train it longer")
-        verts, faces, _, _ = marching_cubes(values, 0.0, allow_degenerate=False)
-        return Shape(shape.frame.undo((verts - 1) * step - 1), faces.astype(np.int64), shape.name)
+    def template(self, resolution: int = 64) -> Shape:
+        """The template's own surface, in the cube; ``resolution`` and errors as of `surface`."""
+
+        @torch.no_grad()
+        def distance(points: Float[Floats, "P 3"]) -> Float[Floats, " P"]:
+            parts = torch.from_numpy(points.astype(np.float32)).split(_AT_ONCE)
+            return torch.cat([self.network.template(part[None])[0, :, 0] for part in parts]).double().numpy()
+
+        return zero_surface(distance, resolution, "template")
+
+    def register(self, shape: ImplicitFit, resolution: int = 64) -> Shape:
+        """The template's surface on a shape, in the file's frame: for all shapes the same vertices and triangles in order.
+
+        Each vertex goes where the deformation comes from, and from there along the distance's slope to the surface.
+        ``resolution`` and errors as of `surface`.
+        """
+        rest = self.template(resolution)
+        places = torch.from_numpy(rest.verts.astype(np.float32))
+        found = torch.cat([self._undeformed(part, shape.code) for part in places.split(_AT_ONCE)])
+        return Shape(shape.frame.undo(found.double().numpy()), rest.faces, shape.name)
+
+    @torch.no_grad()
+    def _undeformed(
+        self, places: Float[torch.Tensor, "P 3"], code: Float[torch.Tensor, " D"]
+    ) -> Float[torch.Tensor, "P 3"]:
+        """Points of a shape's surface whose place on the template is given, as nearly as it can be."""
+        at, network = places.clone(), self.network
+        for _ in range(_NEWTON):
+            off = network.distance(at[None], code[None])[1][0] - places
+            F = network(at[None], code[None]).F[0]
+            at = (at - _at_most(torch.linalg.lstsq(F, off[..., None]).solution[..., 0])).clamp(-1, 1)
+        for _ in range(_ONTO):
+            found = network(at[None], code[None])
+            slope = found.gradient[0]
+            step = found.distance[0, :, None] * slope / slope.square().sum(1, keepdim=True).clamp_min(0.1)
+            at = (at - _at_most(step)).clamp(-1, 1)
+        return at.detach()
+
+    def shares(self, shape: ImplicitFit, points: Float[Floats, "P 3"], seed: int = 0) -> tuple[float, float]:
+        """Shares of a shape's points (in the cube) and of the model's surface that are far from the other."""
+        try:
+            surface = sample_surface(self.surface(shape, _COARSE), len(points), np.random.default_rng(seed)).points
+        except ModelError:
+            return 1.0, 0.0
+        surface, spacing = shape.frame.apply(surface), cKDTree(points).query(points, 2)[0][:, 1]
+        reach = max(2 * FILLED * _REACH / 100, 3 * float(np.median(spacing)))
+        far = [cKDTree(b).query(a)[0] > reach for a, b in ((points, surface), (surface, points))]
+        return float(far[0].mean()), float(far[1].mean())
+
+
+def _at_most(step: Float[torch.Tensor, "P 3"]) -> Float[torch.Tensor, "P 3"]:
+    return step * (_STEP / step.norm(dim=1, keepdim=True).clamp_min(_STEP))
+
+
+def zero_surface(distance: Callable[[Float[Floats, "P 3"]], Float[Floats, " P"]], resolution: int, name: str) -> Shape:
+    """Where distances in the cube are zero, by marching cubes; see `ImplicitModel.surface`."""
+    with needs("skimage", "implicit"):
+        from skimage.measure import marching_cubes
+
+    check_resolution(resolution)
+    step, ticks = 2 / resolution, np.linspace(-1, 1, resolution // 2 + 1, dtype=np.float64)
+    points: Floats = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
+    coarse = distance(points).reshape([len(ticks)] * 3)
+    values = zoom(coarse, (resolution + 1) / len(ticks), order=1)
+    near = np.argwhere(np.abs(values) < 2 * step * math.sqrt(3))  # elsewhere the coarse grid says enough
+    if len(near):
+        values[tuple(near.T)] = distance(np.asarray(near * step - 1, np.float64))
+    values = np.pad(values, 1, constant_values=1.0)  # closed where it meets the cube
+    if not values.min() < 0:
+        raise ModelError(f"the model has no surface for {name}", "train it longer")
+    verts, faces, _, _ = marching_cubes(values, 0.0, allow_degenerate=False)
+    return Shape((verts - 1) * step - 1, faces.astype(np.int64), name)
 
 
 def nearest_on_template(
@@ -171,8 +249,10 @@ def percent_of_side(distance: float) -> float:
 
 
 def load_implicit(folder: str | Path) -> ImplicitModel:
-    """A model that `train_implicit` wrote; `ModelError` if the folder holds none, or a file is damaged or another's."""
-    folder = Path(folder)
+    """A model that `train_implicit` wrote, by its folder or its name in the registry; `ModelError` if there is none, or a
+    file is damaged or another's.
+    """
+    folder = locate_model(folder)
     card = read_implicit_card(folder)
     try:
         config = ImplicitConfig(**card.network)
@@ -188,10 +268,7 @@ def load_implicit(folder: str | Path) -> ImplicitModel:
             Frame(card.frames[number][0], np.eye(3), np.array(card.frames[number][1:]))
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, InputError) as error:
         raise ModelError(f"{folder} holds no implicit model that can be: {error}", "is a file damaged?") from error
-    with (folder / WEIGHTS).open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    if digest != card.weights_sha256:
-        raise ModelError(f"the weights in {folder} are not those of its card", "train it again, or fetch it again")
+    check_weights(folder, card)
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     weights = load_weights(folder / WEIGHTS, expected)
     network.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()}, assign=True)

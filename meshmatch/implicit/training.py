@@ -12,13 +12,13 @@ import torch
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError
-from meshmatch.implicit.card import IMPLICIT, ImplicitCard, write_implicit_card
 from meshmatch.implicit.network import ImplicitConfig, ImplicitNetwork
 from meshmatch.implicit.objective import ImplicitBatch, ImplicitLoss
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
 from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
 from meshmatch.models.card import check_name
 from meshmatch.models.checkpoint import save_weights
+from meshmatch.models.implicit_card import IMPLICIT, ImplicitCard, write_implicit_card
 from meshmatch.models.registry import WEIGHTS
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.sampling import farthest_points

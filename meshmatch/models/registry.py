@@ -1,6 +1,7 @@
 """Models by name: those that ship with the package, and the user's own.
 
-A model is a folder with ``card.json`` (written last), ``weights.safetensors`` and ``template.safetensors``.
+A model is a folder with ``card.json`` (written last), ``weights.safetensors`` and ``template.safetensors``; an implicit
+model one with ``implicit.json`` (written last) and ``weights.safetensors``.
 Listing models loads neither NumPy nor torch.
 """
 
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from meshmatch.errors import MeshmatchError, ModelError, OutputError
 from meshmatch.models.card import ModelCard, check_name, read_card
+from meshmatch.models.implicit_card import IMPLICIT, ImplicitCard, is_implicit, read_implicit_card
 from meshmatch.models.tensor_file import read_header
 from meshmatch.outputs import as_path
 
@@ -36,7 +38,7 @@ class Entry:
     name: str
     folder: Path
     built_in: bool
-    card: ModelCard | None  # None if it cannot be read
+    card: ModelCard | ImplicitCard | None  # None if it cannot be read
     problem: str = ""  # then why
 
 
@@ -82,15 +84,29 @@ def locate_model(name: str | Path) -> Path:
     try:
         return _registered(text)
     except ModelError:
-        if os.path.isdir(folder) and (folder / CARD).is_file():
+        if os.path.isdir(folder) and ((folder / CARD).is_file() or is_implicit(folder)):
             return folder
         raise
 
 
 def check_model(name: str | Path) -> None:
-    """`ModelError` if a model is neither ``auto`` nor the name or the folder of one."""
+    """`ModelError` if a model is neither ``auto`` nor the name or the folder of one with a template of vertices."""
     if name != AUTO:
-        locate_model(name)
+        _refuse_implicit(locate_model(name))
+
+
+def implicit_folder(name: str | Path) -> Path | None:
+    """The folder of an implicit model, given by its name or its folder; None if it is anything else."""
+    try:
+        folder = locate_model(name)
+    except ModelError:
+        return None
+    return folder if is_implicit(folder) else None
+
+
+def read_any_card(folder: Path) -> ModelCard | ImplicitCard:
+    """The card of a model of either kind; `ModelError` as `read_card` has it."""
+    return read_implicit_card(folder) if is_implicit(folder) else read_card(folder / CARD)
 
 
 def find_model(name: str | Path) -> tuple[Path, ModelCard]:
@@ -98,19 +114,25 @@ def find_model(name: str | Path) -> tuple[Path, ModelCard]:
 
     `ModelError` if there is no such model, or it is damaged.
     """
-    import hashlib
-
     folder = locate_model(name)
+    _refuse_implicit(folder)
     card = read_card(folder / CARD)
     for part in (TEMPLATE, WEIGHTS):
         read_header(folder / part)
+    check_weights(folder, card)
+    return folder, card
+
+
+def check_weights(folder: Path, card: ModelCard | ImplicitCard) -> None:
+    """`ModelError` if a model's weights are not those of its card."""
+    import hashlib
+
     with (folder / WEIGHTS).open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if digest != card.weights_sha256:
         hashes = f"sha256 {digest[:12]}..., not {card.weights_sha256[:12]}..."
         problem = f"the weights of model {card.name} are not those of its card ({hashes})"
         raise ModelError(problem, "fetch or add the model again")
-    return folder, card
 
 
 def load_model(name: str | Path = "human") -> TrainedModel:
@@ -125,11 +147,20 @@ def load_model(name: str | Path = "human") -> TrainedModel:
     return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, folder.name if _is_registered(folder) else None)
 
 
-def verify_model(name: str | Path) -> ModelCard:
-    """The card of a model that was loaded to be sure that it can be; `ModelError` if anything about it is wrong."""
+def verify_model(name: str | Path) -> ModelCard | ImplicitCard:
+    """The card of a model that was loaded to be sure that it can be; `ModelError` if anything about it is wrong.
+
+    Of an implicit model its card and the checksum of its weights are looked at.
+    """
     folder = locate_model(name)
+    card: ModelCard | ImplicitCard
     try:
-        card = load_model(folder).card
+        if is_implicit(folder):
+            card = read_implicit_card(folder)
+            read_header(folder / WEIGHTS)
+            check_weights(folder, card)
+        else:
+            card = load_model(folder).card
     except ModelError:
         raise
     except MeshmatchError as error:
@@ -149,10 +180,11 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
     source = _expanded(folder)
     if not os.path.isdir(source):
         raise ModelError(f"there is no folder {str(source)[:200]}", "a model is a folder with a card.json")
-    card = read_card(source / CARD)
+    card = read_any_card(source)
     if card.name == AUTO:
         raise ModelError(f"no model can be called {AUTO}", "change the name on its card")
-    for file in (TEMPLATE, WEIGHTS):
+    large, last = ((WEIGHTS,), IMPLICIT) if isinstance(card, ImplicitCard) else ((TEMPLATE, WEIGHTS), CARD)
+    for file in large:
         read_header(source / file)  # before a huge file is copied
     if (built_in_folder() / card.name).exists():
         raise ModelError(f"a built-in model is called {card.name}", "change the name on its card")
@@ -166,7 +198,7 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
     replaced = user_folder() / f".{card.name}{_REPLACED}"
     try:
         temporary.mkdir(parents=True)
-        for file in (TEMPLATE, WEIGHTS, CARD):
+        for file in (*large, last):
             shutil.copyfile(source / file, temporary / file)
         if verify_model(temporary) != card:
             raise ModelError(f"{source} changed while it was copied", "try again")
@@ -237,6 +269,12 @@ def _restore_interrupted() -> None:
             pass  # another process was faster, or the folder is not ours to write
 
 
+def _refuse_implicit(folder: Path) -> None:
+    if is_implicit(folder):
+        hint = "it goes with `match`, `register` and `interpolate`, or in Python with `load_implicit`"
+        raise ModelError(f"{folder.name} is an implicit model, which has no template of vertices", hint)
+
+
 def _expanded(path: str | Path) -> Path:
     try:
         return as_path(path).expanduser()
@@ -246,6 +284,6 @@ def _expanded(path: str | Path) -> Path:
 
 def _entry(folder: Path, built_in: bool) -> Entry:
     try:
-        return Entry(folder.name, folder, built_in, read_card(folder / CARD))
+        return Entry(folder.name, folder, built_in, read_any_card(folder))
     except ModelError as error:
         return Entry(folder.name, folder, built_in, None, error.message)

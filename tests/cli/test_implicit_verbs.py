@@ -14,9 +14,9 @@ import meshmatch
 from meshmatch.cli import main
 from meshmatch.geometry.triangles import is_watertight
 from meshmatch.implicit import training
-from meshmatch.implicit.card import IMPLICIT, is_implicit, read_implicit_card
 from meshmatch.implicit.codes import fit_implicit
 from meshmatch.implicit.training import train_implicit
+from meshmatch.models.implicit_card import IMPLICIT, is_implicit, read_implicit_card
 from meshmatch.training.train import CHECKPOINT
 from tests.implicit.boxes import TRAIN, box, boxes, config
 
@@ -87,7 +87,7 @@ def test_surfaces_between_two_files(model: Path, folder: Path, tmp_path: Path, c
     assert main([*words, "-o", str(tmp_path / "way")]) == 0
     record = json.loads(capsys.readouterr().out)
     assert record["times"] == [0, 0.5, 1]
-    assert max(record["residuals"]) < 4
+    assert max(fit["residual"] for fit in record["fits"]) < 4
     frames = json.loads((tmp_path / "way" / "frames.json").read_text())["frames"]
     shapes = [meshmatch.load_shape(tmp_path / "way" / frame["file"]) for frame in frames]
     assert [shape.V for shape in shapes] == record["vertices"]
@@ -123,6 +123,52 @@ def test_a_map_through_the_template(model: Path, folder: Path, tmp_path: Path, c
     found = meshmatch.load_map(output, *shapes)
     assert found.verdict == record["verdict"]
     assert np.array_equal(np.sign(shapes[1].verts[found.index]), np.sign(shapes[0].verts))  # corner to corner
+
+
+def test_the_template_on_a_shape(model: Path, folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    found = []
+    for k in (0, 1):
+        words = ["register", str(folder / f"box{k}.ply"), "--model", str(model), "--json"]
+        assert main([*words, "-o", str(tmp_path / f"fit{k}.ply"), "--picture", str(tmp_path / "fit.png")]) == 0
+        record = json.loads(capsys.readouterr().out)
+        assert {"residual", "missed", "invented", "verdict"} <= record.keys()
+        found.append(meshmatch.load_shape(tmp_path / f"fit{k}.ply"))
+        assert found[k].V == record["vertices"]
+        truth = meshmatch.load_shape(folder / f"box{k}.ply")
+        assert np.abs(found[k].bounds - truth.bounds).max() < 0.3 * truth.diagonal
+    assert np.array_equal(found[0].faces, found[1].faces)
+    assert (tmp_path / "fit.png").is_file()
+
+
+def test_the_registry_knows_implicit_models(
+    model: Path, folder: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MESHMATCH_HOME", str(tmp_path / "home"))
+    name = read_implicit_card(model).name
+
+    def run(*words: str) -> str:
+        status = main(list(words))
+        heard = capsys.readouterr()
+        return heard.out if status == 0 else heard.err
+
+    run("models", "add", str(model))
+    assert name in [line.split()[0] for line in run("models", "list").splitlines()]
+    assert json.loads(run("models", "show", name))["shapes"] == ["box0", "box1", "box2"]
+    assert "ok, sha256" in run("models", "verify", name)
+    files = [str(folder / f"box{k}.ply") for k in (0, 1)]
+    assert main(["match", *files, "--model", name, "-o", str(tmp_path / "map.npz")]) == 0
+    assert (tmp_path / "map.npz").is_file()
+    assert meshmatch.load_implicit(name).card.name == name
+    capsys.readouterr()
+    assert main(["models", "verify", "human"]) == 0  # the others are there as before
+    with pytest.raises(meshmatch.MeshmatchError, match="implicit model"):
+        meshmatch.match(*files, model=name)
+    weights = tmp_path / "home" / "models" / name / "weights.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-4] + b"gone")
+    capsys.readouterr()
+    assert "not those of its card" in run("models", "verify", name)
+    run("models", "remove", name)
+    assert name not in run("models", "list")
 
 
 @pytest.mark.parametrize(

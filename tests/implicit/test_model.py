@@ -1,18 +1,21 @@
 """Models come back as they were, or not at all; their surfaces are closed, and their maps go through the template."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("skimage", reason="scikit-image is of the extra `implicit`")
 
 from meshmatch.errors import MeshmatchError, ModelError, OptionError
+from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.triangles import is_watertight
-from meshmatch.implicit.card import IMPLICIT, is_implicit, read_implicit_card
 from meshmatch.implicit.codes import fit_implicit, nearest_code
-from meshmatch.implicit.model import ImplicitModel, load_implicit, nearest_on_template
+from meshmatch.implicit.model import ImplicitFit, ImplicitModel, load_implicit, nearest_on_template
+from meshmatch.models.implicit_card import IMPLICIT, is_implicit, read_implicit_card
 from meshmatch.models.registry import WEIGHTS
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
@@ -91,9 +94,45 @@ def test_an_unseen_shape_finds_its_code(model: ImplicitModel, tmp_path: Path) ->
         fit_implicit(model, moved, steps=0)
 
 
-def test_a_descent_begins_with_the_nearest_shape_of_the_training(model: ImplicitModel, folder: Path) -> None:
-    import torch
+def test_what_a_model_invents_is_told(model: ImplicitModel) -> None:
+    whole = box(np.array([0.8, 0.35, 0.6]), "whole")
+    half = Shape(whole.verts, whole.faces[whole.verts[whole.faces].mean(1)[:, 0] < 0.1], "half")
+    assert 0 < half.F < whole.F
+    found = {shape.name: fit_implicit(model, shape, steps=120) for shape in (whole, half)}
+    assert found["whole"].invented < 0.05
+    assert found["half"].invented > 0.1
+    assert found["half"].verdict == "poor"
+    assert "of the model's surface is over" in " ".join(found["half"].reasons)
 
+
+def test_a_fit_is_as_good_as_its_worst_number() -> None:
+    fit = ImplicitFit("one", torch.zeros(2), Frame(1.0, np.eye(3), np.zeros(3)))
+    assert (fit.verdict, fit.reasons) == ("unknown", ())
+    for numbers, verdict, count in (
+        ({"residual": 1.0}, "good", 0),
+        ({"residual": 1.0, "missed": 0.01, "invented": 0.05}, "fair", 1),
+        ({"residual": 3.0, "missed": 0.2, "invented": 0.05}, "poor", 3),
+    ):
+        judged = replace(fit, **numbers)
+        assert (judged.verdict, len(judged.reasons)) == (verdict, count)
+
+
+def test_the_template_comes_onto_a_shape(model: ImplicitModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    rest = model.template(32)
+    inside = (np.abs(rest.verts) < 0.8).all(1)  # away from the cube's sides, where points are held
+    for name in ("box0", "box1"):
+        shape = model.known(name)
+        found = model.register(shape, 32)
+        assert np.array_equal(found.faces, rest.faces)
+        away, _ = model.distance(shape.frame.apply(found.verts), shape.code)
+        assert np.abs(away).mean() < 0.01  # on the surface
+        with monkeypatch.context() as patch:
+            patch.setattr("meshmatch.implicit.model._ONTO", 0)
+            places = model.to_template(model.register(shape, 32).verts, shape)
+        assert np.linalg.norm(places - rest.verts, axis=1)[inside].max() < 1e-3  # of the vertex's own place
+
+
+def test_a_descent_begins_with_the_nearest_shape_of_the_training(model: ImplicitModel, folder: Path) -> None:
     drawn = sample_surface(load_shape(folder / "box2.ply"), 400, np.random.default_rng(0)).points
     rows = np.column_stack([model.known("box2").frame.apply(drawn), np.zeros((400, 4))])
     found = nearest_code(model, torch.from_numpy(rows.astype(np.float32)))

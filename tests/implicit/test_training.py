@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from meshmatch.errors import ModelError, OptionError
-from meshmatch.implicit.card import IMPLICIT
 from meshmatch.implicit.model import load_implicit
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
 from meshmatch.implicit.training import train_implicit
+from meshmatch.models.implicit_card import IMPLICIT
 from meshmatch.models.registry import WEIGHTS
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.training.loop import StepReport

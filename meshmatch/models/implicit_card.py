@@ -68,7 +68,12 @@ def is_implicit(folder: str | Path) -> bool:
 def write_implicit_card(card: ImplicitCard, folder: Path) -> None:
     """Write a card, or raise `OutputError`. Write it last: a folder without one is not a model."""
     with replace_on_success(folder / IMPLICIT) as temporary:
-        temporary.write_text(json.dumps(asdict(card), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.write_text(implicit_card_to_json(card), encoding="utf-8")
+
+
+def implicit_card_to_json(card: ImplicitCard) -> str:
+    """The text of a card."""
+    return json.dumps(asdict(card), indent=1, allow_nan=False) + "\n"
 
 
 def read_implicit_card(folder: str | Path) -> ImplicitCard:
