@@ -10,13 +10,15 @@ from typer import Argument, Option
 from meshmatch.cli.options import Json, Quiet, Seed, Threads, check_writable, grouped, optional, output_option
 from meshmatch.cli.train_implicit import draw_reports, train_shapes
 from meshmatch.cli.words import Console, print_json
-from meshmatch.errors import needs
+from meshmatch.errors import OptionError, needs
 from meshmatch.models.card import read_card
 from meshmatch.models.registry import CARD
 from meshmatch.outputs import make_folder
 from meshmatch.threads import set_threads
 
 if TYPE_CHECKING:
+    from meshmatch.generators.bodies import Bodies
+    from meshmatch.generators.kinds import Kind
     from meshmatch.training.loop import StepReport
 
 
@@ -122,8 +124,12 @@ class TrainOptions:
     )
     shapes: Path | None = optional(
         "FOLDER",
-        "Learn from a folder that `meshmatch prepare` made, with its template. Default: generated human bodies "
-        "(needs the extra `train`).",
+        "Learn from a folder that `meshmatch prepare` made, with its template. Default: generated shapes of a --kind.",
+    )
+    kind: Literal["human", "quadruped", "hand", "head"] | None = Option(
+        None,
+        help="Learn from generated people, four-legged animals (needs dm_control: pip install --no-deps dm_control), right "
+        "hands or heads; all need the extra `train`. Default: human.",
     )
     implicit: bool = Option(
         False,
@@ -169,7 +175,11 @@ class TrainOptions:
     points: int | None = Option(
         None, min=64, help="Points of a scan that are learned from; fewer are quicker at first. Default: the preset's."
     )
-    identities: int = Option(4096, min=1, help="How many different bodies are generated.")
+    identities: int | None = Option(
+        None,
+        min=1,
+        help="How many different people, or animals, are generated. Default: 4096 people, 1024 of other kinds.",
+    )
     characters: float | None = Option(
         None,
         min=0.0,
@@ -203,8 +213,6 @@ def train(
     `torchrun --nproc-per-node N -m meshmatch train ...`.
     """
     with needs("torch", "train"):
-        from meshmatch.generators.bodies import Bodies
-        from meshmatch.generators.pose_files import load_poses
         from meshmatch.training import train as training
         from meshmatch.training.recipes import recipe_for
 
@@ -234,11 +242,8 @@ def train(
         "threads",
         "seed",
     )
-    recipe = recipe_for(how.shapes, how.preset, how.unsupervised)
+    recipe = recipe_for(how.shapes, how.preset, how.unsupervised, how.kind)
     recipe = recipe.changed(**{name: getattr(how, name) for name in settings})
-    known = None if how.poses is None else load_poses(how.poses, how.pose_share)
-    people = how.shapes is None or known is not None or how.characters is not None
-    bodies = Bodies(how.template, how.identities, known, how.characters) if people else None
     facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, how.start)
     if not how.fresh and (output / training.CHECKPOINT).is_file():
         console.say(f"going on from the checkpoint in {output}; --fresh starts anew")
@@ -251,12 +256,29 @@ def train(
 
     with console.progress() as progress:
         training.train(
-            output, shapes=how.shapes, bodies=bodies, recipe=recipe, facts=facts, resume=not how.fresh,
+            output, shapes=how.shapes, kind=_generated(how), recipe=recipe, facts=facts, resume=not how.fresh,
             progress=progress, report=report,
         )  # fmt: skip
     if first:
         draw_reports(console, how.picture, reports)
         _summary(console, output, recipe.train.steps, how.picture, json)
+
+
+def _generated(how: TrainOptions) -> "Kind | Bodies | None":
+    """What is to be generated; nothing where a folder of shapes is learned, unless both are asked for."""
+    from meshmatch.generators.bodies import Bodies
+    from meshmatch.generators.kinds import Kind
+    from meshmatch.generators.pose_files import load_poses
+
+    known = None if how.poses is None else load_poses(how.poses, how.pose_share)
+    if how.kind in (None, "human"):
+        if how.shapes is not None and how.kind is None and known is None and how.characters is None:
+            return None
+        return Bodies(how.template, how.identities or Bodies.identities, known, how.characters)
+    for name in ("template", "poses", "characters"):
+        if getattr(how, name) is not None:
+            raise OptionError(f"--{name} goes with human bodies, not with --kind {how.kind}", f"leave out --{name}")
+    return Kind(str(how.kind), how.identities or Kind.identities)
 
 
 def _summary(console: Console, output: Path, steps: int, picture: Path | None, json: bool) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -39,6 +40,7 @@ class Bodies:
     identities: int = 4096
     poses: GivenPoses | None = None
     characters: float | None = None  # the recipe's
+    name: ClassVar[str] = "human"  # of the kind
 
     def __post_init__(self) -> None:
         if self.characters is not None and not 0 <= self.characters <= 1:

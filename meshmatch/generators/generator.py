@@ -3,11 +3,53 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from meshmatch.arrays import Float
+from meshmatch.arrays import Float, Int, Ints
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
+from meshmatch.templates.make import NodeConfig, make_template
+from meshmatch.templates.template import Template, read_template
 
 Source = Callable[[int, torch.Generator], Float[Tensor, "N V 3"]]
 """Draws shapes with the template's connectivity: (count, generator) -> vertices (count, V, 3), any unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Generator:
+    """Shapes of a kind: the ``template`` is one at rest, with its parts; ``draw`` gives others on its vertices, of random
+    identities in random poses, a function of the seed. ``data``: what a model's card says of them.
+    """
+
+    kind: str
+    template: Template
+    draw: Source
+    data: str
+
+
+@dataclass(frozen=True, eq=False)
+class Resting:
+    """The shape at rest that becomes a kind's template: the part of every vertex, and those that fix the kind's frame."""
+
+    shape: Shape  # named after the kind
+    labels: Int[Ints, " V"]
+    parts: tuple[str, ...]
+    core: Int[Ints, " C"] | None
+    nodes: NodeConfig
+    source: str = ""
+    licence: str = ""
+
+    def template(self) -> Template:
+        """The template of the included model of the kind, if it is of this shape; else one that is made."""
+        kind = self.shape.name
+        shipped = bundled_folder() / "models" / kind / "template.safetensors"
+        if shipped.is_file():
+            found = read_template(shipped)
+            if np.array_equal(found.dense.faces, self.shape.faces):
+                return found
+        made = make_template(self.shape, kind, self.nodes, labels=self.labels, label_names=self.parts, core=self.core)
+        return replace(made, source=self.source, licence=self.licence)

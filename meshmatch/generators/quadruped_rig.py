@@ -2,8 +2,7 @@
 
 Its skin is a file of MuJoCo: vertices, and the bones that carry them. It is welded, turned so that the animal faces +z,
 stands along y and has its left at +x, its eyeballs are closed over, and one half is decimated and mirrored: vertices and
-triangles that every generated animal has. The files are not part of meshmatch: `pip install --no-deps dm_control`, or
-name their folder.
+triangles that every generated animal has. The files are not part of meshmatch: `pip install --no-deps dm_control`.
 """
 
 from __future__ import annotations
@@ -128,7 +127,7 @@ def find_assets(folder: str | Path | None = None) -> Path:
         found = importlib.util.find_spec("dm_control")
         roots = list(found.submodule_search_locations or []) if found is not None else []
         folder = Path(roots[0]) / _INSIDE if roots else None
-    hint = "pip install --no-deps dm_control, or name the folder of its dog_v2 with --assets"
+    hint = "pip install --no-deps dm_control: its dog is all that is needed"
     if folder is None:
         raise InputError("dm_control, which has the dog, is not installed", hint)
     if missing := [name for name in (SKIN, SKELETON) if not (Path(folder) / name).is_file()]:

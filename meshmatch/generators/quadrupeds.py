@@ -10,11 +10,16 @@ of the dog, Apache-2.0.
 from __future__ import annotations
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, ramp, skinned, smooth_step
+from meshmatch.generators.generator import Generator, Resting
+from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig, ramp, skinned, smooth_step
 from meshmatch.geometry.triangles import vertex_normals
+from meshmatch.progress import Progress
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import NodeConfig
 
 # Proportions against the dog's, 1 (or 0) where they are the same.
 TRAITS = {
@@ -62,6 +67,7 @@ KINDS: dict[str, dict[str, float]] = {
             "neck_thick": 1.8, "neck_down": 40, "head": 1.25, "snout": 1.2, "snout_wide": 1.1, "snout_deep": 1.2,
             "ear": 0.6, "ear_out": 0.5, "tail": 0.3, "hoof": 0.8, "straight": 0.6},
 }  # fmt: skip
+_NODES = NodeConfig("geodesic", 320, 0.13)
 # Beginnings of the names of a group's bones.
 _TRUNK, _LIMBS = ("torso", "L_", "pelvis"), ("upper_leg", "scapula", "upper_arm")
 _SOFT = (*_TRUNK, *_LIMBS, "lower", "foot", "hand", "Ca_1", "Ca_2", "Ca_3", "Ca_4", "Ca_5")
@@ -286,3 +292,28 @@ def body_parts(rig: AnimalRig) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
     sides = {"_L": "left ", "_R": "right "}
     names, label = np.unique([sides.get(name[-2:], "") + group_of(name) for name in rig.names], return_inverse=True)
     return label[rig.weights.argmax(1)].astype(np.int64), tuple(names.tolist())
+
+
+def quadruped_generator(identities: int, seed: int, progress: Progress | None = None) -> Generator:
+    """So many animals, each in a pose of its own. `OptionError` if dm_control, which has the dog, is not installed."""
+    rig = load_rig()
+    labels, parts = body_parts(rig)
+    source = "the dog of dm_control (Apache-2.0), at rest, proportions changed"
+    resting = Resting(
+        Shape(resting_animal(rig), rig.faces, "quadruped"), labels, parts, None, _NODES, source, "Apache-2.0"
+    )
+    made = np.zeros((identities, len(rig.verts), 3), np.float32)
+    for number in range(identities):
+        made[number] = make_animal(rig, seed, number)
+        if progress is not None:
+            progress((number + 1) / identities)
+    animals = torch.from_numpy(made)
+    words = (
+        f"{identities} four-legged animals generated from the dog of dm_control (Apache-2.0), of random kinds and poses"
+    )
+    return Generator(
+        "quadruped",
+        resting.template(),
+        lambda count, generator: animals[torch.randint(len(animals), (count,), generator=generator)],
+        words,
+    )

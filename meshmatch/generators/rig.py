@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import platformdirs
@@ -57,11 +59,20 @@ class Rig:
         return replace(self, rest=self.rest[:, chosen], weights=self.weights[chosen], faces=torch.from_numpy(faces))
 
 
-def _sample_phenotypes(B: int, rng: np.random.Generator) -> dict[str, Tensor]:
-    """Adults mostly, about one child in ten; genders mostly clear, builds wide."""
-    child = rng.random(B) < 0.1
+@dataclass(frozen=True)
+class People:
+    """Who is drawn: adults, a share of ``children`` from an age on (0: newborn, 1: old); which local ``measures`` vary."""
+
+    children: float = 0.1
+    youngest: float = 0.25
+    measures: tuple[str, ...] = _LOCAL_GROUPS
+
+
+def _sample_phenotypes(B: int, rng: np.random.Generator, people: People) -> dict[str, Tensor]:
+    """Genders mostly clear, builds wide."""
+    child = rng.random(B) < people.children
     values = {
-        "age": np.where(child, rng.uniform(0.25, 0.6, B), rng.uniform(0.6, 1.0, B)),
+        "age": np.where(child, rng.uniform(people.youngest, 0.6, B), rng.uniform(0.6, 1.0, B)),
         "gender": rng.beta(0.4, 0.4, B),
         "proportions": rng.uniform(0, 1, B),
     }
@@ -72,12 +83,12 @@ def _sample_phenotypes(B: int, rng: np.random.Generator) -> dict[str, Tensor]:
     return {name: torch.as_tensor(value) for name, value in values.items()}
 
 
-def _sample_local_changes(labels: list[str], B: int, rng: np.random.Generator) -> dict[str, Tensor]:
+def _sample_local_changes(labels: list[str], B: int, rng: np.random.Generator, people: People) -> dict[str, Tensor]:
     """Local measures around the phenotype, the same on both sides up to a little asymmetry."""
     changes: dict[str, Tensor] = {}
     shared: dict[str, np.ndarray] = {}
     for label in labels:
-        if not any(group in label for group in _LOCAL_GROUPS):
+        if not any(group in label for group in people.measures):
             continue
         key = label[2:] if label[:2] in ("l-", "r-") else label
         if key not in shared:
@@ -87,8 +98,8 @@ def _sample_local_changes(labels: list[str], B: int, rng: np.random.Generator) -
     return changes
 
 
-def build_rig(identities: int = 4096, seed: int = 0, progress: Progress | None = None) -> Rig:
-    """Sample identities from anny's phenotype space. `OptionError` if the extra ``train`` is not installed."""
+def body_model() -> Any:
+    """anny's body model. `OptionError` if the extra ``train`` is not installed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -96,24 +107,48 @@ def build_rig(identities: int = 4096, seed: int = 0, progress: Progress | None =
         except ImportError as error:
             hint = "pip install 'meshmatch[train]'"
             raise OptionError("generated human bodies need the package anny", hint) from error
-        model = anny.Anny(topology="notoes", phenotypes="all", local_changes="all", skinning_method="lbs")
+        choices = dict.fromkeys(("phenotypes", "local_changes", "facial_actions"), "all")
+        return anny.Anny(topology="notoes", skinning_method="lbs", **choices)
+
+
+def build_rig(
+    identities: int = 4096,
+    seed: int = 0,
+    progress: Progress | None = None,
+    keep: Int[Ints, " K"] | None = None,
+    people: People | None = None,
+) -> Rig:
+    """Sample identities from anny's phenotype space; of ``keep``, the vertices, alone if given. `OptionError` if the extra
+    ``train`` is not installed.
+    """
+    people = people or People()
+    model = body_model()
     rng = np.random.default_rng(seed)
+    faces = model.get_triangular_faces()
+    chosen = torch.arange(int(faces.max()) + 1) if keep is None else torch.from_numpy(keep)
     rest, heads = [], []
     for start in range(0, identities, 64):
         B = min(64, identities - start)
-        phenotypes = _sample_phenotypes(B, rng)
-        changes = _sample_local_changes(model.local_change_labels, B, rng)
+        phenotypes = _sample_phenotypes(B, rng, people)
+        changes = _sample_local_changes(model.local_change_labels, B, rng, people)
         with torch.no_grad():
             out = model(phenotype_kwargs=phenotypes, local_changes_kwargs=changes)
-        to_frame = torch.as_tensor(_TO_FRAME, dtype=out["rest_vertices"].dtype)
-        rest.append((out["rest_vertices"] @ to_frame.T).half())
-        heads.append((out["rest_bone_heads"] @ to_frame.T).float())
+        rest.append((out["rest_vertices"][:, chosen] @ to_frame(out["rest_vertices"]).T).half())
+        heads.append((out["rest_bone_heads"] @ to_frame(out["rest_bone_heads"]).T).float())
         if progress is not None:
             progress((start + B) / identities)
-    weights = model.dense_vertex_bone_weights.float()
+    weights = model.dense_vertex_bone_weights.float()[chosen]
     weights = weights / weights.sum(1, keepdim=True)
     parents, names = tuple(int(parent) for parent in model.bone_parents), tuple(model.bone_labels)
-    return Rig(torch.cat(rest), torch.cat(heads), weights, parents, names, model.get_triangular_faces())
+    own = torch.full((int(faces.max()) + 1,), -1)
+    own[chosen] = torch.arange(len(chosen))
+    faces = own[faces]
+    return Rig(torch.cat(rest), torch.cat(heads), weights, parents, names, faces[(faces >= 0).all(1)])
+
+
+def to_frame(like: Tensor) -> Float[Tensor, "3 3"]:
+    """From anny's axes (z up, facing -y) to ours."""
+    return torch.as_tensor(_TO_FRAME, dtype=like.dtype)
 
 
 def save_rig(rig: Rig, path: str | Path) -> None:
@@ -136,11 +171,15 @@ def load_rig(path: str | Path) -> Rig:
 
 def cached_rig(identities: int, seed: int, progress: Progress | None = None) -> Rig:
     """The body rig from the cache, or built into it (a minute or two, once)."""
-    cache = Path(platformdirs.user_cache_dir("meshmatch"))
-    path = cache / f"rig-v{RIG_VERSION}-{identities}-{seed}.safetensors"
+    return kept_rig(f"rig-v{RIG_VERSION}-{identities}-{seed}", lambda: build_rig(identities, seed, progress=progress))
+
+
+def kept_rig(name: str, build: Callable[[], Rig]) -> Rig:
+    """The rig of that name from the cache, or built into it."""
+    path = Path(platformdirs.user_cache_dir("meshmatch")) / f"{name}.safetensors"
     if not path.is_file():
         make_folder(path.parent)
-        save_rig(build_rig(identities, seed, progress=progress), path)
+        save_rig(build(), path)
     return load_rig(path)
 
 

@@ -21,8 +21,8 @@ from meshmatch.errors import InputError, OptionError, TemplateError
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.generators.bodies import Bodies
-from meshmatch.generators.characters import people_source
 from meshmatch.generators.generator import Source
+from meshmatch.generators.kinds import Kind
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.models.card import ModelCard, check_name, write_card
 from meshmatch.models.checkpoint import save_weights
@@ -33,9 +33,10 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.sampling import farthest_points
-from meshmatch.templates.prepared_folder import ShapeSamples, frame_of, read_registered, read_samples
-from meshmatch.templates.template import Template, read_template, save_template, template_radius
-from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattice, deformed_source, registered_source
+from meshmatch.templates.prepared_folder import ShapeSamples
+from meshmatch.templates.template import Template, save_template, template_radius
+from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattice
+from meshmatch.training.lessons import kind_named, lessons
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
 from meshmatch.training.recipes import Recipe, recipe_for
@@ -67,7 +68,7 @@ def train(
     output: str | Path,
     *,
     shapes: str | Path | None = None,
-    bodies: Bodies | None = None,
+    kind: str | Kind | Bodies | None = None,
     recipe: Recipe | None = None,
     facts: CardFacts | None = None,
     resume: bool = True,
@@ -78,8 +79,9 @@ def train(
 
     The folder ``output`` receives ``checkpoint/last.safetensors`` on the way and, at every stop, ``template.safetensors``,
     ``weights.safetensors`` and last ``card.json``. It learns from ``shapes``, a folder that `prepare` made, which also has
-    the template, or else from generated human ``bodies``. The recipe is `recipe_for` of the shapes unless another is given,
-    such as ``recipe_for(shapes, ...).changed(steps=..., minutes=...)``. ``progress`` is called with (stage, name, share),
+    the template, or else from generated shapes of a ``kind``: human (the default), quadruped, hand or head, or `Bodies` or
+    a `Kind` with choices. The recipe is `recipe_for` of these unless another is given, such as
+    ``recipe_for(shapes, ...).changed(steps=..., minutes=...)``. ``progress`` is called with (stage, name, share),
     ``report`` with losses and validation every 50 steps.
 
     `InputError` if the folder is not prepared or has too few shapes; `OptionError` for choices that do not go together, or
@@ -91,25 +93,11 @@ def train(
     facts = replace(facts, name=check_name(facts.name or output.resolve().name))
     if isinstance(facts.start, str | Path):
         facts = replace(facts, start=load_model(facts.start))
-    recipe = recipe or recipe_for(shapes)
-    source: Source | ShapeSamples
-    if shapes is None:
-        bodies = bodies or Bodies()
-        if bodies.characters is None:
-            bodies = replace(bodies, characters=recipe.characters)
-        template = read_template(bodies.template or recipe.template)
-        making = Progress(progress, "bodies").stage("making bodies (once)")
-        source = people_source(template, bodies, recipe.train.seed, making)
-        category, data = "human", bodies.words
-    elif bodies is not None:
-        raise OptionError("poses and bodies do not go with a folder of shapes", "leave out one of the two")
-    else:
-        template = read_template(Path(shapes) / TEMPLATE)
-        category = Path(shapes).resolve().name
-        source, data = _source(Path(shapes), template, recipe)
-        if recipe.deform and facts.frame is None:
-            facts = replace(facts, frame=frame_of(shapes))
-    facts = replace(facts, category=facts.category or category, data=facts.data or data)
+    kind = kind_named(kind) if isinstance(kind, str) else kind
+    recipe = recipe or recipe_for(shapes, kind=None if kind is None else kind.name)
+    learned = lessons(shapes, kind, recipe, Progress(progress, "shapes").stage("making shapes (once)"))
+    facts = replace(facts, category=facts.category or learned.category, data=facts.data or learned.data)
+    facts = replace(facts, frame=facts.frame or learned.frame)
 
     def both(now: StepReport) -> None:
         if progress is not None:
@@ -117,19 +105,7 @@ def train(
         if report is not None:
             report(now)
 
-    return train_model(template, source, output, recipe, facts, resume, both)
-
-
-def _source(shapes: Path, template: Template, recipe: Recipe) -> tuple[Source | ShapeSamples, str]:
-    """The shapes of a prepared folder as a recipe needs them, and a few words about them."""
-    name = shapes.resolve().name
-    if recipe.train.loss.needs_correspondence:
-        verts = torch.from_numpy(read_registered(shapes, template))
-        source = (deformed_source if recipe.deform else registered_source)(verts)
-        return source, f"{len(verts)} registered shapes of {name}"
-    samples = read_samples(shapes, template)
-    known = f" and {len(samples.template_landmarks)} known points" if len(samples.template_landmarks) else ""
-    return samples, f"{len(samples.points)} shapes of {name}, without correspondence{known}"
+    return train_model(learned.template, learned.source, output, recipe, facts, resume, both)
 
 
 def train_model(

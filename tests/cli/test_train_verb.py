@@ -1,18 +1,23 @@
 """`train` hands everything on to the training run; the run itself has tests of its own."""
 
+import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
+from meshmatch.generators.generator import Generator
+from meshmatch.generators.kinds import GENERATORS
 from meshmatch.models.card import read_card, write_card
 from meshmatch.templates.location import bundled_folder
 from meshmatch.training import train as training
 from meshmatch.training.loop import StepReport
 from meshmatch.training.recipes import recipe_for
 from tests.cli.conftest import Run
+from tests.fitting.eggs import egg_template
 
 
 class Recorder:
@@ -44,7 +49,7 @@ class Recorder:
 @pytest.fixture
 def stub(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     recorder = Recorder()
-    monkeypatch.setattr(training, "people_source", recorder.people_source)
+    monkeypatch.setattr("meshmatch.training.lessons.people_source", recorder.people_source)
     monkeypatch.setattr(training, "train_model", recorder.train_model)
     monkeypatch.delenv("RANK", raising=False)
     return recorder
@@ -155,6 +160,39 @@ def test_identities(run: Run, stub: Recorder, tmp_path: Path) -> None:
     assert stub.bodies == ("human-T", 10, 3)
 
 
+def test_a_kind_is_generated(run: Run, stub: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, int]] = []
+
+    def made(identities: int, seed: int, progress: Any) -> Generator:
+        asked.append((identities, seed))
+        return Generator("head", egg_template(), torch.zeros, "eggs, painted")
+
+    monkeypatch.setitem(GENERATORS, "head", made)
+    answer = run("train", "-o", tmp_path / "mine", "--kind", "head", "--seed", 3)
+    assert answer.status == 0, answer.err
+    assert stub.called["recipe"] == recipe_for(kind="head").changed(seed=3) != recipe_for()
+    assert (stub.called["category"], stub.called["data"]) == ("head", "eggs, painted")
+    assert stub.called["source"] is torch.zeros
+    run("train", "-o", tmp_path / "mine", "--kind", "head", "--identities", 7)
+    assert asked == [(1024, 3), (7, 0)]
+    assert stub.bodies == ()
+
+
+def test_people_are_the_kind_that_needs_no_name(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    run("train", "-o", tmp_path / "mine", "--kind", "human", "--identities", 10)
+    assert stub.bodies == ("human-T", 10, 0)
+    assert stub.called["recipe"] == recipe_for()
+
+
+def test_animals_without_the_dog(run: Run, stub: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    answer = run("train", "-o", tmp_path / "mine", "--kind", "quadruped")
+    assert answer.status == 1
+    assert "dm_control" in answer.err
+    assert "pip install --no-deps dm_control" in answer.err
+    assert stub.called == {}
+
+
 def test_poses_of_a_file_are_mixed_in(run: Run, stub: Recorder, tmp_path: Path) -> None:
     poses = tmp_path / "dance.csv"
     poses.write_text("pose,joint,x,y,z\n1,head,0,1,0\n2,head,0,-1,0\n")
@@ -210,6 +248,10 @@ def test_of_several_processes_one_speaks(
         (["--poses", "nowhere.npz"], 1, "nowhere.npz"),
         (["--poses", "dance.bvh"], 1, "dance.bvh"),
         (["--pose-share", "1.5"], 2, "--pose-share"),
+        (["--kind", "cat"], 2, "cat"),
+        (["--kind", "hand", "--template", "human-A"], 1, "--template goes with human bodies"),
+        (["--kind", "hand", "--characters", "0.5"], 1, "--characters goes with human bodies"),
+        (["--kind", "human", "--shapes", "nowhere"], 1, "do not go with a folder"),
     ],
 )
 def test_what_cannot_be_is_told(

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from meshmatch.errors import InputError
-from meshmatch.experiments.quadrupeds import main
 from meshmatch.generators import quadruped_rig, quadrupeds
 from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig
 from meshmatch.generators.quadrupeds import KINDS, TRAITS, draw_angles, draw_traits, make_animal, resting_animal
 from meshmatch.geometry.triangles import is_watertight
-from meshmatch.shapes.files import load_shape
+from meshmatch.templates.make import NodeConfig
 
 # Name: parent, place (x forward, y left, z up); those of a side have a partner on the other.
 _LEGS = {
@@ -152,24 +152,22 @@ def test_a_thicker_bone_is_thicker_and_a_longer_one_longer(rig: AnimalRig) -> No
     assert np.ptp(longer[:, 0]) == pytest.approx(np.ptp(rig.verts[:, 0]), rel=0.02)
 
 
-def test_the_command_writes_registered_animals(
-    assets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["--assets", str(assets), "--count", "3", "--seed", "5"]
-    assert main([str(tmp_path / "a"), *words]) == 0
-    assert '"animals": 3' in capsys.readouterr().out
-    files = sorted((tmp_path / "a").glob("*"))
-    assert [file.name for file in files] == ["0-rest.ply", *(f"animal-0000{k}.ply" for k in range(3))]
-    shapes = [load_shape(file) for file in files]
-    assert all(np.array_equal(shape.faces, shapes[0].faces) for shape in shapes)
-    assert is_watertight(shapes[0].faces)
-    assert main([str(tmp_path / "b"), *words]) == 0
-    assert [file.read_bytes() for file in sorted((tmp_path / "b").glob("*"))] == [file.read_bytes() for file in files]
+def test_the_generator_draws_registered_animals(assets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quadruped_rig, "find_assets", lambda folder: assets)
+    monkeypatch.setattr(quadrupeds, "_NODES", NodeConfig("uniform", 60, 0.4))
+    first, again, other = (quadrupeds.quadruped_generator(3, seed) for seed in (5, 5, 6))
+    template = first.template
+    assert (template.name, template.label_names) == ("quadruped", quadrupeds.body_parts(load_rig())[1])
+    assert is_watertight(template.shape.faces)
+    drawn = [made.draw(8, torch.Generator().manual_seed(1)) for made in (first, again, other)]
+    assert drawn[0].shape == (8, template.shape.V, 3)
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+    assert again.template.hash == template.hash == other.template.hash
+    assert "3 four-legged animals" in first.data
 
 
-def test_missing_and_damaged_files_are_errors(
-    assets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_and_damaged_files_are_errors(assets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=r"lacks dog_skin\.skn") as caught:
         load_rig(tmp_path)
     assert "dm_control" in caught.value.hint
@@ -181,9 +179,9 @@ def test_missing_and_damaged_files_are_errors(
         with pytest.raises(InputError, match="of MuJoCo"):
             load_rig(tmp_path)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert main([str(tmp_path / "out")]) == 1
-    assert "--assets" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="not installed") as caught:
+        load_rig()
+    assert "pip install --no-deps dm_control" in caught.value.hint
 
 
 @pytest.mark.skipif(importlib.util.find_spec("dm_control") is None, reason="dm_control is not installed")

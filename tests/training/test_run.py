@@ -181,8 +181,8 @@ def test_an_output_that_cannot_be_made_is_told(prepared: Path, tmp_path: Path) -
 
 
 def test_bodies_do_not_go_with_a_folder(prepared: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="poses and bodies do not go with a folder"):
-        train(tmp_path / "mine", shapes=prepared, bodies=bodies.Bodies())
+    with pytest.raises(OptionError, match="generated shapes do not go with a folder"):
+        train(tmp_path / "mine", shapes=prepared, kind=bodies.Bodies())
 
 
 def test_the_presets_are_what_they_say() -> None:

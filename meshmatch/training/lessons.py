@@ -1,0 +1,72 @@
+"""What a training learns from: the shapes of a prepared folder, or generated ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from meshmatch.errors import OptionError
+from meshmatch.generators.bodies import Bodies
+from meshmatch.generators.characters import people_source
+from meshmatch.generators.generator import Source
+from meshmatch.generators.kinds import Kind
+from meshmatch.models.registry import TEMPLATE
+from meshmatch.progress import Progress
+from meshmatch.templates.prepared_folder import ShapeSamples, frame_of, read_registered, read_samples
+from meshmatch.templates.template import Template, read_template
+from meshmatch.training.datasets import deformed_source, registered_source
+from meshmatch.training.recipes import Recipe
+
+
+@dataclass(frozen=True, eq=False)
+class Lessons:
+    """A template, shapes on its vertices or samples without correspondence, and what the card says of them."""
+
+    template: Template
+    source: Source | ShapeSamples
+    category: str
+    data: str  # a few words
+    frame: dict[str, str] | None = None  # how fits find it, where the shapes say so
+
+
+def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lessons:
+    """Generated shapes; errors are those of their generators."""
+    seed = recipe.train.seed
+    if isinstance(kind, Kind):
+        made = kind.generator(seed, progress)
+        return Lessons(made.template, made.draw, made.kind, made.data)
+    if kind.characters is None:
+        kind = replace(kind, characters=recipe.characters)
+    template = read_template(kind.template or recipe.template)
+    return Lessons(template, people_source(template, kind, seed, progress), "human", kind.words)
+
+
+def prepared(shapes: Path, recipe: Recipe) -> Lessons:
+    """The shapes of a folder that `prepare` made, as a recipe needs them; `InputError` if it is none."""
+    template = read_template(shapes / TEMPLATE)
+    name = shapes.resolve().name
+    frame = frame_of(shapes) if recipe.deform else None
+    if recipe.train.loss.needs_correspondence:
+        verts = torch.from_numpy(read_registered(shapes, template))
+        source = (deformed_source if recipe.deform else registered_source)(verts)
+        return Lessons(template, source, name, f"{len(verts)} registered shapes of {name}", frame)
+    samples = read_samples(shapes, template)
+    known = f" and {len(samples.template_landmarks)} known points" if len(samples.template_landmarks) else ""
+    data = f"{len(samples.points)} shapes of {name}, without correspondence{known}"
+    return Lessons(template, samples, name, data, frame)
+
+
+def kind_named(name: str) -> Kind | Bodies:
+    """What is generated for the name of a kind; `OptionError` if there is none."""
+    return Bodies() if name == "human" else Kind(name)
+
+
+def lessons(shapes: str | Path | None, kind: Kind | Bodies | None, recipe: Recipe, progress: Progress) -> Lessons:
+    """The shapes of a folder, or generated ones; `OptionError` if both are asked for."""
+    if shapes is None:
+        return generated(kind or Bodies(), recipe, progress)
+    if kind is not None:
+        raise OptionError("generated shapes do not go with a folder of shapes", "leave out one of the two")
+    return prepared(Path(shapes), recipe)
