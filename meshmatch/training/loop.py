@@ -31,7 +31,8 @@ class TrainConfig:
     """How long and how fast to learn.
 
     ``steps`` fixes the schedule: warm-up, a constant rate, then a cosine to zero over the last ``decay`` share.
-    ``minutes`` only stops the run (with a checkpoint to go on from). `OptionError` if a number cannot be.
+    ``minutes`` only stops the run (with a checkpoint to go on from). ``align_steps``: so many steps of the aligner alone
+    come first. `OptionError` if a number cannot be.
     """
 
     steps: int = 20_000
@@ -50,6 +51,7 @@ class TrainConfig:
     threads: int = 1
     bf16: bool = False
     seed: int = 0
+    align_steps: int = 0
     loss: Objective = field(default_factory=CorrespondenceLoss)
 
     def __post_init__(self) -> None:

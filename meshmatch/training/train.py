@@ -35,6 +35,7 @@ from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import Template, save_template, template_radius
+from meshmatch.training.aligner import train_aligner
 from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattice
 from meshmatch.training.lessons import kind_named, lessons
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
@@ -154,9 +155,13 @@ def train_model(
         size = config.shapes, config.scans_per_shape
         data = build_dataset(template, source, model, recipe.scan, *size, config.seed, config.steps)
         few = {"shapes": 32, "scans_per_shape": 1}
+    resumed = resume and checkpoint.is_file()
+    if config.align_steps and not resumed and isinstance(data, BatchDataset) and model.aligner is not None:
+        torch.set_num_threads(config.threads)
+        train_aligner(model, data, config.align_steps)
     held_out = replace(data, seed=VALIDATION_SEED, **few)[0]
     trainer = Trainer(model, points, config)
-    if resume and checkpoint.is_file():
+    if resumed:
         trainer.load(checkpoint)
         for name in ("encoder", "aligner"):  # what reads the batches are copies (see `build_dataset`)
             if (reader := getattr(data, name, None)) is not None:

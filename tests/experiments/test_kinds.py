@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from meshmatch.experiments import kinds
+from meshmatch.experiments.cut_scans import CutScan
 from meshmatch.experiments.sets import Pair
+from meshmatch.shapes.files import load_shape
 from tests.experiments.small_bench import build
 
 
@@ -40,3 +42,18 @@ def test_every_pair_counts(agree: str, tmp_path: Path, capsys: pytest.CaptureFix
 def test_without_data_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert kinds.main(["--data", str(tmp_path)]) == 1
     assert "no shapes" in capsys.readouterr().err
+
+
+def test_hands_with_any_model_of_theirs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
+    """Bumpy balls stand for hands, and are matched by a model of a body."""
+    balls = [load_shape(file) for file in sorted(build(tmp_path).glob("faust/*.ply"))]
+    marks = np.arange(0, 70, 7)
+    made = [CutScan(ball, np.where(marks < 20 * number, -1, marks), 2.0) for number, ball in enumerate(balls)]
+    monkeypatch.setattr(kinds, "make_scans", lambda kind, count, seed: made[:count])
+    words = ["--sets", "hand", "--model", "human", "--scans", "3", "--cache", str(tmp_path / "cache")]
+    assert kinds.main(words) == 0
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])["hand"]
+    assert (record["all"]["pairs"], record["all"]["bar"]) == (6, 4.0)
+    assert record["all"]["met"] == (record["all"]["mean_x100"] <= 4.0)
+    assert sum(row["pairs"] for row in record["judged"]) == 6
+    assert set(record["verdicts"]) == {ball.name for ball in balls}
