@@ -1,7 +1,9 @@
 """The aligner alone: it learns orientations of eggs, the same for the same seed; the whole training begins with it."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,8 +14,8 @@ from meshmatch.training.aligner import train_aligner
 from meshmatch.training.datasets import BatchDataset
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.recipes import Recipe
-from meshmatch.training.train import CardFacts, train_model
-from tests.training.small import NETWORK, SCAN, bent_eggs, egg_template, small_data, small_network
+from meshmatch.training.train import CardFacts, build_dataset, build_deformer, train_model
+from tests.training.small import NETWORK, SCAN, bent_eggs, egg_template
 
 
 @pytest.fixture(autouse=True)
@@ -21,10 +23,17 @@ def few_scans(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stage, "_SHAPES", 32)
 
 
+def horned(count: int, generator: torch.Generator) -> torch.Tensor:
+    """Eggs with a horn and a flank: no turn takes them to themselves."""
+    x, y, z = torch.from_numpy(np.array(egg_template().shape.verts)).float().unbind(1)
+    verts = torch.stack([x + 6 * y.clamp_min(0) ** 2, y, z + 2 * x.clamp_min(0)], 1)
+    return verts * (1 + 0.1 * torch.randn(count, 1, 3, generator=generator))
+
+
 def untrained() -> tuple[Deformer, BatchDataset]:
-    template = egg_template()
-    model = small_network(template)
-    return model, small_data(template, model)
+    template, network = egg_template(), replace(NETWORK, align_width=64, align_basis=48)
+    model = build_deformer(template, horned, network, SCAN, "smooth", 0)
+    return model, build_dataset(template, horned, model, SCAN, 4, 2, 0)
 
 
 def test_it_learns_orientations_and_nothing_else() -> None:
@@ -32,8 +41,8 @@ def test_it_learns_orientations_and_nothing_else() -> None:
     before = {name: value.clone() for name, value in model.state_dict().items()}
     early = train_aligner(model, data, 5)
     model.load_state_dict(before)
-    late = train_aligner(model, data, 400)
-    assert late < early - 0.1
+    late = train_aligner(model, data, 200)
+    assert late < 0.85 * early
     changed = {name.split(".")[0] for name, value in model.state_dict().items() if not torch.equal(value, before[name])}
     assert changed == {"aligner"}
 
