@@ -1,6 +1,7 @@
 """Of what kind `--model auto` takes every shape of the benchmark, and things that are of none.
 
-Bodies and animals have a model; hearts, furniture and plain solids have none and must be refused. Clouds with noise, and
+Bodies, animals, hands and heads have a model; hearts, furniture and plain solids have none and must be refused. Hands and
+heads are generated (meshmatch/experiments/cut_scans.py). Clouds with noise, and
 sparse ones with outliers, are bodies too; where a cloud cannot be told alone it takes the kind of the shape that it is
 matched with ("unsure" here). *Reading* is the mean distance of the shape and a model's unrefined template (units of
 sqrt(area)).
@@ -21,6 +22,7 @@ from meshmatch.api.inputs import validated
 from meshmatch.api.kinds import installed_models, kinds_of, read_kinds
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
+from meshmatch.experiments.cut_scans import make_scans
 from meshmatch.experiments.sets import CLOUD_SET, SET_NAMES, load_set
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.kind import KNOWN
@@ -30,7 +32,9 @@ from meshmatch.threads import thread_limit
 
 FOLDERS = {"faust_scans": "human", "animal": "quadruped", "heart": "", "chair": "", "table": "", "plane": ""}
 """Folders of meshes, and their kind; empty: none."""
-SETS = (*SET_NAMES, CLOUD_SET, "outliers", *FOLDERS, "solids")
+MADE = ("hand", "head")
+SETS = (*SET_NAMES, CLOUD_SET, "outliers", *FOLDERS, *MADE, "solids")
+_SCANS = 20
 COLUMNS = {
     **{
         "set": "set",
@@ -51,6 +55,8 @@ def shapes_of(name: str, data: Path) -> Iterator[Shape]:
         yield from (bench.seen(shape) for shape in bench.shapes)
     elif name == "outliers":
         yield from (as_shape(np.asarray(points, float)) for points in np.load(data / "faust_outliers.npy"))
+    elif name in MADE:
+        yield from (scan.shape for scan in make_scans(name, _SCANS))
     elif name == "solids":
         solids = {
             "box": trimesh.creation.box().subdivide().subdivide().subdivide(),
@@ -66,7 +72,7 @@ def shapes_of(name: str, data: Path) -> Iterator[Shape]:
 
 def row_of(name: str, shapes: list[Shape]) -> dict[str, Any]:
     """How many of a set's shapes are taken for what they are; the highest reading of their kind, the lowest of others."""
-    wanted = FOLDERS.get(name, "" if name == "solids" else "human")
+    wanted = FOLDERS.get(name, name if name in MADE else "" if name == "solids" else "human")
     models, config = installed_models(), [FitConfig()]
     right, unsure, wrong, own, others = 0, 0, list[str](), 0.0, np.inf
     for shape in runner.track(shapes, name):

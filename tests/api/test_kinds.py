@@ -107,6 +107,16 @@ def test_samples_are_told_apart() -> None:
     assert abs(again[0] - found[1, 2]) < 0.004
 
 
+def test_hands_are_told_apart() -> None:
+    models = kinds.installed_models()
+    for name, kind in (("waving", "hand"), ("pointing", "hand")):
+        shape = validated(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape
+        readings = kinds.read_kinds(models, [shape], [CONFIG])
+        assert kinds.kinds_of(models, readings, [shape], [CONFIG]) == [kind], name
+        own = [model.card.category for model in models].index(kind)
+        assert np.delete(readings[:, 0], own).min() > readings[own, 0] + 0.005, name
+
+
 def test_a_ring_is_of_no_kind() -> None:
     ring = trimesh.creation.torus(1.0, 0.3)
     with pytest.raises(InputError, match="ring is of no kind"):
@@ -135,7 +145,7 @@ class _Fit:
 def test_damaged_models_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(registry.HOME_VARIABLE, str(tmp_path))
     (tmp_path / "models" / "broken").mkdir(parents=True)
-    assert [model.card.name for model in kinds.installed_models()] == ["human", "quadruped"]
+    assert [model.card.name for model in kinds.installed_models()] == ["hand", "human", "quadruped"]
     monkeypatch.setattr(kinds, "list_models", lambda: ())
     with pytest.raises(ModelError, match="no model is installed"):
         kinds.installed_models()

@@ -27,6 +27,9 @@ def mine(tmp_path: Path) -> Path:
     return folder
 
 
+SHIPPED = ["hand", "human", "quadruped"]
+
+
 def names(run: Run) -> list[str]:
     return [entry["name"] for entry in json.loads(run("models", "list", "--json").out)["models"]]
 
@@ -37,7 +40,7 @@ def test_list_knows_the_model_that_ships(run: Run) -> None:
     assert answer.err == ""
     rows = [line.split() for line in answer.out.splitlines()]
     assert rows[0][0] == "NAME"
-    assert {("human", "human"), ("quadruped", "quadruped")} <= {tuple(row[:2]) for row in rows}
+    assert {(name, name) for name in SHIPPED} <= {tuple(row[:2]) for row in rows}
 
 
 def test_show_is_the_card(run: Run) -> None:
@@ -55,13 +58,13 @@ def test_a_mistyped_name_is_an_error_with_a_guess(run: Run) -> None:
 
 
 def test_add_then_remove(run: Run, mine: Path, home: Path) -> None:
-    assert names(run) == ["human", "quadruped"]
+    assert names(run) == SHIPPED
     answer = run("models", "add", mine)
     assert (answer.status, answer.out) == (0, "")
-    assert names(run) == ["human", "quadruped", "mine"]
+    assert names(run) == [*SHIPPED, "mine"]
     assert (home / "models" / "mine" / "card.json").is_file()
     assert run("models", "remove", "mine").status == 0
-    assert names(run) == ["human", "quadruped"]
+    assert names(run) == SHIPPED
 
 
 def test_a_name_is_taken_once(run: Run, mine: Path) -> None:
@@ -81,14 +84,14 @@ def test_verify(run: Run, mine: Path, home: Path) -> None:
     run("models", "add", mine)
     answer = run("models", "verify")
     assert answer.status == 0
-    assert [line.split(":")[0] for line in answer.out.splitlines()] == ["human", "quadruped", "mine"]
+    assert [line.split(":")[0] for line in answer.out.splitlines()] == [*SHIPPED, "mine"]
     weights = home / "models" / "mine" / "weights.safetensors"
     data = bytearray(weights.read_bytes())
     data[-1] ^= 1
     weights.write_bytes(data)
     answer = run("models", "verify")
     assert answer.status == 1
-    assert [line.split(":")[0] for line in answer.out.splitlines()] == ["human", "quadruped"]
+    assert [line.split(":")[0] for line in answer.out.splitlines()] == SHIPPED
     assert "mine: " in answer.err
     assert "1 model is damaged" in answer.err
     assert run("models", "verify", "human").status == 0
