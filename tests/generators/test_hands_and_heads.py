@@ -17,6 +17,7 @@ from meshmatch.generators.heads import LIMITS as HEAD_LIMITS
 from meshmatch.generators.heads import PARTS, Face, draw_turns
 from meshmatch.generators.kinds import Kind
 from meshmatch.models.registry import load_model
+from meshmatch.training import aligner
 from meshmatch.training.recipes import recipe_for
 from meshmatch.training.train import train
 
@@ -116,8 +117,9 @@ def test_parts(made: Generator) -> None:
 
 @needs_anny
 @pytest.mark.slow
-def test_a_kind_is_trained_from_its_name(made: Generator, tmp_path: Path) -> None:
-    recipe = recipe_for(kind=made.kind).changed(steps=2, workers=0, points=64)
+def test_a_kind_is_trained_from_its_name(made: Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(aligner, "_SHAPES", 32)
+    recipe = recipe_for(kind=made.kind).changed(steps=2, workers=0, points=64, align_steps=2)
     folder = train(tmp_path / "mine", kind=Kind(made.kind, 3), recipe=recipe)
     model = load_model(folder)
     assert (model.card.category, model.card.steps) == (made.kind, 2)
