@@ -33,7 +33,7 @@ def metadata(wheel: zipfile.ZipFile) -> email.message.Message:
 def test_the_wheel_holds_templates_weights_and_samples(wheel: zipfile.ZipFile) -> None:
     held = set(wheel.namelist())
     bundled = {f"human/human-{pose}.safetensors" for pose in "TAI"}
-    for model in ("hand", "human", "quadruped"):
+    for model in ("hand", "head", "human", "quadruped"):
         bundled |= {f"models/{model}/{name}" for name in ("card.json", "weights.safetensors", "template.safetensors")}
     assert {f"meshmatch/_templates/{name}" for name in bundled} <= held
     assert len([name for name in held if name.startswith("meshmatch/_templates/samples/")]) >= 2

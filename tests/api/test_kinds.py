@@ -107,9 +107,9 @@ def test_samples_are_told_apart() -> None:
     assert abs(again[0] - found[1, 2]) < 0.004
 
 
-def test_hands_are_told_apart() -> None:
+def test_hands_and_heads_are_told_apart() -> None:
     models = kinds.installed_models()
-    for name, kind in (("waving", "hand"), ("pointing", "hand")):
+    for name, kind in (("waving", "hand"), ("pointing", "hand"), ("laughing", "head"), ("child", "head")):
         shape = validated(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape
         readings = kinds.read_kinds(models, [shape], [CONFIG])
         assert kinds.kinds_of(models, readings, [shape], [CONFIG]) == [kind], name
@@ -145,7 +145,7 @@ class _Fit:
 def test_damaged_models_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(registry.HOME_VARIABLE, str(tmp_path))
     (tmp_path / "models" / "broken").mkdir(parents=True)
-    assert [model.card.name for model in kinds.installed_models()] == ["hand", "human", "quadruped"]
+    assert [model.card.name for model in kinds.installed_models()] == ["hand", "head", "human", "quadruped"]
     monkeypatch.setattr(kinds, "list_models", lambda: ())
     with pytest.raises(ModelError, match="no model is installed"):
         kinds.installed_models()

@@ -27,7 +27,7 @@ def mine(tmp_path: Path) -> Path:
     return folder
 
 
-SHIPPED = ["hand", "human", "quadruped"]
+SHIPPED = ["hand", "head", "human", "quadruped"]
 
 
 def names(run: Run) -> list[str]:
