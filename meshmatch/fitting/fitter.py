@@ -18,6 +18,7 @@ from meshmatch.fitting.nodes import Landmarks
 from meshmatch.fitting.refinement import REFINEMENTS, Refinement
 from meshmatch.fitting.task import FitTask, Registration
 from meshmatch.fitting.verdict import FAIR_RESIDUAL, empty_share, judge_registration
+from meshmatch.geometry.triangles import face_parts
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.repair import Repaired
@@ -28,6 +29,7 @@ _HINT = "one target vertex for each source vertex, both counted from 0"
 # All of these were set by hand.
 _EMPTY = 0.06  # a fit of the whole that leaves this share of the template without surface may be one of a part
 _OPEN = 0.3  # so may a bad one of a mesh with a boundary of so many sqrt(area)
+_AGAINST = 0.06  # a boundary so near to another part (units of sqrt(area)) is not that of a cut
 _CLOSER = 0.85  # a part is believed if its residual is that much smaller
 _MISSING = 0.03  # and if it lacks that much of the surface
 
@@ -114,9 +116,27 @@ def _as_fit(found: Registration, partial: bool, began: float) -> Fit:
 
 
 def boundary_length(shape: Shape) -> float:
-    """Length of the edges with one face, in the unit of the file."""
+    """Length of the edges with one face, in the unit of the file.
+
+    Those that lie against another connected part of the shape do not count: where an arm ends in a sleeve, nothing is cut.
+    """
     ends = shape.verts[shape.edges.open]  # N 2 3
-    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum())
+    part = face_parts(shape.faces, shape.V)
+    counts = np.ones(len(ends), bool)
+    if len(ends) and part.max() > 0:
+        of_vertex = np.full(shape.V, -1)
+        of_vertex[shape.faces] = part[:, None]
+        corners = shape.verts[shape.faces]
+        points = np.concatenate(
+            [*corners.transpose(1, 0, 2), *(0.5 * (corners[:, k] + corners[:, k - 1]) for k in range(3))]
+        )
+        of_point, of_edge = np.tile(part, 6), of_vertex[shape.edges.open[:, 0]]
+        near = _AGAINST * np.sqrt(shape.area)
+        for own in np.unique(of_edge):
+            mine = of_edge == own
+            others = cKDTree(points[of_point != own])
+            counts[mine] = others.query(ends[mine].mean(1), distance_upper_bound=near)[0] > near
+    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)[counts].sum())
 
 
 def check_landmarks(model: TrainedModel) -> None:

@@ -23,9 +23,9 @@ SHARES = (0.28, 0.12, 0.12, 0.32, 0.16)
 _CHILD = {"head": (1.5, 1.45, 0.14), "neck": (0.75, 1.0, 0.12), "thigh": (0.72, 1.0, 0.12), "shin": (0.72, 1.0, 0.12),
           "upper arm": (0.78, 1.0, 0.1), "forearm": (0.78, 1.0, 0.1), "hand": (0.95, 1.0, 0.08), "foot": (0.95, 1.0, 0.08),
           "belly": (0.95, 1.02, 0.08)}  # fmt: skip
-_TOON = {"head": (2.4, 2.6, 0.28), "neck": (0.35, 1.1, 0.35), "thigh": (0.5, 1.25, 0.3), "shin": (0.5, 1.4, 0.3),
-         "upper arm": (0.7, 1.35, 0.25), "forearm": (0.7, 1.5, 0.25), "hand": (1.25, 1.5, 0.25), "foot": (1.3, 1.6, 0.25),
-         "belly": (0.75, 1.25, 0.22), "chest": (0.8, 1.15, 0.22), "hips": (0.9, 1.25, 0.22)}  # fmt: skip
+_TOON = {"head": (2.6, 2.9, 0.3), "neck": (0.3, 1.1, 0.35), "thigh": (0.3, 1.25, 0.3), "shin": (0.33, 1.4, 0.3),
+         "upper arm": (0.65, 1.35, 0.25), "forearm": (0.65, 1.5, 0.25), "hand": (1.2, 1.5, 0.25),
+         "foot": (1.2, 1.6, 0.25), "belly": (0.8, 1.25, 0.22), "chest": (0.8, 1.15, 0.22), "hips": (0.9, 1.25, 0.22)}  # fmt: skip
 _SPREAD = 0.22  # of free and built bodies
 
 
@@ -66,8 +66,8 @@ def draw_style(B: int, generator: torch.Generator, shares: Sequence[float] = SHA
             drawn[:, rows] = 0.8 * drawn[:, rows[:1]] + 0.6 * drawn[:, rows]
     log = middle[kind][..., [1, 0, 1]] + spread[kind][..., None] * (0.7 * shared + 0.6 * noise)
     # How far towards the typical proportions: from a hint to more than that.
-    strength = torch.where(kind == CHILD, 0.2, 0.35) + torch.rand(B, generator=generator)
-    return Style(kind, (log * strength.clamp(max=1.15)[:, None, None]).exp().clamp(0.25, 4.5))
+    strength = torch.where(kind == CHILD, 0.2, 0.4) + torch.rand(B, generator=generator)
+    return Style(kind, (log * strength.clamp(max=1.3)[:, None, None]).exp().clamp(0.18, 4.5))
 
 
 def _both(name: str) -> tuple[int, ...]:

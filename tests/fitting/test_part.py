@@ -43,6 +43,12 @@ def test_the_boundary_by_hand() -> None:
     assert boundary_length(closed) == 0.0
 
 
+@pytest.mark.parametrize(("gap", "length"), [(0.1, 0.0), (1.0, 16.0)])
+def test_a_boundary_against_another_part_is_no_cut(gap: float, length: float) -> None:
+    verts = np.concatenate([SQUARE.verts, SQUARE.verts + [0, 0, gap]])
+    assert boundary_length(Shape(verts, np.concatenate([SQUARE.faces, SQUARE.faces + 4]))) == length
+
+
 def test_a_smaller_share_costs_more() -> None:
     costs = [Candidate(RigidPose.identity(), np.zeros((1, 3)), 0.02, share).cost for share in SHARES]
     assert costs[0] == 0.02
