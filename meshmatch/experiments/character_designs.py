@@ -27,6 +27,7 @@ from meshmatch.templates.template import Template
 
 TRAINED_SEED = 0
 _FACES = 9_000  # of a clothed body
+_EDGE = 0.08  # metres, of a robot
 # How wide a part of a robot is, across and out, in units of its length.
 _WIDTHS = {"hips": (2.2, 1.3), "belly": (1.7, 1.0), "chest": (1.5, 0.9), "neck": (0.9, 0.9), "head": (1.2, 1.2),
            "upper arm": (0.35, 0.35), "forearm": (0.35, 0.35), "hand": (0.8, 0.5), "thigh": (0.4, 0.4),
@@ -89,6 +90,8 @@ class Designer:
         joints = self._posed(rng)[0]
         girth = rng.uniform(0.8, 1.35)
         designs = {name: _Solid.drawn(rng) for name in _WIDTHS}
+        sides = [joints[joints_of(self.figure.rig, "upper arm", side)[0]] for side in "LR"]
+        shoulders = float(np.linalg.norm(sides[0] - sides[1]))
         solids, bones = [], []
         for p, name in enumerate(PARTS):
             stem, side = (name[:-2], name[-1]) if name[:-2] in SIDED else (name, "")
@@ -96,7 +99,10 @@ class Designer:
             design, along = designs[stem], end - start
             if stem == "head":
                 start, along = end, np.array([0.0, 0.26 * design.size, 0.0])
-            for solid in design.made(start, along, girth * design.size * np.array(_WIDTHS[stem])):
+            wide = girth * design.size * np.array(_WIDTHS[stem])
+            if stem == "chest":  # as wide as from shoulder to shoulder, so that arms hang beside it
+                wide[0] = 0.9 * shoulders / float(np.linalg.norm(along))
+            for solid in design.made(start, along, wide):
                 solids.append(solid)
                 bones.append(p)
         return _joined(f"robot{k}", solids, bones)
@@ -152,11 +158,11 @@ class _Solid:
         frame[:3, 3] = start + 0.5 * length * axis
         x, y = wide * length
         if self.kind == "box":
-            main = trimesh.creation.box((x, y, 0.95 * length)).subdivide().subdivide().subdivide()
+            main = trimesh.creation.box((x, y, 0.95 * length))
         elif self.kind == "ball":
             main = trimesh.creation.icosphere(3).apply_scale((0.55 * x, 0.55 * y, 0.55 * length))
         elif self.kind == "rod":
-            main = trimesh.creation.cylinder(0.5, 0.95 * length, 24).apply_scale((x, y, 1)).subdivide().subdivide()
+            main = trimesh.creation.cylinder(0.5, 0.95 * length, 24).apply_scale((x, y, 1))
         else:
             main = trimesh.creation.icosphere(3)
             main.vertices = np.sign(main.vertices) * np.abs(main.vertices) ** 0.5 * [0.5 * x, 0.5 * y, 0.5 * length]
@@ -164,10 +170,17 @@ class _Solid:
         if self.ball:
             found.append(trimesh.creation.icosphere(2, 0.3 * min(x, y)).apply_translation(start))
         if self.plate:
-            plate = trimesh.creation.box((0.8 * x, 0.15 * y, 0.6 * length)).subdivide().subdivide()
+            plate = trimesh.creation.box((0.8 * x, 0.15 * y, 0.6 * length))
             plate.apply_translation((0, -0.55 * y, 0)).apply_transform(frame)
             found.append(plate)
-        return found
+        return [_fine(each) for each in found]
+
+
+def _fine(solid: trimesh.Trimesh) -> trimesh.Trimesh:
+    """With edges short enough that large parts have more vertices than small ones."""
+    while solid.edges_unique_length.max() > _EDGE:
+        solid = solid.subdivide()
+    return solid
 
 
 def _joined(name: str, solids: Sequence[trimesh.Trimesh], bones: Sequence[Int[Ints, " V"] | int]) -> Character:

@@ -43,6 +43,11 @@ _NEIGHBOURS = 8
 _SETTLED = 0.005  # a relative change of the scale that ends the search
 _BEHIND = 1.1  # times the best residual: candidates further behind say nothing about a cloud's scale
 
+# A shape that the network's own fits of it miss by more than this (units of sqrt(area)) may be built like nobody that the
+# aligner knows: with a large head the core lies further down its own up axis than that by so much. Set by hand.
+_STRANGE = 0.05
+_LOWER = (0.1, 0.2)
+
 STAGE = "fitting as a part"
 # Shares of the surface that a part may show, and all that follows, were set by hand.
 SHARES = (1.0, 0.8, 0.62, 0.48, 0.36)
@@ -66,12 +71,22 @@ def fit_whole(task: FitTask, refine: Refine) -> Registration:
     care = 2 if task.shape.is_cloud else 1
     starts = [(task.coarse, pose) for pose in frames_to_try(task.model, task.samples, task.config)]
     candidates = best_first(task.predictor.fit_all(starts, rounds=care, draws=care))
+    careful = task.config.careful
+    if not task.shape.is_cloud and candidates[0].residual > _STRANGE:
+        lower = [
+            (samples, RigidPose(pose.rotation, pose.center - down * pose.rotation[:, 1]))
+            for samples, pose in starts
+            for down in _LOWER
+        ]
+        candidates = best_first([*candidates, *task.predictor.fit_all(lower, rounds=care, draws=care)])
+        task = replace(task, config=replace(task.config, finalists=2 * task.config.finalists))
+        careful *= 4
     orientation(0.7)
     if task.shape.is_cloud:
         task, candidates = _rescaled(task, candidates)
-    careful = task.predictor.fit_all([(task.samples, each.pose) for each in candidates[: task.config.careful]])
+    best = task.predictor.fit_all([(task.samples, each.pose) for each in candidates[:careful]])
     orientation(1.0)
-    return Registration(task, refine(task, best_first(careful)))
+    return Registration(task, refine(task, best_first(best)))
 
 
 def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list[Candidate]]:

@@ -5,9 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshmatch.fitting.network_fit import Candidate
+from meshmatch.fitting import candidates
+from meshmatch.fitting.candidates import fit_whole
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.network_fit import Candidate, Predictor
 from meshmatch.fitting.refinement import CandidateScorer, averaged, choose, differ
 from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.task import FitTask
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
@@ -29,6 +33,29 @@ def scan(system: NodeSystem) -> OrientedPoints:
 
 def still(system: NodeSystem, residual: float = 0.03) -> Candidate:
     return Candidate(STILL, np.zeros((system.K, 3)), residual)
+
+
+@pytest.mark.parametrize(("residual", "tried", "careful"), [(0.03, 1, 3), (0.06, 3, 12)])
+def test_a_shape_that_the_network_misses_is_tried_with_its_core_further_down(
+    monkeypatch: pytest.MonkeyPatch, residual: float, tried: int, careful: int
+) -> None:
+    model = egg_model()
+    task = FitTask.of(model, FitConfig(), Shape(model.template.shape.verts, model.template.shape.faces))
+    frames = [RigidPose(np.eye(3)[[1, 2, 0]], np.full(3, 0.01 * k)) for k in range(6)]
+    monkeypatch.setattr(candidates, "frames_to_try", lambda *_: frames)
+    asked: list[list[RigidPose]] = []
+
+    def fit_all(self: Predictor, starts: list[tuple[OrientedPoints, RigidPose]], *_: int, **__: int) -> list[Candidate]:
+        asked.append([pose for _, pose in starts])
+        return [Candidate(pose, np.zeros((task.system.K, 3)), residual) for _, pose in starts]
+
+    monkeypatch.setattr(Predictor, "fit_all", fit_all)
+    fit_whole(task, lambda task, found: found[0])
+    assert sum(map(len, asked[:-1])) == tried * len(frames)
+    assert len(asked[-1]) == careful
+    if tried > 1:
+        down = asked[1][0].center - frames[0].center
+        assert np.allclose(down / np.linalg.norm(down), -frames[0].rotation[:, 1])
 
 
 class Scored:

@@ -45,7 +45,7 @@ def test_the_boundary_by_hand() -> None:
 
 @pytest.mark.parametrize(("gap", "length"), [(0.1, 0.0), (1.0, 16.0)])
 def test_a_boundary_against_another_part_is_no_cut(gap: float, length: float) -> None:
-    verts = np.concatenate([SQUARE.verts, SQUARE.verts + [0, 0, gap]])
+    verts = np.concatenate([SQUARE.verts, SQUARE.verts + np.array([0, 0, gap])])
     assert boundary_length(Shape(verts, np.concatenate([SQUARE.faces, SQUARE.faces + 4]))) == length
 
 
