@@ -21,7 +21,7 @@ from meshmatch.fitting.network_fit import Candidate, Mirror, Predictor
 from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import take_samples
-from meshmatch.fitting.verdict import FAIR_RESIDUAL, GOOD_RESIDUAL, judge
+from meshmatch.fitting.verdict import FAIR_RESIDUAL, GOOD_RESIDUAL, SNUG_RESIDUAL, judge
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
@@ -211,6 +211,18 @@ def test_a_verdict_never_improves_while_the_residual_rises(model: TrainedModel) 
     assert GOOD_RESIDUAL < FAIR_RESIDUAL
     for residual, verdict in zip(residuals, verdicts, strict=True):
         assert bool(judge(residual, scan, points)[1]) == (verdict != "good")
+
+
+def test_a_high_residual_is_fair_where_all_of_a_mesh_lies_close(model: TrainedModel) -> None:
+    scan, points = scan_of(model.template.shape, 500), model.template.shape.verts
+    dense = OrientedPoints(points, model.template.shape.vertex_normals)
+    verdict, reasons = judge(0.04, dense, points)
+    assert (verdict, [reason.code for reason in reasons]) == ("fair", ["residual"])
+    assert judge(SNUG_RESIDUAL + 1e-9, dense, points)[0] == "poor"
+    away = points + np.where(np.arange(len(points)) % 20 < 1, 0.05, 0.0)[:, None]  # 5 % of it, a limb's end
+    assert judge(0.04, OrientedPoints(away, dense.normals), points)[0] == "poor"
+    assert judge(0.04, replace(dense, signed=False), points)[0] == "poor"  # a cloud
+    assert judge(0.04, scan, points)[0] == "poor"  # samples too few to lie near all of the template
 
 
 @pytest.mark.parametrize("lost", ["shape", "template"])
