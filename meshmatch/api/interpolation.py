@@ -142,10 +142,13 @@ def _steps(
     binding = None
     if options.mesh == "source":
         binding = SurfaceBinding(shape_of(fits[0]), fits[0], blend.turns(fits[0].vectors), matcher.threads)
-    place = options.place
+    place, mirrored = options.place, any(fit.frame.mirrored for fit in fits)
     if place == "auto":  # files of different units have no place in common
         sizes = [fit.frame.scale for fit in fits]
-        place = "files" if max(sizes) < _ALIKE * min(sizes) else "source"
+        place = "files" if max(sizes) < _ALIKE * min(sizes) and not mirrored else "source"
+    elif place == "files" and mirrored:
+        hint = "leave out the place: the sequence then stays with the source, and ends as the target's mirror image"
+        raise OptionError("a shape and its mirror image have no way between them in their files", hint)
 
     def seen(moment: float) -> tuple[np.ndarray, np.ndarray]:
         """Node vectors and carried vertices, core frame."""
@@ -158,10 +161,10 @@ def _steps(
         frame = blend.frame(moment) if place == "files" else fits[0].frame
         name = f"{number:03d}"
         placed = frame.undo(verts)
-        shape = Shape(placed, fits[0].faces, name) if binding is None else binding.shape(placed, name)
+        shape = Shape(placed, fits[0].shape.faces, name) if binding is None else binding.shape(placed, name)
         if matcher.progress is not None:
             matcher.progress("frames", "sequence", (number + 1) / len(moments))
-        return Step(moment, shape, blend.deviation(moment, vectors), frame.rotation)
+        return Step(moment, shape, blend.deviation(moment, vectors), frame.turn)
 
     for met in blend.times:  # which rounding may have missed by a hair
         moments[np.abs(moments - met) < _HAIR] = met

@@ -202,7 +202,7 @@ class Matcher:
         notes = [f"{clean.shape.name}: {note}" for note in clean.notes]
         if config.for_model(self.model).refine != config.refine:
             notes.append(f"model {self.model.card.name} is pointwise and has no nodes: its code was refined instead")
-        return replace(fit, repaired=clean, notes=tuple(notes))
+        return replace(fit, repaired=clean, notes=(*notes, *fit.notes))
 
     def _agreed(
         self,

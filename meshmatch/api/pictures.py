@@ -107,7 +107,7 @@ def _composed(
         if own is not None and own.hash != shapes[0].hash:
             what = f"the fit is of {own.name or 'another shape'}, not of {shapes[0].name or 'this one'}"
             raise InputError(what, "draw the shape that was fitted")
-        return compose.compose_fit(shapes[0], fit.shape, fit.frame.rotation)
+        return compose.compose_fit(shapes[0], fit.shape, fit.frame.turn)
     looks = [_read_look(source, shape)[0] for source, shape in zip(given, shapes, strict=True)]
     return compose.compose_shapes(list(zip(shapes, looks, strict=True)))
 

@@ -49,7 +49,7 @@ class MatchResult:
     @property
     def rotations(self) -> tuple[Floats, Floats]:
         """(3, 3) of source and target: from their files into the orientation of the template, for pictures."""
-        return self.source_fit.frame.rotation, self.target_fit.frame.rotation
+        return self.source_fit.frame.turn, self.target_fit.frame.turn
 
     def backward(self) -> VertexMap:
         """The map from target to source, made from the same fits: what pulls values from the source to the target."""

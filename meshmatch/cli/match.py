@@ -155,7 +155,7 @@ def register(
     if picture is not None:
         from meshmatch.render.compose import compose_fit
 
-        compose_fit(loaded, fitted, fit.frame.rotation).render(picture)
+        compose_fit(loaded, fitted, fit.frame.turn).render(picture)
     console.say(*fit.notes)
     console.say(f"fitted the template of {fit.model} to {loaded.name}: {words.fit_words(fit)}")
     words.tell_verdict(console, fit.verdict, fit.reasons)

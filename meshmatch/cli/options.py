@@ -184,6 +184,11 @@ class FitOptions:
         "--partial/--whole",
         help="Treat shapes as partial scans (--partial) or as complete (--whole). Default: detect.",
     )
+    mirror: Literal["auto", "no"] | None = Option(
+        None,
+        help="Whether a shape may be the mirror image of what the model knows, a left hand for one of right ones. "
+        "Default: as the model's card says.",
+    )
     seed: Seed = 0
     device: str = Option(
         "cpu", metavar="NAME", help="Where the network is evaluated: cpu, or cuda (needs meshmatch[train])."
@@ -208,7 +213,7 @@ class FitOptions:
         from meshmatch.fitting.fit_config import FitConfig
 
         partial: Literal["auto", "yes", "no"] = "auto" if self.partial is None else "yes" if self.partial else "no"
-        plain = FitConfig(refine=self.refine, seed=self.seed, partial=partial, device=self.device)
+        plain = FitConfig(refine=self.refine, seed=self.seed, partial=partial, mirror=self.mirror, device=self.device)
         return tuple(replace(plain, up=up, front=front) for up, front in self.axes)
 
     def record(self, fit: meshmatch.Fit) -> dict[str, str | int]:
@@ -252,7 +257,8 @@ class PairOptions(FitOptions):
     @property
     def given(self) -> list[str]:
         """The options that only matching can obey, as far as they were given."""
-        names = ["up", "front", "source_up", "source_front", "target_up", "target_front", "partial", "only", "without"]
+        names = ["up", "front", "source_up", "source_front", "target_up", "target_front", "partial", "mirror"]
+        names += ["only", "without"]
         found = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is not None]
         return [*found, *(["--landmarks"] if self.known_pairs is not None else [])]
 

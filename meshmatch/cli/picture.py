@@ -246,7 +246,7 @@ def _compose_fit(
         found = meshmatch.register(shape, model=fit, config=config, progress=report)
     console.say(f"fitted the template of {fit} to {shape.name}: {words.fit_words(found)}")
     fitted = meshmatch.Shape(found.points_in_file, found.faces, f"{fit} on {shape.name}")
-    return compose_fit(shape, fitted, found.frame.rotation, shown.range)
+    return compose_fit(shape, fitted, found.frame.turn, shown.range)
 
 
 @options.grouped

@@ -39,6 +39,11 @@ class PrepareOptions:
     scale: Literal["area", "sphere"] = Option(
         "area", help="What is made equal to the template's: surface area, or the radius around the centroid."
     )
+    mirror: Literal["auto", "no"] = Option(
+        "auto",
+        help="Whether shapes that are mirror images of the others, such as left hands among right ones, are found and "
+        "mirrored; the model then does the same. Of registered shapes none are.",
+    )
     landmarks: str | None = optional(
         "WHERE",
         "Known points of the shapes: a folder of NAME.npy, or a suffix beside them such as .landmarks.npy "
@@ -91,12 +96,13 @@ def prepare(
     console = Console(quiet)
     parts = None if how.labels is None else load_points(how.labels)
     nodes = NodeConfig(how.strategy, how.nodes, how.radius, seed=how.seed, grow=how.grow_radii)
-    config = PrepareConfig(nodes, how.faces, how.decimate, how.template, how.align, how.scale, how.landmarks, parts)
+    turned = how.align, how.scale, how.mirror
+    config = PrepareConfig(nodes, how.faces, how.decimate, how.template, *turned, how.landmarks, parts)
     with console.progress() as progress:
         made = prepare_shapes(shapes, output, config, progress)
     found: dict[str, object] = {}
     if shapes.is_dir():
-        found = {"align": made.align, "scale": how.scale, "landmarks": made.landmarks}
+        found = {"align": made.align, "scale": how.scale, "mirrored": made.mirrored, "landmarks": made.landmarks}
     template, registered, picture = made.template, len(made.shapes), output / "nodes.png"
     compose_shapes([(template, None)]).render(picture)
     console.say(*made.notes)

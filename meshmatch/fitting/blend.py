@@ -121,7 +121,7 @@ class Blend:
         if self._node_field is not None:
             turns = np.stack([polar(self._node_field.strain(vectors))[0] for vectors in met])
             self._correction = np.einsum("nkij,nki->nkj", turns, self._correction)
-        self._turns = RotationBlend([fit.frame.rotation[None] for fit in fits])
+        self._turns = RotationBlend([fit.frame.turn[None] for fit in fits])
         self._scales = np.array([fit.frame.scale for fit in fits])
         self._centers = np.stack([fit.frame.center for fit in fits])
 

@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
 
 Verdict = Literal["good", "fair", "poor"]
-ReasonCode = Literal["residual", "unreached", "part", "empty"]
+ReasonCode = Literal["residual", "unreached", "part", "empty", "side", "unsupervised"]
 """Template and shape stay apart; some of the shape is not reached; it was taken for a part; template lies where the
-shape has no surface."""
+shape has no surface; its mirror image fits as well; the model was learned without
+correspondence."""
 
 
 class Reason(str):
@@ -95,7 +96,7 @@ class Fit:
     @property
     def shape(self) -> Shape:
         """The fitted template, in the frame and unit of the shape's file."""
-        return Shape(self.points_in_file, self.faces)
+        return Shape(self.points_in_file, facing_out(self.faces, self.frame))
 
     def to_trimesh(self) -> Trimesh:
         """The fitted template as a `trimesh.Trimesh`, in the frame and unit of the shape's file."""
@@ -108,6 +109,11 @@ class Fit:
                 f"the fit is of another template ({self.template_hash}, not {expected})",
                 "use the model that made the fit",
             )
+
+
+def facing_out(faces: Int[Ints, "F 3"], frame: Frame) -> Int[Ints, "F 3"]:
+    """Triangles of the template as they face out in the file of a shape, where a mirrored one is the other way round."""
+    return faces[:, ::-1] if frame.mirrored else faces
 
 
 def axis_name(direction: Float[Floats, " 3"]) -> str:
@@ -125,4 +131,4 @@ def dense_shape(model: TrainedModel, fit: Fit) -> Shape:
     fit.check_template(template.hash)
     verts = np.asarray(template.dense.verts)
     moved = verts + model.field(verts).displaced(fit.vectors)
-    return Shape(fit.frame.undo(moved), template.dense.faces, template.name)
+    return Shape(fit.frame.undo(moved), facing_out(template.dense.faces, fit.frame), template.name)

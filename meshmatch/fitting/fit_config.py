@@ -10,9 +10,11 @@ from numbers import Integral
 from typing import TYPE_CHECKING, Literal, get_args
 
 from meshmatch.errors import OptionError
+from meshmatch.models.card import MIRRORINGS
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
+    from meshmatch.shapes.normalise import Mirroring
 
 Refine = Literal["none", "latent", "nodes"]
 """How a fit is refined, see `meshmatch.fitting.refinement.REFINEMENTS`."""
@@ -94,6 +96,8 @@ class FitConfig:
     up, front : axes of the file, such as "y" or "-z"; searched where not given
     partial : whether the shape may be a part: "auto" tries it where a fit of the whole leaves template without surface,
         "yes" always, "no" never
+    mirror : whether the shape may be the mirror image of what the model knows, such as the other hand: "auto" fits both and
+        keeps the better, "no" never; by default as the model's card says
     samples, coarse_samples : points drawn on the surface, and how many of them are used to screen orientations
     copies : turned copies of the samples that vote on the orientation
     hypotheses : voted orientations that are tried, each with its flips
@@ -114,6 +118,7 @@ class FitConfig:
     up: str | None = None
     front: str | None = None
     partial: Partial = "auto"
+    mirror: Mirroring | None = None
     samples: int = 8000
     coarse_samples: int = 2048
     copies: int = 48
@@ -132,6 +137,8 @@ class FitConfig:
             raise OptionError(f"unknown refinement {self.refine!r}", f"choose one of {', '.join(REFINE_NAMES)}")
         if self.partial not in PARTIALS:
             raise OptionError(f"partial cannot be {self.partial!r}", f"choose one of {', '.join(PARTIALS)}")
+        if self.mirror not in (None, *MIRRORINGS):
+            raise OptionError(f"mirror cannot be {self.mirror!r}", f"choose one of {', '.join(MIRRORINGS)}")
         for name, least in _LEAST.items():
             value = getattr(self, name)
             if not isinstance(value, Integral) or value < least:

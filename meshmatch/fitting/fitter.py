@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,8 +13,9 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
 from meshmatch.fitting.candidates import fit_part, fit_whole
-from meshmatch.fitting.fit import Fit, axis_name
+from meshmatch.fitting.fit import Fit, Reason, Verdict, axis_name
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.network_fit import mirror_of
 from meshmatch.fitting.nodes import Landmarks
 from meshmatch.fitting.refinement import REFINEMENTS, Refinement
 from meshmatch.fitting.task import FitTask, Registration
@@ -32,6 +34,7 @@ _OPEN = 0.3  # so may a bad one of a mesh with a boundary of so many sqrt(area)
 _AGAINST = 0.06  # a boundary so near to another part (units of sqrt(area)) is not that of a cut
 _CLOSER = 0.85  # a part is believed if its residual is that much smaller
 _MISSING = 0.03  # and if it lacks that much of the surface
+_SURE_SIDE = 0.95  # left or right is sure if the other side's residual is larger by this factor
 
 
 class Fitter:
@@ -56,9 +59,30 @@ class Fitter:
         """
         if landmarks is not None:
             check_landmarks(self.model)
-        began = time.monotonic()
-        progress = Progress(self.progress, shape.name)
-        task = FitTask.of(self.model, self.config, shape, landmarks, progress)
+        began, progress, card = time.monotonic(), Progress(self.progress, shape.name), self.model.card
+        notes: tuple[str, ...] = ()
+        doubts: list[Reason] = []
+        if (self.config.mirror or card.mirror) == "no" or mirror_of(self.model) is not None:
+            found, partial = self._found(shape, landmarks, progress, mirrored=False)
+        else:
+            half = progress.between(0, 0.5), progress.between(0.5, 1)
+            sides = [self._found(shape, landmarks, half[side], mirrored=bool(side)) for side in (0, 1)]
+            (found, partial), (other, _) = sorted(sides, key=lambda side: side[0].candidate.cost)
+            if found.core_frame.mirrored:
+                notes = (f"{shape.name}: taken for the mirror image of what {card.name} knows",)
+            if found.candidate.cost > _SURE_SIDE * other.candidate.cost:
+                doubts.append(Reason("side", "it fits nearly as well in the mirror: left and right may be exchanged"))
+        if not card.correspondence:
+            doubts.append(Reason("unsupervised", f"{card.name} was learned without correspondence: near may be wrong"))
+        fit = replace(_as_fit(found, partial, began), notes=notes)
+        verdict: Verdict = "fair" if doubts and fit.verdict == "good" else fit.verdict
+        return replace(fit, verdict=verdict, reasons=(*fit.reasons, *doubts))
+
+    def _found(
+        self, shape: Shape, landmarks: Landmarks | None, progress: Progress, mirrored: bool
+    ) -> tuple[Registration, bool]:
+        """The registration of a shape, or of its mirror image, and whether as a part."""
+        task = FitTask.of(self.model, self.config, shape, landmarks, progress, mirrored)
         refinement = REFINEMENTS[task.config.refine]
         found, partial = fit_whole(task, refinement.whole), False
         if landmarks is None and _may_be_part(found, refinement):
@@ -67,7 +91,7 @@ class Fitter:
             closer = part.candidate.cost < _CLOSER * found.candidate.residual
             partial = closer and part.candidate.share < 1 - _MISSING
             found = part if partial else found
-        return _as_fit(found, partial, began)
+        return found, partial
 
 
 def _may_be_part(whole: Registration, refinement: Refinement) -> bool:

@@ -6,6 +6,8 @@ that agree form a hypothesis. Asking again from the voted frame sharpens it.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -32,10 +34,11 @@ _FLIPS = Rotation.from_rotvec(
 ).as_matrix()
 
 
-def scan_frame(model: TrainedModel, shape: Shape) -> Frame:
+def scan_frame(model: TrainedModel, shape: Shape, mirrored: bool = False) -> Frame:
     """The frame in which the model knows shapes, before they are turned: of area 1, or of the template's radius."""
     scale = next(kind for kind in SCALES if kind == model.card.frame["scale"])  # the card knows no other
-    return unit_frame(shape, scale, template_radius(model.template))
+    frame = unit_frame(shape, scale, template_radius(model.template))
+    return replace(frame, rotation=frame.rotation * [[-1], [1], [1]]) if mirrored else frame
 
 
 def frames_to_try(model: TrainedModel, samples: OrientedPoints, config: FitConfig) -> list[RigidPose]:

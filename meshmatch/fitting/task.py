@@ -50,12 +50,13 @@ class FitTask:
         shape: Shape,
         landmarks: Landmarks | None = None,
         progress: Progress | None = None,
+        mirrored: bool = False,
     ) -> FitTask:
-        """The task for a repaired shape, sampled in the frame in which the model knows shapes."""
+        """The task for a repaired shape, or its mirror image, sampled in the frame in which the model knows shapes."""
         config = config.for_noise(shape.roughness)
         rng = np.random.default_rng(config.seed)
         clean = without_outliers(shape)
-        frame, samples = take_samples(clean, config.samples, rng, scan_frame(model, clean))
+        frame, samples = take_samples(clean, config.samples, rng, scan_frame(model, clean, mirrored))
         predictor = Predictor.of(model, rng, config.device)
         progress = progress or Progress()
         return cls(model, config, predictor, shape, clean.roughness, frame, samples, landmarks, progress)

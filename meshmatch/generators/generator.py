@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from meshmatch.arrays import Float, Int, Ints
+from meshmatch.shapes.normalise import Mirroring
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.make import NodeConfig, make_template
@@ -22,13 +23,15 @@ Source = Callable[[int, torch.Generator], Float[Tensor, "N V 3"]]
 @dataclass(frozen=True, eq=False)
 class Generator:
     """Shapes of a kind: the ``template`` is one at rest, with its parts; ``draw`` gives others on its vertices, of random
-    identities in random poses, a function of the seed. ``data``: what a model's card says of them.
+    identities in random poses, a function of the seed. ``data`` is what a model's card says of them, ``mirror`` whether its
+    fits also try mirror images.
     """
 
     kind: str
     template: Template
     draw: Source
     data: str
+    mirror: Mirroring = "no"
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,11 @@ from meshmatch.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A similarity: the way from a file's own coordinates into a model's, and back."""
+    """A similarity: the way from a file's own coordinates into a model's, and back; for a shape that is known by its
+    mirror image, a reflection too."""
 
     scale: float  # length in the file that becomes 1; positive
-    rotation: Float[Floats, "3 3"]  # applied after centering; orthonormal, determinant +1
+    rotation: Float[Floats, "3 3"]  # applied after centering; orthonormal, determinant +1, or -1 in the mirror
     center: Float[Floats, " 3"]  # the file's point that becomes the origin
 
     def __post_init__(self) -> None:
@@ -26,8 +27,8 @@ class Frame:
             raise InputError(f"a frame needs a (3, 3) rotation and a (3,) center, not {rotation.shape}, {center.shape}")
         if not (np.isfinite(self.scale) and self.scale > 0 and np.isfinite(center).all()):
             raise InputError(f"a frame's scale must be positive and finite, not {self.scale}", "has it any size?")
-        if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0):
-            raise InputError("a frame's rotation must be orthonormal with determinant +1")
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+            raise InputError("a frame's rotation must be orthonormal")
         for name, value in (("scale", float(self.scale)), ("rotation", rotation), ("center", center)):
             object.__setattr__(self, name, value)
 
@@ -35,6 +36,16 @@ class Frame:
     def identity(cls) -> Frame:
         """The frame that changes nothing."""
         return cls(1.0, np.eye(3), np.zeros(3))
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether left becomes right."""
+        return bool(np.linalg.det(self.rotation) < 0)
+
+    @property
+    def turn(self) -> Float[Floats, "3 3"]:
+        """The rotation; of a mirrored frame, the one with the same up and front."""
+        return self.rotation * [[-1], [1], [1]] if self.mirrored else self.rotation
 
     def apply(self, points: ArrayLike) -> Float[Floats, "... 3"]:
         """Points (..., 3) of the file, in the model's frame: ``((points - center) @ rotation.T) / scale``."""

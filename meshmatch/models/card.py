@@ -20,23 +20,27 @@ from typing import Any, NoReturn
 from meshmatch.errors import ModelError
 from meshmatch.outputs import replace_on_success
 
-SCHEMA = 3
+SCHEMA = 4
 MAX_BYTES = 1_000_000
 """A larger file is not a card."""
 ORIENTATIONS = ("searched", "none", "near", "rigid")
 """How a fit finds the orientation: asks the network, takes what the file has, improves that, or tries all turns."""
 SCALES = ("area", "sphere")
+MIRRORINGS = ("auto", "no")
+"""Whether a fit also tries the mirror image of a shape: left hands for a model of right ones."""
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 _OLD_FRAME = {"orientation": "searched", "scale": "area"}
 _SINCE: dict[int, dict[str, Any]] = {  # what cards of older schemas lack, and what they meant
-    1: {"frame": _OLD_FRAME, "stiffness": 1.0},
-    2: {"stiffness": 1.0},
+    1: {"frame": _OLD_FRAME, "stiffness": 1.0, "mirror": "no", "correspondence": True},
+    2: {"stiffness": 1.0, "mirror": "no", "correspondence": True},
+    3: {"mirror": "no", "correspondence": True},
 }
 _KINDS: dict[str, tuple[type, str]] = {  # by annotation
     "str": (str, "text"),
     "int": (int, "a whole number"),
     "float": (float, "a number"),
+    "bool": (bool, "true or false"),
     "dict[str, Any]": (dict, "an object"),
 }
 _FIELD_KEYS = {"kernel": "str", "radius": "float", "nodes": "int"}
@@ -50,6 +54,7 @@ _RULES: dict[str, tuple[Callable[[Any], object], str]] = {  # what entries must 
     "field.radius": (lambda radius: radius > 0, "above 0"),
     "field.nodes": (lambda count: count >= 4, "4 or more"),
     "frame.orientation": (ORIENTATIONS.__contains__, f"one of {', '.join(ORIENTATIONS)}"),
+    "mirror": (MIRRORINGS.__contains__, f"one of {', '.join(MIRRORINGS)}"),
     "frame.scale": (SCALES.__contains__, f"one of {', '.join(SCALES)}"),
 }
 
@@ -82,6 +87,8 @@ class ModelCard:
     frame: dict[str, Any] = entry(default_factory=lambda: dict(_OLD_FRAME))
     # How firmly fits that agree hold a common stretch of the template: 1 suits bodies, less suits what varies more.
     stiffness: float = 1.0
+    mirror: str = "no"  # whether fits also try a shape's mirror image: one of `MIRRORINGS`
+    correspondence: bool = True  # whether it was learned from known correspondence; else its fits are fair at best
 
     def __post_init__(self) -> None:
         for item in fields(self):

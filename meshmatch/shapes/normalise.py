@@ -23,6 +23,8 @@ from meshmatch.shapes.shape import Shape
 
 Align = Literal["none", "near", "rigid"]
 ALIGNS: tuple[Align, ...] = get_args(Align)
+Mirroring = Literal["auto", "no"]
+"""Whether the mirror image of a shape is tried too."""
 
 # Set by hand.
 _SCALE = 0.1  # of the robust weight, units of sqrt(area)

@@ -15,16 +15,18 @@ from meshmatch.outputs import as_path, make_folder, replace_on_success
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
-from meshmatch.shapes.normalise import Align, sqrt_area_frame
+from meshmatch.shapes.normalise import Align, Mirroring, sqrt_area_frame
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates import prepared_folder
 from meshmatch.templates.make import LOW_FACES, NodeConfig, low_mesh, make_template
 from meshmatch.templates.prepared_folder import MAX_RESIDUAL, find_landmarks
+from meshmatch.templates.sides import mirrored, other_side
 from meshmatch.templates.template import Scale, Template, save_arrays, save_template
 
 MIN_FACES = 50
 MIN_POINTS = 100
+_MOST_SIDES = 200  # shapes among which sides are looked for: it takes a second or two a shape
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class PrepareConfig:
     template: str | Path | None = None
     align: Align | None = None
     scale: Scale = "area"  # which size of every shape is made that of the template
+    mirror: Mirroring = "auto"  # mirror those that are mirror images of most others, or never
     landmarks: str | Path | None = None  # a folder or suffix: where they are, see `find_landmarks`
     labels: Int[Ints, " V"] | None = None  # part of every vertex of a single shape's file, from 0; for "parts"
 
@@ -56,6 +59,7 @@ class Prepared:
     names: tuple[str, ...]  # files of the shapes
     notes: tuple[str, ...]  # what was found and done
     align: Align = "none"  # how shapes were turned to the template
+    mirrored: tuple[str, ...] = ()  # names of those that were mirrored
     landmarks: int = 0  # how many points are known on each
 
 
@@ -106,6 +110,7 @@ def prepare(
 def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress: Progress) -> Prepared:
     notes: list[str] = []
     found, marks = _read_shapes(folder, output, config, notes, progress.between(0.0, 0.5))
+    flags = _mirror_some(found, marks, config, notes, progress.between(0.5, 0.6))
     first, own = _template_shape(folder, config, found, notes)
     low = low_mesh(first.shape, config.faces, config.decimate)
     vertices = first.kept_vertex[low[0]]
@@ -122,7 +127,7 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
         # the way from the template's file to its frame, read off two of its vertices' places
         template_marks = sqrt_area_frame(Shape(first.shape.verts[low[0]], low[1], name)).apply(template_marks)
     samples, frames, residuals = prepared_folder.collect_samples(
-        *(made, found, marks, template_marks, how, config.scale, config.nodes.seed), progress.between(0.5, 1.0)
+        *(made, found, marks, template_marks, how, config.scale, config.nodes.seed), progress.between(0.6, 1.0)
     )
     if not registered and np.median(residuals) > MAX_RESIDUAL:
         far = f"aligned, they lie {100 * np.median(residuals):.0f} % of sqrt(area) apart"
@@ -142,14 +147,15 @@ def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress:
     save_arrays(output / "points.safetensors", arrays, {"align": samples.align, "scale": samples.scale})
     save_arrays(output / "shapes.safetensors", {"verts": stack})
     names = tuple(clean.original.name for clean in found)
+    turned = tuple(name for name, flag in zip(names, flags, strict=True) if flag)
     words: dict[str, Any] = {"names": names, "registered": registered, "notes": notes, "template": made.hash}
-    words |= {"source": first.original.name, "align": how, "scale": config.scale}
+    words |= {"source": first.original.name, "align": how, "scale": config.scale, "mirrored": turned}
     words["landmarks"] = samples.landmarks.shape[1]
     words["frames"] = [{"scale": f.scale, "rotation": f.rotation.tolist(), "center": f.center.tolist()} for f in frames]
     words |= {"apart": [round(residual, 5) for residual in residuals], "config": asdict(config.nodes)}
     with replace_on_success(output / "prepared.json") as temporary:
         Path(temporary).write_text(json.dumps(words, indent=1), encoding="utf-8")
-    return Prepared(made, stack, names, tuple(notes), how, samples.landmarks.shape[1])
+    return Prepared(made, stack, names, tuple(notes), how, turned, samples.landmarks.shape[1])
 
 
 def _read_shapes(
@@ -177,6 +183,28 @@ def _read_shapes(
     if not found:
         raise InputError(f"no shape in {folder} could be used", notes[0])
     return found, marks
+
+
+def _mirror_some(
+    found: list[Repaired],
+    marks: list[Float[Floats, "L 3"] | None],
+    config: PrepareConfig,
+    notes: list[str],
+    progress: Progress,
+) -> list[bool]:
+    """Mirror the shapes that are mirror images of most others, in place, with their landmarks; which they are."""
+    if config.mirror == "no" or len(found) > _MOST_SIDES or prepared_folder.same_faces(found[0], found):
+        return [False] * len(found)
+    flags = other_side(found, config.scale, config.nodes.seed, progress).tolist()
+    for number in np.flatnonzero(flags):
+        found[number] = repair(mirrored(found[number].original))
+        if (known := marks[number]) is not None:
+            marks[number] = known * [-1, 1, 1]
+    if any(flags):
+        names = [clean.original.name for clean, flag in zip(found, flags, strict=True) if flag]
+        shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+        notes.append(f"{len(names)} of {len(found)} shapes are mirror images of the others, and were mirrored: {shown}")
+    return flags
 
 
 def _template_file(path: Path) -> Repaired:

@@ -238,6 +238,14 @@ def frame_of(folder: str | Path) -> dict[str, str] | None:
         return None  # whoever reads its shapes reports what is wrong with the folder
 
 
+def has_sides(folder: str | Path) -> bool:
+    """Whether shapes of a prepared folder were mirrored, so that what they teach comes in two sides."""
+    try:
+        return bool(_facts(folder).get("mirrored"))
+    except (OSError, ValueError):
+        return False  # whoever reads its shapes reports what is wrong with the folder
+
+
 def _read(
     folder: Path, name: str, template: Template, build: Callable[[dict[str, np.ndarray], dict[str, str]], T]
 ) -> tuple[dict[str, Any], T]:

@@ -14,7 +14,8 @@ from meshmatch.generators.generator import Source
 from meshmatch.generators.kinds import Kind
 from meshmatch.models.registry import TEMPLATE
 from meshmatch.progress import Progress
-from meshmatch.templates.prepared_folder import ShapeSamples, frame_of, read_registered, read_samples
+from meshmatch.shapes.normalise import Mirroring
+from meshmatch.templates.prepared_folder import ShapeSamples, frame_of, has_sides, read_registered, read_samples
 from meshmatch.templates.template import Template, read_template
 from meshmatch.training.datasets import deformed_source, registered_source
 from meshmatch.training.recipes import Recipe
@@ -29,6 +30,7 @@ class Lessons:
     category: str
     data: str  # a few words
     frame: dict[str, str] | None = None  # how fits find it, where the shapes say so
+    mirror: Mirroring = "no"  # "auto" where shapes come in two sides
 
 
 def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lessons:
@@ -36,7 +38,7 @@ def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lesson
     seed = recipe.train.seed
     if isinstance(kind, Kind):
         made = kind.generator(seed, progress)
-        return Lessons(made.template, made.draw, made.kind, made.data)
+        return Lessons(made.template, made.draw, made.kind, made.data, mirror=made.mirror)
     if kind.characters is None:
         kind = replace(kind, characters=recipe.characters)
     template = read_template(kind.template or recipe.template)
@@ -48,14 +50,15 @@ def prepared(shapes: Path, recipe: Recipe) -> Lessons:
     template = read_template(shapes / TEMPLATE)
     name = shapes.resolve().name
     frame = frame_of(shapes) if recipe.deform else None
+    mirror: Mirroring = "auto" if has_sides(shapes) else "no"
     if recipe.train.loss.needs_correspondence:
         verts = torch.from_numpy(read_registered(shapes, template))
         source = (deformed_source if recipe.deform else registered_source)(verts)
-        return Lessons(template, source, name, f"{len(verts)} registered shapes of {name}", frame)
+        return Lessons(template, source, name, f"{len(verts)} registered shapes of {name}", frame, mirror)
     samples = read_samples(shapes, template)
     known = f" and {len(samples.template_landmarks)} known points" if len(samples.template_landmarks) else ""
     data = f"{len(samples.points)} shapes of {name}, without correspondence{known}"
-    return Lessons(template, samples, name, data, frame)
+    return Lessons(template, samples, name, data, frame, mirror)
 
 
 def kind_named(name: str) -> Kind | Bodies:

@@ -62,6 +62,7 @@ class CardFacts:
     licence: str = "unstated"
     stiffness: float = 1.0  # 0.05 suits what differs more from shape to shape than bodies do, such as organs
     start: TrainedModel | str | Path | None = None
+    mirror: str = ""  # "auto" for what comes in two sides, or "no"
     frame: dict[str, str] | None = None  # as the training's shapes and network say
 
 
@@ -98,7 +99,7 @@ def train(
     recipe = recipe or recipe_for(shapes, kind=None if kind is None else kind.name)
     learned = lessons(shapes, kind, recipe, Progress(progress, "shapes").stage("making shapes (once)"))
     facts = replace(facts, category=facts.category or learned.category, data=facts.data or learned.data)
-    facts = replace(facts, frame=facts.frame or learned.frame)
+    facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
 
     def both(now: StepReport) -> None:
         if progress is not None:
@@ -190,7 +191,8 @@ def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, f
         field={"kernel": recipe.kernel, "radius": template.reach, "nodes": template.K},
         data=facts.data, licence=facts.licence, recipe=settings, seed=recipe.train.seed, steps=trainer.step,
         training_minutes=round(trainer.seconds / 60, 1), metrics={"validation": {"distance": round(score, 5)}},
-        weights_sha256=digest, created=datetime.date.today().isoformat(), stiffness=facts.stiffness, **frame,
+        weights_sha256=digest, created=datetime.date.today().isoformat(), stiffness=facts.stiffness,
+        mirror=facts.mirror or "no", correspondence=recipe.train.loss.needs_correspondence, **frame,
     )  # fmt: skip
     write_card(card, output / CARD)
 

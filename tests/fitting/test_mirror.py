@@ -1,84 +1,98 @@
-"""The mirror of a symmetric template: a reading of the mirrored scan is a reading of the scan."""
+"""Shapes that are the mirror image of what a model knows: found, said, and matched all the same."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
+import meshmatch
 from meshmatch.api.inputs import as_model
-from meshmatch.fields.shape_functions import ShapeFunctions
-from meshmatch.fitting.network_fit import Mirror, Predictor, mirror_of
-from meshmatch.fitting.system import node_system
-from meshmatch.geometry.frames import RigidPose
+from meshmatch.api.interpolation import InterpolationOptions, interpolate
+from meshmatch.errors import OptionError
+from meshmatch.fitting import fitter
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.geometry.triangles import triangle_vectors
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
-from tests.fitting.eggs import egg_model, gentle_vectors, scan_of
 
-FLIP = np.array([-1.0, 1, 1])
-
-
-@pytest.fixture(scope="module")
-def human() -> TrainedModel:
-    return as_model("human")
+DANCER = Path(__file__).parents[2] / "templates" / "samples" / "dancer.ply"
 
 
-@pytest.fixture(scope="module")
-def mirror(human: TrainedModel) -> Mirror:
-    found = mirror_of(human)
-    assert found is not None
-    return found
+@pytest.fixture
+def one_sided(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bodies as if left and right were not alike, and the mirror image always lay nearer."""
+    found = fitter.Fitter._found
+
+    def mirror_alone(self, shape, landmarks, progress, mirrored):
+        registration, partial = found(self, shape, landmarks, progress, mirrored)
+        if self.config.mirror == "auto" and not mirrored:
+            object.__setattr__(registration.candidate, "residual", 1.0)
+        return registration, partial
+
+    monkeypatch.setattr(fitter, "mirror_of", lambda model: None)
+    monkeypatch.setattr(fitter.Fitter, "_found", mirror_alone)
 
 
-def test_a_body_has_a_mirror_and_what_is_not_symmetric_has_none(human: TrainedModel) -> None:
-    template = human.template
-    shifted = replace(template, dense=Shape(template.dense.verts + np.array([0.03, 0, 0]), template.dense.faces))
-    assert mirror_of(replace(human, template=shifted)) is None
+def volume(shape: Shape) -> float:
+    return float((triangle_vectors(shape.verts, shape.faces) * shape.verts[shape.faces].mean(1)).sum())
 
 
-def test_the_mirrored_deformation_moves_the_mirrored_template_to_the_mirror_image(
-    human: TrainedModel, mirror: Mirror
-) -> None:
-    system = node_system(human)
-    vectors = 0.5 * gentle_vectors(human)
-    moved = system.moved(mirror.vectors(vectors))
-    # an oracle without the solve: the field itself, asked at the mirrored vertices
-    over = human.field(system.verts * FLIP)
-    assert isinstance(over, ShapeFunctions)
-    across = over.phi.toarray().astype(float)
-    wanted = (system.verts * FLIP + across @ vectors) * FLIP
-    assert np.abs(moved - system.verts).max() > 0.01
-    assert np.abs(moved - wanted).max() < 2e-3
+def turned_over(fit: Fit) -> np.ndarray:
+    """Template vertices on the shape, those of left and right exchanged."""
+    at = cKDTree(fit.resting).query(fit.resting * [-1, 1, 1])[1]
+    return fit.points_in_file[at]
 
 
-def test_twice_in_the_mirror_is_the_same_again(human: TrainedModel, mirror: Mirror) -> None:
-    system = node_system(human)
-    vectors = 0.5 * gentle_vectors(human)
-    twice = mirror.vectors(mirror.vectors(vectors))
-    assert np.abs(system.moved(twice) - system.moved(vectors)).max() < 4e-3
+def test_the_mirror_image_is_fitted_in_its_place(one_sided: None) -> None:
+    fit = meshmatch.register(DANCER, model="human", config=FitConfig(mirror="auto"))
+    plain = meshmatch.register(DANCER, model="human", config=FitConfig(mirror="no"))
+    assert fit.frame.mirrored and not plain.frame.mirrored
+    assert any("dancer.ply: taken for the mirror image of what human knows" in note for note in fit.notes)
+    assert (fit.verdict, fit.up) == ("good", plain.up)
+    size = plain.frame.scale
+    # the fitted template lies on the dancer, faces out, and has left where right is
+    assert volume(fit.shape) > 0 and volume(plain.shape) > 0
+    apart = np.linalg.norm(turned_over(fit) - plain.points_in_file, axis=1).mean() / size
+    assert apart < 0.02 < 0.15 < np.linalg.norm(fit.points_in_file - plain.points_in_file, axis=1).mean() / size
+    dense = meshmatch.Matcher("human").dense(fit)
+    assert volume(dense) > 0
 
 
-def test_a_mirror_adds_as_many_readings_which_a_network_without_sides_reads_the_same() -> None:
-    model = egg_model()
-    system = node_system(model)
-    scan = scan_of(Shape(system.verts, system.faces), 200)
-    asked: list[np.ndarray] = []
+def test_a_shape_and_its_mirror_image_are_matched(one_sided: None) -> None:
+    dancer = meshmatch.load_shape(DANCER)
+    image = Shape(dancer.verts * [-1, 1, 1], dancer.faces[:, ::-1], "image")
+    plain, mirror = FitConfig(mirror="no"), FitConfig(mirror="auto")
+    found = meshmatch.match(dancer, image, model="human", config=(plain, mirror))
+    assert found.target_fit.frame.mirrored
+    error = np.linalg.norm(dancer.verts[found.map.index] - dancer.verts, axis=1) / np.sqrt(dancer.area)
+    assert error.mean() < 0.01
+    with pytest.raises(OptionError, match="no way between them"):
+        interpolate([dancer, image], model="human", config=(plain, mirror), options=InterpolationOptions(place="files"))
 
-    class Still:
-        def predict(self, clouds: Sequence[np.ndarray]) -> np.ndarray:
-            asked.extend(clouds)
-            return np.full((len(clouds), system.K, 3), 0.1)
 
-        def rotate_rows(self, vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
-            return vectors
+def test_what_fits_either_way_is_not_called_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fitter, "mirror_of", lambda model: None)
+    fit = meshmatch.register(DANCER, model="human", config=FitConfig(mirror="auto"))
+    assert fit.verdict == "fair"
+    assert [reason.code for reason in fit.reasons] == ["side"]
 
-    network: Any = Still()
-    mirror = Mirror(np.eye(system.K))
-    # without a tilt and with all points the mirrored questions hold the mirrored points
-    predictor = Predictor(network, system, model.template.core, mirror, np.random.default_rng(0))
-    found = predictor.variants(scan, scan, RigidPose.identity(), 2, 0.0)
-    assert len(found) == 4
-    first, last = (np.sort(asked[k] * flip, axis=0) for k, flip in ((0, 1.0), (3, FLIP)))
-    assert np.allclose(first, last, atol=1e-6)
-    assert np.allclose(found[0].vectors, 0.1) and np.allclose(found[3].vectors, 0.1 * FLIP)
+
+def test_what_is_symmetric_has_no_sides() -> None:
+    fit = meshmatch.register(DANCER, model="human", config=FitConfig(mirror="auto"))
+    assert fit.verdict == "good" and not fit.frame.mirrored
+    assert as_model("human").card.mirror == "no"
+
+
+def test_words_for_the_mirror() -> None:
+    with pytest.raises(OptionError, match="mirror cannot be 'yes'"):
+        FitConfig(mirror="yes")  # type: ignore[arg-type]
+
+
+def test_without_correspondence_near_is_all_that_is_known() -> None:
+    model = as_model("human")
+    blind = TrainedModel(replace(model.card, correspondence=False), model.template, model.inference)
+    fit = meshmatch.register(DANCER, model=blind)
+    assert (fit.verdict, [reason.code for reason in fit.reasons]) == ("fair", ["unsupervised"])

@@ -86,7 +86,7 @@ _WRONG: list[tuple[str, Any, str]] = [
     ("created", "2026-02-30", "ISO date"),
     ("stiffness", 0, "stiffness must be above 0"),
     ("stiffness", -0.5, "stiffness must be above 0"),
-    ("schema", 0, "schema 0, not 3"),
+    ("schema", 0, "schema 0, not 4"),
     ("schema", True, "schema must be a whole number"),
 ]
 
@@ -114,23 +114,33 @@ def test_extra_entries_are_refused() -> None:
 
 def test_a_card_of_the_first_schema_is_read_as_it_was_meant() -> None:
     words = json.loads(card_to_json(small_card())) | {"schema": 1}
-    del words["frame"], words["stiffness"]
+    del words["frame"], words["stiffness"], words["mirror"], words["correspondence"]
     card = card_from_json(json.dumps(words))
-    assert (card.schema, card.frame) == (3, {"orientation": "searched", "scale": "area"})
-    assert card.stiffness == 1.0
+    assert (card.schema, card.frame) == (4, {"orientation": "searched", "scale": "area"})
+    assert (card.stiffness, card.mirror) == (1.0, "no")
     assert card == small_card()
-    with pytest.raises(ModelError, match="missing entries: frame, stiffness"):
-        card_from_json(json.dumps(words | {"schema": 3}))
-    with pytest.raises(ModelError, match="missing entries: stiffness"):  # a frame is no sign of the first schema
+    with pytest.raises(ModelError, match="missing entries: frame, stiffness, mirror, correspondence"):
+        card_from_json(json.dumps(words | {"schema": 4}))
+    with pytest.raises(
+        ModelError, match="missing entries: stiffness, mirror, correspondence"
+    ):  # a frame is no sign of the first schema
         card_from_json(json.dumps(words | {"frame": {"orientation": "none", "scale": "area"}}))
 
 
 def test_a_card_of_the_second_schema_is_as_stiff_as_it_was() -> None:
     words = json.loads(card_to_json(small_card())) | {"schema": 2}
-    del words["stiffness"]
+    del words["stiffness"], words["mirror"], words["correspondence"]
     assert card_from_json(json.dumps(words)) == small_card()
-    with pytest.raises(ModelError, match="schema 2, not 3"):
+    with pytest.raises(ModelError, match="missing entries: mirror, correspondence"):
         card_from_json(json.dumps(words | {"stiffness": 0.5}))
+
+
+def test_a_card_of_the_third_schema_never_mirrors() -> None:
+    words = json.loads(card_to_json(small_card())) | {"schema": 3}
+    del words["mirror"], words["correspondence"]
+    assert card_from_json(json.dumps(words)) == small_card()
+    with pytest.raises(ModelError, match="missing entries: correspondence"):
+        card_from_json(json.dumps(words | {"mirror": "auto"}))
 
 
 @pytest.mark.parametrize(
@@ -149,8 +159,8 @@ def test_a_wrong_frame_is_refused(frame: dict[str, object], told: str) -> None:
 
 
 def test_a_newer_schema_asks_for_an_update_whatever_else_it_holds() -> None:
-    words = json.loads(card_to_json(small_card())) | {"schema": 4, "unheard": 1}
-    with pytest.raises(ModelError, match="schema 4") as caught:
+    words = json.loads(card_to_json(small_card())) | {"schema": 5, "unheard": 1}
+    with pytest.raises(ModelError, match="schema 5") as caught:
         card_from_json(json.dumps(words))
     assert "update" in caught.value.hint
 
