@@ -4,8 +4,7 @@ Generated ones know their truth. In clothes, and stylised: the distance along th
 between the matched place and the true one, at every tenth vertex of the body, in centimetres at 1.9 m2 of skin. All of
 them, and those of the evaluation data (Rogue and Rogue_Hooded, which share a skeleton, without what they hold or wear
 loosely): the share of vertices whose partner hangs on the same bone. Every ordered pair of a group counts, matched as
-`match` does it, from files turned anywhere where they are generated. Seconds are of a pair: two fits and the map, as
-measured one after the other.
+`match` does it, from files turned anywhere where they are generated. Seconds are of CPU: two fits and the map.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ VERDICTS = ("good", "fair", "poor")
 _EVERY = 10  # vertex of the body is a place where errors are measured
 COLUMNS = {
     "group": "group", "pairs": "pairs:d", "mean cm": "mean_cm:.2f", "median": "median_cm:.2f", "worst": "worst_cm:.1f",
-    "same bone": "bone:.3f", "lowest": "lowest:.3f", "good / fair / poor": "verdicts:>", "s a pair": "seconds:.1f",
+    "same bone": "bone:.3f", "lowest": "lowest:.3f", "good / fair / poor": "verdicts:>", "CPU s a pair": "seconds:.1f",
     "at most": "slowest:.1f",
 }  # fmt: skip
 
@@ -96,15 +95,15 @@ def row_of(group: str, cast: list[Character], matcher: Matcher, cache: Path | No
     fits: list[Fit] = []
     fitted = []
     for each in runner.track(cast, f"{group}: fitting", len(cast)):
-        began = time.perf_counter()
+        began = time.process_time()
         fits.append(matcher.fit(each.shape))
-        fitted.append(time.perf_counter() - began)
+        fitted.append(time.process_time() - began)
     pairs = list(itertools.permutations(range(len(cast)), 2))
     found, seconds, verdicts = [], [], Counter[str]()
     for a, b in runner.track(pairs, f"{group}: mapping", len(pairs)):
-        began = time.perf_counter()
+        began = time.process_time()
         vertex_map = matcher.map(fits[a], fits[b])
-        seconds.append(fitted[a] + fitted[b] + time.perf_counter() - began)
+        seconds.append(fitted[a] + fitted[b] + time.process_time() - began)
         verdicts[max((fits[a].verdict, fits[b].verdict), key=VERDICTS.index)] += 1
         found.append(measured(cast[a], cast[b], vertex_map, cache))
     bone = [each["bone"] for each in found]
