@@ -55,6 +55,7 @@ FRAMES = 5
 _POINTS = 2000
 _LABELLED, _PAIRS = 64, 50  # shapes whose points have labels, and pairs of them for each that is compared
 _COMPARED = ("chamfer", "label_iou", "facing_iou", "bend")
+_CORRECT: float = TRAINING.loss.correct
 _MOVED = 0.25  # of the cube's half side: the last color
 
 
@@ -245,6 +246,7 @@ def main(
     steps: Annotated[int, Option(min=1)] = 1000,
     seeds: Annotated[int, Option(min=1, help="trainings of each, on the same shapes")] = 1,
     compared: Annotated[int, Option(min=1, help="shapes reconstructed, and pairs of interpolations")] = 6,
+    correct: Annotated[float, Option(min=0, help="weight of the correction's size in the loss")] = _CORRECT,
     picture: Annotated[Path | None, Option(help="figure 12, a PNG")] = None,
     seed: runner.Seed = 0,
     threads: runner.Threads = 1,
@@ -260,8 +262,11 @@ def main(
             config = ImplicitConfig(METHODS[method])  # type: ignore[arg-type]
             trainings = []
             for number in range(seed, seed + seeds):
-                training = replace(TRAINING, steps=steps, seed=number, checkpoint_minutes=1.0)
+                loss = replace(TRAINING.loss, correct=correct)
+                training = replace(TRAINING, steps=steps, seed=number, checkpoint_minutes=1.0, loss=loss)
                 folder = work / f"{kind}-{METHODS[method]}-{number}"
+                if correct != _CORRECT:
+                    folder = folder.with_name(f"{folder.name}-correct{correct:g}")
                 model = trained(folder, samples, config, training)
                 models.setdefault((kind, method), model)
                 asked = {"shapes": shapes, "steps": steps, "compared": compared, "seed": seed}
