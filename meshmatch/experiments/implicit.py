@@ -286,14 +286,21 @@ def main(
         draw(picture, models, pairs_of(shapes, compared, seed + 1)[0])
     columns = {
         **{"kind": "kind", "deformation": "method", "Chamfer %": "chamfer:.3f", "IoU": "iou:.3f"},
-        **{"label IoU": "label_iou:.3f", "±": "label_iou_sd:.3f"},
-        **{"with normals": "facing_iou:.3f", "± ": "facing_iou_sd:.3f", "undeformed": "undeformed_iou:.3f"},
-        **{"bend %": "bend:.3f", "±  ": "bend_sd:.3f"},
-        **{"of motion": "bend_share:.3f", "volume %": "volume_change:.2f", "pieces": "pieces:.1f"},
-        **{"(det F-1)^2": "volume_energy:.3f", "|F'F-I|": "arap_energy:.3f", "s/step": "seconds:.3f"},
+        **{"label IoU": "label_iou:.3f", "with normals": "facing_iou:.3f", "undeformed": "undeformed_iou:.3f"},
+        **{"bend %": "bend:.3f", "of motion": "bend_share:.3f", "volume %": "volume_change:.2f"},
+        **{"pieces": "pieces:.1f", "(det F-1)^2": "volume_energy:.3f", "|F'F-I|": "arap_energy:.3f"},
+        "s/step": "seconds:.3f",
     }
-    title = f"Implicit surfaces, {shapes} shapes of a kind, {steps} steps, {seeds} trainings"
-    return runner.Report({"rows": rows}, [runner.table(title, rows, columns)])
+    tables = [runner.table(title_of(shapes, steps, seeds), rows, columns)]
+    if seeds > 1:
+        deviations = {"kind": "kind", "deformation": "method"} | {name: f"{name}_sd:.3f" for name in _COMPARED}
+        tables.append(runner.table("Standard deviations over trainings", rows, deviations))
+    return runner.Report({"rows": rows}, tables)
+
+
+def title_of(shapes: int, steps: int, seeds: int) -> str:
+    """Of the table."""
+    return f"Implicit surfaces, {shapes} shapes of a kind, {steps} steps, {seeds} training{'s' * (seeds > 1)} of each"
 
 
 if __name__ == "__main__":
