@@ -1,4 +1,5 @@
-"""Hands and heads that no training drew: other people, other triangles, cut at random, turned anywhere, clutter beside half.
+"""Hands and heads that no training drew: other people, other triangles, cut at random, turned anywhere, clutter beside half;
+of hands, which come in two sides, about half are mirror images: left ones.
 
 Landmarks are places of the whole body, the forearm or the shoulders included; a shape that ends before one lacks it.
 """
@@ -6,7 +7,7 @@ Landmarks are places of the whole body, the forearm or the shoulders included; a
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.sides import mirrored
 from meshmatch.templates.template import Template
 
 STUMPS = {"hand": "wrist", "head": "neck"}
@@ -40,6 +42,7 @@ class CutScan:
     shape: Shape
     landmarks: Int[Ints, " L"]
     length: float
+    mirrored: bool = False
 
 
 def make_scans(kind: str, count: int, seed: int = 0) -> list[CutScan]:
@@ -49,9 +52,14 @@ def make_scans(kind: str, count: int, seed: int = 0) -> list[CutScan]:
     assert isinstance(source, CutShapes)
     whole, cut = (each.double().numpy() for each in source.both(count, torch.Generator().manual_seed(_SEED + seed)))
     marks = farthest_points(whole[0], _LANDMARKS)
-    return [
+    scans = [
         _scan(template, verts, places[marks], f"{kind}-{number:02d}", np.random.default_rng([seed, number]))
         for number, (places, verts) in enumerate(zip(whole, cut, strict=True))
+    ]
+    left = np.random.default_rng(_SEED + seed).random(count) < (0.5 if made.mirror == "auto" else 0.0)
+    return [
+        replace(scan, shape=mirrored(scan.shape), mirrored=True) if flag else scan
+        for scan, flag in zip(scans, left, strict=True)
     ]
 
 

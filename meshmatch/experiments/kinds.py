@@ -8,8 +8,9 @@ meshmatch.experiments.animals. Beside it how far the verdicts tell the truth: th
 of the pair.
 
 Hands and heads are generated (meshmatch/experiments/cut_scans.py): of people and in poses that no training drew, with other
-triangles, cut at random, turned anywhere, every other one with a thing beside it. Their errors are in percent of the
-length of the hand (wrist to fingertips) or the head (chin to crown).
+triangles, cut at random, turned anywhere, every other one with a thing beside it, and hands of both sides; a table says
+how many sides were found, and how many pairs of one wrong side were called good. Their errors are in percent of the length
+of the hand (wrist to fingertips) or the head (chin to crown).
 """
 
 from __future__ import annotations
@@ -153,7 +154,17 @@ def measured_scans(
     title = f"{kind} with {matcher.model.card.name}: error in percent of its length, bar {BARS[kind]:g}"
     whole = rows[0] | {"bar": BARS[kind], "met": rows[0]["mean_x100"] <= BARS[kind]}
     record = {"all": whole, "judged": rows[1:], "verdicts": {name: fit.verdict for name, fit in fits.items()}}
-    return record, [runner.table(title, rows, {"of": "of", **_COLUMNS})]
+    tables = [runner.table(title, rows, {"of": "of", **_COLUMNS})]
+    if matcher.model.card.mirror == "auto":
+        wrong = {name for name, fit in fits.items() if fit.frame.mirrored != scans[name].mirrored}
+        good = sum(worse[pair] == "good" and len(wrong & set(pair)) == 1 for pair in maps)
+        left = sum(scan.mirrored for scan in scans.values())
+        sides: dict[str, Any] = {"shapes": len(scans), "left": left, "found": 1 - len(wrong) / len(scans)}
+        sides["wrong_called_good"] = good
+        columns = {"shapes": "shapes:d", "left": "left:d", "right side found": "found:.1%"}
+        tables.append(runner.table("Sides", [sides], columns | {"wrong pairs called good": "wrong_called_good:d"}))
+        record["sides"] = sides
+    return record, tables
 
 
 @runner.command

@@ -40,6 +40,7 @@ def test_hands_have_other_triangles_and_lose_landmarks(tmp_path: Path, monkeypat
     scans = make_scans("hand", 4, 1)
     assert len({scan.shape.F for scan in scans}) == 4
     assert len({np.median(scan.shape.verts) for scan in make_scans("hand", 4, 1) + scans}) == 4  # seeded
+    assert {scan.mirrored for scan in make_scans("hand", 6, 1)} == {True, False}
     for scan in scans:
         has = scan.landmarks >= 0
         assert 0.5 < has.mean() < 1  # the forearm's end is cut off

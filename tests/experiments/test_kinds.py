@@ -1,14 +1,17 @@
 """Errors of animals by kind, by verdict and by animal: by hand, and bumpy balls with a model of a body."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from meshmatch.api.inputs import as_model
 from meshmatch.experiments import kinds
 from meshmatch.experiments.cut_scans import CutScan
 from meshmatch.experiments.sets import Pair
+from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from tests.experiments.small_bench import build
 
@@ -57,3 +60,19 @@ def test_hands_with_any_model_of_theirs(monkeypatch: pytest.MonkeyPatch, tmp_pat
     assert record["all"]["met"] == (record["all"]["mean_x100"] <= 4.0)
     assert sum(row["pairs"] for row in record["judged"]) == 6
     assert set(record["verdicts"]) == {ball.name for ball in balls}
+
+
+def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
+    """Balls of which one is said to be a left hand; nothing is mirrored by a model of what is symmetric."""
+    balls = [load_shape(file) for file in sorted(build(tmp_path).glob("faust/*.ply"))]
+    made = [CutScan(ball, np.arange(0, 70, 7), 2.0, mirrored=number == 1) for number, ball in enumerate(balls)]
+    monkeypatch.setattr(kinds, "make_scans", lambda kind, count, seed: made[:count])
+    human = as_model("human")
+    both = TrainedModel(replace(human.card, mirror="auto"), human.template, human.inference)
+    record, tables = kinds.measured_scans("hand", 3, kinds.Matcher(both), "no", tmp_path / "cache")
+    assert len(tables) == 2
+    sides = record["sides"]
+    assert (sides["shapes"], sides["left"], sides["found"]) == (3, 1, pytest.approx(2 / 3))
+    good = [name for name, verdict in record["verdicts"].items() if verdict == "good"]
+    pairs = [1 for name in good for other in good if name != other and balls[1].name in (name, other)]
+    assert sides["wrong_called_good"] == len(pairs)
