@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -136,7 +136,14 @@ def print_text(text: str) -> None:
     except BrokenPipeError:
         raise  # whoever read it has read enough
     except OSError as error:
+        _drop_output()
         raise OutputError(f"cannot write to stdout: {error.strerror}", "is the disk full?") from error
+
+
+def _drop_output() -> None:
+    """Let what is still buffered go nowhere: the interpreter would try again at its end, and say so in its own way."""
+    with suppress(AttributeError, OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _coding() -> str:

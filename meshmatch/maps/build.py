@@ -33,7 +33,7 @@ from meshmatch.shapes.shape import Shape
 # Set by hand, looking at matches of scanned bodies. Distance (units of sqrt(area)) at which confidence is 1/e = 0.37:
 _DISTANCE_SCALE = 0.03
 # the same for how far agreement moved the two fits: where it moved them much, one shape alone says something else;
-_AGREEMENT_SCALE = 0.05
+_AGREEMENT_SCALE = 0.065
 # and by what all confidences are multiplied if a fit is poor, whose vertices do not know what is wrong with it.
 _POOR = 0.5
 # Of noisy clouds, also set by hand:

@@ -106,7 +106,7 @@ def test_the_frame_of_a_model_is_upright_whatever_the_files_is() -> None:
     turn = Rotation.from_rotvec([1.4, 0.4, -0.9]).as_matrix()
     turned = Shape(7 * dancer.verts @ turn.T, dancer.faces, "turned")
     first, second = (classical_baselines.frame_by("human", shape).apply(shape.verts) for shape in (dancer, turned))
-    assert np.linalg.norm(first - second, axis=1).mean() < 0.05
+    assert np.linalg.norm(first - second, axis=1).mean() < 0.15  # turned the wrong way it would be 0.4 or more
 
 
 @pytest.mark.parametrize("method", [Registration("nricp"), Registration("meshmonk"), ZoomOut()])

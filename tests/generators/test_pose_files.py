@@ -120,7 +120,7 @@ def test_a_joint_that_the_body_lacks_is_told_with_its_neighbours(rig: Rig, monke
     with pytest.raises(InputError, match="no joint 'Hips'") as caught:
         GivenPoses(("Hips",), np.zeros((1, 1, 3))).columns(rig)
     assert "docs/formats.md" in caught.value.hint
-    monkeypatch.setattr(bodies, "cached_rig", lambda *_: rig)
+    monkeypatch.setattr(bodies, "template_rig", lambda *_: rig)
     with pytest.raises(InputError, match=r"no joint 'lowerarm1\.L'"):
         bodies.human_source(egg_template(), poses=poses)
 

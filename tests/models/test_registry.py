@@ -311,7 +311,7 @@ def test_listing_loads_nothing_heavy(tmp_path: Path) -> None:
     """In a fresh interpreter: listing and finding a folder need neither a network nor NumPy."""
     code = (
         "import sys; from meshmatch.models import card, registry; "
-        "assert [e.name for e in registry.list_models()][0] == 'human'; registry.locate_model('human'); "
+        "assert 'human' in [e.name for e in registry.list_models()]; registry.locate_model('human'); "
         "print(sorted({'torch', 'scipy', 'trimesh', 'pymeshlab', 'numpy', 'safetensors'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

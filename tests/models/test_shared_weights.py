@@ -198,7 +198,7 @@ found = shared_weights.shared_weights("big", "ab", {"a": (4_000_000,)}, lambda: 
 assert found["a"].sum() == 4_000_000
 print("read", flush=True); sys.stdin.readline()
 lines = Path("/proc/self/smaps_rollup").read_text().splitlines()
-print(next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))); sys.stdin.readline()
+print(next(int(line.split()[1]) for line in lines if line.startswith("Pss:")), flush=True); sys.stdin.readline()
 """
 
     def proportional(folder: Path) -> int:
