@@ -31,7 +31,7 @@ def test_where_a_fit_moved_it_is_not_believed() -> None:
         before = [fit, fit]
         before[number] = elsewhere
         found = build_map(part, fit, part, fit, before_agreement=(before[0], before[1]))
-        assert np.allclose(found.confidence[high], np.exp(-((moved / 0.05) ** 2)), atol=1e-6)
+        assert np.allclose(found.confidence[high], np.exp(-((moved / 0.065) ** 2)), atol=1e-6)
         assert np.allclose(found.confidence[~high], 1)
         assert np.array_equal(found.index, sure.index)
     assert np.array_equal(build_map(part, fit, part, fit, before_agreement=(fit, fit)).confidence, sure.confidence)
@@ -44,8 +44,8 @@ def test_both_fits_count_where_the_source_lies() -> None:
     turned = Shape(unit.verts * [1, -1, -1], unit.faces, "turned")
     fit, other = lying_on(unit), replace(lying_on(turned), resting=unit.verts)
     high = unit.verts[:, 2] > 0.1
-    before = replace(fit, points=unit.verts + np.where(high, 0.03, 0.0)[:, None] * [1.0, 0, 0])
-    before_there = replace(other, points=turned.verts + np.where(high, 0.02, 0.0)[:, None] * [0, 1.0, 0])
+    before = replace(fit, points=unit.verts + np.where(high, 0.04, 0.0)[:, None] * [1.0, 0, 0])
+    before_there = replace(other, points=turned.verts + np.where(high, 0.025, 0.0)[:, None] * [0, 1.0, 0])
     found = build_map(repair(unit), fit, repair(turned), other, before_agreement=(before, before_there))
     assert np.allclose(found.confidence[high], np.exp(-1.0), atol=1e-6)
     assert np.allclose(found.confidence[~high], 1)
