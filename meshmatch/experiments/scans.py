@@ -43,8 +43,7 @@ def scan_panels(name: str, fit: Fit, labels: Int[Ints, " V_template"]) -> list[P
     shape = shape_of(fit).shape
     belongs = template_footpoints(shape, fit)[1]
     part = labels[cKDTree(fit.resting).query(belongs)[1]]
-    fitted = Shape(fit.frame.undo(fit.points), fit.faces, name)
-    turn = fit.frame.rotation
+    fitted, turn = Shape(fit.points_in_file, fit.shape.faces, name), fit.frame.turn
     return [
         Panel(shape, label_colors(part), name, sharp=True, rotation=turn),
         Panel(fitted, label_colors(labels), fit.verdict, sharp=True, rotation=turn),

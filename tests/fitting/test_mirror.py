@@ -1,5 +1,6 @@
 """Shapes that are the mirror image of what a model knows: found, said, and matched all the same."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from scipy.spatial import cKDTree
 import meshmatch
 from meshmatch.api.inputs import as_model
 from meshmatch.api.interpolation import InterpolationOptions, interpolate
+from meshmatch.cli import main
 from meshmatch.errors import OptionError
 from meshmatch.fitting import fitter
 from meshmatch.fitting.fit import Fit
@@ -96,3 +98,14 @@ def test_without_correspondence_near_is_all_that_is_known() -> None:
     blind = TrainedModel(replace(model.card, correspondence=False), model.template, model.inference)
     fit = meshmatch.register(DANCER, model=blind)
     assert (fit.verdict, [reason.code for reason in fit.reasons]) == ("fair", ["unsupervised"])
+
+
+def test_the_command_tries_the_mirror_image_if_asked(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(fitter, "mirror_of", lambda model: None)
+    words = ["register", str(DANCER), "-o", str(tmp_path / "fit.ply"), "--model", "human", "--json"]
+    for mirror, codes in (("auto", ["it fits nearly as well in the mirror"]), ("no", [])):
+        assert main([*words, "--mirror", mirror]) == 0
+        reasons = json.loads(capsys.readouterr().out)["reasons"]
+        assert [reason.split(":")[0] for reason in reasons] == codes
