@@ -146,3 +146,15 @@ def test_the_card_says_how_stiff(system: NodeSystem, model: TrainedModel) -> Non
     assert np.array_equal(points(soft), points(model, replace(plain, strain=0.25 * plain.strain)))
     assert np.array_equal(points(model), points(model, plain))
     assert not np.array_equal(points(soft), points(model))
+
+
+def test_momentum_goes_further_in_as_many_steps(model: TrainedModel, system: NodeSystem) -> None:
+    scan, nodes = scan_of(system), model.template.nodes
+    apart = [slid(system, nodes, amount) for amount in (0.1, -0.1)]
+
+    def left(momentum: float) -> float:
+        config = AgreeConfig(steps=3, strain=0.01, momentum=momentum)
+        found = agree(system, [Member(scan, each, config) for each in apart], NodeRefineConfig())
+        return float(np.abs(found[0] - found[1]).mean())
+
+    assert left(AgreeConfig().momentum) < 0.97 * left(0.0)
