@@ -42,12 +42,16 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.Cap
     assert "cannot make the folder" in capsys.readouterr().err
 
 
-def test_simulated_scans_have_holes_and_a_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_simulated_scans_have_holes_and_a_truth(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("anny")
     assert main(["--simulated", "1"]) == 0
     (row,) = json.loads(capsys.readouterr().out.splitlines()[-1])["scans"]
     assert row["verdict"] in ("good", "fair") and row["error_cm"] < 5
     (body, scan), (_, again) = (*simulated_scans(1), *simulated_scans(1))
     assert 0.6 * body.V < scan.V < 0.98 * body.V and np.array_equal(scan.verts, again.verts)
+
+
+def test_nothing_to_fit(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 1
     assert "nothing to fit" in capsys.readouterr().err
 
