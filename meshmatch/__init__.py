@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from meshmatch.api.transfer import transfer_landmarks as transfer_landmarks
     from meshmatch.api.transfer import transfer_values as transfer_values
     from meshmatch.api.transfer import transfer_weights as transfer_weights
+    from meshmatch.collections.atlas import Atlas as Atlas
+    from meshmatch.collections.measures import measure_atlas as measure_atlas
     from meshmatch.errors import MeshmatchError as MeshmatchError
     from meshmatch.fitting.fit import Fit as Fit
     from meshmatch.fitting.fit_config import FitConfig as FitConfig
@@ -53,6 +55,7 @@ if TYPE_CHECKING:
     from meshmatch.transfer.bake import BakeOptions as BakeOptions
 
 _HOMES = {
+    "Atlas": "meshmatch.collections.atlas",
     "BakeOptions": "meshmatch.transfer.bake",
     "ConfidenceRule": "meshmatch.api.results",
     "Fit": "meshmatch.fitting.fit",
@@ -79,6 +82,7 @@ _HOMES = {
     "load_model": "meshmatch.models.registry",
     "load_shape": "meshmatch.shapes.files",
     "match": "meshmatch.api.matching",
+    "measure_atlas": "meshmatch.collections.measures",
     "picture": "meshmatch.api.pictures",
     "prepare": "meshmatch.templates.prepare",
     "register": "meshmatch.api.matching",

@@ -27,7 +27,7 @@ GROUND = ("errors", "threads", "outputs", "progress")
 ROOMS = (
     *GROUND,
     *("arrays", "geometry", "shapes", "templates", "generators", "fields", "models", "training", "fitting"),
-    *("maps", "implicit", "transfer", "render", "api", "cli", "__main__", "experiments"),
+    *("maps", "implicit", "transfer", "render", "api", "collections", "cli", "__main__", "experiments"),
 )
 
 # Which rooms know which third-party library.
@@ -61,6 +61,7 @@ OWNERS = {
             "transfer",
             "render",
             "api",
+            "collections",
         ),
         "experiments",
     },

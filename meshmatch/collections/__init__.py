@@ -1,0 +1,1 @@
+"""Many shapes at once: what is learned from all of them."""

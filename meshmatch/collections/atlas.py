@@ -1,0 +1,289 @@
+"""What a collection of registered shapes has in common, and how they vary: the mean and modes of variation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, get_args
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from meshmatch.arrays import Float, Floats, Int, Ints, as_numbers, frozen
+from meshmatch.collections.groups import Comparison, Statistic, compare_groups
+from meshmatch.collections.modes import inner_products, principal, weighted_sums
+from meshmatch.collections.superimpose import Poses, Scale, Shapes, Superimposed, blocks, superimpose
+from meshmatch.errors import InputError, OptionError
+from meshmatch.outputs import replace_on_success
+from meshmatch.shapes.shape import Shape
+
+VERSION = 1
+"""Of the arrays in ``atlas.npz``."""
+FILE = "atlas.npz"
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """A shape as the atlas sees it.
+
+    ``scores`` (M,) are in standard deviations. ``shape`` is what the modes make of it, and ``distance`` (V,) how far its
+    vertices are from there, in the frame and unit of the given points; ``residual`` is the mean of these distances over
+    the surface.
+    """
+
+    scores: Float[Floats, " M"]
+    shape: Shape
+    distance: Float[Floats, " V"]
+    residual: float
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """The mean of S registered shapes, and the M modes in which they vary.
+
+    Attributes
+    ----------
+    mean : (V, 3) the mean shape, in the unit of the shapes; its surface's center is the origin, its axes are the shapes'
+    modes : (M, V, 3) the modes, the first vary the most; orthonormal in the mean product over the surface
+    deviations : (M,) standard deviations along the modes: root mean square displacements, in the unit of the shapes
+    scores : (S, M) of each shape along each mode, in standard deviations
+    sizes : (S,) root mean square distance of each shape from its center, before it was scaled, unit of its file
+    faces : (F, 3) triangles of all shapes
+    weights : (V,) share of the surface around each vertex
+    names : of the shapes
+    total : variance along all modes, also those that are not kept
+    scale : whether the shapes keep their sizes, or all have been scaled to one
+    robust : whether outliers were kept from mattering
+    """
+
+    mean: Float[Floats, "V 3"]
+    modes: Float[Floats, "M V 3"]
+    deviations: Float[Floats, " M"]
+    scores: Float[Floats, "S M"]
+    sizes: Float[Floats, " S"]
+    faces: Int[Ints, "F 3"]
+    weights: Float[Floats, " V"]
+    names: tuple[str, ...]
+    total: float
+    scale: Scale = "keep"
+    robust: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        points: Shapes,
+        faces: Int[Ints, "F 3"],
+        names: Sequence[str] | None = None,
+        *,
+        modes: int = 100,
+        scale: Scale = "keep",
+        robust: bool = False,
+    ) -> Atlas:
+        """The atlas of S shapes with the same vertices and faces.
+
+        ``points`` (S, V, 3) may be a list, or a memory-mapped array: only some shapes are in memory at a time, beside an
+        S x S matrix. They are laid over one another by rotation and translation (generalised Procrustes analysis, each
+        vertex weighted with its share of the surface), and with ``scale="remove"`` scaled to one size. At most ``modes``
+        are kept, of S - 1. ``robust``: the mean is the spatial median, the modes are spherical principal components
+        (Locantore et al. 1999), which a few shapes that are nothing like the others hardly change.
+
+        `InputError`: fewer than three shapes, shapes that do not have the same vertices or do not differ, names that are
+        not one for each or not different. `OptionError`: another ``scale``, no modes.
+        """
+        if scale not in get_args(Scale):
+            raise OptionError(f"invalid scale {scale!r}", f"choose one of {', '.join(get_args(Scale))}")
+        if modes < 1:
+            raise OptionError(f"an atlas has one mode or more, not {modes}")
+        called = tuple(names) if names is not None else tuple(f"shape-{k:03d}" for k in range(len(points)))
+        if len(called) != len(points) or len(set(called)) < len(called):
+            raise InputError(f"{len(points)} shapes need as many different names", "one for each, in their order")
+        faces = np.array(faces, np.int64)
+        laid = superimpose(points, faces, scale, robust)
+        products = inner_products(points, laid)
+        found = principal(products, modes, robust)
+        sums = weighted_sums(points, laid, np.concatenate([found.center[None], found.modes]))
+        center, kept = sums[0], sums[1:]
+        sign = _outward(kept, laid.consensus + center, laid.weights)
+        moved = products - found.center @ products
+        scores = sign * (moved @ found.modes.T) / found.deviations
+        sizes = np.concatenate([laid.poses(some).sizes for _, some in blocks(points)])
+        mean = laid.consensus + center
+        kept = sign[:, None, None] * kept
+        for array in (mean, kept, found.deviations, scores, sizes, faces, laid.weights):
+            frozen(array)
+        return cls(mean, kept, found.deviations, scores, sizes, faces, laid.weights, called, found.total, scale, robust)
+
+    @property
+    def variances(self) -> Float[Floats, " M"]:
+        """(M,) variances along the modes, in squared units of the shapes."""
+        return np.square(self.deviations)
+
+    @property
+    def compactness(self) -> Float[Floats, " M"]:
+        """(M,) share of all variance that the first modes explain, for one mode, two, ..."""
+        return np.asarray(np.cumsum(self.variances) / self.total)
+
+    @property
+    def distances(self) -> Float[Floats, " S"]:
+        """(S,) root mean square distance of each shape from the mean over the surface, as far as the modes have it."""
+        return np.sqrt(np.square(self.scores * self.deviations).sum(axis=1))
+
+    @cached_property
+    def mean_shape(self) -> Shape:
+        """The mean as a shape."""
+        return Shape(self.mean, self.faces, "mean")
+
+    @cached_property
+    def laid(self) -> Superimposed:
+        """How further shapes are laid over the mean."""
+        size = None
+        if self.scale == "remove":
+            size = float(self.sizes.mean())
+        return Superimposed(self.mean, self.weights, size)
+
+    def offsets(self, scores: Float[Floats, "N M"]) -> Float[Floats, "N V 3"]:
+        """What scores (N, M), in standard deviations, add to the mean; of fewer than all modes, the first."""
+        count = scores.shape[-1]
+        return np.asarray(np.tensordot(scores * self.deviations[:count], self.modes[:count], 1))
+
+    def shape(self, scores: ArrayLike) -> Shape:
+        """The shape with these scores (M,), in standard deviations; modes that are not given count as 0.
+
+        `InputError` for more scores than modes, or scores that are not finite.
+        """
+        given = as_numbers(scores, "scores", finite=True)
+        if given.ndim != 1 or len(given) > len(self.modes):
+            raise InputError(f"scores must be up to {len(self.modes)} numbers, not an array of {given.shape}")
+        return Shape(self.mean + self.offsets(given[None])[0], self.faces)
+
+    def sample(self, count: int, seed: int = 0) -> list[Shape]:
+        """Random shapes: scores from a normal distribution. The same seed gives the same shapes, however many."""
+        if count < 0:
+            raise OptionError(f"cannot make {count} shapes")
+        draws = np.random.default_rng(seed).standard_normal((count, len(self.modes)))
+        offsets = (self.offsets(row[None])[0] for row in draws)
+        return [Shape(self.mean + each, self.faces, f"sample-{k:03d}") for k, each in enumerate(offsets)]
+
+    def align(self, points: Float[Floats, "N V 3"]) -> tuple[Float[Floats, "N V 3"], Poses]:
+        """Shapes laid over the mean, and how they were moved."""
+        poses = self.laid.poses(points)
+        return poses.apply(points), poses
+
+    def project(self, points: ArrayLike) -> Projection:
+        """A further shape (V, 3), registered like the others: its scores, and how much the modes cannot say of it.
+
+        `InputError` for points that are not an array (V, 3), or not finite.
+        """
+        given = as_numbers(points, "points", finite=True)
+        if given.shape != self.mean.shape:
+            hint = "register the shape with the model of the atlas"
+            raise InputError(f"points must be an array of {self.mean.shape}, not {given.shape}", hint)
+        aligned, poses = self.align(given[None])
+        offset = aligned[0] - self.mean
+        raw = np.einsum("mvi,v,vi->m", self.modes, self.weights, offset, optimize=True)
+        scores = raw / self.deviations
+        back = poses.undo((self.mean + self.offsets(scores[None])[0])[None])[0]
+        distance = np.linalg.norm(back - given, axis=1)
+        return Projection(scores, Shape(back, self.faces), distance, float(self.weights @ distance))
+
+    def distance_from_mean(self, name: str) -> Float[Floats, " V"]:
+        """(V,) how far each vertex of a shape of the collection is from the mean, as far as the modes have it.
+
+        `InputError` for a name that the atlas does not have.
+        """
+        return np.linalg.norm(self.offsets(self.scores[self.rows([name])])[0], axis=1)
+
+    def rows(self, names: Sequence[str]) -> Int[Ints, " N"]:
+        """Which shapes have these names; `InputError` for a name that the atlas does not have."""
+        known = {name: k for k, name in enumerate(self.names)}
+        for name in names:
+            if name not in known:
+                some = ", ".join(self.names[:5])
+                raise InputError(f"the atlas has no shape called {name!r}", f"there are {len(known)}: {some}, ...")
+        return np.array([known[name] for name in names], np.int64)
+
+    def compare(
+        self,
+        first: Sequence[str],
+        second: Sequence[str],
+        *,
+        kind: Statistic = "normal",
+        permutations: int = 10_000,
+        seed: int = 0,
+    ) -> Comparison:
+        """Where two groups of shapes differ, given by their names, and whether by more than chance.
+
+        ``kind``: displacement along the normal of the mean ("normal"), or in any direction ("hotelling"). What the modes
+        do not keep plays no part.
+
+        `InputError`: a name that the atlas does not have, or that both groups have. `OptionError`: a group of fewer than
+        two shapes, too few shapes for the statistic, no permutations.
+        """
+        both = set(first) & set(second)
+        if both:
+            raise InputError(f"{min(both)!r} is in both groups", "a shape is in one of them")
+        rows = [self.rows(tuple(dict.fromkeys(names))) for names in (first, second)]
+        chosen = np.concatenate(rows)
+        in_second = np.arange(len(chosen)) >= len(rows[0])
+        return compare_groups(
+            self.offsets(self.scores[chosen]), in_second, self.mean_shape.vertex_normals, self.weights,
+            kind=kind, permutations=permutations, seed=seed,
+        )  # fmt: skip
+
+    def save(self, path: str | Path) -> None:
+        """Write ``atlas.npz``: the attributes as arrays, and the version. `OutputError` where it cannot be written."""
+        arrays: dict[str, Any] = {each.name: np.asarray(getattr(self, each.name)) for each in fields(self)}
+        arrays["version"] = np.int64(VERSION)
+        with replace_on_success(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Atlas:
+        """Read an atlas: the folder that ``meshmatch atlas`` made, or its ``atlas.npz``.
+
+        `InputError` if there is none, or it is damaged or of another version.
+        """
+        file = Path(path) / FILE if Path(path).is_dir() else Path(path)
+        if not file.is_file():
+            raise InputError(f"there is no atlas at {path}", "give the folder that `meshmatch atlas` made")
+        try:
+            with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
+                given = {name: arrays[name] for name in arrays.files}
+        except (OSError, ValueError, EOFError, BadZipFile, AttributeError) as error:
+            raise InputError(f"{file} is not an atlas, or is damaged ({error})", "make it again") from error
+        return cls(**_strict(file, given))
+
+
+def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
+    """The arrays of a file as an `Atlas` has them; `InputError` for anything else."""
+    if "version" not in given or int(given.pop("version")) != VERSION:
+        raise InputError(f"{file} is not an atlas of version {VERSION}", "make it again with this meshmatch")
+    kinds = {each.name: "f" for each in fields(Atlas)} | {"faces": "i", "names": "U", "scale": "U", "robust": "b"}
+    wrong = [name for name in kinds if name not in given or given[name].dtype.kind != kinds[name]]
+    if wrong or len(given) != len(kinds):
+        raise InputError(f"{file} is damaged: {', '.join(wrong) or 'it holds something else'}", "make it again")
+    M, V, S = len(given["modes"]), len(given["mean"]), len(given["names"])
+    sizes = {"mean": (V, 3), "modes": (M, V, 3), "deviations": (M,), "scores": (S, M), "sizes": (S,)}
+    sizes |= {"weights": (V,), "names": (S,), "total": (), "scale": (), "robust": ()}
+    wrong = [name for name, size in sizes.items() if given[name].shape != size]
+    wrong += [name for name, kind in kinds.items() if kind == "f" and not np.isfinite(given[name]).all()]
+    faces = given["faces"]
+    if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or faces.min() < 0 or faces.max() >= V:
+        wrong.append("faces")
+    if wrong or str(given["scale"]) not in get_args(Scale):
+        raise InputError(f"{file} is damaged: {', '.join(wrong) or 'scale'}", "make it again")
+    found: dict[str, Any] = {name: frozen(array) for name, array in given.items()}
+    found |= {"names": tuple(str(name) for name in given["names"]), "scale": str(given["scale"])}
+    return found | {"total": float(given["total"]), "robust": bool(given["robust"])}
+
+
+def _outward(modes: Floats, mean: Floats, weights: Floats) -> Floats:
+    """Signs (M,) with which the modes make the mean larger; where they leave its size, with the largest entry positive."""
+    growth = np.einsum("mvi,v,vi->m", modes, weights, mean, optimize=True)
+    flat = modes.reshape(len(modes), -1)
+    largest = flat[np.arange(len(flat)), np.abs(flat).argmax(axis=1)]
+    size = np.sqrt(weights @ np.square(mean).sum(axis=1))
+    return np.where(np.abs(growth) > 1e-6 * size, np.sign(growth), np.sign(largest))
