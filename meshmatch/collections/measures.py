@@ -1,0 +1,175 @@
+"""How good an atlas is: compactness, generalisation and specificity, by its number of modes.
+
+Source: Davies, Learning shape: optimal models for analysing natural variability (2002). Distances between corresponding
+points praise wrong correspondences: what is wrong in the same way in all shapes looks like the truth. Distances to
+surfaces do not know correspondences, and so are given beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.collections.atlas import Atlas
+from meshmatch.collections.modes import inner_products, principal, weighted_sums
+from meshmatch.collections.superimpose import Shapes, Superimposed
+from meshmatch.errors import InputError
+from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.mapped_mesh import MappedMesh
+
+COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
+"""Numbers of modes that are measured, as far as there are so many, and the largest that can be."""
+FOLDS = 100
+"""Of more shapes than these, several are left out at a time."""
+_POINTS = 600  # of a surface whose distance to the other one is measured
+_LONGER = 0.6  # of the time, for generalisation
+_NEAREST = 3  # shapes of the collection, by their points, to which a random shape's distance is measured
+
+
+@dataclass(frozen=True, eq=False)
+class Measures:
+    """The three measures for K numbers of modes; distances are means over the surface, in the unit of the shapes.
+
+    Attributes
+    ----------
+    counts : (K,) numbers of modes
+    compactness : (K,) share of the variance that so many modes explain
+    generalisation : (K,) distance of a shape that the modes do not know from what they make of it, between points
+    generalisation_error : (K,) its standard error, over the shapes
+    generalisation_surface : (K,) the same between surfaces, both ways
+    specificity : (K,) distance of a random shape from the nearest shape of the collection, between points
+    specificity_error : (K,) its standard error, over the random shapes
+    specificity_surface : (K,) the same between surfaces, both ways
+    samples, seed : how many random shapes, and with which random numbers
+    left_out : how many shapes are left out at a time: 1 but for large collections
+    """
+
+    counts: Int[Ints, " K"]
+    compactness: Float[Floats, " K"]
+    generalisation: Float[Floats, " K"]
+    generalisation_error: Float[Floats, " K"]
+    generalisation_surface: Float[Floats, " K"]
+    specificity: Float[Floats, " K"]
+    specificity_error: Float[Floats, " K"]
+    specificity_surface: Float[Floats, " K"]
+    samples: int
+    seed: int
+    left_out: int
+
+
+def measure_atlas(
+    atlas: Atlas,
+    points: Shapes,
+    *,
+    surfaces: Sequence[Shape] | None = None,
+    samples: int = 50,
+    seed: int = 0,
+    progress: ProgressCallback | None = None,
+) -> Measures:
+    """Measure an atlas on the shapes (S, V, 3) that it was made of; see `Measures`.
+
+    ``surfaces`` are the shapes themselves, each in the frame of its points, if they are to be compared with these rather
+    than with the registered template. Shapes are left out one at a time, of large collections in `FOLDS` parts, the mean
+    and the modes are made of the others, and the shape is laid over that mean. ``samples`` random shapes have normal
+    scores. Between surfaces a random shape is compared with the three nearest by points.
+
+    `InputError` where the shapes are not those of the atlas, or fewer than four: a model of what is left needs three.
+    """
+    S = len(points)
+    if S != len(atlas.names) or (surfaces is not None and len(surfaces) != S):
+        raise InputError(f"the atlas is of {len(atlas.names)} shapes, not of {S}", "give those that it was made of")
+    if S < 4:
+        raise InputError(f"the measures of an atlas need four shapes or more, not {S}")
+    folds = np.array_split(np.random.default_rng(seed).permutation(S), min(S, FOLDS))
+    most = min(len(atlas.modes), S - 1 - len(folds[0]))
+    counts = np.array(sorted({*(count for count in COUNTS if count <= most), min(most, COUNTS[-1])}), np.int64)
+    collection = _Collection(atlas, points, surfaces, seed)
+
+    def told(done: float) -> None:
+        if progress is not None:
+            progress("measures", "atlas", done)
+
+    general = np.empty((2, S, len(counts)))
+    for number, out in enumerate(folds):
+        general[:, out] = collection.generalisation(out, counts)
+        told(_LONGER * (number + 1) / len(folds))
+    special = np.empty((2, samples, len(counts)))
+    draws = np.random.default_rng(seed).standard_normal((samples, len(atlas.modes)))
+    for number, draw in enumerate(draws):
+        special[:, number] = collection.specificity(draw, counts)
+        told(_LONGER + (1 - _LONGER) * (number + 1) / samples)
+    means = [found.mean(axis=0) for found in (*general, *special)]
+    errors = [found.std(axis=0, ddof=1) / np.sqrt(len(found)) for found in (general[0], special[0])]
+    return Measures(
+        counts, atlas.compactness[counts - 1], means[0], errors[0], means[1], means[2], errors[1], means[3],
+        samples, seed, len(folds[0]),
+    )  # fmt: skip
+
+
+class _Collection:
+    """An atlas, with the shapes that it was made of."""
+
+    def __init__(self, atlas: Atlas, points: Shapes, surfaces: Sequence[Shape] | None, seed: int) -> None:
+        self._atlas, self._shapes, self._surfaces = atlas, points, surfaces
+        self._products = inner_products(points, atlas.laid)
+        rows = np.random.default_rng(seed).permutation(len(atlas.mean))[:_POINTS]
+        self._rows, self._share = rows, atlas.weights[rows] / atlas.weights[rows].sum()
+
+    def generalisation(self, out: Int[Ints, " B"], counts: Int[Ints, " K"]) -> Float[Floats, "2 B K"]:
+        """How far shapes are from what a model of all others makes of them, between points and between surfaces."""
+        atlas, S = self._atlas, len(self._shapes)
+        kept = np.setdiff1d(np.arange(S), out)
+        found = principal(self._products[np.ix_(kept, kept)], int(counts[-1]), atlas.robust)
+        shares = np.zeros((1 + len(found.modes), S))
+        shares[:, kept] = np.concatenate([found.center[None], found.modes])
+        sums = weighted_sums(self._shapes, atlas.laid, shares)
+        laid = Superimposed(atlas.mean + sums[0], atlas.weights, atlas.laid.size)
+        apart = np.empty((2, len(out), len(counts)))
+        for number, row in enumerate(out.tolist()):
+            known, real = self._laid(row, laid)
+            scores = np.einsum("mvi,v,vi->m", sums[1:], atlas.weights, known - laid.consensus, optimize=True)
+            for column, count in enumerate(counts.tolist()):
+                made = laid.consensus + np.tensordot(scores[:count], sums[1 : 1 + count], 1)
+                apart[:, number, column] = self._apart(made, known), self._between_surfaces(made, known, real)
+        return apart
+
+    def specificity(self, draw: Float[Floats, " M"], counts: Int[Ints, " K"]) -> Float[Floats, "2 K"]:
+        """How far the shapes of random scores are from the nearest shape, between points and between surfaces."""
+        atlas = self._atlas
+        own = atlas.scores * atlas.deviations
+        apart = np.empty((2, len(counts)))
+        for column, count in enumerate(counts.tolist()):
+            made = atlas.mean + atlas.offsets(draw[None, :count])[0]
+            # Squared distances over the surface: along these modes, and across.
+            along = np.square(own[:, :count] - draw[:count] * atlas.deviations[:count]).sum(axis=1)
+            squared = along + np.diag(self._products) - np.square(own[:, :count]).sum(axis=1)
+            near = [self._laid(row, atlas.laid) for row in np.argsort(squared)[:_NEAREST].tolist()]
+            apart[0, column] = min(self._apart(made, known) for known, _ in near)
+            apart[1, column] = min(self._between_surfaces(made, known, real) for known, real in near)
+        return apart
+
+    def _laid(self, row: int, laid: Superimposed) -> tuple[Floats, Shape]:
+        """The points of a shape laid over the others, and its surface."""
+        points = np.asarray(self._shapes[row], np.float64)[None]
+        poses = laid.poses(points)
+        known = poses.apply(points)[0]
+        if self._surfaces is None:
+            return known, Shape(known, self._atlas.faces)
+        return known, Shape(poses.apply(self._surfaces[row].verts[None])[0], self._surfaces[row].faces)
+
+    def _apart(self, made: Floats, known: Floats) -> float:
+        return float(self._atlas.weights @ np.linalg.norm(made - known, axis=1))
+
+    def _between_surfaces(self, made: Floats, known: Floats, real: Shape) -> float:
+        """Mean distance of some points of each from the other's surface, the mean of both ways."""
+        there = MappedMesh.of(real).query(made[self._rows]).distance @ self._share
+        points, share = known[self._rows], self._share
+        if self._surfaces is not None:
+            rows = np.linspace(0, real.V - 1, min(real.V, _POINTS)).astype(np.int64)
+            points, share = real.verts[rows], real.vertex_areas[rows] / real.vertex_areas[rows].sum()
+        back = MappedMesh.of(Shape(made, self._atlas.faces)).query(points).distance @ share
+        return float(there + back) / 2
