@@ -17,6 +17,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
 from meshmatch.maps.evaluate import Evaluation, evaluate_map
 from meshmatch.maps.files import load_map
+from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.repair import Repaired
@@ -89,9 +90,8 @@ def map_of_fits(fits: tuple[Fit, Fit], before: tuple[Fit, Fit], threads: int) ->
     """The map from the shape of the first fit to that of the second. `OptionError` where the fits are of different
     templates, or do not know their shapes.
     """
-    source, target = fits
-    shapes = shape_of(source), shape_of(target)
-    return build_map(shapes[0], source, shapes[1], target, workers=threads, before_agreement=before)
+    source, target = (Places.of(shape_of(fit), fit, own, threads) for fit, own in zip(fits, before, strict=True))
+    return build_map(source, target, threads)
 
 
 def shape_of(fit: Fit) -> Repaired:

@@ -24,6 +24,7 @@ from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.maps.build import build_map
+from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.picture import Look, Panel, render_shapes
 from meshmatch.shapes.colors import label_colors
@@ -132,12 +133,10 @@ def fitted_maps(
     fitter = Fitter(loaded, config)
     fits = [fitter.fit(validated(shape).shape) for shape in track(shapes.values(), "fitting")]
     verdicts: dict[str, str] = {name: fit.verdict for name, fit in zip(shapes, fits, strict=True)}
-    clean = [validated(shape).shape for shape in shapes.values()]
-    agreed = dict(zip(shapes, agreed_fits(loaded, clean, fits, config), strict=True))
-    maps = {
-        (a, b): build_map(validated(shapes[a]), agreed[a], validated(shapes[b]), agreed[b])
-        for a, b in track(pairs, "mapping")
-    }
+    clean = [validated(shape) for shape in shapes.values()]
+    agreed = agreed_fits(loaded, [each.shape for each in clean], fits, config)
+    places = {name: Places.of(part, fit) for name, part, fit in zip(shapes, clean, agreed, strict=True)}
+    maps = {(a, b): build_map(places[a], places[b]) for a, b in track(pairs, "mapping")}
     return maps, verdicts
 
 

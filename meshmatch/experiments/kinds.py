@@ -39,6 +39,7 @@ from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.build import build_map
+from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VertexMap
 
 OFF = 0.1
@@ -64,14 +65,15 @@ def maps_of(matcher: Matcher, fits: Mapping[str, Fit], pairs: Sequence[Pair], ag
         shapes = [clean[name].shape for name in names]
         return dict(zip(names, agreed_fits(matcher.model, shapes, own, matcher.config, threads=threads), strict=True))
 
-    together = agreed(list(fits)) if agree == "all" else {}
+    def placed(names: Sequence[str]) -> dict[str, Places]:
+        return {name: Places.of(clean[name], fit, fits[name]) for name, fit in agreed(names).items()}
+
+    together = placed(list(fits)) if agree == "all" else {}
     found = {}
     for a, b in runner.track(sorted({(min(pair), max(pair)) for pair in pairs}), "mapping"):
-        both = together or agreed([a, b])
+        both = together or placed([a, b])
         for pair in {(a, b), (b, a)} & set(pairs):
-            source, target = pair
-            before = fits[source], fits[target]
-            found[pair] = build_map(clean[source], both[source], clean[target], both[target], before_agreement=before)
+            found[pair] = build_map(both[pair[0]], both[pair[1]])
     return found
 
 

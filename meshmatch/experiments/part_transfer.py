@@ -47,12 +47,12 @@ from meshmatch.experiments.part_votes import Electorate
 from meshmatch.experiments.segments import KEYPOINTS, RIGHT, keypoint_errors, stood_alike
 from meshmatch.experiments.sets import Pair, load_folder
 from meshmatch.fitting.agree import agreed_fits
-from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.build import build_map
+from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.trained import TrainedModel
 from meshmatch.render.picture import Panel, render_shapes
@@ -131,15 +131,16 @@ def best_maps(
 ) -> dict[Pair, VertexMap]:
     """Maps of pairs, each through the template that lies nearest to both shapes together."""
     clean = {name: validated(shape) for name, shape in shapes.items()}
-    fits: list[dict[str, Fit]] = []
+    fits: list[dict[str, tuple[float, Places]]] = []  # residuals and places, by model and shape
     for model in models:
         raw = [Fitter(model, config).fit(each.shape) for each in runner.track(clean.values(), "fitting")]
         agreed = agreed_fits(model, [each.shape for each in clean.values()], raw, config)
-        fits.append(dict(zip(clean, agreed, strict=True)))
+        places = {name: (fit.residual, Places.of(clean[name], fit)) for name, fit in zip(clean, agreed, strict=True)}
+        fits.append(places)
     found = {}
     for a, b in runner.track(pairs, "mapping"):
-        best = min(fits, key=lambda each: each[a].residual + each[b].residual)
-        found[a, b] = build_map(clean[a], best[a], clean[b], best[b])
+        best = min(fits, key=lambda each: each[a][0] + each[b][0])
+        found[a, b] = build_map(best[a][1], best[b][1])
     return found
 
 

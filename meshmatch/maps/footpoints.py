@@ -89,15 +89,16 @@ class Footpoints:
 class Surface:
     """A mesh (or cloud) arranged for many closest-point queries; lengths in units of sqrt(area).
 
-    `normals` are of unit length, zeros where unknown. `resting` is where each vertex belongs on the resting template:
-    queries with such a place of their own find the right one of two sheets that touch, such as a hand on a thigh.
+    `normals` are of unit length, zeros where unknown, None where they do not count. `resting` is where each vertex belongs
+    on the resting template: queries with such a place of their own find the right one of two sheets that touch, such as
+    a hand on a thigh.
     """
 
     def __init__(
         self,
         verts: Float[Floats, "V 3"],
         faces: Int[Ints, "F 3"],
-        normals: Float[Floats, "V 3"],
+        normals: Float[Floats, "V 3"] | None = None,
         resting: Float[Floats, "V 3"] | None = None,
     ) -> None:
         self.verts, self.faces = verts, faces
@@ -112,11 +113,11 @@ class Surface:
     def query(
         self,
         points: Float[Floats, "N 3"],
-        normals: Float[Floats, "N 3"],
+        normals: Float[Floats, "N 3"] | None = None,
         workers: int = 1,
         resting: Float[Floats, "N 3"] | None = None,
     ) -> Footpoints:
-        """Closest points to points with unit normals (zeros where unknown); ``resting`` if the surface has it."""
+        """Closest points to points with unit normals (zeros where unknown); ``normals``, ``resting`` as the surface's."""
         N = len(points)
         vertex = np.empty(N, np.int64)
         face = np.full(N, -1, np.int64)
@@ -125,7 +126,7 @@ class Surface:
 
         def answer(low: int) -> None:
             part = slice(low, min(low + _CHUNK, N))
-            features = _features(points[part], normals[part], None if resting is None else resting[part])
+            features = _features(*(None if rows is None else rows[part] for rows in (points, normals, resting)))
             vertex[part] = self._used[self._tree.query(features)[1]]
             if len(self.faces):
                 face[part], weights[part], distance[part] = self._on_faces(points[part], vertex[part])
@@ -152,9 +153,9 @@ class Surface:
         return face[best], weights[best], np.sqrt(squared[best])
 
 
-def _features(points: Floats, normals: Floats, resting: Floats | None) -> Floats:
-    parts = [points, NORMAL_WEIGHT * normals]
-    return np.concatenate(parts if resting is None else [*parts, RESTING_WEIGHT * resting], 1)
+def _features(*rows: Floats | None) -> Floats:
+    weighed = zip((1.0, NORMAL_WEIGHT, RESTING_WEIGHT), rows, strict=True)
+    return np.concatenate([weight * each for weight, each in weighed if each is not None], 1)
 
 
 def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footpoints, Float[Floats, "V 3"]]:

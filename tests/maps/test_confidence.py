@@ -7,11 +7,19 @@ import pytest
 
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
-from meshmatch.shapes.repair import repair
+from meshmatch.maps.places import Places
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from tests.conftest import some_fit
 from tests.maps.solids import bumpy_sphere
 from tests.transfer.known import brute_force
+
+
+def mapped(
+    source: Repaired, fit: Fit, target: Repaired, other: Fit, before: tuple[Fit | None, Fit | None] = (None, None)
+) -> VertexMap:
+    return build_map(Places.of(source, fit, before[0]), Places.of(target, other, before[1]))
 
 
 def lying_on(shape: Shape) -> Fit:
@@ -23,18 +31,18 @@ def test_where_a_fit_moved_it_is_not_believed() -> None:
     ball = bumpy_sphere()
     unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
     part, fit = repair(unit), lying_on(unit)
-    sure = build_map(part, fit, part, fit)
+    sure = mapped(part, fit, part, fit)
     assert np.allclose(sure.confidence, 1)
     high = unit.verts[:, 2] > 0.1
     for number, moved in enumerate((0.05, 0.1)):
         elsewhere = replace(fit, points=unit.verts + np.where(high, moved, 0.0)[:, None] * [1.0, 0, 0])
         before = [fit, fit]
         before[number] = elsewhere
-        found = build_map(part, fit, part, fit, before_agreement=(before[0], before[1]))
+        found = mapped(part, fit, part, fit, (before[0], before[1]))
         assert np.allclose(found.confidence[high], np.exp(-((moved / 0.065) ** 2)), atol=1e-6)
         assert np.allclose(found.confidence[~high], 1)
         assert np.array_equal(found.index, sure.index)
-    assert np.array_equal(build_map(part, fit, part, fit, before_agreement=(fit, fit)).confidence, sure.confidence)
+    assert np.array_equal(mapped(part, fit, part, fit, (fit, fit)).confidence, sure.confidence)
 
 
 def test_both_fits_count_where_the_source_lies() -> None:
@@ -46,7 +54,7 @@ def test_both_fits_count_where_the_source_lies() -> None:
     high = unit.verts[:, 2] > 0.1
     before = replace(fit, points=unit.verts + np.where(high, 0.04, 0.0)[:, None] * [1.0, 0, 0])
     before_there = replace(other, points=turned.verts + np.where(high, 0.025, 0.0)[:, None] * [0, 1.0, 0])
-    found = build_map(repair(unit), fit, repair(turned), other, before_agreement=(before, before_there))
+    found = mapped(repair(unit), fit, repair(turned), other, (before, before_there))
     assert np.allclose(found.confidence[high], np.exp(-1.0), atol=1e-6)
     assert np.allclose(found.confidence[~high], 1)
 
@@ -58,7 +66,7 @@ def test_a_map_by_a_poor_fit_is_believed_half() -> None:
     for verdict, believed in (("good", 1.0), ("fair", 1.0), ("poor", 0.5)):
         judged = replace(fit, verdict=verdict)
         for source_fit, target_fit in ((judged, fit), (fit, judged)):
-            found = build_map(part, source_fit, part, target_fit)
+            found = mapped(part, source_fit, part, target_fit)
             assert np.allclose(found.confidence, believed)
             assert found.verdict == verdict
 
@@ -70,11 +78,9 @@ def test_distance_from_the_template_costs_confidence_on_both_sides(side: str) ->
     unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
     part, fit = repair(unit), lying_on(unit)
     large = replace(fit, points=1.05 * unit.verts)
-    if side == "source":
-        distance, _ = brute_force(unit.verts, large.points, unit.faces)
-        found = build_map(part, large, part, fit)
-    else:
-        distance, _ = brute_force(large.points, unit.verts, unit.faces)
-        found = build_map(part, fit, part, large)
+    distance, _ = brute_force(unit.verts, large.points, unit.faces)
+    near = Places.of(part, fit)
+    far = replace(Places.of(part, large), resting=near.resting)  # the same places: these cost nothing
+    found = build_map(far, near) if side == "source" else build_map(near, far)
     assert distance.max() > 0.01
     assert np.allclose(found.confidence, np.exp(-((distance / 0.03) ** 2)), atol=0.02)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from meshmatch.fitting.fit import Fit
-from meshmatch.maps import build
-from meshmatch.maps.build import expectation, is_noisy, most_likely_points, noise_level
+from meshmatch.maps import places
+from meshmatch.maps.build import build_map
+from meshmatch.maps.places import Places, expectation, is_noisy, noise_level
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from tests.conftest import some_fit
@@ -61,15 +62,13 @@ def test_a_point_far_from_everything_has_a_mean_all_the_same() -> None:
 
 
 def test_of_two_points_as_near_the_better_known_one_is_chosen() -> None:
-    """Between two plates a point may belong to either: it stands back behind one that lies on its plate."""
-    low, high = plate(), plate(height=0.1)
-    points = np.concatenate([low.points, high.points])
-    fit = replace(low, points=points, resting=points, faces=np.concatenate([low.faces, high.faces + len(low.points)]))
-    cloud = Shape(np.array([[0.5, 0.52, 0.05], [0.5, 0.45, 0.0]]), NO_FACES)
-    sought = np.array([[0.5, 0.5, 0.02]])
-    found = most_likely_points(cloud, fit, 0.02, sought, sought)
+    """Both belong to the same place on the average, but one of them might as well be elsewhere."""
+    cloud = Shape(np.array([[0.5, 0.5, 0.0], [0.5, 0.5, 0.01]]), NO_FACES)
+    known = Places.of(repair(cloud), plate())
+    unsure = replace(known, spread=np.array([0.05, 0.01], np.float32))
+    found = unsure.nearest(np.array([[0.5, 0.52, 0.0]], np.float32))
     assert found.vertex.tolist() == [1]
-    assert found.distance == pytest.approx(np.hypot(0.05, 0.02))
+    assert found.distance == pytest.approx(np.hypot(0.01, 0.02), rel=1e-5)
     assert found.face.tolist() == [-1] and found.barycentric.tolist() == [[1, 0, 0]]
 
 
@@ -94,7 +93,7 @@ def test_noise_costs_a_map_less_than_closest_points_do(monkeypatch: pytest.Monke
     assert is_noisy(source) and is_noisy(target) and not is_noisy(noisy(clean, 0.0, 1))
     errors = []
     for rule in (is_noisy, lambda shape: False):
-        monkeypatch.setattr(build, "is_noisy", rule)
-        found = build.build_map(repair(source), fit, repair(target), fit)
+        monkeypatch.setattr(places, "is_noisy", rule)
+        found = build_map(Places.of(repair(source), fit), Places.of(repair(target), fit))
         errors.append(np.linalg.norm(clean[found.index] - clean, axis=1).mean())
     assert errors[0] < 0.99 * errors[1]

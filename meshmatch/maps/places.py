@@ -1,0 +1,177 @@
+"""Where the vertices of a shape belong on the template: what one fit knows, and all that maps need of it.
+
+Of a noisy cloud no place is known for a point, but how likely each is. Noise moves points across the surface and along it
+alike. Taking the closest point of the template undoes the first and keeps the second. Here a point belongs to all of the
+template within reach, with Gaussian weights; its place is the expectation, and its spread says how well it is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_matrix, identity, vstack
+from scipy.spatial import cKDTree
+
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Ints32
+from meshmatch.fitting.fit import Fit
+from meshmatch.geometry.triangles import blend, triangle_areas, vertex_areas
+from meshmatch.maps.footpoints import Footpoints, Surface, closest_footpoints, in_core_frame, template_footpoints
+from meshmatch.shapes.repair import Repaired
+from meshmatch.shapes.shape import Shape
+
+# Of noisy clouds, set by hand:
+_ROUGH = 0.5  # from this `Shape.roughness` on, noise is larger than the template's triangles
+_SAMPLES = 48  # of the template that share a point
+_NOISE_RANGE = 0.006, 0.03  # units of sqrt(area)
+_CHUNK = 8192  # points at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where the vertices of one shape belong on the template. Two of them, of one template, make a map.
+
+    Vertices and faces are those of the shape's file, lengths in units of sqrt(area).
+
+    Attributes
+    ----------
+    name, hash : of the shape, see `Shape.hash`
+    template_hash : which template
+    resting : (V, 3) where each vertex belongs on the resting template, template frame
+    distance : (V,) how far each vertex lies from the fitted template
+    shift : (V,) how far the template moved there when it had to agree with other fits; None if it had not
+    spread : (V,) of a noisy cloud, standard deviation of the place; None for other shapes
+    stands : (V,) which vertex stands for each: itself, its twin, or the nearest that was fitted
+    faces : (F, 3) all triangles; fitted : (F,) whether each was fitted, or dropped as broken
+    verdict, reasons : of the fit
+    """
+
+    name: str
+    hash: str
+    template_hash: str
+    resting: Float[Floats32, "V 3"]
+    distance: Float[Floats32, " V"]
+    shift: Float[Floats32, " V"] | None
+    spread: Float[Floats32, " V"] | None
+    stands: Int[Ints32, " V"]
+    faces: Int[Ints32, "F 3"]
+    fitted: Bool[Bools, " F"]
+    verdict: str
+    reasons: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, part: Repaired, fit: Fit, before: Fit | None = None, workers: int = 1) -> Places:
+        """The places of a repaired shape; ``before`` is its fit before it agreed with others."""
+        foot, resting = template_footpoints(part.shape, fit, workers)
+        distance, spread, shift = foot.distance, None, None
+        if is_noisy(part.shape):
+            distance = closest_footpoints(part.shape, fit, workers).distance
+            points = in_core_frame(part.shape, fit)[0]
+            (_, resting), variance = expectation(points, fit, noise_level(distance), [fit.points, fit.resting])
+            spread = np.sqrt(variance)
+        if before is not None:
+            shift = np.linalg.norm(foot.values(fit.faces, fit.points - before.points), axis=1)
+
+        def of_file(values: Floats) -> Floats32:
+            return values.astype(np.float32)[part.original_to_repaired]
+
+        original = part.original
+        fitted = np.zeros(original.F, bool)
+        fitted[part.kept_face] = True
+        return cls(
+            original.name,
+            original.hash,
+            fit.template_hash,
+            of_file(resting),
+            of_file(distance),
+            None if shift is None else of_file(shift),
+            None if spread is None else of_file(spread),
+            part.kept_vertex[part.original_to_repaired].astype(np.int32),
+            original.faces.astype(np.int32),
+            fitted,
+            fit.verdict,
+            fit.reasons,
+        )
+
+    def nearest(self, resting: Float[Floats32, "N 3"], workers: int = 1) -> Footpoints:
+        """The points of this shape that belong nearest to N places on the resting template."""
+        asked = resting.astype(np.float64)
+        if len(self._used):
+            found = self._surface.query(asked, None, workers)
+            corners = self.faces[self._used].take(found.face, 0)
+            nearest = np.take_along_axis(corners, found.barycentric.argmax(1)[:, None], 1)[:, 0]
+            vertex = self.stands[nearest].astype(np.int64)
+            return Footpoints(vertex, self._used[found.face], found.barycentric, found.distance)
+        known = np.zeros((len(asked), 0 if self.spread is None else 1))
+        distance, index = self._tree.query(np.column_stack([asked, known]), workers=workers)
+        weights = np.tile([1.0, 0.0, 0.0], (len(asked), 1))
+        return Footpoints(self._points[index], np.full(len(asked), -1, np.int64), weights, distance)
+
+    @cached_property
+    def _used(self) -> Ints:
+        """Numbers of the faces that were fitted."""
+        return np.flatnonzero(self.fitted)
+
+    @cached_property
+    def _surface(self) -> Surface:
+        """The faces as they lie on the resting template."""
+        return Surface(self.resting.astype(np.float64), self.stands[self.faces[self._used]].astype(np.int64))
+
+    @cached_property
+    def _points(self) -> Ints:
+        """Vertices that stand for themselves."""
+        return np.flatnonzero(self.stands == np.arange(len(self.stands)))
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        """Of a cloud. The expected squared distance is that of the means, plus the variance of this shape's point."""
+        columns = [self.resting] if self.spread is None else [self.resting, self.spread[:, None]]
+        return cKDTree(np.concatenate(columns, 1)[self._points])
+
+
+def is_noisy(shape: Shape) -> bool:
+    """Whether a shape is a cloud so noisy that expectations pay."""
+    return shape.roughness >= _ROUGH
+
+
+def noise_level(distance: Float[Floats, " N"]) -> float:
+    """Standard deviation of noise, from distances between points and a surface: robust against outliers.
+
+    The median of a Gaussian's absolute values is 0.6745 standard deviations.
+    """
+    return float(np.clip(np.median(distance) / 0.6745, *_NOISE_RANGE))
+
+
+def expectation(
+    points: Float[Floats, "N 3"], fit: Fit, noise: float, values: Sequence[Float[Floats, "T D"]]
+) -> tuple[list[Float[Floats, "N D"]], Float[Floats, " N"]]:
+    """Expected values over the places of the template where points may belong, and how uncertain the first are.
+
+    `points` are in the fit's core frame; `noise` is the standard deviation along each axis, in units of sqrt(area);
+    `values` belong to the vertices of the fitted template. Returns the mean of each, and the variance of the first,
+    summed over D.
+    """
+    # vertices and face centers of the template, as a matrix over the vertices, and the area that each stands for
+    F, T = len(fit.faces), len(fit.points)
+    rows = np.repeat(np.arange(F), 3)
+    centers = csr_matrix((np.full(3 * F, 1 / 3), (rows, fit.faces.reshape(-1))), (F, T))
+    matrix = vstack([identity(T), centers]).tocsr()
+    areas = vertex_areas(fit.points, fit.faces), triangle_areas(fit.points, fit.faces)  # half of the whole each
+    prior = np.concatenate([0.5 * area for area in areas])
+    tree = cKDTree(matrix @ fit.points)
+    sampled = [matrix @ value for value in values]
+    means = [np.empty((len(points), value.shape[1])) for value in values]
+    variance = np.empty(len(points))
+    for low in range(0, len(points), _CHUNK):
+        part = slice(low, low + _CHUNK)
+        distance, index = tree.query(points[part], min(_SAMPLES, tree.n))
+        further = np.square(distance) - np.square(distance[:, :1])  # the closest keeps its weight at any distance
+        weight = prior[index] * np.exp(-0.5 * further / noise**2)
+        weight /= weight.sum(1, keepdims=True)
+        for mean, value in zip(means, sampled, strict=True):
+            mean[part] = blend(value[index], weight)
+        deviation = np.square(sampled[0][index] - means[0][part][:, None]).sum(2)
+        variance[part] = (weight * deviation).sum(1)
+    return means, variance
