@@ -25,11 +25,11 @@ def grown(shape: Shape, *factors: float, colors: bool = False) -> list[Shape]:
     return [Shape(shape.verts * [1, factor, 1], shape.faces, "grown", tint) for factor in factors]
 
 
-def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def read(path: Path, more: dict[str, str] | None = None) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     text = path.read_text(encoding="utf-8")
     words = json.loads(re.findall(r'id="words">(.*?)</script>', text, re.S)[0])
     data = zlib.decompress(base64.b64decode(re.findall(r'id="packed">(.*?)</script>', text, re.S)[0]))
-    kinds = {"Uint8Array": "u1", "Int8Array": "i1", "Uint16Array": "<u2", "Uint32Array": "<u4"}
+    kinds = {"Uint8Array": "u1", "Int8Array": "i1", "Uint16Array": "<u2", "Uint32Array": "<u4"} | (more or {})
     return words, {
         row["name"]: np.frombuffer(data, kinds[row["kind"]], row["length"], row["start"]) for row in words["arrays"]
     }

@@ -22,7 +22,14 @@ from meshmatch.outputs import replace_on_success
 
 # Control characters, ends of lines, and marks that turn the direction of writing.
 _UNSEEMLY = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
-_KINDS = {"u1": "Uint8Array", "i1": "Int8Array", "u2": "Uint16Array", "u4": "Uint32Array", "f4": "Float32Array"}
+_KINDS = {
+    "u1": "Uint8Array",
+    "i1": "Int8Array",
+    "u2": "Uint16Array",
+    "i2": "Int16Array",
+    "u4": "Uint32Array",
+    "f4": "Float32Array",
+}
 
 
 def check_page(path: str | Path) -> None:

@@ -11,7 +11,7 @@ async function readArrays(table) {
   element.remove();
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('deflate'));
   const bytes = await new Response(stream).arrayBuffer();
-  const kinds = { Uint8Array, Int8Array, Uint16Array, Uint32Array, Float32Array };
+  const kinds = { Uint8Array, Int8Array, Uint16Array, Int16Array, Uint32Array, Float32Array };
   const arrays = {};
   for (const { name, kind, start, length } of table) arrays[name] = new kinds[kind](bytes, start, length);
   return arrays;

@@ -1,19 +1,12 @@
 // A shape that moves: between two of its frames every vertex goes straight from one to the next.
 
-const VIEW = { turn: 20, tilt: 8, field: 28 }; // degrees
 const SECONDS = 4; // from the first frame to the last
 const words = readWords();
-const calm = matchMedia('(prefers-reduced-motion: reduce)').matches;
 const state = { time: words.times[0], playing: false, frames: 0 };
-let renderer,
-  scene,
-  camera,
-  control,
-  geometry,
+let geometry,
   uniforms,
   places,
   normals,
-  due = false,
   before = 0,
   ahead = 1;
 
@@ -49,14 +42,7 @@ function between(time) {
   return [k, Math.min(Math.max((time - times[k]) / (times[k + 1] - times[k]), 0), 1)];
 }
 
-function soon() {
-  if (due) return;
-  due = true;
-  requestAnimationFrame(frame);
-}
-
 function frame(now) {
-  due = false;
   if (state.playing) {
     const { times } = words,
       first = times[0],
@@ -68,10 +54,9 @@ function frame(now) {
     show(time);
     soon();
   }
-  control.update();
-  renderer.render(scene, camera);
+  const rows = renderer.domElement.height; // pixels of the screen
+  uniforms.pointSize.value = (words.radius * rows) / Math.tan((VIEW.field * Math.PI) / 360);
   state.frames++;
-  document.documentElement.dataset.ready = '';
 }
 
 function show(time) {
@@ -95,29 +80,6 @@ function play(wanted) {
   soon();
 }
 
-function reset() {
-  const [turn, tilt, half] = [VIEW.turn, VIEW.tilt, VIEW.field / 2].map((degrees) => (degrees * Math.PI) / 180);
-  const [w, h, d] = words.extent;
-  const width = w * Math.cos(turn) + d * Math.sin(turn);
-  const distance = Math.max(h / 2, width / 2 / camera.aspect) / Math.tan(half) / 0.88 + d / 2;
-  control.target.set(0, 0, 0);
-  camera.position
-    .set(-Math.sin(turn) * Math.cos(tilt), Math.sin(tilt), Math.cos(turn) * Math.cos(tilt))
-    .multiplyScalar(distance);
-  camera.lookAt(0, 0, 0);
-  soon();
-}
-
-function resize() {
-  const { clientWidth: width, clientHeight: height } = $('stage');
-  renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
-  renderer.setSize(width, height, false);
-  camera.aspect = width / Math.max(height, 1);
-  camera.updateProjectionMatrix();
-  uniforms.pointSize.value = (words.radius * height * renderer.getPixelRatio()) / Math.tan((VIEW.field * Math.PI) / 360);
-  soon();
-}
-
 function keys(event) {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   const key = event.key.toLowerCase();
@@ -126,27 +88,7 @@ function keys(event) {
   else if (event.target === $('canvas')) return turn(event);
 }
 
-function turn(event) {
-  const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
-  const polar = new THREE.Spherical().setFromVector3(camera.position.clone().sub(control.target));
-  if (event.key in steps) {
-    polar.theta -= (8 * steps[event.key][0] * Math.PI) / 180;
-    polar.phi -= (8 * steps[event.key][1] * Math.PI) / 180;
-  } else if (event.key === '+' || event.key === '=') polar.radius /= 1.15;
-  else if (event.key === '-') polar.radius *= 1.15;
-  else return;
-  event.preventDefault();
-  camera.position.setFromSpherical(polar.makeSafe()).add(control.target);
-  camera.lookAt(control.target);
-  soon();
-}
-
 function prepare(arrays) {
-  const canvas = $('canvas');
-  renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
-  renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader writes colors as they are to appear
-  camera = new THREE.PerspectiveCamera(VIEW.field, 1, 0.005, 50);
-  scene = new THREE.Scene();
   geometry = new THREE.BufferGeometry();
   const many = words.times.length;
   const split = (array) => {
@@ -166,12 +108,8 @@ function prepare(arrays) {
     side: THREE.DoubleSide,
   });
   const body = words.cloud ? new THREE.Points(geometry, material) : new THREE.Mesh(geometry, material);
-  body.frustumCulled = false;
   body.position.set(...words.low); // the cube's corner; its edge is 1
-  scene.add(body);
-  control = new THREE.OrbitControls(camera, canvas);
-  Object.assign(control, { enableDamping: !calm, dampingFactor: 0.18, minDistance: 0.03, maxDistance: 12 });
-  control.addEventListener('change', soon);
+  openView(body);
 }
 
 // Names of the shapes that are met, above the slider.

@@ -167,4 +167,4 @@ def write_motion(
         "extent": (extent / edge).round(6).tolist(),
         "radius": float(f"{part.radius / edge:.4g}"),
     }
-    return write_html(Path(path), "motion", ("data", "materials", "motion"), words, arrays, title)
+    return write_html(Path(path), "motion", ("data", "materials", "single", "motion"), words, arrays, title)

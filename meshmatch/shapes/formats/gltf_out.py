@@ -1,4 +1,4 @@
-"""Writing glTF 2.0, binary (glb): one node, one mesh, one primitive, and its texture within the file.
+"""Writing glTF 2.0, binary (glb): one node, one mesh, one primitive, and within the file its texture or its morph targets.
 
 Specification: Khronos glTF 2.0.
 """
@@ -6,6 +6,7 @@ Specification: Khronos glTF 2.0.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,16 @@ def write(path: Path, shape: Shape) -> None:
     _write(path, shape.name, attributes, shape.faces, {}, b"")
 
 
+def write_morphs(path: Path, shape: Shape, targets: Mapping[str, Float[Floats, "V 3"]]) -> None:
+    """A mesh with morph targets by name: where its vertices are when the target's weight is 1. All weights are 0."""
+    normals = smooth_normals(shape.verts, shape.faces)
+    moves = {
+        name: {"POSITION": verts - shape.verts, "NORMAL": smooth_normals(verts, shape.faces) - normals}
+        for name, verts in targets.items()
+    }
+    _write(path, shape.name, {"POSITION": shape.verts, "NORMAL": normals}, shape.faces, {}, b"", moves)
+
+
 def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
     """A mesh that wears one image (a PNG): the first vertices are those of the shape, copies for seams follow.
 
@@ -58,13 +69,30 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
     _write(path, name, attributes, faces, look, png)
 
 
-def _write(path: Path, name: str, attributes: dict[str, Floats], faces: Ints, look: dict[str, Any], png: bytes) -> None:
+def _write(
+    path: Path,
+    name: str,
+    attributes: dict[str, Floats],
+    faces: Ints,
+    look: dict[str, Any],
+    png: bytes,
+    moves: Mapping[str, dict[str, Floats]] | None = None,
+) -> None:
     """Arrays and an image one after the other, each at a multiple of four bytes, behind what describes them."""
     arrays: list[NDArray[Any]] = [values.astype("<f4") for values in attributes.values()]
     primitive: dict[str, Any] = {"attributes": {key: k for k, key in enumerate(attributes)}, "mode": _POINTS}
     if len(faces):
         primitive |= {"mode": _TRIANGLES, "indices": len(arrays)}
         arrays.append(faces.astype("<u4").reshape(-1, 1))
+    places = [0]  # positions need their box
+    mesh: dict[str, Any] = {"primitives": [primitive], "name": name}
+    if moves:
+        primitive["targets"] = []
+        mesh |= {"weights": [0.0] * len(moves), "extras": {"targetNames": list(moves)}}
+    for move in (moves or {}).values():
+        places.append(len(arrays))
+        primitive["targets"].append({key: len(arrays) + k for k, key in enumerate(move)})
+        arrays += [values.astype("<f4") for values in move.values()]
     chunks = [*(values.tobytes() for values in arrays), *([png] if png else [])]
     padded = [chunk + b"\0" * (-len(chunk) % 4) for chunk in chunks]
     starts = np.cumsum([0, *map(len, padded)]).tolist()
@@ -78,9 +106,10 @@ def _write(path: Path, name: str, attributes: dict[str, Floats], faces: Ints, lo
         views[k]["target"] = _INDICES if whole else _VERTICES
         kinds = {"componentType": _UNSIGNED if whole else _FLOAT, "type": _TYPES[values.shape[1]]}
         accessors.append({"bufferView": k, **kinds, "count": len(values)})
-    accessors[0] |= {"min": arrays[0].min(0).tolist(), "max": arrays[0].max(0).tolist()}  # positions need their box
+    for k in places:
+        accessors[k] |= {"min": arrays[k].min(0).tolist(), "max": arrays[k].max(0).tolist()}
     document = {"asset": {"version": "2.0", "generator": "meshmatch"}, "scene": 0, "scenes": [{"nodes": [0]}]}
-    document |= {"nodes": [{"mesh": 0, "name": name}], "meshes": [{"primitives": [primitive], "name": name}]} | look
+    document |= {"nodes": [{"mesh": 0, "name": name}], "meshes": [mesh]} | look
     document |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
     if png:
         primitive["material"] = 0

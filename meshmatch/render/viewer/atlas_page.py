@@ -1,0 +1,83 @@
+"""The page of a mean shape and its modes of variation, with a slider for each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.errors import OptionError
+from meshmatch.render.scales import CLAY, Scale
+from meshmatch.render.viewer.assembly import check_page, plain_text, scaled, small_integers, write_html
+from meshmatch.render.viewer.drawn import MOST, draw
+from meshmatch.shapes.shape import Shape
+
+MOST_MODES = 12
+"""Of an atlas with more modes the page shows the first."""
+MOST_PLACES = 4_000_000
+"""Vertices times modes up to which a shape is drawn whole."""
+_RAMP = 33  # colors
+
+
+@dataclass(frozen=True, eq=False)
+class Varying:
+    """A mean shape and how it varies: M modes, each a displacement (V, 3) by one standard deviation, and which ``shares``
+    (M,) of the variance they explain; the ``scores`` (S, M) of known shapes, in standard deviations, and their names.
+    """
+
+    mean: Shape
+    modes: Float[Floats, "M V 3"]
+    shares: Float[Floats, " M"]
+    scores: Float[Floats, "S M"]
+    names: Sequence[str]
+
+
+def write_atlas_page(
+    path: str | Path, atlas: Varying, *, rotation: Float[Floats, "3 3"], title: str = "", most: int = MOST
+) -> int:
+    """Write a page on which sliders vary a shape, colored by its distance from the mean; how many bytes it has.
+
+    The same input gives the same bytes. ``rotation`` leads into y up, z to the front. Up to ``most`` vertices are drawn,
+    fewer of a shape with many modes. `OptionError` for a suffix that is no page's, and for a mean that has no surface or
+    no modes; `OutputError` where the file cannot be written.
+    """
+    check_page(path)
+    count = min(len(atlas.modes), MOST_MODES)
+    if count == 0 or atlas.mean.is_cloud:
+        raise OptionError("a page of modes needs a surface and a mode")
+    part = draw(atlas.mean, min(most, MOST_PLACES // count))
+    mean = atlas.mean.verts[part.vertex] @ rotation.T
+    modes = atlas.modes[:count, part.vertex] @ rotation.T
+    seen = np.concatenate([mean, *(mean + sign * mode for mode in modes for sign in (-2, 2))])
+    low, extent = seen.min(axis=0), np.ptp(seen, axis=0)
+    edge = float(extent.max()) or 1.0
+    reach = np.abs(modes).max(axis=(1, 2))
+    # Colors reach as far as two standard deviations of the first mode do.
+    scale = Scale.of(2 * np.linalg.norm(atlas.modes[0], axis=1))
+    arrays: dict[str, NDArray[Any]] = {
+        "position": scaled((mean - low) / edge, np.uint16),
+        "mode": scaled(modes / np.maximum(reach, 1e-300)[:, None, None], np.int16),
+        "face": small_integers(part.faces),
+        "score": atlas.scores[:, :count].astype(np.float32),
+    }
+    words = {
+        "title": plain_text(title),
+        "note": f"{len(atlas.names):,} shapes, {part.note or f'{atlas.mean.V:,} vertices'}",
+        "kept": f"{100 * float(atlas.shares[:count].sum()):.1f} % of the variance in {count} of {len(atlas.modes)} modes",
+        "names": [plain_text(name) for name in atlas.names],
+        "shares": [round(float(share), 6) for share in atlas.shares[:count]],
+        "reach": [float(f"{value:.7g}") for value in reach / edge],
+        "unit": edge,
+        "far": scale.high,
+        "high": f"{scale.high:.4g}",
+        "ramp": Scale(0.0, 1.0).colors(np.linspace(0, 1, _RAMP)).round(4).tolist(),
+        "clay": list(CLAY),
+        "low": (-extent / edge / 2).round(6).tolist(),
+        "extent": (extent / edge).round(6).tolist(),
+    }
+    return write_html(Path(path), "atlas", ("data", "materials", "single", "atlas"), words, arrays, title)
