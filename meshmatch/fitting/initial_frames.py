@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.arrays import Float, Floats
 from meshmatch.fitting.fit_config import FitConfig, axis_of
 from meshmatch.geometry.frames import Frame, RigidPose
-from meshmatch.geometry.oriented import OrientedPoints, quick_tree
+from meshmatch.geometry.oriented import OrientedPoints, nearest
 from meshmatch.models.network import Network
 from meshmatch.models.trained import TrainedModel, once_per_model
 from meshmatch.shapes.normalise import ALIGNS, align
@@ -117,7 +117,7 @@ def ask_aligner(
     cloud = (points - middle).astype(np.float32)
     # Turning the basis the other way is cheaper than turning and indexing the points N times.
     queries = np.einsum("mk,nkl->nml", network.align_basis, turns).astype(np.float32)
-    offsets = cloud[quick_tree(cloud).query(queries)[1]] - queries  # N M 3
+    offsets = cloud[nearest(cloud, queries.reshape(-1, 3))].reshape(queries.shape) - queries  # N M 3
     R, t = network.read_frames(offsets @ turns.astype(np.float32).transpose(0, 2, 1))
     back = turns.transpose(0, 2, 1)
     return back @ R, (back @ t[..., None])[..., 0] + middle

@@ -18,7 +18,7 @@ from scipy.special import erf
 from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.errors import OptionError, needs
 from meshmatch.fields.shape_functions import has_nodes
-from meshmatch.geometry.oriented import quick_tree
+from meshmatch.geometry.oriented import nearest, quick_tree
 from meshmatch.models.checkpoint import load_weights
 from meshmatch.models.network import POINT_SIZES, Network, NetworkConfig, weight_shapes
 from meshmatch.models.shared_weights import shared_weights
@@ -79,8 +79,8 @@ class NodeNetwork:
 
     def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B K 3"]:
         points = [np.asarray(cloud, np.float32) for cloud in clouds]
-        trees = beside(quick_tree, points)
-        vectors = self._decode(self._encode(points, trees))
+        vectors = self._decode(self._encode(points))
+        trees = beside(quick_tree, points) if self.config.corrections else []
         for _ in range(self.config.corrections):
             vectors = self._correct(vectors, points, trees)
         return vectors.astype(np.float64)
@@ -91,7 +91,7 @@ class NodeNetwork:
 
     def encode(self, cloud: Float[Floats, "P 3"]) -> Float[Floats, " D"]:
         points = np.asarray(cloud, np.float32)
-        return self._encode([points], [quick_tree(points)])[0].astype(np.float64)
+        return self._encode([points])[0].astype(np.float64)
 
     def decode(self, code: Float[Floats, " D"]) -> Float[Floats, "K 3"]:
         return self._decode(code[None].astype(np.float32))[0].astype(np.float64)
@@ -101,11 +101,11 @@ class NodeNetwork:
         # A node at q moves to Q^T (q + u), so its vector in the turned frame is that minus q.
         return (nodes + rows) @ turn - nodes
 
-    def _encode(self, clouds: Sequence[Floats32], trees: Sequence[cKDTree]) -> Float[Floats32, "B D"]:
+    def _encode(self, clouds: Sequence[Floats32]) -> Float[Floats32, "B D"]:
         if self.config.encoder == "point":
             return np.stack([self._encode_points(cloud) for cloud in clouds])
         basis = self.weights["encoder.basis"]
-        seen = beside(lambda cloud, tree: 5 * _offsets(basis, cloud, tree), clouds, trees)
+        seen = beside(lambda cloud: 5 * (cloud[nearest(cloud, basis)] - basis), clouds)
         return self._residual_mlp("encoder.network", np.stack(seen).reshape(len(clouds), -1))
 
     def _encode_points(self, cloud: Float[Floats32, "P 3"]) -> Float[Floats32, " D"]:
@@ -180,16 +180,11 @@ def _gelu(x: Floats32) -> Floats32:
     return np.float32(0.5) * x * (1 + erf(x * np.float32(np.sqrt(0.5))))
 
 
-def _offsets(queries: Float[Floats32, "Q 3"], points: Floats32, tree: cKDTree) -> Float[Floats32, "Q 3"]:
-    """From each query to the nearest of the points, which the tree holds."""
-    return points[tree.query(queries)[1]] - queries
-
-
 def _two_way_offsets(anchors: Float[Floats32, "A 3"], points: Floats32, tree: cKDTree) -> Floats32:
     """What a registration sees at its anchors (A, 7); see `models.layers.two_way_offsets`."""
     A = len(anchors)
-    forward = _offsets(anchors, points, tree)
-    owner = quick_tree(anchors).query(points)[1]
+    forward = points[tree.query(anchors)[1]] - anchors
+    owner = nearest(anchors, points)
     back = points - anchors[owner]
     count = np.bincount(owner, minlength=A).astype(np.float32)[:, None]
     total = np.stack([np.bincount(owner, back[:, k], A) for k in range(3)], 1).astype(np.float32)

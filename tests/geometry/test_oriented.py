@@ -12,6 +12,7 @@ from meshmatch.geometry.oriented import (
     NORMAL_WEIGHT,
     OrientedPoints,
     feature_tree,
+    nearest,
     nearest_unsigned,
     quick_tree,
     with_normals,
@@ -79,6 +80,14 @@ def test_normals_without_a_sign_are_compared_both_ways() -> None:
     assert np.array_equal(turned, both[1][0] < both[0][0]) and 50 < turned.sum() < 450
     assert np.array_equal(index, np.where(turned, both[1][1], both[0][1])) and (index == tree.n).any()
     assert [len(each) for each in nearest_unsigned(tree, points[:0], normals[:0], 0.2)] == [0, 0, 0]
+
+
+@pytest.mark.parametrize(("P", "Q"), [(1, 5), (300, 2000), (3000, 768)])
+def test_comparing_all_with_all_answers_as_a_tree_does(P: int, Q: int) -> None:
+    rng = np.random.default_rng(0)
+    points, queries = (rng.normal(size=(count, 3)).astype(np.float32) for count in (P, Q))
+    queries[::2] *= 9  # far away
+    assert (nearest(points, queries) == quick_tree(points).query(queries)[1]).all()
 
 
 @pytest.mark.parametrize("plant", [quick_tree, feature_tree])
