@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -11,43 +13,62 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, MeshmatchError, ModelError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import may_show_part
-from meshmatch.fitting.kind import KNOWN, kind_samples, read_kind
+from meshmatch.fitting.kind import KNOWN, SURE, kind_samples, read_kind
+from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import list_models
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import beside
 
+_PEOPLE = "human"
 _NAME_IT = "name the model with --model (model=...) if that is wrong"
 
 
-def installed_models() -> list[TrainedModel]:
-    """The models of the registry that can be loaded; `ModelError` if there are none."""
-    found = []
-    for entry in list_models():
-        try:
-            found.append(as_model(entry.folder))
-        except MeshmatchError:  # `meshmatch models list` tells what is wrong with it
-            continue
+@dataclass(frozen=True)
+class Installed:
+    """A model that shapes may be of, loaded when it is first asked."""
+
+    card: ModelCard
+    load: Callable[[], TrainedModel]
+    built_in: bool = False
+
+    @classmethod
+    def loaded(cls, model: TrainedModel) -> Installed:
+        return cls(model.card, lambda: model)
+
+
+def installed_models() -> list[Installed]:
+    """The models of the registry whose cards can be read; `ModelError` if there are none."""
+    found = [
+        Installed(entry.card, partial(as_model, entry.folder), entry.built_in)
+        for entry in list_models()
+        if isinstance(entry.card, ModelCard)
+    ]
     if not found:
-        raise ModelError("no model is installed", "see `meshmatch models list`")
+        raise _no_model()
     return found
 
 
+def _no_model() -> ModelError:
+    return ModelError("no model is installed", "see `meshmatch models list`")
+
+
 def read_kinds(
-    models: Sequence[TrainedModel], shapes: Sequence[Shape], configs: Sequence[FitConfig]
+    models: Sequence[Installed], shapes: Sequence[Shape], configs: Sequence[FitConfig], sure: float = SURE
 ) -> Float[Floats, "M S"]:
     """`read_kind` of repaired shapes by models; infinite where a model cannot see a shape, or was not asked.
 
-    Every model is asked about the first shape. Those of its kind are asked about the others first, and the rest only where
-    they do not know them.
+    One shape decides first, if possible a whole one. The model of people, and the user's own, are asked about it, and all
+    others only where none of these is ``sure``. Models of its kind are then asked about the other shapes, and the rest
+    where they do not know them: but not about a part of something whose kind is known.
     """
     samples = beside(kind_samples, shapes, [config.seed for config in configs])
 
-    def reading(model: TrainedModel, number: int) -> float:
+    def reading(model: Installed, number: int) -> float:
         try:
-            return read_kind(model, shapes[number], samples[number], configs[number])
-        except MeshmatchError:
+            return read_kind(model.load(), shapes[number], samples[number], configs[number])
+        except MeshmatchError:  # also of a damaged model: `meshmatch models list` tells what is wrong with it
             return np.inf
 
     found = np.full((len(models), len(shapes)), np.inf)
@@ -57,13 +78,24 @@ def read_kinds(
         for place, value in zip(at, beside(lambda at: reading(models[at[0]], at[1]), at), strict=True):
             found[place] = value
 
-    every, others = range(len(models)), range(1, len(shapes))
-    ask(every, [0])
-    kind = models[int(found[:, 0].argmin())].card.category
-    same = [row for row in every if models[row].card.category == kind and found[:, 0].min() <= KNOWN]
+    parts = [_is_part(shape, config) for shape, config in zip(shapes, configs, strict=True)]
+    first, *others = sorted(range(len(shapes)), key=lambda number: shapes[number].is_cloud or parts[number])
+    likely = [row for row, model in enumerate(models) if model.card.category == _PEOPLE or not model.built_in]
+    ask(likely, [first])
+    if found[:, first].min() > sure:
+        ask([row for row in range(len(models)) if row not in likely], [first])
+    known = found[:, first].min() <= KNOWN
+    kind = models[int(found[:, first].argmin())].card.category
+    same = [row for row, model in enumerate(models) if model.card.category == kind and known]
     ask(same, others)
-    ask([row for row in every if row not in same], [number for number in others if found[:, number].min() > KNOWN])
+    unknown = [number for number in others if found[:, number].min() > KNOWN and not (known and parts[number])]
+    ask([row for row in range(len(models)) if row not in same], unknown)
     return found
+
+
+def _is_part(shape: Shape, config: FitConfig) -> bool:
+    """Whether its user says that a shape is a part, and it may be one."""
+    return config.partial == "yes" and may_show_part(shape, replace(config, partial="auto"))
 
 
 def choose_model(
@@ -75,10 +107,12 @@ def choose_model(
     `InputError` if two shapes are of different kinds, or one of none; `ModelError` if no model is installed.
     """
     models = installed_models()
-    if settled is not None and settled not in models:
-        models.append(settled)
+    if settled is not None and settled.card not in [model.card for model in models]:
+        models.append(Installed.loaded(settled))
     shapes = [each.shape for each in clean]
     readings = read_kinds(models, shapes, configs)
+    if np.isinf(readings).all():
+        raise _no_model()
     kinds = kinds_of(models, readings, shapes, configs)
     told: dict[str, str] = {} if settled is None else {settled.card.category: "the shapes before"}
     for shape, kind in zip(shapes, kinds, strict=True):
@@ -90,16 +124,13 @@ def choose_model(
             told.setdefault(kind, shape.name)
     common = next(iter(told), models[int(readings.sum(1).argmin())].card.category)
     rows = [row for row, model in enumerate(models) if model.card.category == common]
-    chosen = settled or models[min(rows, key=lambda row: readings[row].sum())]
+    chosen = settled or models[min(rows, key=lambda row: readings[row].sum())].load()
     unsure = f"may be a part, or a rough cloud: taken for {common}; {_NAME_IT}"
     return chosen, [f"{s.name}: {k}" if k else f"{s.name} {unsure}" for s, k in zip(shapes, kinds, strict=True)]
 
 
 def kinds_of(
-    models: Sequence[TrainedModel],
-    readings: Float[Floats, "M S"],
-    shapes: Sequence[Shape],
-    configs: Sequence[FitConfig],
+    models: Sequence[Installed], readings: Float[Floats, "M S"], shapes: Sequence[Shape], configs: Sequence[FitConfig]
 ) -> list[str | None]:
     """The category of each shape's best reading, None where it is too high for a shape that may hide some of itself.
 

@@ -21,6 +21,8 @@ from meshmatch.shapes.shape import Shape
 KNOWN = 0.0485
 """Readings up to this (units of sqrt(area)) are of a shape that the model knows. The benchmark's bodies, scans and animals
 have 0.046 at most, its hearts and furniture 0.051 at least (docs/results.md)."""
+SURE = 0.042
+"""Up to this a reading needs no other model's beside it: another kind's were 0.0439 at least (docs/results.md)."""
 _SAMPLES, _THIN = 2048, 768  # how many the reading is of, and how many rank the orientations
 
 

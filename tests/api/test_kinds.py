@@ -11,9 +11,10 @@ import trimesh
 import meshmatch
 from meshmatch.api import kinds
 from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.kinds import Installed
 from meshmatch.api.matching import Matcher
 from meshmatch.errors import InputError, ModelError, OptionError
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fit_config import FitConfig, Partial
 from meshmatch.models import registry
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
@@ -43,7 +44,7 @@ def models(monkeypatch: pytest.MonkeyPatch) -> list[TrainedModel]:
     def read(models: list[TrainedModel], shapes: list[Shape], configs: Any) -> np.ndarray:
         return np.array([[float(word) / 100 for word in shape.name.split()[1:]] for shape in shapes]).T[: len(models)]
 
-    monkeypatch.setattr(kinds, "installed_models", lambda: list(known))
+    monkeypatch.setattr(kinds, "installed_models", lambda: [Installed.loaded(model) for model in known])
     monkeypatch.setattr(kinds, "read_kinds", read)
     return known
 
@@ -92,10 +93,42 @@ def test_what_may_be_a_part_takes_the_other_shapes_kind(unsure: Shape) -> None:
     assert choose(unsure)[0] == "quadruped"  # alone, what reads it best
 
 
+def asked(monkeypatch: pytest.MonkeyPatch, shapes: list[Shape], partial: Partial = "auto") -> list[str]:
+    """Which models are asked about which shapes, where three are installed and one is the user's own."""
+    calls: list[str] = []
+
+    def read(model: Any, shape: Shape, *_: Any) -> float:
+        name, *words = shape.name.split()
+        calls.append(f"{model} {name}")
+        return float(words[["human", "quadruped", "own"].index(model)]) / 100
+
+    monkeypatch.setattr(kinds, "read_kind", read)
+    cards = {name: as_model(name).card for name in ("human", "quadruped")}
+    cards["own"] = replace(cards["quadruped"], name="own", category="ape")
+    models = [Installed(card, lambda name=name: name, name != "own") for name, card in cards.items()]
+    kinds.read_kinds(models, shapes, [FitConfig(partial=partial)] * len(shapes))
+    return sorted(calls)
+
+
+def test_who_is_sure_needs_no_other_built_in_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert asked(monkeypatch, [ball("man 3 7 7"), ball("boy 3 7 7")]) == ["human boy", "human man", "own man"]
+    assert asked(monkeypatch, [ball("man 4.5 7 7")]) == ["human man", "own man", "quadruped man"]
+    assert asked(monkeypatch, [ball("ape 7 7 3"), ball("kong 7 7 3")]) == ["human ape", "own ape", "own kong"]
+
+
+def test_a_whole_shape_decides_before_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    half = ball("half 6 6 6", opened=True)
+    for shapes in ([half, ball("man 3 7 7")], [ball("man 3 7 7"), half]):
+        assert asked(monkeypatch, shapes, "yes") == ["human half", "human man", "own man"]
+    # a cloud may be of another kind
+    found = asked(monkeypatch, [cloud("rough 6 6 6"), ball("man 3 7 7")])
+    assert found == ["human man", "human rough", "own man", "own rough", "quadruped rough"]
+
+
 def test_samples_are_told_apart() -> None:
     names = "climber", "dancer", "calf", "fox"
     shapes = [validated(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape for name in names]
-    models = [as_model("human"), as_model("quadruped")]
+    models = [Installed.loaded(as_model(name)) for name in ("human", "quadruped")]
     found = kinds.read_kinds(models, shapes, [CONFIG] * 4)
     assert (found[0, :2] < 0.042).all() and found[1, 0] > 0.05
     assert found[1, 1] == np.inf  # the dancer is what the climber is: nobody else was asked

@@ -16,7 +16,7 @@ from tests.conftest import icosphere
 def readings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Read off a shape's name, in hundredths: by the human model, by the other."""
 
-    def read(models: list[Any], shapes: list[Shape], configs: Any) -> np.ndarray:
+    def read(models: list[Any], shapes: list[Shape], configs: Any, sure: float) -> np.ndarray:
         return np.array([[float(word) / 100] for word in shapes[0].name.split()[1:]])
 
     monkeypatch.setattr(chosen_models, "read_kinds", read)
