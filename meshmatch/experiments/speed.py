@@ -83,14 +83,16 @@ def cost_of(command: Sequence[str]) -> Cost:
     """Run a command to its end and read what the kernel counted.
 
     Memory is never less than what this process itself holds, for a child begins as its copy. Compiled modules are kept
-    for the next run, as they are by an installation, whatever the environment says.
+    for the next run, as they are by an installation, and memory is given back as nobody's settings say, whatever the
+    environment has.
 
     Raises
     ------
     MeshmatchError
         It did not end with status 0; the message is its last line of stderr.
     """
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    own = ("PYTHONDONTWRITEBYTECODE", "MALLOC_")
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(own)}
     with tempfile.TemporaryFile() as told:
         started = time.perf_counter()
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=told, env=environment)
