@@ -44,6 +44,11 @@ class AgreeConfig:
     back_points: int = 8000
     shared: float = 0.0
 
+    @classmethod
+    def for_model(cls, model: TrainedModel) -> AgreeConfig:
+        """As stiff as the model's card says."""
+        return cls(strain=cls.strain * model.card.stiffness)
+
     def for_noise(self, roughness: float) -> AgreeConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all samples, shared, a stiffer template."""
         return replace(
@@ -77,20 +82,11 @@ def agreed_fits(
     if any(fit.verdict == "poor" for fit in fits) or not config.moves_nodes:
         return list(fits)
     system = node_system(model)
-    if how is None:
-        how = AgreeConfig()
-        how = replace(how, strain=how.strain * model.card.stiffness)
+    how = how or AgreeConfig.for_model(model)
 
     def member(number: int) -> Member:
-        shape, fit = shapes[number], fits[number]
         known = None if landmarks is None else landmarks[number]
-        local = None if known is None else (known[0], fit.frame.apply(known[1]))
-        own = config.for_noise(shape.roughness)
-        frame, samples = take_samples(shape, own.samples, np.random.default_rng(own.seed))
-        points = fit.frame.apply(frame.undo(samples.points))
-        normals = samples.normals @ frame.rotation @ fit.frame.rotation.T
-        samples = replace(samples, points=points, normals=normals).facing(system.surface(fit.vectors))
-        return Member(samples, fit.vectors, how.for_noise(shape.roughness), local, fit.partial)
+        return member_of(system, shapes[number], fits[number], config, how, known)
 
     with ThreadPoolExecutor(threads) as pool:
         members = list(pool.map(member, range(len(fits))))
@@ -98,6 +94,19 @@ def agreed_fits(
     return [
         replace(fit, vectors=vectors, points=system.moved(vectors)) for fit, vectors in zip(fits, refined, strict=True)
     ]
+
+
+def member_of(
+    system: NodeSystem, shape: Shape, fit: Fit, config: FitConfig, how: AgreeConfig, landmarks: Landmarks | None = None
+) -> Member:
+    """What agreement needs of a repaired shape and its fit; landmarks are in the shape's file frame."""
+    local = None if landmarks is None else (landmarks[0], fit.frame.apply(landmarks[1]))
+    own = config.for_noise(shape.roughness)
+    frame, samples = take_samples(shape, own.samples, np.random.default_rng(own.seed))
+    points = fit.frame.apply(frame.undo(samples.points))
+    normals = samples.normals @ frame.rotation @ fit.frame.rotation.T
+    samples = replace(samples, points=points, normals=normals).facing(system.surface(fit.vectors))
+    return Member(samples, fit.vectors, how.for_noise(shape.roughness), local, fit.partial)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,15 +128,6 @@ def agree(
     ``nodes`` says how pairs of points are found and weighed, where a member's own configuration does not.
     """
 
-    def step(member: Member, vectors: Floats, F: Floats, common: Floats) -> Floats:
-        config = member.config
-        pairing = replace(nodes, **{name: getattr(config, name) for name in _PAIRING})
-        terms = pair_terms(system, member.samples, vectors, config.scale, pairing, member.partial)
-        if member.landmarks is not None:
-            add_landmarks(terms, member.landmarks, nodes.landmark_weight)
-        targets = nearest_rotations(F, common) @ common
-        return system.solve(*terms, config.strain / len(F), targets, nodes.damping / system.K, vectors)
-
     refined = before = [member.vectors for member in members]
     with ThreadPoolExecutor(threads) as pool:
         for _ in range(members[0].config.steps):
@@ -135,16 +135,46 @@ def agree(
             before, refined = refined, [now + each.config.momentum * (now - last) for each, now, last in paths]
             gradients = [system.deformation_gradient(vectors) for vectors in refined]
             common = [mean_stretch(gradients)] * len(members)
-            refined = list(pool.map(step, members, refined, gradients, common))
+            refined = list(
+                pool.map(lambda *each: agree_step(system, nodes, *each), members, refined, gradients, common)
+            )
     return refined
+
+
+def agree_step(
+    system: NodeSystem,
+    nodes: NodeRefineConfig,
+    member: Member,
+    vectors: Float[Floats, "K 3"],
+    F: Float[Floats, "G 3 3"],
+    common: Float[Floats, "G 3 3"],
+) -> Float[Floats, "K 3"]:
+    """One step of one fit, from node vectors with the deformation gradients F towards the common stretch."""
+    config = member.config
+    pairing = replace(nodes, **{name: getattr(config, name) for name in _PAIRING})
+    terms = pair_terms(system, member.samples, vectors, config.scale, pairing, member.partial)
+    if member.landmarks is not None:
+        add_landmarks(terms, member.landmarks, nodes.landmark_weight)
+    targets = nearest_rotations(F, common) @ common
+    return system.solve(*terms, config.strain / len(F), targets, nodes.damping / system.K, vectors)
 
 
 def mean_stretch(gradients: Sequence[Float[Floats, "G 3 3"]]) -> Float[Floats, "G 3 3"]:
     """Log-Euclidean mean of the right stretches sqrt(F^T F): exp of the mean of their logarithms."""
     total = np.zeros_like(gradients[0])
     for F in gradients:
-        squares, axes = np.linalg.eigh(F.transpose(0, 2, 1) @ F)
-        logs = 0.5 * np.log(np.maximum(squares, _MIN_STRETCH**2))
-        total += (axes * logs[:, None, :]) @ axes.transpose(0, 2, 1)
-    logs, axes = np.linalg.eigh(total / len(gradients))
-    return (axes * np.exp(logs)[:, None, :]) @ axes.transpose(0, 2, 1)
+        total += log_stretch(F)
+    return stretch_of(total / len(gradients))
+
+
+def log_stretch(F: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+    """Logarithm of the right stretch sqrt(F^T F)."""
+    squares, axes = np.linalg.eigh(F.transpose(0, 2, 1) @ F)
+    logs = 0.5 * np.log(np.maximum(squares, _MIN_STRETCH**2))
+    return np.asarray((axes * logs[:, None, :]) @ axes.transpose(0, 2, 1))
+
+
+def stretch_of(logarithm: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+    """The stretch of a logarithm."""
+    logs, axes = np.linalg.eigh(logarithm)
+    return np.asarray((axes * np.exp(logs)[:, None, :]) @ axes.transpose(0, 2, 1))
