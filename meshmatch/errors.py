@@ -7,12 +7,17 @@ its traceback.
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+LONGEST = 300
+"""Letters of a message or a hint; of a longer one the middle is left out."""
+_UNSEEN = dict.fromkeys((*range(32), *range(127, 160), 0x2028, 0x2029, *range(0x202A, 0x202F), *range(0x2066, 0x206A)))
+_SHOWN = {code: "\ufffd" for code in _UNSEEN if chr(code) not in "\t\n"}
+
 
 class MeshmatchError(Exception):
     """Something that the user can put right: what is wrong, and a hint what to do (may be empty), in one line each."""
 
     def __init__(self, message: str, hint: str = "") -> None:
-        self.message, self.hint = (" ".join(str(text).split()) for text in (message, hint))
+        self.message, self.hint = (_line(text) for text in (message, hint))
         super().__init__(self.message)
 
     def __reduce__(self) -> tuple[type["MeshmatchError"], tuple[str, str]]:
@@ -41,6 +46,18 @@ class OutputError(MeshmatchError):
 
 class PoorFit(MeshmatchError):
     """A fit was judged poor, and the caller asked for this to be an error."""
+
+
+def visible(text: str) -> str:
+    """Text that cannot command a terminal: control characters and those that turn the order of letters round become
+    U+FFFD; tabs and new lines stay.
+    """
+    return text.translate(_SHOWN)
+
+
+def _line(text: str) -> str:
+    line = visible(" ".join(str(text).split()))
+    return line if len(line) <= LONGEST else f"{line[: LONGEST - 103]}...{line[-100:]}"
 
 
 @contextmanager

@@ -1,29 +1,32 @@
 """The only place where an error becomes words and an exit status.
 
-0 done, 1 the user's data or choice, 2 usage, 130 interrupted, 143 killed by SIGTERM. Anything that is not a
-`MeshmatchError` is a bug and keeps its traceback; with MESHMATCH_DEBUG=1 so does everything else.
+0 done, 1 the user's data or choice (or too little memory for it), 2 usage, 130 interrupted, 143 killed by SIGTERM, 129 by
+SIGHUP. Anything that is not a `MeshmatchError` is a bug and keeps its traceback; with MESHMATCH_DEBUG=1 so does
+everything else.
 """
 
+import errno
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
-from meshmatch.cli.words import Console
+from meshmatch.cli.words import Console, stdout_refused
 from meshmatch.errors import MeshmatchError
 
 DEBUG_VARIABLE = "MESHMATCH_DEBUG"
-INTERRUPTED, KILLED = 130, 143
+INTERRUPTED = 130
+_SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _TWICE = 1.0  # seconds within which a second signal is the same one: `timeout` sends two
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line, by default the words after the process's name, and return its exit status."""
     debug = os.environ.get(DEBUG_VARIABLE, "") not in ("", "0")
-    with _kill_as_interrupt() as killed:
+    with _kills_as_interrupts() as killed:
         try:
             status = _run(arguments)
         except (KeyboardInterrupt, Exception) as error:
@@ -34,19 +37,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
             elif isinstance(error, MeshmatchError):
                 Console().trouble("error", error.message, error.hint)
                 return 1
+            elif _no_memory(error):
+                Console().trouble("error", "there is not enough memory for this", "take smaller shapes, or free some")
+                return 1
             else:
                 raise
     if killed() and status:
-        status = KILLED
-    if status in (INTERRUPTED, KILLED):
-        Console().trouble("interrupted" if status == INTERRUPTED else "killed", "no file is half-written")
+        status = 128 + killed()
+    if status == INTERRUPTED or (killed() and status):
+        with suppress(OSError):  # of a hang-up: the terminal may be gone
+            Console().trouble("interrupted" if status == INTERRUPTED else "killed", "no file is half-written")
     return status
 
 
+def _no_memory(error: BaseException) -> bool:
+    """Whether it says that there is no memory: torch has words for that, but no class."""
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "can't allocate memory" in str(error))
+
+
 @contextmanager
-def _kill_as_interrupt() -> Iterator[Callable[[], bool]]:
-    """Inside, SIGTERM ends the program as Ctrl-C does (unless it has another handler); gives whether it came."""
+def _kills_as_interrupts() -> Iterator[Callable[[], int]]:
+    """Inside, SIGTERM and SIGHUP end the program as Ctrl-C does (unless they have another handler); gives which came
+    first, 0 if none did.
+    """
     came: list[float] = []
+    first: list[int] = []
     owner = os.getpid()
 
     def stop(number: int, frame: Any) -> None:
@@ -56,18 +71,19 @@ def _kill_as_interrupt() -> Iterator[Callable[[], bool]]:
             return
         again = bool(came) and time.monotonic() - came[0] < _TWICE
         came.append(time.monotonic())
+        first.append(number)
         if not again:
             raise KeyboardInterrupt
 
     ours = threading.current_thread() is threading.main_thread()
-    if not ours or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield lambda: False
-        return
-    signal.signal(signal.SIGTERM, stop)
+    borrowed = [number for number in _SIGNALS if ours and signal.getsignal(number) is signal.SIG_DFL]
+    for number in borrowed:
+        signal.signal(number, stop)
     try:
-        yield lambda: bool(came)
+        yield lambda: first[0] if first else 0
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number in borrowed:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _run(arguments: Sequence[str] | None) -> int:
@@ -80,6 +96,10 @@ def _run(arguments: Sequence[str] | None) -> int:
     try:
         # not app(...): that would replace sys.excepthook, and a bug keeps Python's own traceback
         get_command(app)(args=arguments, prog_name="meshmatch")
+    except OSError as error:
+        if error.errno != errno.ENOSPC or error.filename is not None:
+            raise
+        raise stdout_refused(error) from error  # of --help and --version, which typer writes
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     return 0

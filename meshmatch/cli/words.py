@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import meshmatch
-from meshmatch.errors import OutputError, PoorFit
+from meshmatch.errors import OutputError, PoorFit, visible
 from meshmatch.outputs import plain_text
 from meshmatch.progress import ProgressCallback
 
@@ -69,7 +69,7 @@ class Console:
 
             def report(stage: str, name: str, share: float) -> None:
                 if name not in rows:
-                    rows[name] = bars.add_task(name, total=1.0, what=stage)
+                    rows[name] = bars.add_task(visible(name), total=1.0, what=stage)
                 bars.update(rows[name], completed=share, what=stage)
 
             self._open.append((console, report))
@@ -99,7 +99,9 @@ class Console:
         color = {"error": "bold red", "warning": "bold yellow", "hint": "dim"}.get(label, "bold")
         words = Text(f"{label}: ", style=color) if label else Text()
         console = self._open[0][0] if self._open else _terminal()  # above the bars
-        console.print(words.append(plain_text(text), style="default"), soft_wrap=True, highlight=False)
+        console.print(
+            words.append(visible(plain_text(text)).replace("\n", " "), style="default"), soft_wrap=True, highlight=False
+        )
 
 
 def _terminal() -> rich.console.Console:
@@ -113,13 +115,17 @@ def print_json(record: Json) -> None:
     line = json.dumps(record, ensure_ascii=False, default=str)
     try:
         line.encode(_coding())
+        plain = visible(line) == line
     except UnicodeEncodeError:  # a terminal without these letters, or a file's name that is not UTF-8
+        plain = False
+    if not plain:
         line = json.dumps(record, default=str)
     print_text(line + "\n")
 
 
 def print_rows(rows: Sequence[Sequence[str]]) -> None:
     """Text on stdout, one row a line, columns flush."""
+    rows = [[cell.replace("\n", " ") for cell in row] for row in rows]
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
     print_text("".join(line.rstrip() + "\n" for line in lines))
@@ -127,7 +133,7 @@ def print_rows(rows: Sequence[Sequence[str]]) -> None:
 
 def print_text(text: str) -> None:
     """Text on stdout, letters that it cannot show as their numbers; `OutputError` if it is closed, or its disk full."""
-    coding = _coding()
+    coding, text = _coding(), visible(text)
     try:
         if sys.stdout is None:
             raise OSError(9, "it is closed")
@@ -136,14 +142,17 @@ def print_text(text: str) -> None:
     except BrokenPipeError:
         raise  # whoever read it has read enough
     except OSError as error:
-        _drop_output()
-        raise OutputError(f"cannot write to stdout: {error.strerror}", "is the disk full?") from error
+        raise stdout_refused(error) from error
 
 
-def _drop_output() -> None:
-    """Let what is still buffered go nowhere: the interpreter would try again at its end, and say so in its own way."""
+def stdout_refused(error: OSError) -> OutputError:
+    """The error for a stdout that takes nothing more.
+
+    What is still buffered goes nowhere: the interpreter would try again at its end, and say so in its own way.
+    """
     with suppress(AttributeError, OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return OutputError(f"cannot write to stdout: {error.strerror}", "is the disk full?")
 
 
 def _coding() -> str:

@@ -121,7 +121,8 @@ sys.exit(main(["info", "a.ply"]))
 """
 
 
-def test_a_kill_leaves_no_file_behind_and_is_143(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_kill_leaves_no_file_behind_and_has_its_status(tmp_path: Path, number: signal.Signals) -> None:
     outside = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         [sys.executable, "-c", WRITING],
@@ -132,9 +133,9 @@ def test_a_kill_leaves_no_file_behind_and_is_143(tmp_path: Path) -> None:
         assert process.stdout.readline() == "writing\n"
         (half,) = tmp_path.iterdir()
         assert half.name.startswith(".out.")
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(number)
         words = process.communicate()[1]
-    assert (process.returncode, words) == (143, "killed: no file is half-written\n")
+    assert (process.returncode, words) == (128 + number, "killed: no file is half-written\n")
     assert [path.name for path in tmp_path.iterdir()] == ["cleaned"]
 
 
@@ -190,6 +191,22 @@ def test_the_signal_is_only_borrowed(run: Run, monkeypatch: pytest.MonkeyPatch) 
         signal.signal(signal.SIGTERM, before)
     assert inside[0] is not signal.SIG_DFL
     assert inside[1:] == [own, signal.SIG_IGN]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("[enforce] DefaultCPUAllocator: can't allocate memory")])
+def test_too_little_memory_is_told_in_words(run: Run, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    fail(error, monkeypatch)
+    answer = run("info", "a.ply")
+    assert (answer.status, answer.out) == (1, "")
+    assert answer.err.splitlines()[0] == "error: there is not enough memory for this"
+
+
+def test_a_reader_that_had_enough_is_no_error(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "meshmatch", "models", "show", "human"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
 
 
 def test_a_bug_keeps_its_traceback(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,8 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import OutputError
+from meshmatch.maps.files import save_map
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import folder_on_success, replace_on_success
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -107,7 +109,9 @@ def test_inputs_that_are_no_files(run: Run, tmp_path: Path, name: str, told: str
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
-@pytest.mark.parametrize("words", [["info", "a.ply"], ["info", "a.ply", "--json"], ["models", "show", "human"]])
+@pytest.mark.parametrize(
+    "words", [["info", "a.ply"], ["info", "a.ply", "--json"], ["models", "show", "human"], ["--help"], ["--version"]]
+)
 def test_a_full_disk_behind_stdout_is_told(tmp_path: Path, cube: Shape, words: list[str]) -> None:
     save_shape(tmp_path / "a.ply", cube)
     with open("/dev/full", "w") as full:
@@ -147,3 +151,22 @@ def test_an_mtl_whose_images_have_names_in_latin_1(tmp_path: Path) -> None:
     )
     found = load_appearance(tmp_path / "a.obj", load_shape(tmp_path / "a.obj"))
     assert found.textured
+
+
+def test_what_a_file_says_commands_no_terminal(run: Run, tmp_path: Path, cube: Shape) -> None:
+    """Its title would change, its text turn red; a new line would pass for a message of ours."""
+    bad = "\x1b]0;pwned\x07\x9b31m\nerror: me"
+    found = VertexMap("a" + bad, "b", np.arange(8), verdict="poor", reasons=(bad,))
+    save_map(tmp_path / "m.npz", found)
+    (tmp_path / "a.obj").write_text(f"mtllib {bad.partition(chr(10))[0]}x.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    answers = [
+        run("info", tmp_path / "m.npz"),
+        run("info", tmp_path / "m.npz", "--json"),
+        run("picture", tmp_path / "a.obj", "-o", tmp_path / "p.png"),
+    ]
+    for answer in answers:
+        lines = (answer.out + answer.err).splitlines()
+        assert not any(ord(letter) < 32 or 126 < ord(letter) < 160 for line in lines for letter in line)
+        assert not any(line.startswith("error: me") for line in lines)
+    assert [answer.status for answer in answers] == [0, 0, 1]
+    assert json.loads(answers[1].out)["reasons"] == [bad]
