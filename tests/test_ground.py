@@ -3,6 +3,7 @@
 import errno
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import threading
@@ -14,6 +15,7 @@ import pytest
 import meshmatch
 from meshmatch import errors
 from meshmatch.errors import InputError, MeshmatchError, OutputError
+from meshmatch.locks import locked
 from meshmatch.outputs import folder_on_success, replace_on_success
 from meshmatch.threads import beside, one_of, set_threads, thread_limit
 
@@ -22,6 +24,12 @@ def test_error_has_a_line_and_a_hint() -> None:
     error = InputError("cannot\n read  it", "try\nagain")
     assert (error.message, error.hint, str(error)) == ("cannot read it", "try again", "cannot read it")
     assert InputError("x").hint == ""
+
+
+def test_a_message_is_short_and_commands_no_terminal() -> None:
+    error = InputError("\x1b]0;pwned\x07\x9b31m a\u202eb " + "x" * 5000 + " end", "y" * 301)
+    assert len(error.message) == len(error.hint) == 300
+    assert error.message.startswith("\ufffd]0;pwned\ufffd\ufffd31m a\ufffdb xxx") and error.message.endswith("x end")
 
 
 def test_every_error_is_one_family() -> None:
@@ -169,6 +177,38 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "full" / "mine.txt").read_text() == "mine"
     assert (tmp_path / "late" / "theirs.txt").read_text() == "came in between"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "full", "late"]
+
+
+# Holds the lock of a file, as does a process that it forked, and waits.
+HOLDING = """
+import os, sys, time
+from pathlib import Path
+from meshmatch.locks import locked
+with locked(Path(sys.argv[1]), "busy", ""):
+    child = os.fork()
+    if child:
+        print(child, flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_a_lock_ends_with_its_owner(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    with subprocess.Popen([sys.executable, "-c", HOLDING, path], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        child = int(process.stdout.readline())
+        try:
+            with pytest.raises(OutputError, match="busy"), locked(path, "busy", "", wait=0.1):
+                pytest.fail("two hold one lock")
+            process.kill()
+            process.wait()
+            with locked(path, "busy", "", wait=5.0):
+                os.kill(child, 0)  # the forked one is still there
+        finally:
+            os.kill(child, signal.SIGKILL)
+    with pytest.raises(OutputError, match="cannot write"), locked(tmp_path / "no" / "lock", "busy", ""):
+        pytest.fail("there is no such folder")
 
 
 def counts() -> dict[str, int]:

@@ -20,10 +20,10 @@ from meshmatch.models.card import check_name
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.implicit_card import IMPLICIT, ImplicitCard, write_implicit_card
 from meshmatch.models.registry import WEIGHTS
-from meshmatch.outputs import make_folder
 from meshmatch.shapes.sampling import farthest_points
+from meshmatch.training.alone import CHECKPOINT, alone
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
-from meshmatch.training.train import CHECKPOINT, CardFacts
+from meshmatch.training.train import CardFacts
 
 _POINTS = 512  # of a shape in a step
 TRAINING = TrainConfig(
@@ -60,6 +60,7 @@ def build_implicit(samples: ImplicitSamples, config: ImplicitConfig, seed: int) 
     return ImplicitNetwork(config, len(samples.names), torch.from_numpy(np.concatenate([near, far])).float(), radii)
 
 
+@alone
 def train_implicit(
     output: str | Path,
     shapes: str | Path | ImplicitSamples,
@@ -77,14 +78,13 @@ def train_implicit(
     control nodes. Returns the folder ``output``, with ``weights.safetensors`` and last ``implicit.json``.
 
     `InputError` for shapes that cannot be learned from; `OptionError` for a training in bfloat16; `ModelError` for a
-    checkpoint of another training; `OutputError` if the folder cannot be written.
+    checkpoint of another training; `OutputError` if the folder cannot be written, or another training writes to it.
     """
     output, checkpoint = Path(output), Path(output) / CHECKPOINT
     facts, config = facts or CardFacts(), config or ImplicitConfig()
     name = check_name(facts.name or output.resolve().name)
     if training.bf16:
         raise OptionError("implicit models are not trained in bfloat16", "leave out --bf16")
-    make_folder(checkpoint.parent)
     data, folder = "samples", "shapes"
     if not isinstance(shapes, ImplicitSamples):
         folder = Path(shapes).resolve().name

@@ -19,6 +19,7 @@ from meshmatch.errors import MeshmatchError, ModelError, OutputError
 from meshmatch.models.card import ModelCard, check_name, read_card
 from meshmatch.models.implicit_card import IMPLICIT, ImplicitCard, is_implicit, read_implicit_card
 from meshmatch.models.tensor_file import read_header
+from meshmatch.models.unfinished import changing, copy_for, needs_settling, put, settle
 from meshmatch.outputs import as_path
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ CARD, WEIGHTS, TEMPLATE = "card.json", "weights.safetensors", "template.safetens
 HOME_VARIABLE = "MESHMATCH_HOME"
 AUTO = "auto"
 """In place of a model's name: the shapes decide which of the installed models fits them."""
-_REPLACED = ".replaced"  # the end of the hidden name of a model that is being replaced
+_ELSEWHERE = f"try again, or set {HOME_VARIABLE} to a folder of yours"
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,8 @@ def user_folder() -> Path:
 
 def list_models() -> tuple[Entry, ...]:
     """All models, built-in ones first, by name; damaged ones too, with their problem."""
-    _restore_interrupted()
+    if needs_settling(user_folder()):
+        settle(user_folder())
     found: dict[str, Entry] = {}
     for parent, built_in in ((built_in_folder(), True), (user_folder(), False)):
         for folder in sorted(parent.glob("[!.]*/")):  # a hidden folder is a copy in the making
@@ -188,34 +190,22 @@ def add_model(folder: str | Path, *, replace: bool = False) -> Entry:
         read_header(source / file)  # before a huge file is copied
     if (built_in_folder() / card.name).exists():
         raise ModelError(f"a built-in model is called {card.name}", "change the name on its card")
-    _restore_interrupted()
-    target = user_folder() / card.name
-    hint = f"`meshmatch models remove {card.name}`, or --replace"
-    taken = ModelError(f"there is a model called {card.name} already", hint)
-    if target.exists() and not replace:
-        raise taken
-    temporary = user_folder() / f".{card.name}.{os.urandom(4).hex()}"
-    replaced = user_folder() / f".{card.name}{_REPLACED}"
-    try:
-        temporary.mkdir(parents=True)
-        for file in (*large, last):
-            shutil.copyfile(source / file, temporary / file)
-        if verify_model(temporary) != card:
-            raise ModelError(f"{source} changed while it was copied", "try again")
-        if replace and target.exists():
-            os.rename(target, replaced)  # if this is the end, `_restore_interrupted` takes it back
+    target, temporary = user_folder() / card.name, copy_for(user_folder(), card.name)
+    with changing(user_folder(), _ELSEWHERE):
+        if target.exists() and not replace:
+            hint = f"`meshmatch models remove {card.name}`, or --replace"
+            raise ModelError(f"there is a model called {card.name} already", hint)
         try:
-            os.rename(temporary, target)
+            temporary.mkdir()
+            for file in (*large, last):
+                shutil.copyfile(source / file, temporary / file)
+            if verify_model(temporary) != card:
+                raise ModelError(f"{source} changed while it was copied", "try again")
+            put(temporary, target)
         except OSError as error:
-            if target.exists():
-                raise taken from error  # another process was faster
-            raise
-    except OSError as error:
-        hint = f"set {HOME_VARIABLE} to a folder of yours"
-        raise OutputError(f"cannot write {user_folder()}: {error.strerror}", hint) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        _restore_interrupted()
+            raise OutputError(f"cannot write {user_folder()}: {error.strerror}", _ELSEWHERE) from error
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
     return _entry(target, False)
 
 
@@ -228,24 +218,26 @@ def remove_model(name: str) -> None:
         raise ModelError(f"{name} is a built-in model and cannot be removed")
     with suppress(OSError):  # of no use to anybody, and replaced if it stays
         shared_file(name).unlink(missing_ok=True)
-    try:
-        if folder.is_symlink():
-            folder.unlink()
-            return
-        grave = folder.with_name(f".{name}.{os.urandom(4).hex()}")
-        os.rename(folder, grave)  # it loses its name at once, so that a half-removed model is never found
-        shutil.rmtree(grave)
-    except OSError as error:
-        raise OutputError(f"cannot remove {folder}: {error.strerror}") from error
+    with changing(user_folder(), _ELSEWHERE):
+        try:
+            if folder.is_symlink():
+                folder.unlink()
+                return
+            grave = copy_for(user_folder(), name)
+            os.rename(folder, grave)  # it loses its name at once, so that a half-removed model is never found
+            shutil.rmtree(grave)
+        except OSError as error:
+            raise OutputError(f"cannot remove {folder}: {error.strerror}") from error
 
 
 def _registered(name: str) -> Path:
     """The folder of a registered model; `ModelError` if there is none."""
     check_name(name)
-    _restore_interrupted()
-    for parent in (built_in_folder(), user_folder()):
-        if (parent / name).is_dir():
-            return parent / name
+    for act in (lambda: None, lambda: settle(user_folder())):
+        act()
+        for parent in (built_in_folder(), user_folder()):
+            if (parent / name).is_dir():
+                return parent / name
     names = [entry.name for entry in list_models()]
     near = get_close_matches(name, names, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {', '.join(names) or 'none'}"
@@ -254,19 +246,6 @@ def _registered(name: str) -> Path:
 
 def _is_registered(folder: Path) -> bool:
     return folder.parent in (built_in_folder(), user_folder()) and not folder.name.startswith(".")
-
-
-def _restore_interrupted() -> None:
-    """Give a model that was being replaced its name back if nothing took its place; else remove it."""
-    for replaced in user_folder().glob(f".*{_REPLACED}"):
-        target = replaced.with_name(replaced.name[1 : -len(_REPLACED)])
-        try:
-            if target.exists():
-                replaced.unlink() if replaced.is_symlink() else shutil.rmtree(replaced)
-            else:
-                os.rename(replaced, target)
-        except OSError:
-            pass  # another process was faster, or the folder is not ours to write
 
 
 def _refuse_implicit(folder: Path) -> None:

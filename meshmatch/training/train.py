@@ -36,6 +36,8 @@ from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import Template, save_template, template_radius
 from meshmatch.training.aligner import train_aligner
+from meshmatch.training.alone import CHECKPOINT as CHECKPOINT
+from meshmatch.training.alone import alone
 from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattice
 from meshmatch.training.lessons import kind_named, lessons
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
@@ -43,7 +45,6 @@ from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
 from meshmatch.training.recipes import Recipe, recipe_for
 from meshmatch.training.scans import ScanConfig
 
-CHECKPOINT = Path("checkpoint", "last.safetensors")  # in the model folder
 VALIDATION_SEED = 999_983
 """Of the batch that no training sees and every training is measured on."""
 
@@ -66,6 +67,7 @@ class CardFacts:
     frame: dict[str, str] | None = None  # as the training's shapes and network say
 
 
+@alone
 def train(
     output: str | Path,
     *,
@@ -88,7 +90,7 @@ def train(
 
     `InputError` if the folder is not prepared or has too few shapes; `OptionError` for choices that do not go together, or
     if the extra ``train`` is not installed; `ModelError` for a name that cannot be one, or a checkpoint of another
-    training; `OutputError` if the folder cannot be written.
+    training; `OutputError` if the folder cannot be written, or another training writes to it.
     """
     output = Path(output)
     facts = facts or CardFacts()

@@ -4,12 +4,13 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
 from meshmatch.errors import ModelError, OutputError
-from meshmatch.models import registry
+from meshmatch.models import registry, unfinished
 from meshmatch.models.card import card_to_json, write_card
 from meshmatch.models.registry import (
     add_model,
@@ -252,11 +253,11 @@ def test_a_killed_replacement_gives_the_old_model_back(blob: Path, monkeypatch: 
     def killed(source: Path, target: Path) -> None:
         rename(source, target)
         if str(target).endswith(".replaced"):
-            monkeypatch.setattr(registry, "_restore_interrupted", lambda: None)  # no time left
+            monkeypatch.setattr(unfinished, "_give_back", lambda folder: None)  # no time left
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(registry.os, "rename", killed)
+        patch.setattr(unfinished.os, "rename", killed)
         with pytest.raises(KeyboardInterrupt):
             add_model(blob, replace=True)
     assert names() == ["human"]
@@ -268,18 +269,36 @@ def test_a_killed_replacement_gives_the_old_model_back(blob: Path, monkeypatch: 
     assert os.listdir(user_folder()) == ["blob"]
 
 
-def test_the_slower_of_two_that_add_one_name_is_refused(blob: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    copy, first = registry.shutil.copyfile, []
+@pytest.mark.parametrize("replace", [False, True])
+def test_of_two_that_add_one_name_the_later_waits(blob: Path, monkeypatch: pytest.MonkeyPatch, replace: bool) -> None:
+    """Locks are of open files: a thread meets them as another process does."""
+    copy, told, threads = registry.shutil.copyfile, [], []
+
+    def other() -> None:
+        try:
+            told.append(add_model(blob, replace=replace).name)
+        except ModelError as error:
+            told.append(error.message)
 
     def other_in_between(source: Path, target: Path) -> None:
         copy(source, target)
-        if not first:
-            first.append(source)
-            add_model(blob)
+        if not threads:
+            threads.append(threading.Thread(target=other))
+            threads[0].start()
+            threads[0].join(0.2)  # it would be done if nothing held it
 
     monkeypatch.setattr(registry.shutil, "copyfile", other_in_between)
-    with pytest.raises(ModelError, match="there is a model called blob already"):
-        add_model(blob)
+    add_model(blob, replace=replace)
+    threads[0].join()
+    assert told == ["blob" if replace else "there is a model called blob already"]
+    assert os.listdir(user_folder()) == ["blob"]
+    assert verify_model("blob").name == "blob"
+
+
+def test_what_killed_ones_left_is_swept_up(blob: Path) -> None:
+    for left in (".blob.0123abcd", ".other.89abcdef"):
+        write_model(user_folder() / left)
+    add_model(blob)
     assert os.listdir(user_folder()) == ["blob"]
 
 

@@ -15,6 +15,8 @@ from meshmatch.fitting.fitter import Fitter
 from meshmatch.generators import bodies
 from meshmatch.generators import rig as rigs
 from meshmatch.generators.generator import Source
+from meshmatch.implicit.training import train_implicit
+from meshmatch.locks import locked
 from meshmatch.models.registry import load_model, verify_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import save_shape
@@ -178,6 +180,15 @@ def test_an_output_that_cannot_be_made_is_told(prepared: Path, tmp_path: Path) -
     (tmp_path / "taken").write_text("a file")
     with pytest.raises(OutputError, match="cannot make the folder"):
         trained(prepared, tmp_path / "taken")
+
+
+def test_a_second_training_in_a_folder_is_refused(prepared: Path, tmp_path: Path) -> None:
+    (tmp_path / "m" / "checkpoint").mkdir(parents=True)
+    with locked(tmp_path / "m" / "checkpoint" / "lock", "", ""):
+        with pytest.raises(OutputError, match="another training writes to"):
+            train(tmp_path / "m", shapes=prepared)
+        with pytest.raises(OutputError, match="another training writes to"):
+            train_implicit(tmp_path / "m", prepared)
 
 
 def test_bodies_do_not_go_with_a_folder(prepared: Path, tmp_path: Path) -> None:
