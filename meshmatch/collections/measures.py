@@ -21,13 +21,13 @@ from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import MappedMesh
 
-COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
+COUNTS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 """Numbers of modes that are measured, as far as there are so many, and the largest that can be."""
 FOLDS = 100
 """Of more shapes than these, several are left out at a time."""
-_POINTS = 600  # of a surface whose distance to the other one is measured
+_POINTS = 300  # of a surface whose distance to the other one is measured
 _LONGER = 0.6  # of the time, for generalisation
-_NEAREST = 3  # shapes of the collection, by their points, to which a random shape's distance is measured
+_NEAREST = 2  # shapes of the collection, by their points, to which a random shape's distance is measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def measure_atlas(
     ``surfaces`` are the shapes themselves, each in the frame of its points, if they are to be compared with these rather
     than with the registered template. Shapes are left out one at a time, of large collections in `FOLDS` parts, the mean
     and the modes are made of the others, and the shape is laid over that mean. ``samples`` random shapes have normal
-    scores. Between surfaces a random shape is compared with the three nearest by points.
+    scores. Between surfaces a random shape is compared with the two nearest by points.
 
     `InputError` where the shapes are not those of the atlas, or fewer than four: a model of what is left needs three.
     """
@@ -110,6 +110,15 @@ def measure_atlas(
     )  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class _Real:
+    """A shape's surface, some points on it, and the share of the surface around each."""
+
+    surface: MappedMesh
+    points: Float[Floats, "N 3"]
+    share: Float[Floats, " N"]
+
+
 class _Collection:
     """An atlas, with the shapes that it was made of."""
 
@@ -130,11 +139,11 @@ class _Collection:
         laid = Superimposed(atlas.mean + sums[0], atlas.weights, atlas.laid.size)
         apart = np.empty((2, len(out), len(counts)))
         for number, row in enumerate(out.tolist()):
-            known, real = self._laid(row, laid)
+            known, real = self._laid(row, laid), self._real(row, laid)
             scores = np.einsum("mvi,v,vi->m", sums[1:], atlas.weights, known - laid.consensus, optimize=True)
             for column, count in enumerate(counts.tolist()):
                 made = laid.consensus + np.tensordot(scores[:count], sums[1 : 1 + count], 1)
-                apart[:, number, column] = self._apart(made, known), self._between_surfaces(made, known, real)
+                apart[:, number, column] = self._apart(made, known), self._between_surfaces(made, real)
         return apart
 
     def specificity(self, draw: Float[Floats, " M"], counts: Int[Ints, " K"]) -> Float[Floats, "2 K"]:
@@ -147,29 +156,34 @@ class _Collection:
             # Squared distances over the surface: along these modes, and across.
             along = np.square(own[:, :count] - draw[:count] * atlas.deviations[:count]).sum(axis=1)
             squared = along + np.diag(self._products) - np.square(own[:, :count]).sum(axis=1)
-            near = [self._laid(row, atlas.laid) for row in np.argsort(squared)[:_NEAREST].tolist()]
-            apart[0, column] = min(self._apart(made, known) for known, _ in near)
-            apart[1, column] = min(self._between_surfaces(made, known, real) for known, real in near)
+            near = np.argsort(squared)[: 2 * _NEAREST].tolist()
+            own_points = [self._apart(made, self._laid(row, atlas.laid)) for row in near]
+            apart[0, column] = min(own_points)
+            best = [near[k] for k in np.argsort(own_points)[:_NEAREST]]
+            apart[1, column] = min(self._between_surfaces(made, self._real(row, atlas.laid)) for row in best)
         return apart
 
-    def _laid(self, row: int, laid: Superimposed) -> tuple[Floats, Shape]:
-        """The points of a shape laid over the others, and its surface."""
-        points = np.asarray(self._shapes[row], np.float64)[None]
-        poses = laid.poses(points)
-        known = poses.apply(points)[0]
+    def _laid(self, row: int, laid: Superimposed) -> Floats:
+        """The points of a shape laid over the others."""
+        return laid.align(np.asarray(self._shapes[row], np.float64)[None])[0]
+
+    def _real(self, row: int, laid: Superimposed) -> _Real:
+        """The surface of a shape laid over the others."""
         if self._surfaces is None:
-            return known, Shape(known, self._atlas.faces)
-        return known, Shape(poses.apply(self._surfaces[row].verts[None])[0], self._surfaces[row].faces)
+            known = self._laid(row, laid)
+            return _Real(MappedMesh.of(Shape(known, self._atlas.faces)), known[self._rows], self._share)
+        poses = laid.poses(np.asarray(self._shapes[row], np.float64)[None])
+        own = self._surfaces[row]
+        shape = Shape(poses.apply(own.verts[None])[0], own.faces)
+        rows = np.linspace(0, shape.V - 1, min(shape.V, _POINTS)).astype(np.int64)
+        share = shape.vertex_areas[rows] / shape.vertex_areas[rows].sum()
+        return _Real(MappedMesh.of(shape), shape.verts[rows], share)
 
     def _apart(self, made: Floats, known: Floats) -> float:
         return float(self._atlas.weights @ np.linalg.norm(made - known, axis=1))
 
-    def _between_surfaces(self, made: Floats, known: Floats, real: Shape) -> float:
+    def _between_surfaces(self, made: Floats, real: _Real) -> float:
         """Mean distance of some points of each from the other's surface, the mean of both ways."""
-        there = MappedMesh.of(real).query(made[self._rows]).distance @ self._share
-        points, share = known[self._rows], self._share
-        if self._surfaces is not None:
-            rows = np.linspace(0, real.V - 1, min(real.V, _POINTS)).astype(np.int64)
-            points, share = real.verts[rows], real.vertex_areas[rows] / real.vertex_areas[rows].sum()
-        back = MappedMesh.of(Shape(made, self._atlas.faces)).query(points).distance @ share
+        there = real.surface.query(made[self._rows]).distance @ self._share
+        back = MappedMesh.of(Shape(made, self._atlas.faces)).query(real.points).distance @ real.share
         return float(there + back) / 2

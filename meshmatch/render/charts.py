@@ -95,6 +95,46 @@ def draw_lines(
         figure.legend(loc="outside upper left", ncols=max(1, min(len(lines), 88 // (6 + max(map(len, lines))))))
 
 
+def draw_beside(
+    charts: Mapping[str, tuple[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]]],
+    path: str | Path,
+    xlabel: str,
+) -> None:
+    """Draw charts side by side, each with a title, the words at its vertical axis, and lines by name: places, and values of
+    0 or more there.
+    """
+    with saved(path, 3.4 * len(charts), 3.2) as figure:
+        from matplotlib.ticker import MaxNLocator
+
+        row = figure.subplots(1, len(charts), squeeze=False)[0]
+        for axes, (title, (ylabel, lines)) in zip(row, charts.items(), strict=True):
+            for number, (name, (x, y)) in enumerate(lines.items()):
+                axes.plot(x, y, marker="o", clip_on=False, label=short(name, 30), **pen(number))
+            axes.set(xlabel=short(xlabel), ylabel=short(ylabel), title=short(title, 40))
+            axes.set_ylim(bottom=0)
+            axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+            if len(lines) > 1:
+                axes.legend(loc="best")
+
+
+def draw_histogram(
+    path: str | Path, values: Sequence[float], xlabel: str, ylabel: str, marks: Mapping[float, str]
+) -> None:
+    """Draw how often numbers of 0 or more occur, with a stroke for each. ``marks`` are numbers with a name."""
+    with saved(path, 6.4, 3.2) as figure:
+        from matplotlib.ticker import MaxNLocator
+
+        axes = figure.subplots()
+        axes.hist(values, bins="auto", range=(0, max(values)), color=COLORS[0], alpha=0.75, edgecolor="white")
+        axes.plot(values, [0] * len(values), "|", color=COLORS[-1], markersize=9, alpha=0.5, clip_on=False)
+        for place, name in marks.items():
+            at: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+            axes.annotate(short(name, 30), (place, 1), (0, 2), ha="right", color=_GREY, **at)
+            axes.axvline(place, color=_GREY, linewidth=0.9, zorder=1)
+        axes.set(xlabel=short(xlabel), ylabel=short(ylabel), xlim=(0, None))
+        axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
+
+
 def draw_losses(
     path: str | Path, steps: Sequence[int], terms: Mapping[str, Sequence[float]], validation: Mapping[int, float]
 ) -> None:

@@ -42,7 +42,8 @@ class Panel:
 
     ``points`` (K, 3) are drawn as balls on top, in the shape's own frame: nodes, landmarks; with ``point_colors`` (K, 3)
     and ``point_radius`` in the unit of the shape. ``rotation`` (3, 3) leads into a frame with y up and z to the front, as
-    `Frame.rotation` of a fit; it overrides the axes of the picture.
+    `Frame.rotation` of a fit; it overrides the axes of the picture. ``unit`` is the length, in the unit of the shape, that
+    is drawn as 1: the same for all panels, sizes can be compared. By default the root of the shape's own area.
     """
 
     shape: Shape
@@ -57,6 +58,7 @@ class Panel:
     rotation: ArrayLike | None = None
     glass: bool = False
     over: Shape | None = None
+    unit: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +97,7 @@ def build_figure(panel: Panel, up: str | None, front: str | None, turn: float, t
     # A flat scrap or a lone point has no area to speak of; outliers far away would shrink everything else.
     if not 0.2 * longest < scale < 2 * longest:
         scale = longest if longest > 0 else 1.0
+    scale = panel.unit or scale
     foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
     camera = rotation_about_x(tilt)
 

@@ -9,7 +9,7 @@ from PIL import Image
 from meshmatch.errors import OptionError, OutputError
 from meshmatch.maps.evaluate import Errors
 from meshmatch.render import charts
-from meshmatch.render.charts import draw_curves, draw_lines, draw_losses
+from meshmatch.render.charts import draw_beside, draw_curves, draw_histogram, draw_lines, draw_losses
 from tests.render.spots import middle, spots
 
 STEPS = list(range(50, 2050, 50))
@@ -99,3 +99,30 @@ def test_a_file_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.Monke
         draw_lines(LINE, tmp_path / "a.png", "steps", "cm", {})
     assert told.value.hint == "pip install 'meshmatch[plots]'"
     assert not list(tmp_path.iterdir())
+
+
+def test_charts_beside_one_another(tmp_path: Path) -> None:
+    charts = {
+        "first": ("m", {"a": ((1, 2, 4), (1, 2, 4))}),
+        "second": ("s", {"a": ((1, 4), (3, 3)), "b": ((4,), (1.5,))}),
+    }
+    draw_beside(charts, tmp_path / "a.png", "modes")
+    line = spots(tmp_path / "a.png", 0, right=0.5)
+    slope, start = np.polyfit(line[:, 0], line[:, 1], 1)
+    assert slope > 0.3
+    assert np.abs(line[:, 1] - (slope * line[:, 0] + start)).max() < 9
+    with Image.open(tmp_path / "a.png") as image:
+        middle_column = image.width / 2
+    assert middle(spots(tmp_path / "a.png", 1, right=1.0))[0] > middle_column
+    draw_beside(charts, tmp_path / "b.png", "modes")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_a_histogram_is_high_where_many_are(tmp_path: Path) -> None:
+    draw_histogram(tmp_path / "h.png", [1.0] * 2 + [4.0] * 6, "mm", "shapes", {4.0: "far"})
+    with Image.open(tmp_path / "h.png") as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    blue = (pixels[..., 2] - pixels[..., 0] > 80).sum(axis=0)
+    wide = np.flatnonzero(blue > 10)
+    left, right = np.array_split(blue[wide], 2)
+    assert right.max() == pytest.approx(3 * left.max(), rel=0.05)

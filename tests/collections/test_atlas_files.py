@@ -1,0 +1,129 @@
+"""The folder of an atlas: every file says what the atlas knows."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from meshmatch.collections.atlas import Atlas
+from meshmatch.collections.atlas_files import Findings, record, write_folder
+from meshmatch.collections.measures import Measures, measure_atlas
+from meshmatch.shapes.files import load_shape
+from tests.collections.ellipsoids import ellipsoids
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("meshmatch.render.picture.HEIGHT", 240)
+
+
+@pytest.fixture(scope="module")
+def atlas() -> Atlas:
+    given = ellipsoids(8, splits=1)
+    return Atlas.of(given.points, given.faces, [f"é, {k}.ply" for k in range(8)])
+
+
+def table(path: Path) -> tuple[list[str], list[list[str]]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        head, *rows = csv.reader(file)
+    return head, rows
+
+
+def glb(path: Path) -> tuple[dict, list[np.ndarray]]:
+    """The document of a glb, and its accessors as arrays, read by the specification."""
+    data = path.read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + length])
+    body = data[28 + length :]
+    arrays = []
+    for each in document["accessors"]:
+        view = document["bufferViews"][each["bufferView"]]
+        kind, width = {5126: "<f4", 5125: "<u4"}[each["componentType"]], {"VEC3": 3, "SCALAR": 1}[each["type"]]
+        arrays.append(np.frombuffer(body, kind, each["count"] * width, view["byteOffset"]).reshape(-1, width))
+    return document, arrays
+
+
+def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> None:
+    given = ellipsoids(8, splits=1)
+    measures = measure_atlas(atlas, given.points, samples=2)
+    comparison = atlas.compare(atlas.names[:4], atlas.names[4:])
+    findings = Findings(measures, comparison, ("thin", "thick"), 2, 7)
+    names = write_folder(tmp_path, atlas, findings, rotation=np.eye(3), title="eggs")
+    assert names == sorted(path.name for path in tmp_path.iterdir())
+    assert np.array_equal(Atlas.load(tmp_path).modes, atlas.modes)
+    assert np.allclose(load_shape(tmp_path / "mean.ply").verts, atlas.mean)
+    head, rows = table(tmp_path / "scores.csv")
+    assert head[:4] == ["name", "size", "distance", "mode_1"]
+    assert tuple(row[0] for row in rows) == atlas.names
+    numbers = np.array([[float(cell) for cell in row[1:]] for row in rows])
+    assert np.allclose(numbers, np.column_stack([atlas.sizes, atlas.distances, atlas.scores]), rtol=1e-5, atol=1e-6)
+    apart = np.load(tmp_path / "distances.npy")
+    assert apart.shape == (len(atlas.mean), 8)
+    assert np.allclose(apart[:, 3], atlas.distance_from_mean(atlas.names[3]), atol=1e-6)
+    head, rows = table(tmp_path / "measures.csv")
+    assert head[:3] == ["modes", "compactness", "generalisation"]
+    assert [int(row[0]) for row in rows] == measures.counts.tolist()
+    assert [float(row[2]) for row in rows] == pytest.approx(measures.generalisation, rel=1e-5)
+    head, rows = table(tmp_path / "groups.csv")
+    assert len(rows) == len(atlas.mean)
+    assert [float(row[head.index("p_corrected")]) for row in rows] == pytest.approx(comparison.p_corrected, rel=1e-5)
+    samples = sorted((tmp_path / "samples").iterdir())
+    assert [path.name for path in samples] == ["sample-000.ply", "sample-001.ply"]
+    assert np.allclose(load_shape(samples[1]).verts, atlas.sample(2, 7)[1].verts)
+    told = json.loads((tmp_path / "atlas.json").read_text())
+    assert told == json.loads(json.dumps(record(atlas, findings)))
+    assert told["groups"]["names"] == ["thin", "thick"]
+    assert told["groups"]["labellings"] == 70
+    assert told["seed"] == 7
+    assert told["measures"]["counts"] == measures.counts.tolist()
+    assert "<title>eggs</title>" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    for name in ("modes", "distances", "groups", "histogram", "measures"):
+        with Image.open(tmp_path / f"{name}.png") as image:
+            assert np.asarray(image.convert("L")).std() > 5, name
+
+
+def test_morph_targets_are_the_modes(tmp_path: Path, atlas: Atlas) -> None:
+    write_folder(tmp_path, atlas, rotation=np.eye(3))
+    document, arrays = glb(tmp_path / "modes.glb")
+    (mesh,) = document["meshes"]
+    (primitive,) = mesh["primitives"]
+    names = mesh["extras"]["targetNames"]
+    assert names[:4] == ["mode 1, +2 sd", "mode 1, -2 sd", "mode 2, +2 sd", "mode 2, -2 sd"]
+    assert mesh["weights"] == [0] * len(names)
+    assert len(primitive["targets"]) == len(names) == 2 * len(atlas.modes)
+    base = arrays[primitive["attributes"]["POSITION"]]
+    assert np.allclose(base, atlas.mean, atol=1e-6)
+    for k, target in enumerate(primitive["targets"]):
+        moved = arrays[target["POSITION"]]
+        accessor = document["accessors"][target["POSITION"]]
+        assert np.allclose(accessor["max"], moved.max(axis=0))
+        sign = -1 if k % 2 else 1
+        assert np.allclose(moved, sign * 2 * atlas.deviations[k // 2] * atlas.modes[k // 2], atol=1e-6)
+        normals = arrays[primitive["attributes"]["NORMAL"]] + arrays[target["NORMAL"]]
+        assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    assert np.allclose(load_shape(tmp_path / "modes.glb").verts, atlas.mean, atol=1e-6)
+
+
+def test_the_same_atlas_gives_the_same_bytes(tmp_path: Path, atlas: Atlas) -> None:
+    """And what was not asked for is not there."""
+    folders = [tmp_path / name for name in "ab"]
+    for folder in folders:
+        folder.mkdir()
+        write_folder(folder, atlas)
+    first, second = ({path.name: path.read_bytes() for path in folder.iterdir()} for folder in folders)
+    assert first == second
+    assert not {"measures.csv", "measures.png", "groups.csv", "groups.png", "samples"} & set(first)
+
+
+def test_no_charts_without_matplotlib(tmp_path: Path, atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("meshmatch.collections.atlas_files.find_spec", lambda name: None)
+    nothing = np.zeros(1)
+    empty = Measures(np.ones(1, np.int64), *(7 * [nothing]), 1, 0, 1)
+    names = write_folder(tmp_path, atlas, Findings(empty))
+    assert "histogram.png" not in names
+    assert "measures.csv" in names
