@@ -8,7 +8,7 @@ and carry along everything beyond the joint.
 from __future__ import annotations
 
 import csv
-import json
+import io
 import math
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -23,7 +23,7 @@ from meshmatch.arrays import Float, Floats32
 from meshmatch.errors import InputError, OptionError
 from meshmatch.generators.rig import Rig, forward_kinematics
 from meshmatch.generators.rotations import rotation_from_vector
-from meshmatch.shapes.input_files import read_npz
+from meshmatch.shapes.input_files import read_json, read_npz, read_text
 
 MAX_BYTES = 60_000_000
 """A larger file is refused before it is read."""
@@ -141,7 +141,7 @@ def _read_npz(path: Path) -> tuple[list[Any], Any]:
 
 def _read_json(path: Path) -> tuple[list[Any], Any]:
     """An object with `joints`, a list of names, and `rotations`, lists of numbers."""
-    found: Any = json.loads(path.read_text(encoding="utf-8-sig"))
+    found: Any = read_json(path)
     if not isinstance(found, dict):
         raise ValueError("it is not an object with joints and rotations")
     joints, rotations = _entry(found, "joints"), _entry(found, "rotations")
@@ -158,7 +158,7 @@ def _read_csv(path: Path) -> tuple[list[Any], Any]:
     poses: dict[str, int] = {}
     joints: dict[str, int] = {}
     turns: dict[tuple[int, int], list[float]] = {}
-    with path.open(encoding="utf-8-sig", newline="") as file:
+    with io.StringIO(read_text(path, 450)) as file:
         rows = csv.reader(file)
         if tuple(word.strip() for word in next(rows, [])) != COLUMNS:
             raise ValueError(f"its first line is not {','.join(COLUMNS)}")

@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -27,7 +28,7 @@ from meshmatch.maps.mat_file import read_mat
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap, check_map
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.files import ShapeLike, as_shape
-from meshmatch.shapes.input_files import read_npy, read_npz
+from meshmatch.shapes.input_files import check_memory, read_bytes, read_json, read_npy, read_npz, read_text
 
 CSV_COLUMNS = ("source_vertex", "target_vertex", "face", "w0", "w1", "w2", "confidence")
 _ARRAYS = ("index", "face", "barycentric", "confidence")
@@ -35,6 +36,7 @@ _WORDS = ("source", "target", "verdict", "source_hash", "target_hash")
 _COUNTS = ("source_vertices", "target_vertices")
 _KNOWN = (*_ARRAYS, *_WORDS, *_COUNTS, "reasons")
 _FORMAT = "meshmatch map 1"
+_VERTEX = 140  # bytes of memory for each vertex, while a map is read
 check_suffix = partial(table_files.check_suffix, suffixes=MAP_SUFFIXES, what="maps")
 
 
@@ -70,6 +72,8 @@ def _read(path: Path) -> VertexMap:
     record = _FORMATS[path.suffix.lower()][1](path)
     if not isinstance(record, dict) or "index" not in record:
         raise InputError("there is no 'index' in it")
+    others = sum(np.size(record[name]) for name in _ARRAYS if isinstance(record.get(name), np.ndarray | list))
+    check_memory(path.name, path.stat().st_size, _VERTEX * np.size(record["index"]) + 16 * others)
     return VertexMap(**{"source": "", "target": "", **{k: v for k, v in record.items() if k in _KNOWN}})
 
 
@@ -96,6 +100,11 @@ def _write_txt(path: Path, m: VertexMap) -> None:
     path.write_text("\n".join(map(str, m.index.tolist())) + "\n", encoding="ascii")
 
 
+def _read_txt(path: Path) -> dict[str, Any]:
+    with io.StringIO(read_text(path, _VERTEX)) as file:
+        return _bare(np.loadtxt(file, dtype=np.int64, ndmin=1))
+
+
 def _write_npz(path: Path, m: VertexMap) -> None:
     table_files.write_npz(path, _record(m) | {"reasons": np.array(m.reasons, dtype=np.str_)})
 
@@ -112,7 +121,7 @@ def _write_csv(path: Path, m: VertexMap) -> None:
 
 
 def _read_csv(path: Path) -> dict[str, Any]:
-    with path.open(encoding="utf-8-sig", newline="") as file:
+    with io.StringIO(read_text(path, _VERTEX, 16)) as file:
         names = [name.strip() for name in next(csv.reader(file))]
         if "target_vertex" not in names:
             raise InputError("there is no column 'target_vertex'", f"the columns are {','.join(CSV_COLUMNS)}")
@@ -134,7 +143,7 @@ def _write_json(path: Path, m: VertexMap) -> None:
 
 
 def _read_json(path: Path) -> Any:
-    record = table_files.read_json(path)
+    record = read_json(path)
     return _bare(np.array(record)) if isinstance(record, list) else record
 
 
@@ -149,7 +158,7 @@ def _write_mat(path: Path, m: VertexMap) -> None:
 
 
 def _read_mat(path: Path) -> dict[str, Any]:
-    record = _plain(read_mat(path.read_bytes(), _KNOWN))
+    record = _plain(read_mat(read_bytes(path), _KNOWN))
     reasons = record.get("reasons", ())
     record["reasons"] = tuple(reasons) if isinstance(reasons, list) else ()
     return record | {name: np.ravel(record[name]) for name in ("index", "face", "confidence") if name in record}
@@ -159,7 +168,7 @@ _FORMATS: dict[str, tuple[Callable[[Path, VertexMap], None], Callable[[Path], An
     ".npy": (lambda path, m: table_files.write_npy(path, m.index), lambda path: _bare(read_npy(path))),
     ".npz": (_write_npz, _read_npz),
     ".csv": (_write_csv, _read_csv),
-    ".txt": (_write_txt, lambda path: _bare(np.loadtxt(path, dtype=np.int64, ndmin=1, encoding="utf-8"))),
+    ".txt": (_write_txt, _read_txt),
     ".mat": (_write_mat, _read_mat),
     ".json": (_write_json, _read_json),
 }

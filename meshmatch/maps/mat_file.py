@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
+from meshmatch.shapes.input_files import ROOM
 
 Value = NDArray[np.generic] | str | list[str]
 """Numbers in the array's own shape; the letters of a text, row by row; the texts of a cell array."""
 
-LARGEST = 1 << 30  # bytes of one variable, unpacked
+LARGEST = 1 << 30  # bytes of all variables, unpacked; fewer where the file is small
 _HEADER = 128
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -31,7 +32,7 @@ _HINT = "save it with -v7, or as .csv"
 def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
     """Those of the named variables that the file holds and that are numbers, text, or cells of text.
 
-    `InputError` if it is not a MAT-file of level 5, is damaged, or a variable is larger than `LARGEST`.
+    `InputError` if it is not a MAT-file of level 5, is damaged, or its variables are larger than `LARGEST`.
     """
     if data[:4] == b"\x89HDF" or data[:10] == b"MATLAB 7.3":
         raise InputError("it is a MAT-file of version 7.3", _HINT)
@@ -39,13 +40,15 @@ def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
     if order is None:
         raise InputError("it is not a MAT-file of version 5 to 7", _HINT)
     wanted, found = set(names), {}
+    left = min(LARGEST, len(data) + ROOM // 4)  # what is unpacked is held up to four times while it is read
     try:
         for kind, body in _elements(data[_HEADER:], order):
             if kind == _COMPRESSED:
                 stream = zlib.decompressobj()
-                unpacked = stream.decompress(body, LARGEST)
-                if stream.unconsumed_tail:
-                    raise ValueError(f"a variable of more than {LARGEST} bytes")
+                unpacked = stream.decompress(body, left + 1)
+                left -= len(unpacked)
+                if left < 0:
+                    raise ValueError("variables that unpack to too many bytes")
                 kind, body = next(_elements(unpacked, order))
             name, value = _matrix(body, order) if kind == _MATRIX else ("", None)
             if name in wanted and value is not None:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.outputs import as_path, plain_text
-from meshmatch.shapes.input_files import existing, read_npy
+from meshmatch.shapes.input_files import existing, read_npy, read_text
 
 T = TypeVar("T")
 _PAIRS = "one pair a line: a vertex of the source, then a vertex of the target, counted from 0"
@@ -60,14 +60,9 @@ def read_by_suffix(path: str | Path, readers: Mapping[str, Callable[[Path], T]],
         raise InputError(f"{path.name} does not hold {what} that can be read: {error}", hint) from error
 
 
-def read_text(path: Path) -> str:
-    """A file's text, in UTF-8."""
-    return path.read_text(encoding="utf-8-sig")
-
-
 def read_rows(path: Path) -> list[list[str]]:
     """The rows of a csv file that are not empty, without spaces around the cells."""
-    return [[cell.strip() for cell in row] for row in csv.reader(read_text(path).splitlines()) if row]
+    return [[cell.strip() for cell in row] for row in csv.reader(read_text(path, 280, 120).splitlines()) if row]
 
 
 def check_numbered(numbers: ArrayLike) -> None:
@@ -83,11 +78,6 @@ def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]])
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
         writer.writerows(rows)
-
-
-def read_json(path: Path) -> Any:
-    """The value of a JSON file."""
-    return json.loads(read_text(path))
 
 
 def write_json(path: Path, record: Mapping[str, Any], indent: int | None = None) -> None:
@@ -125,8 +115,7 @@ def load_points(path: str | Path) -> Int[Ints, " N"]:
 
 
 def _table(path: Path, columns: int, hint: str) -> Ints:
-    if not path.is_file():
-        raise InputError(f"there is no file {path}", hint)
+    existing(path, hint)
     try:
         rows = read_npy(path) if path.suffix.lower() == ".npy" else _from_text(path)
         if rows.dtype.kind not in "iu":
@@ -149,7 +138,7 @@ def _table(path: Path, columns: int, hint: str) -> Ints:
 def _from_text(path: Path) -> Ints:
     rows: list[list[int]] = []
     words_allowed = True
-    for number, line in enumerate(read_text(path).splitlines(), 1):
+    for number, line in enumerate(read_text(path, 240, 100).splitlines(), 1):
         cells = line.partition("#")[0].replace(",", " ").replace(";", " ").split()
         if not cells:
             continue

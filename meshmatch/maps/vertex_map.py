@@ -86,8 +86,8 @@ class VertexMap:
         check_range(vertex, self.target_vertices, label)
         size = len(vertex)
         faces = np.full(size, -1) if self.face is None else _whole_numbers(self.face, f"{label}: face")
-        vertices_alone = np.tile([1.0, 0.0, 0.0], (size, 1))
-        weights = np.array(vertices_alone if self.barycentric is None else self.barycentric, np.float64)
+        first = self.barycentric is None
+        weights = np.tile([1.0, 0.0, 0.0], (size, 1)) if first else np.array(self.barycentric, np.float64)
         trust = np.array(np.ones(size) if self.confidence is None else self.confidence, np.float32)
         arrays: dict[str, NDArray[Any]] = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
         for name, array in arrays.items():

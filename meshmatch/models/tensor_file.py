@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from meshmatch.errors import ModelError
 
-MAX_BYTES = 1_000_000_000
+MAX_BYTES = 500_000_000
 """A larger file is refused."""
 
 

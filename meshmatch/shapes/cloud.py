@@ -25,7 +25,7 @@ def local_areas(points: Float[Floats, "V 3"]) -> Float[Floats, " V"]:
     per cent of the points, and only the growth of r^2 from k / 3 to k counts. Where limbs are thinner than the
     neighbourhood the result is some per cent low (measured on bodies: -10 to +8 % of area).
     """
-    if len(points) < 4:
+    if len(_part(points)) < 4:
         return np.zeros(len(points))
     part, distance, _, k, noise = _neighbourhoods(points)
     squared = distance**2
@@ -48,7 +48,7 @@ def estimate_normals(points: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
     Signs are made to agree between neighbours (Hoppe et al. 1992, section 3.3), then each connected part is turned to
     face away from its own center; for an open or very noisy cloud that can be wrong, so treat the sign with care.
     """
-    if len(points) < 4:
+    if len(_part(points)) < 4:
         return np.zeros((len(points), 3))
     part, _, index, k, _ = _neighbourhoods(points)
     found = np.linalg.eigh(_spread(part, index[:, : k + 1]))[1][:, :, 0]
@@ -67,16 +67,16 @@ def estimate_normals(points: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
 
 def roughness(points: Float[Floats, "V 3"]) -> float:
     """How noisy a cloud is beside its spacing, 0..1: about 0 for a clean one, 1 for noise of 1 % of the diagonal."""
-    return 0.0 if len(points) < 20 else _neighbourhoods(points)[4]
+    return 0.0 if len(_part(points)) < 20 else _neighbourhoods(points)[4]
 
 
 def outlier_points(points: Float[Floats, "V 3"], far: float = 3.0) -> Bool[Bools, " V"]:
     """True for a point that lies ``far`` times further from its neighbours than these from theirs, and than usual."""
     from scipy.spatial import cKDTree
 
-    if len(points) < 20:
-        return np.zeros(len(points), bool)
     part = _part(points)
+    if len(part) < 20:
+        return np.zeros(len(points), bool)
     tree = cKDTree(part)
     distance, index = tree.query(points, 9)  # 8 neighbours, and itself
     own_reach = (distance if part is points else tree.query(part, 9)[0])[:, -1]
@@ -92,9 +92,14 @@ def on_a_line(points: Float[Floats, "V 3"]) -> bool:
 
 
 def _part(points: Floats) -> Floats:
-    if len(points) <= LARGEST:
-        return points
-    return points[np.sort(np.random.default_rng(0).choice(len(points), LARGEST, replace=False))]
+    """What stands for all points: a random part; where most of these lie on others, each place once, for a search among
+    many at one place looks at all of them.
+    """
+    part = points
+    if len(points) > LARGEST:
+        part = points[np.sort(np.random.default_rng(0).choice(len(points), LARGEST, replace=False))]
+    places = np.unique(part, axis=0)
+    return places if 2 * len(places) < len(part) else part
 
 
 def _neighbourhoods(points: Floats) -> tuple[Floats, Floats, Ints, int, float]:

@@ -4,6 +4,7 @@ can promise more than they hold. Nothing is unpickled.
 
 from __future__ import annotations
 
+import json
 import math
 import warnings
 import zipfile
@@ -20,9 +21,15 @@ from meshmatch.errors import InputError
 
 LARGEST_FILE = 1 << 32
 """Bytes: a hundred million vertices, more than anything here can work on. Larger files are refused unread."""
+LARGEST_TEXT = 1 << 29
+"""Bytes of a file of text."""
 LARGEST = 1 << 30
 """Uncompressed bytes of one array in an npz file; a million vertices with 120 dense weights fit."""
+ROOM = 800_000_000
+"""Bytes that a file may take besides four times its size; the rest of a gigabyte is the program's."""
+_COPIES = 24  # bytes for each number of an array: it becomes one of 64 bits, and is compared and copied
 _LAST_CHARACTER = 0x10FFFF
+_LINE_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e\x85"  # where `str.splitlines` splits
 
 
 def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path:
@@ -61,12 +68,57 @@ def _similar(path: Path, suffixes: tuple[str, ...]) -> str:
     return f"did you mean {path.parent / close[0]}?" if close else "check the name and the folder"
 
 
-def read_bytes(path: Path, hint: str = "") -> bytes:
-    """All of a file; `InputError` as `existing`, or if reading fails."""
+def read_bytes(path: Path, hint: str = "", largest: int = LARGEST_FILE) -> bytes:
+    """All of a file; `InputError` as `existing`, for one of text that is larger than that, or if reading fails."""
     try:
-        return existing(path, hint).read_bytes()
+        if existing(path, hint).stat().st_size > largest:
+            raise _much_text(path.name, path.stat().st_size, largest)
+        return path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}", hint or "check the disk") from error
+
+
+def read_text(path: Path, line: int, cell: int = 0) -> str:
+    """A file's text in UTF-8, where a line takes so many bytes of memory, and each further cell; `InputError` if that
+    would be too much (`check_memory`), or the file is too large.
+    """
+    data = read_bytes(path, largest=LARGEST_TEXT // 2)
+    check_memory(path.name, len(data), line * sum(map(data.count, _LINE_ENDS)) + cell * sum(map(data.count, b",;")))
+    return data.decode("utf-8-sig")
+
+
+def check_text(name: str, data: bytes) -> None:
+    """Refuse a text that is too large, or has more lines or gaps between words than it may have (`InputError`)."""
+    if len(data) > LARGEST_TEXT:
+        raise _much_text(name, len(data), LARGEST_TEXT)
+    lines, gaps = (sum(map(data.count, each)) for each in (b"\r\n", b" \t"))
+    check_memory(name, len(data), 40 * lines + 20 * gaps)
+
+
+def _much_text(name: str, size: int, largest: int) -> InputError:
+    large = f"{name} is too large for a file of text: {size >> 20} MiB, of {largest >> 20} at most"
+    return InputError(large, "save it in a binary format, such as .ply, .glb or .npz")
+
+
+def read_json(path: Path) -> Any:
+    """The value of a JSON file; `InputError` if that would take too much memory (`check_memory`)."""
+    return json_of(path.name, read_bytes(path, largest=LARGEST_TEXT // 2))
+
+
+def json_of(name: str, data: bytes) -> Any:
+    """The value of a JSON text, if it does not take too much memory; `ValueError` if it is none."""
+    check_memory(name, len(data), 100 * sum(map(data.count, b",[")) + 250 * data.count(b"{"))
+    try:
+        return json.loads(data.decode("utf-8-sig"))
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def check_memory(name: str, size: int, need: int) -> None:
+    """Refuse a file of so many bytes that would need more memory than four times that and a gigabyte (`InputError`)."""
+    if need > 4 * size + ROOM:
+        large = f"{name} promises too much: of {size / 1e6:,.0f} MB it would make {need / 1e9:.1f} GB"
+        raise InputError(large, "make it smaller, or save it uncompressed in a binary format")
 
 
 def beside(folder: Path, name: str) -> Path | None:
@@ -88,7 +140,8 @@ def read_npy(path: Path) -> NDArray[Any]:
             if start != b"\x93N":
                 raise InputError(f"{path.name} is not an npy file", "does the suffix fit the content?")
             file.seek(0)
-            return _array(file, path.name, path.stat().st_size)
+            size = path.stat().st_size
+            return _array(file, path.name, size, size)
     except InputError:
         raise
     except Exception as error:  # a damaged header can break Python's parser and NumPy in a dozen ways
@@ -103,18 +156,21 @@ def read_npz(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
     try:
         with zipfile.ZipFile(path) as archive:
             there = set(archive.namelist())
-            for name in names:
-                member = f"{name}.npy"
-                if member in there:
-                    with archive.open(member) as file:
-                        found[name] = _array(file, member, min(archive.getinfo(member).file_size, LARGEST))
+            members = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in there}
+            size = path.stat().st_size
+            check_memory(path.name, size, sum(member.file_size for member in members.values()))
+            for name, member in members.items():
+                with archive.open(member) as file:
+                    found[name] = _array(file, member.filename, min(member.file_size, LARGEST), size)
+    except InputError:
+        raise
     except Exception as error:  # as above, and the zip around it
         raise _not_arrays(path, error) from error
     return found
 
 
-def _array(file: IO[bytes], name: str, most: int) -> NDArray[Any]:
-    """The array of an open npy file, if it promises no more than `most` bytes."""
+def _array(file: IO[bytes], name: str, most: int, size: int) -> NDArray[Any]:
+    """The array of an open npy file, if it promises no more than `most` bytes, nor too much for a file of a size."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of headers as Python 2 wrote them
         version = npy_format.read_magic(file)
@@ -125,9 +181,10 @@ def _array(file: IO[bytes], name: str, most: int) -> NDArray[Any]:
         if kind.hasobject:
             raise ValueError("it holds Python objects")
         # An item counts, also one of no bytes: so many of them would fill a list.
-        size = math.prod((max(int(kind.itemsize), 1), *(int(axis) for axis in shape)))
-        if min(shape, default=0) < 0 or size > most:
-            raise ValueError(f"{name} promises {size} bytes")
+        promised = math.prod((max(int(kind.itemsize), 1), *(int(axis) for axis in shape)))
+        if min(shape, default=0) < 0 or promised > most:
+            raise ValueError(f"{name} promises {promised} bytes")
+        check_memory(name, size, _COPIES * math.prod(int(axis) for axis in shape))
         file.seek(0)
         array = np.asarray(npy_format.read_array(file, allow_pickle=False))
     if array.dtype.kind == "U" and array.size:

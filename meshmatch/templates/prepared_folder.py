@@ -7,7 +7,7 @@ on each of a folder's shapes, in one order.
 
 from __future__ import annotations
 
-import json
+import io
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
-from meshmatch.shapes.input_files import read_npy
+from meshmatch.shapes.input_files import read_json, read_npy, read_text
 from meshmatch.shapes.normalise import ALIGNS, Align, align, residual
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.sampling import sample_surface
@@ -146,10 +146,11 @@ def read_landmarks(file: Path, clean: Repaired) -> Float[Floats, "L 3"]:
         if file.suffix == ".npy":
             values = read_npy(file)
         else:
-            delimiter = "," if "," in file.read_text(encoding="utf-8") else None
+            text = read_text(file, 100, 40)
+            delimiter = "," if "," in text else None
             with warnings.catch_warnings():  # of a file without numbers, which is refused below
                 warnings.simplefilter("ignore", UserWarning)
-                values = np.asarray(np.loadtxt(file, delimiter=delimiter))
+                values = np.asarray(np.loadtxt(io.StringIO(text), delimiter=delimiter))
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read the landmarks {file.name}", "numbers, one point a line") from error
     if values.ndim == 2 and values.shape[1] == 3 and values.dtype.kind in "fiu":
@@ -263,8 +264,11 @@ def _read(
 
 
 def _facts(folder: str | Path) -> dict[str, Any]:
-    """What ``prepared.json`` says; `OSError` or `ValueError` if it is missing, or not a JSON object."""
-    words = json.loads((Path(folder) / "prepared.json").read_text(encoding="utf-8"))
+    """What ``prepared.json`` says; `ValueError` if it is missing, or not a JSON object."""
+    try:
+        words = read_json(Path(folder) / "prepared.json")
+    except InputError as error:
+        raise ValueError(error.message) from error
     if not isinstance(words, dict):
         raise ValueError("not an object")
     return words

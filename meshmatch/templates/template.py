@@ -26,6 +26,8 @@ from meshmatch.templates.location import bundled_folder
 Scale = Literal["area", "sphere"]
 SCALES: tuple[Scale, ...] = get_args(Scale)
 SCHEMA = 2
+MAX_BYTES = 50_000_000
+"""A larger bundle is refused: a number of 8 bits takes 64, and more while it is checked."""
 _ONE_RADIUS = 1  # the schema of bundles whose nodes share one radius, which is in the words; later ones have an array
 _ARRAYS = ("verts", "faces", "dense_verts", "dense_faces", "nodes", "labels", "core")
 
@@ -115,6 +117,8 @@ def load_template(path: str | Path) -> Template:
     path = Path(path)
     if not path.is_file():
         raise TemplateError(f"no template bundle at {path}", "make one with `meshmatch prepare`")
+    if path.stat().st_size > MAX_BYTES:
+        raise TemplateError(f"{path.name} is larger than a template may be: {MAX_BYTES // 10**6} MB", "make it smaller")
     try:
         with safe_open(str(path), framework="np") as file:
             words = json.loads((file.metadata() or {})["template"])

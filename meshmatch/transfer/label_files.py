@@ -20,7 +20,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import label_colors
-from meshmatch.shapes.input_files import read_npy
+from meshmatch.shapes.input_files import read_json, read_npy, read_text
 from meshmatch.shapes.shape import Shape
 
 On = Literal["vertices", "faces"]
@@ -74,7 +74,7 @@ def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
     readers = {
         ".npy": lambda path: (_listed(read_npy(path)), None),
         ".csv": lambda path: _read_csv(path, (shape.V, shape.F)),
-        ".txt": lambda path: ([line.strip() for line in table_files.read_text(path).rstrip().splitlines()], None),
+        ".txt": lambda path: ([line.strip() for line in read_text(path, 240).rstrip().splitlines()], None),
         ".json": lambda path: _read_json(path, shape, on),
     }
     values, written = table_files.read_by_suffix(path, readers, "labels", _HINT)
@@ -157,7 +157,7 @@ def _read_csv(path: Path, counts: tuple[int, int]) -> tuple[list[str], str | Non
 
 
 def _read_json(path: Path, shape: Shape, on: On | None) -> tuple[list[Any], str | None]:
-    record = table_files.read_json(path)
+    record = read_json(path)
     if isinstance(record, list):
         return record, None
     if not isinstance(record, dict):

@@ -20,6 +20,7 @@ from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps import table_files
 from meshmatch.maps.vertex_map import VertexMap, corners_of
 from meshmatch.outputs import plain_text
+from meshmatch.shapes.input_files import read_bytes, read_json
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals
 
@@ -27,6 +28,7 @@ from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, know
 _ELSEWHERE = 0.25
 LANDMARK_SUFFIXES = (".csv", ".json", ".pp")
 check_landmarks_suffix = partial(table_files.check_suffix, suffixes=LANDMARK_SUFFIXES, what="landmarks")
+_LARGEST_PP = 10_000_000
 _PLACES = ({"vertex"}, {"x", "y", "z"}, {"face", "w0", "w1", "w2"})
 # One as a file has it: name; vertex, face and barycentric, or position. What is missing may be left out.
 _Record = dict[str, Any]
@@ -200,7 +202,7 @@ def _read_csv(path: Path) -> list[_Record]:
 
 
 def _read_json(path: Path) -> list[_Record]:
-    found = table_files.read_json(path)
+    found = read_json(path)
     if isinstance(found, dict) and isinstance(found.get("landmarks"), list | dict):
         found = found["landmarks"]
     if isinstance(found, dict):
@@ -242,7 +244,9 @@ def _three(values: Any, name: str) -> list[float]:
 
 
 def _read_pp(path: Path) -> list[_Record]:
-    data = path.read_bytes()
+    data = read_bytes(path)
+    if len(data) > _LARGEST_PP:
+        raise InputError(f"it is too large: over {_LARGEST_PP // 10**6} MB", "landmarks are a few named points")
     if b"<!ENTITY" in data:
         raise InputError("it defines XML entities, which a file of picked points has no use for")
     try:

@@ -22,7 +22,7 @@ from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.input_files import read_npy, read_npz
+from meshmatch.shapes.input_files import read_bytes, read_json, read_npy, read_npz
 from meshmatch.shapes.shape import Shape
 
 VALUE_SUFFIXES = (".npy", ".csv", ".ply")
@@ -183,9 +183,9 @@ def load_weights(path: str | Path, shape: Shape) -> SkinWeights:
 
     readers = {
         ".npz": lambda path: _from_record(read_npz(path, ("format", "names", "joints", "weights"))),
-        ".json": lambda path: _from_record(table_files.read_json(path)),
-        ".glb": lambda path: read_skin(path, path.read_bytes()),
-        ".gltf": lambda path: read_skin(path, path.read_bytes()),
+        ".json": lambda path: _from_record(read_json(path)),
+        ".glb": lambda path: read_skin(path, read_bytes(path)),
+        ".gltf": lambda path: read_skin(path, read_bytes(path)),
     }
     matrix, names = table_files.read_by_suffix(path, readers, "skin weights", _WEIGHTS_HINT)
     return SkinWeights(_normalized(Path(path).name, matrix, shape), names)

@@ -187,13 +187,7 @@ def test_a_folder_that_refuses_files(
 
 @pytest.mark.parametrize(
     ("text", "told"),
-    [
-        ("", "holds no vertex"),
-        ("nose\n", "pairs.txt"),
-        ("1 2 3\n", "pairs.txt"),
-        ("0 -1\n", "-1"),
-        ("1.5 2\n", "pairs.txt"),
-    ],
+    [("", "is empty"), ("nose\n", "pairs.txt"), ("1 2 3\n", "pairs.txt"), ("0 -1\n", "-1"), ("1.5 2\n", "pairs.txt")],
 )
 def test_landmarks_that_are_none(run: Run, two: tuple[Path, Path], tmp_path: Path, text: str, told: str) -> None:
     (tmp_path / "pairs.txt").write_text(text)

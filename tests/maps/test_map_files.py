@@ -12,6 +12,7 @@ from meshmatch.errors import InputError, OptionError, OutputError
 from meshmatch.maps import MAP_SUFFIXES, files
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes import input_files
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from tests.maps.test_vertex_map import A, B, C, random_map
@@ -132,6 +133,41 @@ def test_a_map_that_promises_more_than_it_holds(tmp_path: Path, suffix: str) -> 
     else:
         path.write_bytes(array)
     with pytest.raises(InputError, match=r"^a\.np[yz] .* promises 200000000000 bytes"):
+        load_map(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.json", b"[0" + b",0" * 2000 + b"]"),
+        ("a.json", b'{"index": [' + b"[]," * 2000 + b"[]]}"),
+        ("a.json", b"[" + b'{"":0},' * 2000 + b"0]"),
+        ("a.txt", b"0\n" * 2000),
+        ("a.csv", b"target_vertex\n" + b"0\n" * 2000),
+    ],
+)
+def test_text_that_would_take_too_much_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes
+) -> None:
+    monkeypatch.setattr(input_files, "ROOM", 100_000)
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=rf"^{name} promises too much"):
+        load_map(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".mat"])
+def test_arrays_that_would_take_too_much_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    """Of one byte each, where a map has eight; or deflated."""
+    path, index = tmp_path / f"a{suffix}", np.zeros(5000, np.int8)
+    if suffix == ".npy":
+        np.save(path, index)
+    elif suffix == ".npz":
+        np.savez_compressed(path, index=index)
+    else:
+        savemat(path, {"index": index})
+    load_map(path)
+    monkeypatch.setattr(input_files, "ROOM", 60_000)
+    with pytest.raises(InputError, match="promises too much"):
         load_map(path)
 
 

@@ -43,7 +43,7 @@ def test_points_from_text(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "holds no vertex"),
+        ("", "is empty"),
         ("# nothing\n", "holds no vertex"),
         ("1\n2\n", "not 2 a line"),
         ("1 2 3\n", "not 2 a line"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from meshmatch.shapes import cloud
-from meshmatch.shapes.cloud import estimate_normals, local_areas, outlier_points
+from meshmatch.shapes.cloud import estimate_normals, local_areas, outlier_points, roughness
 from meshmatch.shapes.faces import agreeing_flips
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.sampling import sample_surface
@@ -181,3 +181,13 @@ def test_bodies_keep_their_size_as_clouds(bench: Path, noise: float) -> None:
         mesh = load_shape(bench / name)
         points = mesh.verts + rng.normal(size=mesh.verts.shape) * noise * mesh.diagonal
         assert np.sqrt(Shape(points, []).area / mesh.area) == pytest.approx(1.0, abs=0.05), name
+
+
+def test_points_that_lie_on_each_other_are_judged_once() -> None:
+    """A search among many at one place looks at all of them: it would take hours."""
+    crowd = np.concatenate([np.tile([[0.0, 1.0, 2.0]], (3000, 1)), np.random.default_rng(0).normal(size=(2000, 3))])
+    assert len(cloud._part(crowd)) == 2001
+    assert cloud._part(crowd[2000:]) is not crowd and len(cloud._part(crowd[2000:])) == 3000
+    equal = np.ones((300, 3))
+    assert (local_areas(equal) == 0).all() and (estimate_normals(equal) == 0).all() and roughness(equal) == 0
+    assert local_areas(crowd).shape == (5000,)

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
+from meshmatch.shapes import formats, input_files
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats import gltf
+from meshmatch.shapes.formats import gltf, ply_rows
 from meshmatch.shapes.formats.gltf_attributes import read_skin
 from meshmatch.shapes.input_files import read_npy
 from meshmatch.shapes.shape import Shape
@@ -190,7 +192,10 @@ def test_gltf_with_a_buffer_that_claims_a_terabyte(tmp_path: Path) -> None:
         (("buffers", 0, "byteLength"), 10**12),
         (("accessors", 4), {"componentType": 5126, "type": "VEC3", "count": 10**7}),
     )
-    with pytest.raises(InputError, match="promises 10000000 values"):
+    with pytest.raises(InputError, match="makes 13,333,333 vertices"):
+        load_shape(path)
+    path = broken(tmp_path, (("accessors", 4), {"componentType": 5126, "type": "VEC3", "count": 10**6}))
+    with pytest.raises(InputError, match="promises 1000000 values"):
         load_shape(path)
 
 
@@ -198,9 +203,106 @@ def test_gltf_of_one_mesh_a_thousand_times(tmp_path: Path, monkeypatch: pytest.M
     copies = [{"mesh": 0}] * 1000
     path = broken(tmp_path, (("nodes",), copies), (("scenes", 0, "nodes"), list(range(1000))))
     assert load_shape(path).V == 4000
-    monkeypatch.setattr(gltf, "MOST_CORNERS", 9_000)
-    with pytest.raises(InputError, match="over 9000 vertices"):
+    monkeypatch.setattr(formats, "FEW_PLACES", 3_000)
+    with pytest.raises(InputError, match=r"makes [0-9,]+ vertices and faces"):
         load_shape(path)
+    monkeypatch.undo()
+    monkeypatch.setattr(gltf, "MOST_NODES", 900)
+    with pytest.raises(InputError, match="over 900 nodes"):
+        load_shape(path)
+
+
+@pytest.mark.parametrize("case", ["points", "faces", "a polygon", "rows of unequal length"])
+def test_ply_of_more_than_its_bytes_can_mean(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str) -> None:
+    """Numbers of one byte become eight, and a polygon of a thousand corners a thousand faces."""
+    axes = [f"property char {axis}" for axis in "xyz"]
+    some = ["element vertex 3", *axes, "element face {n}", "property list {size} uchar vertex_indices"]
+    lines, body = {
+        "points": (["element vertex 5000", *axes], bytes(15_000)),
+        "faces": ([line.format(n=4000, size="uchar") for line in some], bytes(9) + bytes([3, 0, 1, 2]) * 4000),
+        "a polygon": (
+            [line.format(n=1, size="int") for line in some],
+            bytes(9) + (9000).to_bytes(4, "little") + bytes(9000),
+        ),
+        "rows of unequal length": (
+            [line.format(n=2500, size="uchar") for line in some],
+            bytes(9) + bytes([1, 0, 2, 0, 0]) * 1250,
+        ),
+    }[case]
+    content = "\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header", ""]).encode() + body
+    (tmp_path / "a.ply").write_bytes(content)
+    load_shape(tmp_path / "a.ply")
+    monkeypatch.setattr(formats, "FEW_PLACES", 100)
+    monkeypatch.setattr(ply_rows, "FEW_PLACES", 100)
+    refused(tmp_path / "a.ply", content, r"makes [0-9,]+ vertices and faces|has lists of [0-9,]+ numbers")
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".xyz", ".stl", ".npy"])
+def test_more_than_the_bytes_of_a_file_can_mean(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    corners = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+    content = {
+        ".obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * 1000,
+        ".off": "OFF\n3 1000 0\n0 0 0\n1 0 0\n0 1 0\n" + "3 0 1 2\n" * 1000,
+        ".xyz": "0 0 0\n1 0 0\n0 1 0\n" * 333,
+        ".stl": f"solid x\n{corners * 1000}endsolid x\n",
+    }.get(suffix, "")
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".npy":
+        np.save(path, np.zeros((1000, 3), np.float16))
+    else:
+        path.write_text(content)
+    assert load_shape(path).V > 2
+    monkeypatch.setattr(formats, "FEW_PLACES", 100)
+    refused(path, path.read_bytes(), "vertices and faces")
+
+
+@pytest.mark.parametrize("line", ["element e 0", "comment x\nproperty int p"])
+def test_ply_headers_of_thousands_of_lines(tmp_path: Path, line: str) -> None:
+    refused(tmp_path / "a.ply", ply("element vertex 3", *XYZ, "element other 0", *[line] * 5000), "header has over")
+
+
+def test_text_of_more_lines_than_it_may_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(input_files, "ROOM", 10_000)
+    for name, content in (("a.obj", b"v 0 0 0\n"), ("a.xyz", b"0 0 0\n"), ("a.off", b"OFF 1 0 0\n0 0 0\n")):
+        refused(tmp_path / name, content + b"\n" * 1000, "promises too much")
+    monkeypatch.setattr(input_files, "LARGEST_TEXT", 900)
+    refused(tmp_path / "a.ply", ply("element vertex 300", *XYZ, body="0 0 0\n" * 300), "too large for a file of text")
+
+
+# 100,000 points that stand two thousand times in a scene; an index of half a billion zeros, deflated.
+BOMBS = r"""
+import json, resource, struct, sys, zipfile
+from meshmatch.cli import main
+
+body = bytes(1_200_000)
+words = json.dumps({
+    "asset": {"version": "2.0"}, "nodes": [{"mesh": 0}] * 2000,
+    "meshes": [{"primitives": [{"mode": 0, "attributes": {"POSITION": 0}}]}],
+    "accessors": [{"bufferView": 0, "componentType": 5126, "count": 100_000, "type": "VEC3"}],
+    "bufferViews": [{"buffer": 0, "byteLength": len(body)}], "buffers": [{"byteLength": len(body)}],
+}).encode()
+words += b" " * (-len(words) % 4)
+head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(words) + len(body), len(words), b"JSON")
+open("a.glb", "wb").write(head + words + struct.pack("<I4s", len(body), b"BIN\0") + body)
+with zipfile.ZipFile("a.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+    with archive.open("index.npy", "w") as file:
+        header = "{'descr': '|i1', 'fortran_order': False, 'shape': (536870912,), }".ljust(117) + "\n"
+        file.write(b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header.encode())
+        for _ in range(512):
+            file.write(bytes(1 << 20))
+resource.setrlimit(resource.RLIMIT_AS, (3 << 29, 3 << 29))
+sys.exit(main(["info", "a.glb"]) + 2 * main(["info", "a.npz"]))
+"""
+
+
+def test_small_files_that_promise_gigabytes(tmp_path: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    done = subprocess.run(
+        [sys.executable, "-c", BOMBS], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 3, done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error")]
+    assert "a.glb makes" in errors[0] and "index.npy promises" in errors[1]
 
 
 def test_files_that_are_too_large_are_not_read(tmp_path: Path) -> None:

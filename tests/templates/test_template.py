@@ -206,6 +206,13 @@ def test_a_damaged_bundle_is_refused(ball: Template, tmp_path: Path, how: dict, 
     assert caught.value.hint
 
 
+def test_a_huge_bundle_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "a.safetensors").open("wb") as file:
+        file.truncate(51_000_000)
+    with pytest.raises(TemplateError, match="larger than a template may be"):
+        load_template(tmp_path / "a.safetensors")
+
+
 @pytest.mark.parametrize("content", [b"", b"ply\n", b"\xff" * 40])
 def test_what_is_no_bundle_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.safetensors"

@@ -173,7 +173,7 @@ def test_wrong_known_points_are_told(pears: Path, tmp_path: Path, values: list, 
     with pytest.raises(InputError) as caught:
         read_landmarks(tmp_path / "x.npy", repair(load_shape(pears / "pear0.ply")))
     assert told in caught.value.message + caught.value.hint
-    for words in ("", "# only words\n"):
+    for words in ("# nothing\n", "# only words\n"):
         (tmp_path / "x.txt").write_text(words)
         with pytest.raises(InputError, match="holds no landmarks"):
             read_landmarks(tmp_path / "x.txt", repair(load_shape(pears / "pear0.ply")))

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -29,6 +30,12 @@ from meshmatch.errors import InputError
 NO_FACES = np.empty((0, 3), np.int64)
 NO_MESH = "is it a mesh or a point cloud at all?"
 WRONG_SUFFIX = "does the suffix fit the content?"
+MOST_PLACES = 40_000_000
+"""Vertices and faces of one file: more than anything here can work on."""
+FEW_PLACES = 3_500_000
+"""How many a file of any size may have; and one more for every 12 of its bytes, or 24 where it is text."""
+_CHUNK = 1 << 22
+_GAP = re.compile(rb"\s")
 _SPACE = np.zeros(256, bool)
 _SPACE[[9, 10, 11, 12, 13, 32]] = True
 
@@ -62,6 +69,16 @@ class Textured:
 def damaged(name: str, what: str) -> InputError:
     """The error for a file that does not hold what it promises."""
     return InputError(f"{name}: {what[:300]}", "the file is damaged or was cut short; export or download it again")
+
+
+def check_places(name: str, size: int, vertices: int, faces: int = 0, text: bool = False) -> None:
+    """Refuse a file that makes more vertices and faces than its bytes can mean (`InputError`): each takes up to 200 bytes
+    of memory, and hours where there are many.
+    """
+    most = min(MOST_PLACES, FEW_PLACES + size // (24 if text else 12))
+    if vertices + faces > most:
+        many = f"{name} makes {vertices + faces:,} vertices and faces, of {most:,} at most for its size"
+        raise InputError(many, "decimate it, or export it as a binary .ply or .glb with fewer copies of its meshes")
 
 
 def runs(starts: Int[Ints, " N"], sizes: Int[Ints, " N"], step: int = 1) -> Int[Ints, " M"]:
@@ -111,15 +128,33 @@ def numbers(name: str, text: bytes) -> Float[Floats, " N"]:
             return np.fromstring(text, dtype=np.float64, sep=" ")
         except (DeprecationWarning, ValueError):
             pass
-    values = []
-    for word in text.split():
+    parts = []
+    for start, end in _chunks(text):  # Python's own numbers and words take ten times the memory
+        words = text[start:end].split()
         try:
-            values.append(float(word))
-        except ValueError:
-            if b"nan" not in word.lower() and b"#" not in word:  # 1.#QNAN, -nan(ind)
-                raise damaged(name, f"found {word[:20].decode(errors='replace')!r} where a number should be") from None
-            values.append(np.nan)
-    return np.array(values)
+            parts.append(np.array([_number(word) for word in words], np.float64))
+        except ValueError as error:
+            raise damaged(name, f"found {error} where a number should be") from None
+    return np.concatenate(parts)
+
+
+def _number(word: bytes) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        if b"nan" in word.lower() or b"#" in word:  # 1.#QNAN, -nan(ind)
+            return np.nan
+    raise ValueError(repr(word[:20].decode(errors="replace")))
+
+
+def _chunks(text: bytes) -> Iterator[tuple[int, int]]:
+    """Beginnings and ends of parts of a text; no word is cut."""
+    start = 0
+    while start < len(text):
+        found = _GAP.search(text, min(start + _CHUNK, len(text)))
+        end = found.start() if found else len(text)
+        yield start, end
+        start = end
 
 
 def words_per_line(text: bytes) -> Int[Ints, " lines"]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,17 +21,15 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_srgb
-from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, damaged
-from meshmatch.shapes.input_files import beside, read_bytes
+from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, check_places, damaged
+from meshmatch.shapes.input_files import beside, check_text, json_of, read_bytes
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
-MOST_CORNERS = 30_000_000
-"""Vertices of a scene, and corners of its faces: about 2 GB while it is read. One mesh may stand in a scene a thousand
-times, so that a small file can promise any number.
-"""
+MOST_NODES = 100_000
+"""Nodes of a scene, and primitives that it draws: each takes up to 0.1 ms."""
 Found = TypeVar("Found")
 
 
@@ -54,13 +51,14 @@ class Document:
 
     def __init__(self, path: Path, data: bytes) -> None:
         self.path, self.name = path, path.name
-        self.body = b""
+        self.body, self.size = b"", len(data)
         if data[:4] == b"glTF":
             data = self._chunks(data)
         elif path.suffix.lower() == ".glb":
             raise InputError(f"{self.name} is not a glb file: it does not begin with 'glTF'", "does the suffix fit?")
         try:
-            self.json = json.loads(data)
+            check_text(self.name, data)
+            self.json = json_of(self.name, data)
         except ValueError as error:
             raise damaged(self.name, "its description is not JSON") from error
         if not isinstance(self.json, dict) or "asset" not in self.json:
@@ -91,13 +89,14 @@ class Document:
         faces: list[Ints] = [NO_FACES]
         colors: list[Floats | None] = []
         meshes: list[tuple[tuple[str, ...], int]] = []
-        total = seen = 0
+        places = seen = 0
+        # One mesh may stand in a scene a thousand times, so that a small file can promise any number.
         for node, primitive in self.primitives():
-            total += self.count(primitive["attributes"]["POSITION"])
-            total += self.count(primitive["indices"]) if "indices" in primitive else 0
-            if total > MOST_CORNERS:
-                many = f"the scene of {self.name} has over {MOST_CORNERS} vertices and corners of faces"
-                raise InputError(many, "export it with fewer copies of its meshes")
+            vertices = self.count(primitive["attributes"]["POSITION"])
+            corners = self.count(primitive["indices"]) if "indices" in primitive else vertices
+            thirds = 1 if primitive.get("mode", _TRIANGLES) in (_STRIP, _FAN) else 3
+            places += vertices + (corners // thirds if primitive.get("mode", _TRIANGLES) != _POINTS else 0)
+            check_places(self.name, self.size, places)
             own = self._placed(node, primitive)
             triangles = self.triangles(primitive)
             if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
@@ -122,11 +121,19 @@ class Document:
 
     def primitives(self) -> Iterator[tuple[int, dict[str, Any]]]:
         """Node and primitive of all that is drawn but lines, in the order of `scene`."""
+        seen = 0
         for node in self._walk():
             if "mesh" in self.nodes[node]:
                 for primitive in self.json["meshes"][self.nodes[node]["mesh"]]["primitives"]:
+                    seen += 1
+                    self._check_many(seen)
                     if primitive.get("mode", _TRIANGLES) in (_POINTS, _TRIANGLES, _STRIP, _FAN):
                         yield node, primitive
+
+    def _check_many(self, number: int) -> None:
+        if number > MOST_NODES:
+            many = f"the scene of {self.name} has over {MOST_NODES} nodes, or parts of meshes"
+            raise InputError(many, "join its meshes before it is exported")
 
     def _walk(self) -> list[int]:
         """Node numbers, depth first, parents before children; fills `world`."""
@@ -137,6 +144,7 @@ class Document:
             roots = sorted(set(range(len(self.nodes))) - {c for n in self.nodes for c in n.get("children", [])})
         stack = [(node, np.eye(4)) for node in reversed(roots)]
         while stack:
+            self._check_many(len(self.world))
             node, parent = stack.pop()
             if node in self.world:
                 raise damaged(self.name, f"node {node} has two parents")
@@ -249,6 +257,7 @@ class Document:
         if number not in self.buffers:
             uri = self.json["buffers"][number].get("uri")
             self.buffers[number] = self.body if uri is None else self.resource(uri)
+            self.size += 0 if uri is None or uri.startswith("data:") else len(self.buffers[number])
         return self.buffers[number]
 
     def resource(self, uri: str) -> bytes:

@@ -13,6 +13,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes import formats
 from meshmatch.shapes.formats import Raw, columns, damaged, fan, numbers, words_per_line
+from meshmatch.shapes.input_files import check_text
 from meshmatch.shapes.shape import Shape
 
 
@@ -21,7 +22,9 @@ def read(path: Path, data: bytes) -> Raw:
     name = path.name
     if b"\0" in data[:4096]:
         raise InputError(f"{name} is not an obj file: it is binary", formats.WRONG_SUFFIX)
+    check_text(name, data)
     text, vertex_lines, faces_text, sizes, face_lines = entries_and_faces(name, joined_lines(data), b"v")
+    formats.check_places(name, len(data), len(vertex_lines), max(int(sizes.sum()) - 2 * len(sizes), 0), text=True)
     if len(vertex_lines) == 0:
         raise InputError(f"{name} holds no vertices: it has no 'v' lines", formats.NO_MESH)
     counts = words_per_line(text)

@@ -21,6 +21,7 @@ from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lin
 from meshmatch.shapes.input_files import beside, read_bytes
 from meshmatch.shapes.shape import Shape
 
+_LARGEST_MTL = 10_000_000  # bytes
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
 _OPTION = re.compile(
     rf"(?:(-o|-s|-t)((?:\s+{_NUMBER}(?!\S)){{0,3}})|-mm\s+\S+\s+\S+|(-clamp)\s+(\S+)|"
@@ -141,7 +142,8 @@ def _beside(folder: Path, name: str) -> Path | None:
 def _parse(file: Path) -> dict[str, _Entry]:
     entries: dict[str, _Entry] = {}
     entry = _Entry()
-    for line in joined_lines(file.read_bytes()).decode("utf-8", "surrogateescape").splitlines():
+    data = joined_lines(read_bytes(file, largest=_LARGEST_MTL))
+    for line in data.decode("utf-8", "surrogateescape").splitlines():
         word, rest = (*line.split(None, 1), "", "")[:2]
         word, rest = word.lower(), rest.strip()
         try:

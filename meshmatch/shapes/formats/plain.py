@@ -12,7 +12,7 @@ import numpy as np
 from meshmatch.errors import InputError
 from meshmatch.shapes import formats
 from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, numbers, words_per_line
-from meshmatch.shapes.input_files import read_npy
+from meshmatch.shapes.input_files import check_text, read_npy
 from meshmatch.shapes.shape import Shape
 
 _HEADER = re.compile(rb"\s*((?:ST)?C?N?)OFF\b|\s*((?:ST)?C?N?)OFF(?=\d)")
@@ -21,6 +21,7 @@ _HEADER = re.compile(rb"\s*((?:ST)?C?N?)OFF\b|\s*((?:ST)?C?N?)OFF(?=\d)")
 def read_off(path: Path, data: bytes) -> Raw:
     """With or without colors and normals."""
     name = path.name
+    check_text(name, data)
     text = formats.without_comments(data).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     header = _HEADER.match(text)
     if not header:
@@ -37,6 +38,7 @@ def read_off(path: Path, data: bytes) -> Raw:
     body = body[head.end() :]
     if len(body) < V + F:  # a row takes two bytes and more
         raise damaged(name, f"{promise} is only {len(data)} bytes long")
+    formats.check_places(name, len(data), V, F, text=True)
     counts = words_per_line(body)
     if len(counts) < V + F:
         raise damaged(name, f"{promise} has only {len(counts)} lines of them")
@@ -56,6 +58,7 @@ def read_off(path: Path, data: bytes) -> Raw:
     if not ((corners >= 0) & (corners < sizes)).all():
         raise damaged(name, "a face has fewer corners than it says")
     many = corners.astype(np.int64)
+    formats.check_places(name, len(data), V, max(int(many.sum()) - 2 * F, 0), text=True)
     return Raw(verts, formats.fan(formats.indices(name, faces[formats.runs(starts + 1, many)]), many), colors)
 
 
@@ -73,6 +76,11 @@ def read_stl(path: Path, data: bytes) -> Raw:
     """Every corner of a triangle is a vertex of its own, in the file's order; several solids one after the other."""
     from trimesh.exchange.stl import load_stl  # 0.7 s to import: only where it is needed
 
+    if data[:5].lower() == b"solid":  # text, unless the size is just that of a binary file
+        check_text(path.name, data)
+        formats.check_places(path.name, len(data), data.count(b"vertex") * 4 // 3, text=True)
+    else:
+        formats.check_places(path.name, len(data), 0, len(data) // 50 * 4)
     logging.getLogger("trimesh").addHandler(logging.NullHandler())  # or it prints tracebacks of damaged files
     try:
         found = load_stl(BytesIO(data))
@@ -96,8 +104,10 @@ def read_xyz(path: Path, data: bytes) -> Raw:
     name = path.name
     if b"\0" in data[:4096]:
         raise InputError(f"{name} is not a text file of points", formats.WRONG_SUFFIX)
+    check_text(name, data)
     text = formats.without_comments(data.translate(bytes.maketrans(b",;\r", b"  \n")))
     counts = words_per_line(text)
+    formats.check_places(name, len(data), len(counts), text=True)
     if len(counts) > 1 and counts[0] == 1 and text.split(None, 1)[0] == str(len(counts) - 1).encode():
         text, counts = text.split(None, 1)[1], counts[1:]  # a first line with the number of points
     if len(counts) == 0:
@@ -121,6 +131,7 @@ def read_points(path: Path, data: bytes) -> Raw:
     if array.ndim != 2 or array.shape[1] not in (3, 6):
         hint = "points are an array of (N, 3), or (N, 6)"
         raise InputError(f"{path.name} holds an array of {array.shape}, not a point cloud", hint)
+    formats.check_places(path.name, len(data), len(array))
     return Raw(np.array(array[:, :3], np.float64), NO_FACES)
 
 

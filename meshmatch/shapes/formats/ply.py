@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias
@@ -12,16 +11,13 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Floats, Int, Ints
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import NO_FACES, NO_MESH, WRONG_SUFFIX, Raw, damaged, fan, indices, numbers, runs
+from meshmatch.shapes.formats import NO_FACES, NO_MESH, WRONG_SUFFIX, Raw, check_places, damaged, fan
+from meshmatch.shapes.formats.ply_rows import TYPES, Body, Element, Property
 from meshmatch.shapes.shape import Shape
 
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8",
-}  # fmt: skip
+_MOST_LINES = 4096  # of a header that declare something
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 _END = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:\r\n|[\r\n]|\Z)")
 _DATA = re.compile(rb"^DATA[ \t]+(ascii|binary)[ \t]*\r?\n", re.MULTILINE)
@@ -29,20 +25,6 @@ _CHANNELS = ("red", "green", "blue", "alpha")
 Columns: TypeAlias = Mapping[str, NDArray[Any]]
 _NONE: Columns = MappingProxyType({})
 _NUMBERS = ("x", "y", "z", *_CHANNELS, "r", "g", "b", "a")
-
-
-@dataclass
-class _Property:
-    name: str
-    kind: str
-    count_kind: str | None = None  # set for a list
-
-
-@dataclass
-class _Element:
-    name: str
-    count: int
-    properties: list[_Property] = field(default_factory=list)
 
 
 def read(path: Path, data: bytes) -> Raw:
@@ -53,7 +35,10 @@ def read(path: Path, data: bytes) -> Raw:
     if "vertex" not in known:
         raise InputError(f"{name}: the header declares no vertices", NO_MESH)
     wanted = [k for k, element in enumerate(elements) if element.name in ("vertex", "face", "tristrips")]
-    body = _Body(name, data, start, order)
+    promised = sum(element.count for element in elements if element.name in ("vertex", "face") and element.properties)
+    if promised < len(data):  # else it is told as damage, below
+        check_places(name, len(data), promised, text=order is None)
+    body = Body(name, data, start, order)
     places, faces, colors = [], NO_FACES, None
     for element in elements[: max(wanted) + 1]:
         if not element.properties:
@@ -83,12 +68,13 @@ def read_pcd(path: Path, data: bytes) -> Raw:
     lines = data[: start.start()].decode("latin-1").splitlines()
     head = {line.split()[0]: line.split()[1:] for line in lines if line.strip()}
     try:
-        points = _Element("vertex", int(head["POINTS"][0]))
+        points = Element("vertex", int(head["POINTS"][0]))
         counts = head.get("COUNT", ["1"] * len(head["FIELDS"]))
         for label, kind, size, count in zip(head["FIELDS"], head["TYPE"], head["SIZE"], counts, strict=True):
-            known = _TYPES[{"F": "float", "I": "int", "U": "uint"}[kind] + str(8 * int(size))]
-            points.properties += [_Property(label, known)] * min(int(count), len(data))
-        table = _Body(name, data, start.end(), None if start[1] == b"ascii" else "<").element(points)
+            known = TYPES[{"F": "float", "I": "int", "U": "uint"}[kind] + str(8 * int(size))]
+            points.properties += [Property(label, known)] * min(int(count), len(data))
+        check_places(name, len(data), points.count)
+        table = Body(name, data, start.end(), None if start[1] == b"ascii" else "<").element(points)
         verts = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     except (KeyError, ValueError, IndexError) as error:
         raise damaged(name, "its header makes no sense, or names no x, y and z") from error
@@ -138,26 +124,28 @@ def _rows(table: dict[str, NDArray[Any]], count: int, fields: list[Any], header:
     return rows.tobytes()
 
 
-def _header(name: str, data: bytes) -> tuple[str | None, list[_Element], int]:
+def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int]:
     """Byte order (None: text), elements, and where the body starts."""
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
         raise InputError(f"{name} is not a ply file: it does not begin with 'ply'", WRONG_SUFFIX)
     end = _END.search(data)
     if not end:
         raise damaged(name, "the header has no end")
+    if data.count(b"element", 0, end.start()) + data.count(b"property", 0, end.start()) > _MOST_LINES:
+        raise damaged(name, f"its header has over {_MOST_LINES} lines")
     order: str | None = ""
-    elements: list[_Element] = []
+    elements: list[Element] = []
     try:
         for line in data[: end.start()].decode("latin-1").replace("\r\n", "\n").replace("\r", "\n").split("\n"):
             match line.split():
                 case ["format", kind, *_]:
                     order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}[kind]
                 case ["element", element, count, *_]:
-                    elements.append(_Element(element, int(count)))
-                case ["property", "list", count_kind, kind, label, *_] if _TYPES[count_kind][0] != "f":
-                    elements[-1].properties.append(_Property(label, _TYPES[kind], _TYPES[count_kind]))
+                    elements.append(Element(element, int(count)))
+                case ["property", "list", count_kind, kind, label, *_] if TYPES[count_kind][0] != "f":
+                    elements[-1].properties.append(Property(label, TYPES[kind], TYPES[count_kind]))
                 case ["property", kind, label, *_]:
-                    elements[-1].properties.append(_Property(label, _TYPES[kind]))
+                    elements[-1].properties.append(Property(label, TYPES[kind]))
     except (KeyError, ValueError, IndexError) as error:
         raise damaged(name, f"the header line {line.strip()[:60]!r} makes no sense") from error
     if order == "":
@@ -168,7 +156,7 @@ def _header(name: str, data: bytes) -> tuple[str | None, list[_Element], int]:
     return order, elements, end.end()
 
 
-def _check_kinds(name: str, element: _Element) -> None:
+def _check_kinds(name: str, element: Element) -> None:
     """Refuse a list where a number is needed, and the other way round."""
     for place, p in enumerate(element.properties):
         lists = {"face": p.name in _FACE_LISTS, "tristrips": place == 0}.get(element.name, False)
@@ -199,96 +187,3 @@ def _colors(table: dict[str, Any], kinds: dict[str, str]) -> Floats | None:
         largest = 1.0 if small else 65535.0 if kinds[name] == "u2" else 255.0
         out[:, k] = np.clip(np.nan_to_num(values) / largest, 0.0, 1.0)
     return out
-
-
-class _Body:
-    """The bytes behind the header, read one element after the other.
-
-    A text body (``order`` is None) becomes float64 numbers first, and is then read as a binary one of these.
-    """
-
-    def __init__(self, name: str, data: bytes, start: int, order: str | None) -> None:
-        self.name, self.at, self.order, self.text = name, start, order or "=", order is None
-        self.data: Any = data
-        if self.text:
-            self.data, self.at = numbers(name, data[start:]).view(np.uint8).data, 0
-
-    def element(self, element: _Element) -> dict[str, Any]:
-        """By property: its numbers, or, of lists, all their items and the size of each."""
-        kinds = [self._dtype(p.count_kind or p.kind) for p in element.properties]
-        self._check(element, self.at + element.count * sum(kind.itemsize for kind in kinds))
-        table = self._equal_rows(element) if element.count else None
-        return table if table is not None else self._walk(element)
-
-    def _check(self, element: _Element, end: int) -> None:
-        if element.count < 0 or end > len(self.data):
-            raise damaged(self.name, f"fewer {element.name} rows than the {element.count} that its header promises")
-
-    def _dtype(self, kind: str) -> np.dtype[Any]:
-        return np.dtype("f8" if self.text else self.order + kind)
-
-    def _equal_rows(self, element: _Element) -> dict[str, Any] | None:
-        """All rows as long as the first one: a structured array over the bytes, nothing copied. None if they differ."""
-        fields: list[Any] = []
-        at = self.at
-        for k, p in enumerate(element.properties):
-            size = 1
-            if p.count_kind:
-                size = self._count(at, p.count_kind)
-                at += self._dtype(p.count_kind).itemsize
-                fields.append((f"n{k}", self._dtype(p.count_kind)))
-            at += size * self._dtype(p.kind).itemsize
-            if at > len(self.data):
-                return None
-            fields.append((f"v{k}", self._dtype(p.kind), (size,) if p.count_kind else ()))
-        end = self.at + (at - self.at) * element.count
-        if end > len(self.data):
-            return None
-        rows = np.frombuffer(self.data, np.dtype(fields), element.count, self.at)
-        out: dict[str, Any] = {}
-        for k, p in enumerate(element.properties):
-            out[p.name] = rows[f"v{k}"]
-            if p.count_kind:
-                sizes = rows[f"n{k}"]
-                if (sizes != sizes[0]).any() or sizes[0] < 0:
-                    return None
-                out[p.name] = indices(self.name, rows[f"v{k}"]).ravel(), indices(self.name, sizes)
-        self.at = end
-        return out
-
-    def _walk(self, element: _Element) -> dict[str, Any]:
-        places: list[list[int]] = [[] for _ in element.properties]
-        sizes = [self._dtype(p.kind).itemsize for p in element.properties]
-        steps = list(zip(element.properties, places, sizes, strict=True))
-        at = self.at
-        for _ in range(element.count):
-            for p, where, item in steps:
-                where.append(at)
-                kind = p.count_kind
-                at += self._dtype(kind).itemsize + self._count(at, kind) * item if kind else item
-            self._check(element, at)
-        self.at = at
-        out: dict[str, Any] = {}
-        for p, where, item in steps:
-            starts = np.array(where, np.int64)
-            if p.count_kind:
-                counts = np.maximum(indices(self.name, self._gather(starts, p.count_kind)), 0)
-                items = runs(starts + self._dtype(p.count_kind).itemsize, counts, item)
-                out[p.name] = indices(self.name, self._gather(items, p.kind)), counts
-            else:
-                out[p.name] = self._gather(starts, p.kind)
-        return out
-
-    def _count(self, at: int, kind: str) -> int:
-        """The size of the list at a place; 0 behind the end, and for one that is negative or not a number."""
-        if kind == "u1" and not self.text:  # by far the most frequent
-            return int(self.data[at]) if at < len(self.data) else 0
-        if at + self._dtype(kind).itemsize > len(self.data):
-            return 0
-        value = np.frombuffer(self.data, self._dtype(kind), 1, at)[0]
-        return int(value) if 0 < value < 2**53 else 0
-
-    def _gather(self, starts: Int[Ints, " N"], kind: str) -> NDArray[Any]:
-        dtype = self._dtype(kind)
-        raw = np.frombuffer(self.data, np.uint8)[starts[:, None] + np.arange(dtype.itemsize)]
-        return np.ascontiguousarray(raw).view(dtype)[:, 0]
