@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from meshmatch.api.transfer import transfer_values as transfer_values
     from meshmatch.api.transfer import transfer_weights as transfer_weights
     from meshmatch.collections.atlas import Atlas as Atlas
+    from meshmatch.collections.collection import Collection as Collection
     from meshmatch.collections.measures import measure_atlas as measure_atlas
     from meshmatch.errors import MeshmatchError as MeshmatchError
     from meshmatch.fitting.fit import Fit as Fit
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "Atlas": "meshmatch.collections.atlas",
     "BakeOptions": "meshmatch.transfer.bake",
+    "Collection": "meshmatch.collections.collection",
     "ConfidenceRule": "meshmatch.api.results",
     "Fit": "meshmatch.fitting.fit",
     "FitConfig": "meshmatch.fitting.fit_config",

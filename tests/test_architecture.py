@@ -34,8 +34,10 @@ ROOMS = (
 OWNERS = {
     "PIL": {"shapes", "maps", "transfer", "render", "experiments"},
     "anny": {"generators"},
+    "distributed": {"collections"},
     "embreex": {"render"},
     "fast_simplification": {"shapes"},
+    "fsspec": {"collections"},
     "jaxtyping": {"arrays"},
     "matplotlib": {"render"},
     "meshmonk": {"experiments"},
@@ -45,7 +47,7 @@ OWNERS = {
     "pymeshlab": {"shapes"},
     "rich": {"experiments", "cli"},
     "robust_laplacian": {"templates", "maps"},
-    "safetensors": {"templates", "generators", "models", "training"},
+    "safetensors": {"collections", "templates", "generators", "models", "training"},
     "scipy": {
         *(
             "fields",
@@ -79,7 +81,14 @@ DISTRIBUTIONS = {
     "robust_laplacian": "robust-laplacian",
     "skimage": "scikit-image",
 }
-EXTRAS = ("meshlab", "train", "implicit", "bench", "plots")  # what the package imports only where it is installed
+EXTRAS = (
+    "meshlab",
+    "train",
+    "implicit",
+    "cluster",
+    "bench",
+    "plots",
+)  # what the package imports only where it is installed
 HEAVY = {"torch", "trimesh", "pymeshlab", "scipy", "safetensors", "matplotlib", "jaxtyping"}
 NO_TORCH = ("geometry", "shapes", "templates", "maps", "transfer", "render")
 FORBIDDEN_NAMES = {"utils", "util", "common", "helpers", "helper", "base", "misc"}

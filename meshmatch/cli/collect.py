@@ -1,0 +1,107 @@
+"""``meshmatch fit`` and ``map``: many shapes fitted once, and maps of any two of them."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Argument, Option
+
+import meshmatch
+from meshmatch.cli import options
+from meshmatch.cli.options import FitOptions, grouped, optional, output_option
+from meshmatch.cli.words import Console, print_json
+from meshmatch.errors import OptionError, PoorFit
+from meshmatch.models.registry import check_model
+
+Jobs = Annotated[int | None, Option(min=1, metavar="N", help="Number of processes. Default: one a core.")]
+Scheduler = Annotated[
+    str | None,
+    Option(
+        metavar="ADDRESS",
+        help="Let the workers of a Dask scheduler do the work, such as tcp://127.0.0.1:8786. They must see the same "
+        "files (needs meshmatch[cluster]).",
+    ),
+]
+
+
+@grouped
+def fit(
+    *,
+    shapes: list[str] = Argument(..., metavar="SHAPES", help="Files, folders, or patterns in quotes; URLs of folders."),
+    output: str = output_option("FITS", "The folder of the fits, or its URL; if it is there, the work goes on."),
+    how: FitOptions,
+    agree: bool = Option(
+        True, "--agree/--alone", help="Let all fits agree on how the template stretches, or keep them alone."
+    ),
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
+    strict: bool = Option(False, "--strict", help="Exit with 1 if a shape could not be fitted, or a fit is poor."),
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Fit every shape of a collection once, for maps between any two of them and for atlases.
+
+    A shape that cannot be fitted is told, and stops nobody. What a run that was stopped had finished is kept, and shapes
+    that were added since are fitted when it is run again. FITS/fits.csv says what became of each shape.
+    """
+    from meshmatch.collections.tasks import FAILED
+
+    how.check()
+    check_model(how.model)
+    console = Console(quiet)
+
+    def tell(record: Any) -> None:
+        if record.verdict == FAILED:
+            console.warn(f"{record.name}: {record.reasons}")
+        elif record.verdict == "poor":
+            console.warn(f"{record.name}: poor fit: {record.reasons}")
+        else:
+            axes = f"up {record.up}, front {record.front}"
+            console.say(f"{record.name}: {record.verdict} fit, {axes} ({record.seconds:.1f} s)")
+
+    with console.progress() as progress:
+        collection = meshmatch.Collection(output, scheduler or jobs, progress)
+        made = collection.fit(
+            shapes, model=how.model, config=how.configs()[0], only=how.only or (), without=how.without or (),
+            agree=agree, tell=tell,
+        )  # fmt: skip
+    counts = made.counts
+    told = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+    console.say(f"wrote {len(made.records) - counts[FAILED]} fits to {output}: {told}")
+    if made.agreed:
+        console.say(f"{made.agreed} fits agreed on how the template stretches")
+    if json:
+        print_json({"output": output, "model": made.model, "seed": how.seed, "agreed": made.agreed, "verdicts": counts})
+    if strict and (counts["poor"] or counts[FAILED]):
+        raise PoorFit(f"not every fit is to be trusted: {told}", f"see {output}/fits.csv")
+
+
+def map(
+    fits: Annotated[str, Argument(metavar="FITS", help="A folder that `meshmatch fit` made, or its URL.")],
+    output: str = output_option("MAPS", "The folder of the maps: the one from A to B is MAPS/A/B with a suffix."),
+    pairs: Path | None = optional("FILE", "Map these: the names of a source and a target a line."),
+    to: str | None = optional("NAME", "Or map every shape to this one."),
+    all_pairs: bool = Option(False, "--all", help="Or map every shape to every other."),
+    suffix: str = Option(
+        ".npz", "--format", metavar="SUFFIX", help="How maps are written: .npy .npz .csv .txt .mat .json."
+    ),
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Map shapes of a collection to each other; nothing is fitted again.
+
+    Maps that are there are kept if they are as new as the fits.
+    """
+    from meshmatch.collections.map_all import load_pairs
+
+    if [pairs is not None, to is not None, all_pairs].count(True) != 1:
+        raise OptionError("which maps?", "choose one of --pairs FILE, --to NAME and --all")
+    console = Console(quiet)
+    with console.progress() as progress:
+        collection = meshmatch.Collection(fits, scheduler or jobs, progress)
+        wanted = collection.pairs(to) if pairs is None else load_pairs(pairs)
+        count = collection.save_maps(output, wanted, suffix=suffix)
+    console.say(f"wrote {count} maps to {output}: {output}/SOURCE/TARGET{suffix}")
+    if json:
+        print_json({"output": output, "fits": fits, "maps": count})

@@ -1,0 +1,143 @@
+"""Many shapes of one kind: each fitted once, all agreeing on how the template stretches, and a map of any two by look-up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from difflib import get_close_matches
+from functools import cached_property, lru_cache
+from itertools import permutations
+from pathlib import Path
+
+from meshmatch.collections.fit_all import TEMPLATE, Fitted, fit_all, read_about, settled
+from meshmatch.collections.fit_files import StoredFit, load_fit
+from meshmatch.collections.map_all import Pair, map_all
+from meshmatch.collections.sources import find_sources
+from meshmatch.collections.stores import Store
+from meshmatch.collections.tasks import FITS, SUFFIX, Record, Setting
+from meshmatch.collections.workers import hired
+from meshmatch.errors import InputError
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.maps.build import build_map
+from meshmatch.maps.places import Places
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.registry import AUTO
+from meshmatch.progress import ProgressCallback
+from meshmatch.templates.template import Template, load_template
+
+_KEPT = 64  # fits in memory
+
+
+class Collection:
+    """A folder of fits of shapes of one kind, named by its path or a URL; it may be yet to be filled by `fit`.
+
+    ``workers`` are so many processes, by default one a core, or those of a Dask scheduler, named by its address.
+    ``progress`` is called with the stage, the folder and the share of the stage that is done (0..1).
+
+    Fits are read when they are asked for, and some are kept in memory. Of a folder without fits, all but `fit` is an
+    `InputError`.
+
+    >>> collection = meshmatch.Collection("fits")
+    >>> collection.fit("scans")
+    >>> collection.map("anna", "ben").index
+    """
+
+    def __init__(
+        self, folder: str | Path, workers: int | str | None = None, progress: ProgressCallback | None = None
+    ) -> None:
+        self.store = Store.of(folder)
+        self.workers = workers
+        self.progress = progress
+        self._read = lru_cache(maxsize=_KEPT)(self._load)
+
+    def fit(
+        self,
+        shapes: str | Path | Sequence[str | Path],
+        *,
+        model: str | Path = AUTO,
+        config: FitConfig | None = None,
+        only: Sequence[str] = (),
+        without: Sequence[str] = (),
+        agree: bool = True,
+        tell: Callable[[Record], None] | None = None,
+    ) -> Fitted:
+        """Fit every shape once, and let all fits agree on how the template stretches.
+
+        ``shapes`` are files, folders, patterns such as ``scans/*.ply``, or URLs of folders; ``only`` and ``without`` as in
+        `load_shape`. A run that was stopped goes on where it was, and shapes that were added since are fitted; the fits
+        are those of a run that nobody stopped, bit for bit. ``tell`` is called with the record of each shape, as they
+        come in.
+
+        A shape that cannot be read or fitted is a record, and stops nobody. `MeshmatchError`: there is no shape, two have
+        the same name, none could be fitted, or the folder holds fits of another model or made in another way.
+        """
+        sources = find_sources(shapes, self.store)
+        wish = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without))
+        setting = settled(wish, sources)
+        with hired(self.workers) as crew:
+            made = fit_all(setting, sources, crew, agree, self.progress, tell)
+        self._read.cache_clear()
+        return made
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the fitted shapes, sorted."""
+        if read_about(self.store) is None:
+            hint = "make one with `meshmatch fit SHAPES -o FOLDER`"
+            raise InputError(f"{self.store.location} is not a folder of fits", hint)
+        found = [name.removesuffix(SUFFIX) for name in self.store.names(FITS) if name.endswith(SUFFIX)]
+        if not found:
+            raise InputError(f"{self.store.location} holds no finished fit", "run `meshmatch fit` to its end")
+        return found
+
+    @cached_property
+    def template(self) -> Template:
+        """The template of all fits."""
+        with self.store.reading(TEMPLATE) as path:
+            return load_template(path)
+
+    def fit_of(self, name: str) -> Fit:
+        """The fit of a shape, after all have agreed. It does not know the shape itself: its ``verts`` are none."""
+        return self._read(name).fit
+
+    def places_of(self, name: str) -> Places:
+        """Where the vertices of a shape belong on the template."""
+        found = self._read(name).places
+        assert found is not None
+        return found
+
+    def map(self, source: str, target: str) -> VertexMap:
+        """The map between two shapes, by their names: nothing is fitted, only looked up."""
+        return build_map(self.places_of(source), self.places_of(target))
+
+    def pairs(self, to: str | None = None) -> list[Pair]:
+        """All ordered pairs of names, or those that lead to one."""
+        names = self.names
+        if to is None:
+            return list(permutations(names, 2))
+        self.places_of(to)  # is it there?
+        return [(name, to) for name in names if name != to]
+
+    def save_maps(self, output: str | Path, pairs: Sequence[Pair] | None = None, *, suffix: str = ".npz") -> int:
+        """Write the maps of pairs of names, by default of all, and return how many there are.
+
+        The one from A to B is ``output/A/B`` with the suffix, which chooses the format. Maps that are as new as the fits
+        are kept. `MeshmatchError`: an unknown name or format, or the folder cannot be written.
+        """
+        wanted = self.pairs() if pairs is None else list(pairs)
+        known = set(self.names)
+        for name in (name for pair in wanted for name in pair if name not in known):
+            self._read(name)  # says what is wrong
+        with hired(self.workers) as crew:
+            return map_all(self.store, Store.of(output), wanted, suffix, crew, self.progress)
+
+    def _load(self, name: str) -> StoredFit:
+        file = f"{FITS}/{name}{SUFFIX}"
+        if not self.store.exists(file):
+            close = get_close_matches(name, self.names, n=1)
+            raise InputError(f"the collection has no fit of {name}", f"did you mean {close[0]}?" if close else "")
+        with self.store.reading(file) as path:
+            found = load_fit(path, self.template)
+        if found.places is None:
+            raise InputError(f"the fit of {name} is not finished", "run `meshmatch fit` to its end")
+        return found

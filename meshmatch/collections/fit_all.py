@@ -1,0 +1,233 @@
+"""All shapes of a collection: fitted alone, agreed, and finished; each stage by whatever workers there are."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from meshmatch.api.inputs import as_model, check_config, validated
+from meshmatch.api.kinds import choose_model
+from meshmatch.arrays import Floats
+from meshmatch.collections.stores import Store
+from meshmatch.collections.tasks import (
+    AGREEING,
+    FAILED,
+    AgreeTask,
+    FinishTask,
+    FitTask,
+    Group,
+    Record,
+    Setting,
+    Source,
+    agree_a_little,
+    common_file,
+    finish,
+    fit_alone,
+    is_finished,
+    save_array,
+)
+from meshmatch.collections.workers import Died, Item, Result, Workers
+from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.fitting.agree import AgreeConfig, stretch_of
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.maps.vertex_map import VERDICTS
+from meshmatch.models.registry import AUTO
+from meshmatch.outputs import replace_on_success
+from meshmatch.progress import ProgressCallback
+from meshmatch.templates.template import save_template
+
+SCHEMA = 1
+ABOUT, TEMPLATE, TABLE = "collection.json", "template.safetensors", "fits.csv"
+COLUMNS = ("name", "file", "verdict", "reasons", "residual", "up", "front", "vertices", "seconds")
+_GROUP = 4  # fits that one task of the agreement takes a step with: fixed, for sums must not depend on the workers
+_READ_AHEAD = 20  # shapes that are asked for their kind before none is known
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What became of every shape of a collection, also of those that could not be fitted; and with which model."""
+
+    records: tuple[Record, ...]
+    agreed: int  # fits that took part in the agreement
+    model: str
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many fits are good, fair or poor, and how many shapes failed."""
+        found = Counter(record.verdict for record in self.records)
+        return {verdict: found[verdict] for verdict in (*VERDICTS[:3], FAILED)}
+
+
+def fit_all(
+    setting: Setting,
+    sources: Sequence[Source],
+    crew: Workers,
+    agree: bool = True,
+    progress: ProgressCallback | None = None,
+    tell: Callable[[Record], None] | None = None,
+) -> Fitted:
+    """Fit all shapes of a collection; see `Collection.fit`."""
+    run = _Run(setting, sources, crew, progress or (lambda stage, name, share: None))
+    records = run.fit_alone(tell)
+    fitted = [number for number, record in enumerate(records) if record.fitted]
+    if not fitted:
+        _write_table(setting.store, records)
+        raise InputError(f"none of {len(records)} shapes could be fitted: {records[0].name}: {records[0].reasons}")
+    agreeing = [number for number in fitted if records[number].verdict != "poor"]
+    moves = setting.config.for_model(setting.trained).moves_nodes
+    groups = run.groups(agreeing) if agree and moves and len(agreeing) > 1 else []
+    tasks = run.last_tasks({number: records[number] for number in fitted}, groups)
+    if groups and not all(is_finished(setting.store, task) for task in tasks.values()):
+        run.agree(groups, len(agreeing))
+    for number, trouble in run.finish(tasks):
+        records[number] = replace(records[number], verdict=FAILED, reasons=trouble)
+    setting.store.remove(AGREEING)
+    _write_table(setting.store, records)
+    return Fitted(tuple(records), len(agreeing) if groups else 0, setting.model)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """The stages of one run, in which workers do all that takes long."""
+
+    setting: Setting
+    sources: Sequence[Source]
+    crew: Workers
+    report: ProgressCallback
+
+    def _each(
+        self, task: Callable[[Item], Result], items: Sequence[Item], stage: str
+    ) -> Iterator[tuple[int, Result | Died]]:
+        self.report(stage, self.setting.store.location, 0.0)
+        for done, (number, result) in enumerate(self.crew.each(task, items)):
+            self.report(stage, self.setting.store.location, (done + 1) / len(items))
+            yield number, result
+
+    def fit_alone(self, tell: Callable[[Record], None] | None) -> list[Record]:
+        """Fit every shape on its own."""
+        found: dict[int, Record] = {}
+        tasks = [FitTask(self.setting, source) for source in self.sources]
+        for number, result in self._each(fit_alone, tasks, "fitting"):
+            if isinstance(result, Died):
+                result = Record(self.sources[number].name, self.sources[number].path, reasons=result.message)
+            found[number] = result
+            if tell is not None:
+                tell(result)
+        return [found[number] for number in range(len(tasks))]
+
+    def groups(self, numbers: Sequence[int]) -> list[Group]:
+        """Who takes part in the agreement, a few together."""
+        names = [self.sources[number].name for number in numbers]
+        parts = [tuple(names[first : first + _GROUP]) for first in range(0, len(names), _GROUP)]
+        return [Group(number, part) for number, part in enumerate(parts)]
+
+    def last_tasks(self, records: Mapping[int, Record], groups: Sequence[Group]) -> dict[int, FinishTask]:
+        """What finishes each fit; a digest of all that agree tells whether that was done before."""
+        parts = [f"{record.name} {record.digest} {record.verdict}" for record in records.values()]
+        digest = hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()
+        steps = AgreeConfig.for_model(self.setting.trained).steps
+        group_of = {name: group for group in groups for name in group.names}
+        found = {}
+        for number, record in records.items():
+            own = group_of.get(record.name)
+            agreed_with = "nobody" if own is None else digest
+            found[number] = FinishTask(self.setting, self.sources[number], record.digest, agreed_with, own, steps)
+        return found
+
+    def agree(self, groups: Sequence[Group], count: int) -> None:
+        """All steps of the agreement; the cost grows as the number of fits. Sums are taken in the order of the groups."""
+        steps = AgreeConfig.for_model(self.setting.trained).steps
+        for step in range(steps + 1):
+            total, next_one = None, 0
+            waiting: dict[int, Floats] = {}
+            tasks = [AgreeTask(self.setting, group, step) for group in groups]
+            for number, result in self._each(agree_a_little, tasks, f"agreeing, step {step} of {steps}"):
+                if isinstance(result, Died):
+                    raise result
+                waiting[number] = result
+                while next_one in waiting:
+                    here = waiting.pop(next_one)
+                    total, next_one = here if total is None else total + here, next_one + 1
+            assert total is not None
+            if step < steps:
+                save_array(self.setting.store, common_file(step + 1), stretch_of(total / count))
+
+    def finish(self, tasks: Mapping[int, FinishTask]) -> Iterator[tuple[int, str]]:
+        """Place the vertices of every shape; gives the numbers of those where that failed, and why."""
+        numbers = list(tasks)
+        for at, trouble in self._each(finish, list(tasks.values()), "placing vertices"):
+            trouble = trouble.message if isinstance(trouble, Died) else trouble
+            if trouble:
+                yield numbers[at], trouble
+
+
+def settled(wish: Setting, sources: Sequence[Source]) -> Setting:
+    """What all tasks share: a model that is named. What a folder of fits says of itself is written, or checked if it was
+    there before.
+
+    `OptionError` if it holds fits of another model, or made in another way; or as `choose_model`.
+    """
+    check_config(wish.config)
+    store, about, model = wish.store, read_about(wish.store), wish.model
+    if model == AUTO:
+        model = _chosen(sources, wish.config) if about is None else str(about["model"])
+    trained = as_model(model)
+    setting = replace(wish, model=model if model == trained.card.name else str(Path(model).resolve()))
+    wanted = {"schema": SCHEMA, "template": trained.template.hash} | setting.choices()
+    if about is None:
+        with store.writing(TEMPLATE) as path:
+            save_template(trained.template, path)
+        _write(store, ABOUT, json.dumps(wanted, indent=2) + "\n")  # last: a folder without it is no collection
+    elif differs := [name for name in wanted if about[name] != wanted[name]]:
+        other = f"the fits in {store.location} were made with another {differs[0]}"
+        raise OptionError(other, "choose another folder, or the options of before")
+    return setting
+
+
+def _chosen(sources: Sequence[Source], config: FitConfig) -> str:
+    """The installed model that knows the kind of the first shape which can be read and is of a known kind."""
+    trouble: MeshmatchError | None = None
+    for source in sources[:_READ_AHEAD]:
+        try:
+            chosen = choose_model([validated(source.load())], [config])[0]
+        except MeshmatchError as error:
+            trouble = trouble or error
+        else:
+            return chosen.card.name
+    assert trouble is not None
+    raise trouble
+
+
+def read_about(store: Store) -> dict[str, Any] | None:
+    """What a folder says of its fits; None if it is no folder of fits."""
+    if not store.exists(ABOUT):
+        return None
+    try:
+        with store.reading(ABOUT) as path:
+            about = json.loads(path.read_text(encoding="utf-8"))
+        if about["schema"] != SCHEMA:
+            raise InputError(f"{ABOUT} has schema {about['schema']!r}, not {SCHEMA}", "update meshmatch")
+        return {name: about[name] for name in ("schema", "template", "model", "only", "without", "fit")}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{store.location}/{ABOUT} is damaged", "remove the folder, and fit again") from error
+
+
+def _write_table(store: Store, records: Sequence[Record]) -> None:
+    """``fits.csv``: a row for each shape."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(COLUMNS)
+    table.writerows([getattr(record, name) for name in COLUMNS] for record in records)
+    _write(store, TABLE, text.getvalue())
+
+
+def _write(store: Store, name: str, text: str) -> None:
+    with store.writing(name) as path, replace_on_success(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

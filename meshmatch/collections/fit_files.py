@@ -1,0 +1,149 @@
+"""Fits as files: safetensors with the arrays, and a JSON header for the words.
+
+A fit is kept in two states. Alone, it has the samples of its shape with it, for it has yet to agree with others. Finished,
+it knows where the vertices of its shape belong on the template (`Places`), which is all that maps ask. Neither holds the
+template, which a collection keeps once, nor anything that differs from run to run.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from meshmatch.errors import InputError, ModelError
+from meshmatch.fitting.fit import Fit, Reason
+from meshmatch.geometry.frames import Frame
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.maps.places import Places
+from meshmatch.models.tensor_file import read_header
+from meshmatch.templates.template import Template, save_arrays
+
+SCHEMA = 1
+_HINT = "fit the shape again: remove the file, and run `meshmatch fit` as before"
+_FIT_WORDS = ("template_hash", "residual", "verdict", "up", "front", "seed", "partial", "model")
+_PLACES = ("resting", "distance", "stands", "faces", "fitted")
+_OPTIONAL = ("shift", "spread")
+Words = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFit:
+    """A fit that was read from a file: it does not know its shape, but where the shape's vertices belong.
+
+    ``verts`` of the fit are none, and its ``seconds`` 0. ``words`` are what else the file says.
+    """
+
+    fit: Fit
+    places: Places | None  # of a finished fit
+    samples: OrientedPoints | None  # of a fit alone, in the fit's core frame
+    words: Words
+
+
+def save_fit(
+    path: str | Path,
+    fit: Fit,
+    places: Places | None = None,
+    samples: OrientedPoints | None = None,
+    words: Words | None = None,
+) -> None:
+    """Write a fit with the places or the samples of its shape; ``words`` are what else is worth knowing (JSON)."""
+    arrays: dict[str, np.ndarray] = {"points": fit.points, "vectors": fit.vectors}
+    arrays |= {"rotation": fit.frame.rotation, "center": fit.frame.center}
+    about: Words = {name: getattr(fit, name) for name in _FIT_WORDS}
+    about |= {"reasons": [[reason.code, str(reason)] for reason in fit.reasons], "scale": fit.frame.scale}
+    if places is not None:
+        arrays |= {name: getattr(places, name) for name in _PLACES}
+        arrays |= {name: kept for name in _OPTIONAL if (kept := getattr(places, name)) is not None}
+        about |= {"shape": places.name, "shape_hash": places.hash}
+    if samples is not None:
+        arrays |= {"sample_points": samples.points, "sample_normals": samples.normals}
+        if samples.weights is not None:
+            arrays["sample_weights"] = samples.weights
+        about["signed"] = samples.signed
+    header = {"schema": SCHEMA, "fit": about, "more": words or {}}
+    save_arrays(path, arrays, {"fit": json.dumps(header, sort_keys=True)})
+
+
+def load_words(path: str | Path) -> tuple[Words, Words]:
+    """What a fit's file says in words: of the fit, and what else; the arrays are not read. Errors as `load_fit`."""
+    path = Path(path)
+    try:
+        read_header(path)
+        with safe_open(str(path), framework="np") as file:
+            header = json.loads((file.metadata() or {})["fit"])
+        if header["schema"] != SCHEMA:
+            raise InputError(f"{path.name} has fit schema {header['schema']!r}, not {SCHEMA}", "update meshmatch")
+        return dict(header["fit"]), dict(header["more"])
+    except ModelError as error:
+        raise InputError(error.message, _HINT) from error
+    except (SafetensorError, KeyError, TypeError, ValueError, OSError, RecursionError) as error:
+        raise InputError(f"{path.name} is not a fit's file", _HINT) from error
+
+
+def load_fit(path: str | Path, template: Template) -> StoredFit:
+    """Read a fit of this template; `InputError` if the file is missing, damaged, of another schema or template."""
+    path = Path(path)
+    about, more = load_words(path)
+    try:
+        with safe_open(str(path), framework="np") as file:
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
+        if about["template_hash"] != template.hash:
+            wrong = f"{path.name} is a fit of another template ({about['template_hash']}, not {template.hash})"
+            raise InputError(wrong, "a collection holds fits of one model")
+        V = template.shape.V
+        fit = Fit(
+            frame=Frame(float(about["scale"]), arrays["rotation"], arrays["center"]),
+            points=_checked(arrays, "points", np.float64, (V, 3)),
+            vectors=_checked(arrays, "vectors", np.float64, (template.K, 3)),
+            resting=np.asarray(template.shape.verts),
+            faces=np.asarray(template.shape.faces),
+            verts=np.empty((0, 3)),
+            reasons=tuple(Reason(code, sentence) for code, sentence in about["reasons"]),
+            seconds=0.0,
+            **{name: about[name] for name in _FIT_WORDS},
+        )
+        return StoredFit(fit, _places(arrays, about, fit), _samples(arrays, about), more)
+    except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
+        raise InputError(f"{path.name} is damaged: {error}", _HINT) from error
+
+
+def _places(arrays: dict[str, np.ndarray], about: Words, fit: Fit) -> Places | None:
+    if "resting" not in arrays:
+        return None
+    V, F = len(arrays["resting"]), len(arrays["faces"])
+    kinds: dict[str, tuple[Any, tuple[int, ...]]] = {
+        **dict.fromkeys(("distance", *_OPTIONAL), (np.float32, (V,))),
+        **{"resting": (np.float32, (V, 3)), "stands": (np.int32, (V,))},
+        **{"faces": (np.int32, (F, 3)), "fitted": (np.bool_, (F,))},
+    }
+    found = {name: _checked(arrays, name, *kinds[name]) for name in kinds if name in arrays}
+    for name in ("stands", "faces"):
+        if found[name].size and not (0 <= found[name].min() and found[name].max() < V):
+            raise ValueError(f"{name} names a vertex that is not there")
+    optional: Words = {name: found.get(name) for name in _OPTIONAL}
+    required: Words = {name: found[name] for name in _PLACES}
+    words: Words = {"name": str(about["shape"]), "hash": str(about["shape_hash"]), "template_hash": fit.template_hash}
+    return Places(**words, **required, **optional, verdict=fit.verdict, reasons=tuple(map(str, fit.reasons)))
+
+
+def _samples(arrays: dict[str, np.ndarray], about: Words) -> OrientedPoints | None:
+    if "sample_points" not in arrays:
+        return None
+    P = len(arrays["sample_points"])
+    points, normals = (_checked(arrays, f"sample_{name}", np.float64, (P, 3)) for name in ("points", "normals"))
+    weights = _checked(arrays, "sample_weights", np.float64, (P,)) if "sample_weights" in arrays else None
+    return OrientedPoints(points, normals, bool(about["signed"]), weights)
+
+
+def _checked(arrays: dict[str, np.ndarray], name: str, kind: Any, shape: tuple[int, ...]) -> Any:
+    array = arrays[name]
+    if array.dtype != kind or array.shape != shape:
+        raise ValueError(f"{name} is an array of {array.shape} {array.dtype}, not of {shape} {np.dtype(kind)}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{name} has numbers that are not finite")
+    return array

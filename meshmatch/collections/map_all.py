@@ -1,0 +1,125 @@
+"""Maps of many pairs of a collection, written one by one: never more than a few of them are in memory."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from meshmatch.collections.fit_all import TEMPLATE
+from meshmatch.collections.fit_files import load_fit
+from meshmatch.collections.stores import Store
+from meshmatch.collections.tasks import FITS, SUFFIX
+from meshmatch.collections.workers import Died, Workers
+from meshmatch.errors import InputError
+from meshmatch.maps.build import build_map
+from meshmatch.maps.files import check_suffix, save_map
+from meshmatch.maps.places import Places
+from meshmatch.outputs import as_path
+from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.input_files import existing
+from meshmatch.templates.template import Template, load_template
+
+Pair = tuple[str, str]
+"""Names of a source and of a target."""
+_SOURCES = 64  # of one task: enough to pay for the target's tree
+_KEPT = 64  # shapes' places in memory
+
+
+@dataclass(frozen=True)
+class MapTask:
+    """Maps of some shapes to one."""
+
+    fits: Store
+    output: Store
+    sources: tuple[str, ...]
+    target: str
+    suffix: str
+
+    def file(self, source: str) -> str:
+        """Where a map is written."""
+        return f"{source}/{self.target}{self.suffix}"
+
+
+def load_pairs(path: str | Path) -> list[Pair]:
+    """Names of a source and a target a line, with a tab, a comma or spaces between them; ``#`` begins a comment.
+
+    `InputError` if the file is missing, or a line holds anything else.
+    """
+    path = existing(as_path(path))
+    found = []
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
+        text = line.partition("#")[0].strip()
+        mark = next((each for each in "\t," if each in text), None)
+        words = [word.strip() for word in text.split(mark)]
+        if text and len(words) != 2:
+            hint = "a source and a target a line; put a comma between names that hold spaces"
+            raise InputError(f"{path.name}, line {number}: not two names", hint)
+        if text:
+            found.append((words[0], words[1]))
+    if not found:
+        raise InputError(f"{path.name} holds no pair of names", "a source and a target a line")
+    return found
+
+
+def map_some(task: MapTask) -> int:
+    """Write maps to one shape; how many there are. Those that are as new as the fits are kept."""
+    for source in task.sources:
+        if not _is_new(task, source):
+            found = build_map(_places(task.fits, source), _places(task.fits, task.target))
+            with task.output.writing(task.file(source)) as path:
+                save_map(path, found)
+    return len(task.sources)
+
+
+def map_all(
+    fits: Store,
+    output: Store,
+    pairs: Sequence[Pair],
+    suffix: str,
+    crew: Workers,
+    progress: ProgressCallback | None = None,
+) -> int:
+    """Maps of pairs of fits; see `Collection.save_maps`."""
+    check_suffix(Path(f"map{suffix}"))
+    sources: dict[str, list[str]] = defaultdict(list)
+    for source, target in pairs:
+        sources[target].append(source)
+    tasks = [
+        MapTask(fits, output, tuple(group[first : first + _SOURCES]), target, suffix)
+        for target, group in sources.items()
+        for first in range(0, len(group), _SOURCES)
+    ]
+    done = 0
+    for _, result in crew.each(map_some, tasks):
+        if isinstance(result, Died):
+            raise result
+        done += result
+        if progress is not None:
+            progress("mapping", output.location, done / len(pairs))
+    return done
+
+
+def _is_new(task: MapTask, source: str) -> bool:
+    """Whether a map here was written after both fits, as far as files here tell."""
+    if task.fits.remote or task.output.remote:
+        return False
+    path = Path(task.output.location, task.file(source))
+    both = [Path(task.fits.location, FITS, f"{name}{SUFFIX}") for name in (source, task.target)]
+    return path.is_file() and path.stat().st_mtime > max(fit.stat().st_mtime for fit in both)
+
+
+@lru_cache(maxsize=_KEPT)
+def _places(fits: Store, name: str) -> Places:
+    with fits.reading(f"{FITS}/{name}{SUFFIX}") as path:
+        found = load_fit(path, _template(fits)).places
+    assert found is not None
+    return found
+
+
+@lru_cache(maxsize=1)
+def _template(fits: Store) -> Template:
+    with fits.reading(TEMPLATE) as path:
+        return load_template(path)

@@ -1,0 +1,61 @@
+"""Which shapes a collection is made of, and what they are called in it."""
+
+from __future__ import annotations
+
+import glob
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+
+from meshmatch.collections.stores import Store, is_url
+from meshmatch.collections.tasks import Source
+from meshmatch.errors import InputError
+from meshmatch.outputs import as_path
+from meshmatch.shapes.files import SUFFIXES
+
+_ARRAYS = ".npy"  # a cloud, or whatever else somebody keeps beside his shapes
+_PATTERN = "*?["
+
+
+def find_sources(shapes: str | Path | Sequence[str | Path], output: Store) -> list[Source]:
+    """The shapes of files, folders, patterns and URLs of folders, sorted by name.
+
+    A shape of a folder is called by its path in it, without the suffix; any other by its file's name. What lies in the
+    folder of the fits is left out, and arrays (.npy) of a folder that holds shapes of another format.
+
+    `InputError` if there is nothing, or two shapes have one name.
+    """
+    given = [shapes] if isinstance(shapes, str | Path) else list(shapes)
+    found = sorted((source for each in given for source in _sources(each, output)), key=lambda source: source.name)
+    if not found:
+        raise InputError(
+            f"there are no shapes in {given[0] if given else 'nothing'}", f"read are {', '.join(SUFFIXES)}"
+        )
+    counts = Counter(source.name for source in found)
+    for source in found:
+        if counts[source.name] > 1:
+            both = " and ".join(each.file for each in found if each.name == source.name)
+            raise InputError(f"two shapes are called {source.name}: {both}", "rename one, or put them into two folders")
+    return found
+
+
+def _sources(given: str | Path, output: Store) -> Iterable[Source]:
+    if is_url(given):
+        return _of_folder(Store.of(given), output)
+    path = as_path(given)
+    if path.is_dir():
+        return _of_folder(Store.of(path), output)
+    if not path.exists() and any(mark in str(given) for mark in _PATTERN):
+        files = [Path(match) for match in glob.glob(str(path), recursive=True)]
+        files = [file for file in files if file.suffix.lower() in SUFFIXES]
+    else:
+        files = [path]
+    return [Source(file.stem, Store.of(file.parent), file.name) for file in files]
+
+
+def _of_folder(folder: Store, output: Store) -> list[Source]:
+    files = [PurePosixPath(name) for name in folder.names() if PurePosixPath(name).suffix.lower() in SUFFIXES]
+    files = [file for file in files if not f"{folder.location}/{file}".startswith(f"{output.location}/")]
+    if any(file.suffix.lower() != _ARRAYS for file in files):
+        files = [file for file in files if file.suffix.lower() != _ARRAYS]
+    return [Source(str(file.with_suffix("")), folder, str(file)) for file in files]

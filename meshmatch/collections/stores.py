@@ -1,0 +1,109 @@
+"""Where the files of a collection lie: a folder here, or any place that fsspec reaches by a URL."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from meshmatch.errors import InputError, OutputError, needs
+from meshmatch.outputs import make_folder
+
+
+def is_url(location: str | Path) -> bool:
+    """Whether a location is a URL, such as ``s3://bucket/scans``, rather than a path."""
+    return isinstance(location, str) and "://" in location
+
+
+@dataclass(frozen=True)
+class Store:
+    """A folder, named by a path or a URL. Names in it are relative, with ``/`` between folders."""
+
+    location: str
+
+    @classmethod
+    def of(cls, location: str | Path) -> Store:
+        """A path becomes absolute: workers may have another working directory."""
+        return cls(str(location).rstrip("/") if is_url(location) else os.path.abspath(location))
+
+    @property
+    def remote(self) -> bool:
+        """Whether it is named by a URL."""
+        return is_url(self.location)
+
+    @contextmanager
+    def reading(self, name: str) -> Iterator[Path]:
+        """A file as a path on this machine; a copy, of a remote one. `InputError` if it cannot be fetched."""
+        if not self.remote:
+            yield Path(self.location, name)
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            local = Path(folder, PurePosixPath(name).name)
+            files, root = _filesystem(self.location)
+            try:
+                files.get_file(f"{root}/{name}", str(local))
+            except OSError as error:
+                raise InputError(f"cannot read {self.location}/{name}: {error}", "is the address right?") from error
+            yield local
+
+    @contextmanager
+    def writing(self, name: str) -> Iterator[Path]:
+        """A path to write a file to, by a writer that leaves nothing half-written; `OutputError` if it cannot be sent."""
+        if not self.remote:
+            path = Path(self.location, name)
+            make_folder(path.parent)
+            yield path
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            local = Path(folder, PurePosixPath(name).name)
+            yield local
+            files, root = _filesystem(self.location)
+            try:
+                files.makedirs(f"{root}/{PurePosixPath(name).parent}", exist_ok=True)
+                files.put_file(str(local), f"{root}/{name}")
+            except OSError as error:
+                raise OutputError(f"cannot write {self.location}/{name}: {error}", "may you write there?") from error
+
+    def exists(self, name: str) -> bool:
+        """Whether there is such a file or folder."""
+        if not self.remote:
+            return Path(self.location, name).exists()
+        files, root = _filesystem(self.location)
+        return bool(files.exists(f"{root}/{name}"))
+
+    def names(self, folder: str = "") -> list[str]:
+        """All files in a folder and below it, sorted, relative to the folder; those whose names begin with a dot are not
+        seen."""
+        if self.remote:
+            files, root = _filesystem(self.location)
+            top = f"{root}/{folder}".rstrip("/")
+            found = [path[len(top) + 1 :] for path in files.find(top)] if files.exists(top) else []
+        else:
+            base = Path(self.location, folder)
+            found = [path.relative_to(base).as_posix() for path in base.rglob("*") if path.is_file()]
+        return sorted(name for name in found if not any(part.startswith(".") for part in name.split("/")))
+
+    def remove(self, name: str) -> None:
+        """Remove a file, or a folder with all that is in it."""
+        if self.remote:
+            files, root = _filesystem(self.location)
+            if files.exists(f"{root}/{name}"):
+                files.rm(f"{root}/{name}", recursive=True)
+        else:
+            path = Path(self.location, name)
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def _filesystem(location: str) -> tuple[Any, str]:
+    with needs("fsspec", "cluster"):
+        import fsspec
+    try:
+        found: tuple[Any, str] = fsspec.core.url_to_fs(location)
+        return found
+    except (ValueError, ImportError) as error:
+        raise InputError(f"cannot reach {location}: {error}", "install what fsspec needs for such a URL") from error

@@ -1,0 +1,76 @@
+"""``meshmatch fit`` and ``map`` as their users meet them."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from meshmatch.maps.files import load_map
+from tests.cli.conftest import Run
+
+SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
+
+
+@pytest.fixture(scope="module")
+def fits(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Fits that the verb made, of two bodies and of a file that is none."""
+    from meshmatch.cli import main
+
+    folder = tmp_path_factory.mktemp("collection")
+    (folder / "shapes").mkdir()
+    for name in ("climber", "dancer"):
+        shutil.copy(SAMPLES / f"{name}.ply", folder / "shapes")
+    (folder / "shapes" / "empty.obj").write_text("")
+    words = ["fit", str(folder / "shapes"), "-o", str(folder / "fits"), "--model", "human", "--jobs", "1", "-q"]
+    assert main(words) == 0
+    return folder / "fits"
+
+
+def test_what_is_said(fits: Path, run: Run) -> None:
+    """The second time nothing is left to do, and all is said again."""
+    words = ["fit", fits.parent / "shapes", "-o", fits, "--jobs", "1"]
+    answer = run(*words, "--json")
+    assert answer.status == 0
+    assert "dancer: good fit, up +y, front +z" in answer.err
+    assert "warning: empty: empty.obj is empty (0 bytes)" in answer.err
+    assert f"wrote 2 fits to {fits}: 2 good, 1 failed" in answer.err
+    record = json.loads(answer.out)
+    assert record["verdicts"] == {"good": 2, "fair": 0, "poor": 0, "failed": 1}
+    assert (record["model"], record["agreed"], record["seed"]) == ("human", 2, 0)
+    strict = run(*words, "--strict", "-q")
+    assert strict.status == 1 and "not every fit is to be trusted: 2 good, 1 failed" in strict.err
+
+
+def test_maps_of_names(fits: Path, run: Run, tmp_path: Path) -> None:
+    answer = run("map", fits, "-o", tmp_path / "maps", "--to", "dancer", "--jobs", "1", "--json")
+    assert answer.status == 0 and json.loads(answer.out)["maps"] == 1
+    found = load_map(tmp_path / "maps" / "climber" / "dancer.npz", SAMPLES / "climber.ply", SAMPLES / "dancer.ply")
+    assert found.verdict == "good"
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("# both ways\nclimber, dancer\ndancer\tclimber\n\n")
+    answer = run("map", fits, "-o", tmp_path / "some", "--pairs", pairs, "--format", ".csv", "-q", "--jobs", "1")
+    assert (answer.status, answer.err) == (0, "")
+    assert len(list((tmp_path / "some").rglob("*.csv"))) == 2
+
+
+def test_what_cannot_be_mapped(fits: Path, run: Run, tmp_path: Path) -> None:
+    def refused(*words: str | Path) -> str:
+        answer = run("map", *words, "-o", tmp_path / "maps")
+        assert answer.status == 1 and not (tmp_path / "maps").exists()
+        return answer.err
+
+    assert "which maps?" in refused(fits)
+    assert "which maps?" in refused(fits, "--all", "--to", "dancer")
+    assert "is not a folder of fits" in refused(fits.parent / "shapes", "--all")
+    assert "did you mean dancer?" in refused(fits, "--to", "dancr")
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("climber dancer climber\n")
+    assert "pairs.txt, line 1: not two names" in refused(fits, "--pairs", pairs)
+    pairs.write_text("# nothing\n")
+    assert "holds no pair of names" in refused(fits, "--pairs", pairs)
+
+
+def test_a_model_that_is_not_there_is_told_before_the_work(fits: Path, run: Run, tmp_path: Path) -> None:
+    answer = run("fit", fits.parent / "shapes", "-o", tmp_path / "new", "--model", "humann")
+    assert answer.status == 1 and not (tmp_path / "new").exists()

@@ -1,0 +1,163 @@
+"""A collection is fitted, stopped, gone on with and mapped."""
+
+import csv
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import meshmatch
+from meshmatch.collections.fit_files import load_fit, load_words
+from meshmatch.collections.tasks import Record
+from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+
+SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
+NAMES = ["climber", "dancer", "turned"]
+
+
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two bodies, one of them also on its side and ten times as large, and a file that is none."""
+    folder = tmp_path_factory.mktemp("shapes")
+    for name in ("climber", "dancer"):
+        shutil.copy(SAMPLES / f"{name}.ply", folder)
+    dancer = load_shape(SAMPLES / "dancer.ply")
+    save_shape(folder / "turned.obj", Shape(10 * dancer.verts[:, [1, 2, 0]], dancer.faces))
+    (folder / "broken.ply").write_text("ply\nnothing of the sort\n")
+    (folder / "turned.truth.npy").write_bytes(b"not of this format")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(shapes: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, tuple[Record, ...]]]:
+    folder = tmp_path_factory.mktemp("out") / "fits"
+    told: list[Record] = []
+    found = meshmatch.Collection(folder, workers=1).fit(shapes, model="human", tell=told.append)
+    assert list(found.records) == told and found.agreed == 3
+    yield folder, found.records
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((folder / "fits").rglob("*.safetensors"))}
+
+
+def test_a_bad_shape_is_told_and_stops_nobody(made: tuple[Path, tuple[Record, ...]]) -> None:
+    folder, records = made
+    assert [record.name for record in records] == ["broken", *NAMES]
+    assert [record.verdict for record in records] == ["failed", "good", "good", "good"]
+    assert "broken.ply" in records[0].reasons
+    with open(folder / "fits.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["name"] for row in rows] == ["broken", *NAMES]
+    assert float(rows[1]["residual"]) == records[1].residual and rows[1]["file"].endswith("/climber.ply")
+    assert meshmatch.Collection(folder).names == NAMES
+
+
+def test_a_body_on_its_side_is_the_same_body(made: tuple[Path, tuple[Record, ...]]) -> None:
+    collection = meshmatch.Collection(made[0])
+    found = collection.map("dancer", "turned")
+    dancer = load_shape(SAMPLES / "dancer.ply")
+    off = np.linalg.norm(dancer.verts[found.index] - dancer.verts, axis=1) / np.sqrt(dancer.area)
+    assert off.mean() < 0.01
+    assert (found.source, found.target, found.verdict) == ("dancer", "turned", "good")
+    assert found.source_hash == dancer.hash and found.confidence.mean() > 0.8
+    assert (collection.map("dancer", "dancer").index == np.arange(dancer.V)).mean() > 0.95
+
+
+def test_a_fit_that_was_read_is_the_fit(made: tuple[Path, tuple[Record, ...]]) -> None:
+    collection = meshmatch.Collection(made[0])
+    fit, alone = collection.fit_of("dancer"), meshmatch.register(SAMPLES / "dancer.ply", model="human")
+    assert (fit.verdict, fit.up, fit.front, fit.residual) == (alone.verdict, alone.up, alone.front, alone.residual)
+    assert np.array_equal(fit.frame.rotation, alone.frame.rotation) and fit.frame.scale == alone.frame.scale
+    moved = np.linalg.norm(fit.points - alone.points, axis=1)
+    assert 0 < moved.mean() < 0.02  # it has agreed with the others
+
+
+def test_the_maps_are_close_to_those_of_a_pair(made: tuple[Path, tuple[Record, ...]]) -> None:
+    pair = meshmatch.match(SAMPLES / "climber.ply", SAMPLES / "dancer.ply", model="human").map
+    found = meshmatch.Collection(made[0]).map("climber", "dancer")
+    dancer = load_shape(SAMPLES / "dancer.ply")
+    apart = np.linalg.norm(dancer.verts[found.index] - dancer.verts[pair.index], axis=1) / np.sqrt(dancer.area)
+    assert apart.mean() < 0.01
+
+
+def test_nothing_is_done_twice_and_more_may_come(shapes: Path, tmp_path: Path) -> None:
+    """Two processes, and a shape that comes later: the fits are those of one run in one process, bit for bit."""
+    first, whole = tmp_path / "first", tmp_path / "whole"
+    two = [shapes / "dancer.ply", shapes / "climber.ply"]
+    collection = meshmatch.Collection(first, workers=2)
+    collection.fit(two, model="human")
+    before = contents(first)
+    times = {path: path.stat().st_mtime_ns for path in first.rglob("*.safetensors")}
+    collection.fit(two)
+    assert {path: path.stat().st_mtime_ns for path in first.rglob("*.safetensors")} == times
+    collection.fit(shapes)
+    meshmatch.Collection(whole, workers=1).fit(shapes, model="human")
+    assert contents(first) == contents(whole) != before and set(before) < set(contents(first))
+    assert not (first / "agreeing").exists()
+
+
+def test_fits_alone_do_not_move(shapes: Path, tmp_path: Path) -> None:
+    collection = meshmatch.Collection(tmp_path / "alone", workers=1)
+    made = collection.fit(str(shapes / "[cd]*.ply"), model="human", agree=False)
+    assert made.agreed == 0 and collection.names == ["climber", "dancer"]
+    alone = meshmatch.register(SAMPLES / "climber.ply", model="human")
+    assert np.array_equal(collection.fit_of("climber").points, alone.points)
+    assert collection.places_of("climber").shift is None
+
+
+def test_maps_are_written_once(made: tuple[Path, tuple[Record, ...]], tmp_path: Path) -> None:
+    collection, folder = meshmatch.Collection(made[0], workers=1), tmp_path / "maps"
+    assert collection.save_maps(folder) == 6
+    written = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
+    assert written == [f"{a}/{b}.npz" for a in NAMES for b in NAMES if a != b]
+    read = meshmatch.load_map(folder / "dancer" / "turned.npz", SAMPLES / "dancer.ply")
+    assert np.array_equal(read.index, collection.map("dancer", "turned").index)
+    times = [path.stat().st_mtime_ns for path in sorted(folder.rglob("*.npz"))]
+    assert collection.save_maps(folder, [("dancer", "turned")]) == 1
+    assert [path.stat().st_mtime_ns for path in sorted(folder.rglob("*.npz"))] == times
+
+
+def test_what_is_wrong_is_said(made: tuple[Path, tuple[Record, ...]], shapes: Path, tmp_path: Path) -> None:
+    folder, _ = made
+    collection = meshmatch.Collection(folder)
+    with pytest.raises(InputError, match="no fit of dancr") as error:
+        collection.map("dancr", "climber")
+    assert error.value.hint == "did you mean dancer?"
+    with pytest.raises(OptionError, match="not a format"):
+        collection.save_maps(tmp_path / "maps", suffix=".png")
+    with pytest.raises(OptionError, match="another fit"):
+        collection.fit(shapes, config=meshmatch.FitConfig(seed=1))
+    with pytest.raises(OptionError, match="another template"):
+        collection.fit(shapes, model="quadruped")
+    with pytest.raises(InputError, match="not a folder of fits"):
+        meshmatch.Collection(tmp_path).names  # noqa: B018
+    with pytest.raises(InputError, match="no shapes"):
+        meshmatch.Collection(tmp_path / "new").fit(tmp_path)
+    with pytest.raises(InputError, match="two shapes are called dancer"):
+        meshmatch.Collection(tmp_path / "new").fit([shapes / "dancer.ply", SAMPLES / "dancer.ply"])
+    with pytest.raises(MeshmatchError, match="none of 1 shapes"):
+        meshmatch.Collection(tmp_path / "new").fit(shapes / "broken.ply", model="human")
+
+
+def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_path: Path) -> None:
+    template = meshmatch.Collection(made[0]).template
+    whole = (made[0] / "fits" / "dancer.safetensors").read_bytes()
+    broken = tmp_path / "dancer.safetensors"
+    for data in (b"", whole[:1000], whole[:-1], whole.replace(b'"schema', b'"schemo', 1), b"\xff" * 100):
+        broken.write_bytes(data)
+        with pytest.raises(InputError):
+            load_fit(broken, template)
+    numbers = whole.replace(b'\\"schema\\": 1', b'\\"schema\\": 9')
+    assert numbers != whole
+    broken.write_bytes(numbers)
+    with pytest.raises(InputError, match="schema 9"):
+        load_words(broken)
+    broken.write_bytes(whole)
+    other = meshmatch.load_model("quadruped").template
+    with pytest.raises(InputError, match="another template"):
+        load_fit(broken, other)
