@@ -22,6 +22,7 @@ from meshmatch.fitting.nodes import add_landmarks, nearest_rotations, pair_terms
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.task import Landmarks, take_samples
 from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.symmetric import entries_of, exponential, logarithm, matrices_of
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
 
@@ -169,12 +170,9 @@ def mean_stretch(gradients: Sequence[Float[Floats, "G 3 3"]]) -> Float[Floats, "
 
 def log_stretch(F: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
     """Logarithm of the right stretch sqrt(F^T F)."""
-    squares, axes = np.linalg.eigh(F.transpose(0, 2, 1) @ F)
-    logs = 0.5 * np.log(np.maximum(squares, _MIN_STRETCH**2))
-    return np.asarray((axes * logs[:, None, :]) @ axes.transpose(0, 2, 1))
+    return matrices_of(0.5 * logarithm(entries_of(F.transpose(0, 2, 1) @ F), _MIN_STRETCH**2))
 
 
-def stretch_of(logarithm: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
+def stretch_of(logs: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
     """The stretch of a logarithm."""
-    logs, axes = np.linalg.eigh(logarithm)
-    return np.asarray((axes * np.exp(logs)[:, None, :]) @ axes.transpose(0, 2, 1))
+    return matrices_of(exponential(entries_of(logs)))
