@@ -72,7 +72,8 @@ def fit_whole(task: FitTask, refine: Refine) -> Registration:
     starts = [(task.coarse, pose) for pose in frames_to_try(task.model, task.samples, task.config)]
     candidates = best_first(task.predictor.fit_all(starts, rounds=care, draws=care))
     careful = task.config.careful
-    if not task.shape.is_cloud and candidates[0].residual > _STRANGE:
+    part = task.config.partial == "yes"  # which is no strange body
+    if candidates[0].residual > _STRANGE and not (task.shape.is_cloud or part):
         lower = [
             (samples, RigidPose(pose.rotation, pose.center - down * pose.rotation[:, 1]))
             for samples, pose in starts
