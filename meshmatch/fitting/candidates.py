@@ -98,7 +98,8 @@ def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list
 
     near = _BEHIND * candidates[0].residual
     best = [each for each in candidates[: task.config.careful] if each.residual <= near]
-    found = [estimate_scale(task.system, task.samples, candidate, fit_again) for candidate in best]
+    isolated = isolated_points(task.samples.points)
+    found = [estimate_scale(task.system, task.samples, isolated, candidate, fit_again) for candidate in best]
     # the last fits alone need their residuals
     residuals = [two_way_residual(task.system, left.to_local(fit.pose), fit.vectors) for _, left, fit in found]
     scale, samples, first = found[int(np.argmin(residuals))]
@@ -112,23 +113,25 @@ def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list
 def estimate_scale(
     system: NodeSystem,
     samples: OrientedPoints,
+    isolated: Bool[Bools, " P"],
     candidate: Candidate,
     fit_again: Callable[[OrientedPoints, RigidPose], Candidate],
 ) -> tuple[float, OrientedPoints, Candidate]:
     """Rescale samples of a cloud (area 1 by estimate) by the network's fit, drop outliers, fit again, a few times.
 
+    Outliers are those of the ``isolated`` samples, see `isolated_points`, that lie far from the fit.
+
     Returns the scale, by which lengths of the old frame are to be divided; the samples that are left, in the new frame;
     and their fit.
     """
-    isolated = isolated_points(samples.points)
     resting = vertex_areas(system.verts, system.faces).sum()
     total = 1.0
     for _ in range(_ROUNDS):
         moved, pose = system.moved(candidate.vectors), candidate.pose
         step = np.sqrt(vertex_areas(moved, system.faces).sum() / resting)
         step = np.clip(step, 1 / _MAX_CHANGE / total, _MAX_CHANGE / total)
-        far = cKDTree(pose.to_world(moved)).query(samples.points)[0] > _FAR
-        keep = ~(far & isolated)
+        keep = ~isolated
+        keep[isolated] = cKDTree(pose.to_world(moved)).query(samples.points[isolated])[0] <= _FAR
         total *= step
         samples, isolated = samples.rows(keep), isolated[keep]
         samples = replace(samples, points=samples.points / step)
