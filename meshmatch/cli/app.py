@@ -6,6 +6,7 @@ import typer
 from typer.core import TyperGroup
 
 from meshmatch import __version__
+from meshmatch.cli.atlas import atlas
 from meshmatch.cli.collect import fit, map
 from meshmatch.cli.info import info
 from meshmatch.cli.interpolate import interpolate
@@ -62,7 +63,7 @@ def root(
 for verb in (
     *(match, register, evaluate),
     *(transfer_texture, transfer_color, transfer_labels, transfer_weights, transfer_landmarks),
-    *(fit, map),
+    *(fit, map, atlas),
     *(interpolate, picture, view, info, prepare, train),
 ):
     app.command()(verb)

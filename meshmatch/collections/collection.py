@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import cached_property, lru_cache
 from itertools import permutations
 from pathlib import Path
 
+import numpy as np
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.fit_all import TEMPLATE, Fitted, fit_all, read_about, settled
-from meshmatch.collections.fit_files import StoredFit, load_fit
+from meshmatch.collections.fit_files import StoredFit, load_fit, load_words
 from meshmatch.collections.map_all import Pair, map_all
+from meshmatch.collections.registered import Registered, held
 from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
+from meshmatch.collections.superimpose import Scale
 from meshmatch.collections.tasks import FITS, SUFFIX, Record, Setting
 from meshmatch.collections.workers import hired
 from meshmatch.errors import InputError
@@ -130,6 +137,34 @@ class Collection:
             self._read(name)  # says what is wrong
         with hired(self.workers) as crew:
             return map_all(self.store, Store.of(output), wanted, suffix, crew, self.progress)
+
+    def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False, poor: bool = False) -> Atlas:
+        """The mean and the modes of the fitted shapes, see `Atlas.of`; poor fits count only if asked for."""
+        with self.registered(poor) as shapes:
+            return Atlas.of(shapes.points, shapes.faces, shapes.names, modes=modes, scale=scale, robust=robust)
+
+    @contextmanager
+    def registered(self, poor: bool = False) -> Iterator[Registered]:
+        """The template on every shape, in the unit of its file and with the axes of the template, without poor fits unless
+        asked for; held in memory, or in a file until the block ends. `InputError` where fewer than three are left.
+        """
+        verdicts = {}
+        for name in self.names:
+            with self.store.reading(f"{FITS}/{name}{SUFFIX}") as path:
+                verdicts[name] = str(load_words(path)[0]["verdict"])
+        left_out = {name: verdict for name, verdict in verdicts.items() if verdict == "poor" and not poor}
+        names = tuple(name for name in verdicts if name not in left_out)
+        if len(names) < 3:
+            out = f" and {len(left_out)} poor ones" if left_out else ""
+            raise InputError(f"{self.store.location} holds {len(names)} fits{out}", "an atlas needs three or more")
+
+        def read(number: int) -> Float[Floats, "V 3"]:
+            fit = self.fit_of(names[number])
+            return np.asarray(fit.points * fit.frame.scale)
+
+        faces = np.asarray(self.template.shape.faces)
+        with held(len(names), self.template.shape.V, read) as points:
+            yield Registered(points, faces, names, np.eye(3), left_out)
 
     def _load(self, name: str) -> StoredFit:
         file = f"{FITS}/{name}{SUFFIX}"

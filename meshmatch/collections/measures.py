@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -26,6 +27,7 @@ COUNTS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 FOLDS = 100
 """Of more shapes than these, several are left out at a time."""
 _POINTS = 300  # of a surface whose distance to the other one is measured
+_KEPT = 100  # surfaces in memory
 _LONGER = 0.6  # of the time, for generalisation
 _NEAREST = 2  # shapes of the collection, by their points, to which a random shape's distance is measured
 
@@ -126,6 +128,7 @@ class _Collection:
         self._atlas, self._shapes, self._surfaces = atlas, points, surfaces
         self._products = inner_products(points, atlas.laid)
         rows = np.random.default_rng(seed).permutation(len(atlas.mean))[:_POINTS]
+        self._known = lru_cache(maxsize=_KEPT)(lambda row: self._real(row, atlas.laid))
         self._rows, self._share = rows, atlas.weights[rows] / atlas.weights[rows].sum()
 
     def generalisation(self, out: Int[Ints, " B"], counts: Int[Ints, " K"]) -> Float[Floats, "2 B K"]:
@@ -160,7 +163,7 @@ class _Collection:
             own_points = [self._apart(made, self._laid(row, atlas.laid)) for row in near]
             apart[0, column] = min(own_points)
             best = [near[k] for k in np.argsort(own_points)[:_NEAREST]]
-            apart[1, column] = min(self._between_surfaces(made, self._real(row, atlas.laid)) for row in best)
+            apart[1, column] = min(self._between_surfaces(made, self._known(row)) for row in best)
         return apart
 
     def _laid(self, row: int, laid: Superimposed) -> Floats:

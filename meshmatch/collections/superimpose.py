@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import vertex_areas
 
 Scale = Literal["keep", "remove"]
-Shapes = Sequence[ArrayLike]
+Shapes: TypeAlias = Sequence[ArrayLike] | Floats
 """S arrays (V, 3): an array (S, V, 3), a list, or anything that gives one shape after the other when it is indexed."""
 _BLOCK = 4_000_000  # coordinates at a time: what is held in memory of a long list
 _ROUNDS, _CLOSE = 200, 1e-10  # at most; a change, as a share of the size, that ends them

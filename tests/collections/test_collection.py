@@ -3,13 +3,15 @@
 import csv
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import meshmatch
-from meshmatch.collections.fit_files import load_fit, load_words
+from meshmatch.cli import main
+from meshmatch.collections.fit_files import load_fit, load_words, save_fit
 from meshmatch.collections.tasks import Record
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.shapes.files import load_shape, save_shape
@@ -161,3 +163,43 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
     other = meshmatch.load_model("quadruped").template
     with pytest.raises(InputError, match="another template"):
         load_fit(broken, other)
+
+
+def test_a_collection_has_an_atlas(made: tuple[Path, tuple[Record, ...]], tmp_path: Path) -> None:
+    """In the axes of the template and the unit of the files: a body on its side, ten times as large, is the same body."""
+    collection = meshmatch.Collection(made[0])
+    with collection.registered() as shapes:
+        assert shapes.names == tuple(NAMES) and not shapes.left_out
+        for points, name in zip(shapes.points, NAMES, strict=True):
+            fit = collection.fit_of(name)
+            assert np.allclose(points @ fit.frame.rotation, fit.points_in_file - fit.frame.center)
+            assert np.ptp(points, axis=0).argmax() in (0, 1)  # upright, or arms that are spread
+    atlas = collection.atlas(scale="remove")
+    assert atlas.names == tuple(NAMES)
+    apart = np.linalg.norm((atlas.scores[:, None] - atlas.scores) * atlas.deviations, axis=2)
+    assert apart[1, 2] < 0.1 * apart[0, 1]
+    assert atlas.sizes[2] == pytest.approx(10 * atlas.sizes[1], rel=0.02)
+    output = tmp_path / "atlas"
+    assert main(["atlas", str(made[0]), "-o", str(output), "--scale", "remove", "-q"]) == 0
+    assert np.allclose(meshmatch.Atlas.load(output).scores, atlas.scores)
+    assert not (output / "measures.csv").exists()  # three shapes are too few
+
+
+def test_poor_fits_are_left_out_of_an_atlas(
+    made: tuple[Path, tuple[Record, ...]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "fits"
+    shutil.copytree(made[0], folder)
+    collection = meshmatch.Collection(folder)
+    found = load_fit(folder / "fits" / "turned.safetensors", collection.template)
+    save_fit(folder / "fits" / "turned.safetensors", replace(found.fit, verdict="poor"), found.places)
+    with pytest.raises(InputError, match="holds 2 fits and 1 poor ones"):
+        collection.atlas()
+    with collection.registered(poor=True) as shapes:
+        assert shapes.names == tuple(NAMES)
+    shutil.copy(folder / "fits" / "dancer.safetensors", folder / "fits" / "again.safetensors")
+    output = tmp_path / "atlas"
+    assert main(["atlas", str(folder), "-o", str(output), "-q", "--scale", "remove"]) == 0
+    assert capsys.readouterr().err == "warning: turned: left out, for its fit is poor\n"
+    assert meshmatch.Atlas.load(output).names == ("again", "climber", "dancer")
+    assert main(["atlas", str(tmp_path / "gone"), "-o", str(tmp_path / "b"), "-q"]) == 1

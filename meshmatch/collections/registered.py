@@ -1,0 +1,108 @@
+"""Shapes that share their vertices, as an atlas needs them: from a folder of meshes here, from fits in `collection`."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.errors import InputError
+from meshmatch.maps.table_files import read_by_suffix
+from meshmatch.shapes.files import SUFFIXES, load_shape
+from meshmatch.shapes.input_files import read_text
+
+_IN_MEMORY = 256 * 2**20  # bytes; more are kept in a temporary file
+_LINE = 200  # bytes of memory for a line
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """S shapes with the same vertices and faces, and their names.
+
+    ``rotation`` leads into y up, z to the front, where it is known. ``left_out`` are names of shapes that are not to be
+    trusted, and why.
+    """
+
+    points: Float[Floats, "S V 3"]
+    faces: Int[Ints, "F 3"]
+    names: tuple[str, ...]
+    rotation: Float[Floats, "3 3"] | None
+    left_out: dict[str, str]
+
+
+@contextmanager
+def registered_meshes(folder: str | Path) -> Iterator[Registered]:
+    """The meshes of a folder, by the names of their files without suffix; held in memory, or in a file until the block ends.
+
+    `InputError`: fewer than three meshes, two of one name, or meshes that do not share vertices and faces.
+    """
+    files = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    names = tuple(path.stem for path in files)
+    if len(files) < 3:
+        raise InputError(f"{folder} holds {len(files)} meshes", "an atlas needs three or more, registered")
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{folder} holds two meshes called {twice}", "an atlas needs different names")
+    first = load_shape(files[0])
+    if first.is_cloud:
+        raise InputError(f"{files[0].name} has no faces", "an atlas is made of meshes")
+
+    def read(number: int) -> Float[Floats, "V 3"]:
+        shape = load_shape(files[number])
+        if shape.V != first.V or not np.array_equal(shape.faces, first.faces):
+            what = f"{files[number].name} does not have the vertices and faces of {files[0].name}"
+            raise InputError(what, "register the shapes first: meshmatch fit")
+        return shape.verts
+
+    with held(len(files), first.V, read) as points:
+        yield Registered(points, first.faces, names, None, {})
+
+
+@contextmanager
+def held(count: int, vertices: int, read: Callable[[int], Float[Floats, "V 3"]]) -> Iterator[Float[Floats, "S V 3"]]:
+    """Shapes, each read once: in memory, or if they are many in a file until the block ends."""
+    size = count, vertices, 3
+    with tempfile.TemporaryDirectory() as folder:
+        points: Floats
+        if 8 * count * vertices * 3 > _IN_MEMORY:
+            points = np.lib.format.open_memmap(Path(folder, "points.npy"), mode="w+", dtype=np.float64, shape=size)
+        else:
+            points = np.empty(size)
+        for number in range(count):
+            points[number] = read(number)
+        yield points
+
+
+def read_group(path: str | Path, shapes: Registered) -> list[str]:
+    """The names in a file (.txt, .csv), one a line, as the shapes have them: a name may have a suffix. Those that are left
+    out do not count. `InputError` for a name that is unknown, or a file that cannot be read.
+    """
+    found = []
+    known = set(shapes.names)
+
+    def read(path: Path) -> list[str]:
+        return read_text(path, _LINE).splitlines()
+
+    for line in read_by_suffix(path, {".txt": read, ".csv": read}, "names of shapes", "write one name a line"):
+        word = line.strip()
+        if not word:
+            continue
+        meant = [name for name in (word, str(Path(word).with_suffix(""))) if name in known or name in shapes.left_out]
+        if not meant:
+            close = get_close_matches(word, shapes.names, n=1)
+            hint = f"did you mean {close[0]}?" if close else "write one name a line"
+            raise InputError(f"{Path(path).name}: there is no shape called {word}", hint)
+        if meant[0] in known:
+            found.append(meant[0])
+    return found
+
+
+def size_ratio(sizes: Sequence[float] | Floats) -> float:
+    """How many times as large the largest shape is as the smallest."""
+    return float(np.max(sizes) / np.min(sizes))

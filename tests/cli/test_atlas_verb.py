@@ -1,0 +1,88 @@
+"""``meshmatch atlas`` on meshes that share their vertices."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch import Atlas
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Shape
+from tests.cli.conftest import Run
+from tests.collections.ellipsoids import ellipsoids
+
+
+@pytest.fixture
+def shapes(tmp_path: Path) -> Path:
+    folder = tmp_path / "shapes"
+    folder.mkdir()
+    given = ellipsoids(8, splits=1)
+    for k, points in enumerate(given.points):
+        save_shape(folder / f"egg-{k}.ply", Shape(points, given.faces))
+    return folder
+
+
+def group(path: Path, numbers: range) -> Path:
+    path.write_text("".join(f"egg-{k}.ply\n" for k in numbers))
+    return path
+
+
+def test_a_folder_of_meshes_becomes_an_atlas(run: Run, shapes: Path, tmp_path: Path) -> None:
+    output, names = tmp_path / "atlas", ("thin", "thick")
+    groups = [group(tmp_path / f"{name}.txt", range(4 * k, 4 * k + 4)) for k, name in enumerate(names)]
+    words = ("atlas", shapes, "-o", output, "--groups", *groups, "--samples", 2, "--modes", 2, "--seed", 3, "--json")
+    answer = run(*words)
+    assert answer.status == 0
+    told = json.loads(answer.out)
+    assert told["output"] == str(output)
+    assert sorted(told["files"]) == sorted(path.name for path in output.iterdir())
+    assert (told["shapes"], told["modes"], told["seed"]) == (8, 2, 3)
+    assert told["groups"]["names"] == list(names)
+    assert told["groups"]["labellings"] == 70
+    assert told["measures"]["counts"] == [1, 2]
+    found = Atlas.load(output)
+    plain = Atlas.of(ellipsoids(8, splits=1).points, found.faces, found.names, modes=2)
+    assert np.allclose(found.scores, plain.scores)
+    assert len(list((output / "samples").iterdir())) == 2
+    assert "thin and thick (4 and 4 shapes): p = " in answer.err
+    again = run(*words)
+    assert again.status == 1
+    assert "is not empty" in again.err
+
+
+def test_what_is_chosen_is_done(run: Run, shapes: Path, tmp_path: Path) -> None:
+    output = tmp_path / "atlas"
+    answer = run("atlas", shapes, "-o", output, "--no-measures", "--robust", "--scale", "remove", "-q")
+    assert (answer.status, answer.out, answer.err) == (0, "", "")
+    found = Atlas.load(output)
+    assert found.robust
+    assert found.scale == "remove"
+    assert not (output / "measures.csv").exists()
+
+
+def test_other_units_are_told(run: Run, shapes: Path, tmp_path: Path) -> None:
+    given = ellipsoids(8, splits=1)
+    save_shape(shapes / "egg-2.ply", Shape(1000 * given.points[2], given.faces))
+    answer = run("atlas", shapes, "-o", tmp_path / "a", "--no-measures", "-q")
+    assert "do the files have one unit?" in answer.err
+    answer = run("atlas", shapes, "-o", tmp_path / "b", "--no-measures", "-q", "--scale", "remove")
+    assert answer.err == ""
+
+
+@pytest.mark.parametrize("wrong", ["nowhere", "file", "input", "both", "unknown", "statistic"])
+def test_what_is_refused_leaves_nothing(run: Run, shapes: Path, tmp_path: Path, wrong: str) -> None:
+    output, one = tmp_path / "atlas", group(tmp_path / "one.txt", range(4))
+    other = group(tmp_path / "other.txt", range(3, 7) if wrong == "both" else range(7, 12))
+    where = {"nowhere": tmp_path / "gone", "file": one}.get(wrong, shapes)
+    more = {
+        "both": ("--groups", one, other),
+        "unknown": ("--groups", one, other),
+        "statistic": ("--statistic", "hotelling"),
+    }
+    before = sorted(tmp_path.rglob("*"))
+    answer = run("atlas", where, "-o", shapes if wrong == "input" else output, *more.get(wrong, ()))
+    assert answer.status == 1
+    assert answer.err.startswith("error: ")
+    assert answer.err.count("\n") == 2
+    assert sorted(tmp_path.rglob("*")) == before

@@ -1,0 +1,83 @@
+"""Where the shapes of an atlas come from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshmatch.collections.registered import Registered, held, read_group, registered_meshes, size_ratio
+from meshmatch.errors import InputError
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Shape
+from tests.collections.ellipsoids import ellipsoids
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    given = ellipsoids(4, splits=1)
+    for k, points in enumerate(given.points):
+        save_shape(tmp_path / f"b{3 - k}.ply", Shape(points, given.faces))
+    (tmp_path / "words.txt").write_text("no mesh\n")
+    return tmp_path
+
+
+def test_meshes_come_in_the_order_of_their_names(folder: Path) -> None:
+    given = ellipsoids(4, splits=1)
+    with registered_meshes(folder) as found:
+        assert found.names == ("b0", "b1", "b2", "b3")
+        assert np.array_equal(found.points, given.points[::-1])
+        assert np.array_equal(found.faces, given.faces)
+
+
+def test_many_are_kept_in_a_file(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("meshmatch.collections.registered._IN_MEMORY", 100)
+    with registered_meshes(folder) as found:
+        assert isinstance(found.points, np.memmap)
+        file = Path(found.points.filename)
+        assert np.array_equal(found.points, ellipsoids(4, splits=1).points[::-1])
+    assert not file.exists()
+    with held(3, 5, lambda k: np.full((5, 3), float(k))) as points:
+        assert points[:, 0, 0].tolist() == [0, 1, 2]
+
+
+def test_other_meshes_are_refused(folder: Path) -> None:
+    ball = ellipsoids(1, splits=2)
+    wrong = folder / "c.obj"
+    for other, message in {
+        Shape(ball.points[0], ball.faces): "does not have the vertices",
+        Shape(ellipsoids(1, splits=1).points[0], ellipsoids(1, splits=1).faces[::-1]): "does not have the vertices",
+    }.items():
+        save_shape(wrong, other)
+        with pytest.raises(InputError, match=message), registered_meshes(folder):
+            pass
+    wrong.unlink()
+    save_shape(folder / "b1.off", Shape(ball.points[0], ball.faces))
+    with pytest.raises(InputError, match="two meshes called b1"), registered_meshes(folder):
+        pass
+    for path in folder.glob("b*"):
+        path.unlink()
+    with pytest.raises(InputError, match="0 meshes"), registered_meshes(folder):
+        pass
+    for k in range(3):
+        save_shape(folder / f"a{k}.ply", Shape(ball.points[0], np.empty((0, 3), np.int64)))
+    with pytest.raises(InputError, match="no faces"), registered_meshes(folder):
+        pass
+
+
+def test_a_group_is_a_list_of_names(tmp_path: Path) -> None:
+    shapes = Registered(np.empty((2, 1, 3)), np.empty((0, 3), np.int64), ("a.b", "é c"), None, {"worse": "poor"})
+    file = tmp_path / "group.txt"
+    file.write_text("a.b.ply\n\n  é c \nworse.ply\n", encoding="utf-8")
+    assert read_group(file, shapes) == ["a.b", "é c"]
+    file.write_text("a.b\né d\n", encoding="utf-8")
+    with pytest.raises(InputError, match="no shape called é d") as refused:
+        read_group(file, shapes)
+    assert refused.value.hint == "did you mean é c?"
+    with pytest.raises(InputError):
+        read_group(tmp_path / "gone.txt", shapes)
+
+
+def test_sizes_that_are_far_apart_are_told() -> None:
+    assert size_ratio([2.0, 1.0, 5.0]) == 5
