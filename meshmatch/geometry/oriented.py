@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.geometry.frames import Frame, RigidPose
+from meshmatch.geometry.triangles import squared_lengths
 
 # How far a normal that points the other way (2 units) pushes a neighbour away, in units of sqrt(area). Set by hand.
 NORMAL_WEIGHT = 0.15
@@ -127,6 +128,6 @@ def nearest(points: Float[Floats32, "P 3"], queries: Float[Floats32, "Q 3"]) -> 
     Half of the time of a tree, which is slow where queries are far away. In float64, so the answers are a tree's.
     """
     lifted = np.concatenate([queries, np.ones((len(queries), 1))], 1)
-    against = np.concatenate([-2.0 * points, np.square(points, dtype=np.float64).sum(1, keepdims=True)], 1).T
+    against = np.concatenate([-2.0 * points, squared_lengths(points.astype(np.float64))[:, None]], 1).T
     rows = max(1, _COMPARED // len(points))
     return np.concatenate([(lifted[k : k + rows] @ against).argmin(1) for k in range(0, len(lifted), rows)])
