@@ -125,7 +125,7 @@ class Cluster:
 
         numbers = {self._client.submit(task, item, pure=False): number for number, item in enumerate(items)}
         try:
-            for future in as_completed(list(numbers)):
+            for future in as_completed(list(numbers), loop=self._client.loop):
                 number = numbers.pop(future)
                 try:
                     yield number, future.result()

@@ -1,0 +1,104 @@
+"""A real Dask scheduler with two worker processes on the loopback, one of which is killed."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import meshmatch
+from meshmatch.errors import OptionError
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.shape import Shape
+
+pytest.importorskip("distributed")
+SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
+ROOT = Path(__file__).parents[2]
+
+
+class Scheduler:
+    """Processes as docs/cluster.md starts them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.processes: list[subprocess.Popen[bytes]] = []
+        self.address = ""
+
+    def start(self, *words: str) -> subprocess.Popen[bytes]:
+        log = self.folder / f"{len(self.processes)}.log"
+        with log.open("wb") as file:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "distributed.cli.dask_" + words[0], *words[1:]],
+                stdout=file,
+                stderr=file,
+                cwd=self.folder,
+                env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "ignore"},
+            )
+        self.processes.append(process)
+        return process
+
+    def wait_for(self, pattern: str, number: int) -> str:
+        log = self.folder / f"{number}.log"
+        for _ in range(600):
+            found = re.search(pattern, log.read_text(errors="replace"))
+            if found:
+                return found[1]
+            assert self.processes[number].poll() is None, log.read_text(errors="replace")
+            time.sleep(0.1)
+        raise AssertionError(log.read_text(errors="replace"))
+
+
+@pytest.fixture
+def scheduler(tmp_path: Path) -> Iterator[Scheduler]:
+    folder = tmp_path / "dask"
+    folder.mkdir()
+    found = Scheduler(folder)
+    try:
+        found.start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+        found.address = found.wait_for(r"Scheduler at:\s+(tcp://[\d.:]+)", 0)
+        for number in (1, 2):
+            found.start("worker", found.address, "--nthreads", "1", "--no-dashboard", "--no-nanny")
+            found.wait_for(r"(Registered to)", number)
+        yield found
+    finally:
+        for process in found.processes:
+            process.kill()
+            process.wait()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((folder / "fits").glob("*.safetensors"))}
+
+
+def test_a_cluster_of_which_one_worker_is_killed(scheduler: Scheduler, tmp_path: Path) -> None:
+    shapes = tmp_path / "shapes"
+    shapes.mkdir()
+    dancer = load_shape(SAMPLES / "dancer.ply")
+    for number in range(4):
+        save_shape(shapes / f"dancer-{number}.ply", Shape((number + 1) * dancer.verts, dancer.faces))
+    shutil.copy(SAMPLES / "climber.ply", shapes)
+    killed = []
+
+    def kill_one(record: object) -> None:
+        if not killed:
+            scheduler.processes[1].kill()
+            killed.append(record)
+
+    far = meshmatch.Collection(tmp_path / "far", workers=scheduler.address)
+    made = far.fit(shapes, model="human", tell=kill_one)
+    assert killed and [record.verdict for record in made.records] == ["good"] * 5
+    here = meshmatch.Collection(tmp_path / "here", workers=1)
+    here.fit(shapes, model="human")
+    assert contents(tmp_path / "far") == contents(tmp_path / "here")
+    assert far.save_maps(tmp_path / "maps") == 20
+
+
+def test_nobody_at_the_address(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("meshmatch.collections.workers._CONNECT", 0.5)
+    with pytest.raises(OptionError, match="no Dask scheduler answers"):
+        meshmatch.Collection(tmp_path / "fits", workers="tcp://127.0.0.1:9").fit(SAMPLES / "dancer.ply", model="human")
