@@ -90,6 +90,19 @@ class Matcher:
         fits = self._fit_all(clean, configs)
         return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kinds, fits, strict=True)]
 
+    def follow(self, shape: ShapeLike, last: Fit) -> Fit:
+        """Fit the next frame of a sequence from where the fit of the last one ended, and from nothing where that is lost.
+
+        Both are in the same coordinates. Half the time of `fit`, and no left and right that are exchanged on the way.
+        `OptionError` for a fit of another template; other errors as `fit`.
+        """
+        from meshmatch.fitting.following import follow
+
+        last.check_template(self.model.template.hash)
+        clean = validated(as_shape(shape))
+        with thread_limit(1):
+            return self._finished(follow(Fitter(self.model, self.config), clean.shape, last), clean, self.config)
+
     def dense(self, fit: Fit) -> Shape:
         """The template in its full resolution on the shape of a fit, in the frame and unit of its file."""
         from meshmatch.fitting.fit import dense_shape

@@ -32,6 +32,9 @@ def fit(
     agree: bool = Option(
         True, "--agree/--alone", help="Let all fits agree on how the template stretches, or keep them alone."
     ),
+    sequence: bool = Option(
+        False, "--sequence", help="The shapes of a folder are frames: each fit starts where the last one ended."
+    ),
     jobs: Jobs = None,
     scheduler: Scheduler = None,
     strict: bool = Option(False, "--strict", help="Exit with 1 if a shape could not be fitted, or a fit is poor."),
@@ -62,7 +65,7 @@ def fit(
         collection = meshmatch.Collection(output, scheduler or jobs, progress)
         made = collection.fit(
             shapes, model=how.model, config=how.configs()[0], only=how.only or (), without=how.without or (),
-            agree=agree, tell=tell,
+            sequence=sequence, agree=agree, tell=tell,
         )  # fmt: skip
     counts = made.counts
     told = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)

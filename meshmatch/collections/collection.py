@@ -65,21 +65,23 @@ class Collection:
         config: FitConfig | None = None,
         only: Sequence[str] = (),
         without: Sequence[str] = (),
+        sequence: bool = False,
         agree: bool = True,
         tell: Callable[[Record], None] | None = None,
     ) -> Fitted:
         """Fit every shape once, and let all fits agree on how the template stretches.
 
         ``shapes`` are files, folders, patterns such as ``scans/*.ply``, or URLs of folders; ``only`` and ``without`` as in
-        `load_shape`. A run that was stopped goes on where it was, and shapes that were added since are fitted; the fits
-        are those of a run that nobody stopped, bit for bit. ``tell`` is called with the record of each shape, as they
-        come in.
+        `load_shape`. With ``sequence`` the shapes of a folder are frames, in the natural order of their names, and each
+        fit starts where the last one ended. A run that was stopped goes on where it was, and shapes that were added since
+        are fitted; the fits are those of a run that nobody stopped, bit for bit. ``tell`` is called with the record of
+        each shape, as they come in.
 
         A shape that cannot be read or fitted is a record, and stops nobody. `MeshmatchError`: there is no shape, two have
         the same name, none could be fitted, or the folder holds fits of another model or made in another way.
         """
         sources = find_sources(shapes, self.store)
-        wish = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without))
+        wish = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without), sequence)
         setting = settled(wish, sources)
         with hired(self.workers) as crew:
             made = fit_all(setting, sources, crew, agree, self.progress, tell)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 from meshmatch.api.inputs import as_model, check_config, validated
 from meshmatch.api.kinds import choose_model
 from meshmatch.arrays import Floats
+from meshmatch.collections.sources import natural
 from meshmatch.collections.stores import Store
 from meshmatch.collections.tasks import (
     AGREEING,
@@ -28,6 +28,7 @@ from meshmatch.collections.tasks import (
     Source,
     agree_a_little,
     common_file,
+    digest_of,
     finish,
     fit_alone,
     is_finished,
@@ -111,16 +112,37 @@ class _Run:
             yield number, result
 
     def fit_alone(self, tell: Callable[[Record], None] | None) -> list[Record]:
-        """Fit every shape on its own."""
+        """Fit every shape on its own; the frames of a sequence one after the other, of several sequences beside each
+        other.
+        """
         found: dict[int, Record] = {}
-        tasks = [FitTask(self.setting, source) for source in self.sources]
-        for number, result in self._each(fit_alone, tasks, "fitting"):
-            if isinstance(result, Died):
-                result = Record(self.sources[number].name, self.sources[number].path, reasons=result.message)
-            found[number] = result
-            if tell is not None:
-                tell(result)
-        return [found[number] for number in range(len(tasks))]
+        chains = self._chains()
+        for turn in range(max(map(len, chains))):
+            numbers = [chain[turn] for chain in chains if turn < len(chain)]
+            before = [self._last(chain[:turn], found) for chain in chains if turn < len(chain)]
+            places = zip(numbers, before, strict=True)
+            tasks = [FitTask(self.setting, self.sources[number], last) for number, last in places]
+            for at, result in self._each(fit_alone, tasks, "fitting"):
+                source = self.sources[numbers[at]]
+                if isinstance(result, Died):
+                    result = Record(source.name, source.path, reasons=result.message)
+                found[numbers[at]] = result
+                if tell is not None:
+                    tell(result)
+        return [found[number] for number in range(len(self.sources))]
+
+    def _chains(self) -> list[list[int]]:
+        """Numbers of shapes that are fitted one after the other: each alone, or the frames of each folder."""
+        if not self.setting.sequence:
+            return [[number] for number in range(len(self.sources))]
+        folders: dict[str, list[int]] = defaultdict(list)
+        for number in sorted(range(len(self.sources)), key=lambda number: natural(self.sources[number].name)):
+            folders[self.sources[number].path.rpartition("/")[0]].append(number)
+        return list(folders.values())
+
+    def _last(self, before: Sequence[int], found: Mapping[int, Record]) -> Record | None:
+        """The last frame that was fitted."""
+        return next((found[number] for number in reversed(before) if found[number].fitted), None)
 
     def groups(self, numbers: Sequence[int]) -> list[Group]:
         """Who takes part in the agreement, a few together."""
@@ -131,7 +153,7 @@ class _Run:
     def last_tasks(self, records: Mapping[int, Record], groups: Sequence[Group]) -> dict[int, FinishTask]:
         """What finishes each fit; a digest of all that agree tells whether that was done before."""
         parts = [f"{record.name} {record.digest} {record.verdict}" for record in records.values()]
-        digest = hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()
+        digest = digest_of(*parts)
         steps = AgreeConfig.for_model(self.setting.trained).steps
         group_of = {name: group for group in groups for name in group.names}
         found = {}
@@ -214,7 +236,7 @@ def read_about(store: Store) -> dict[str, Any] | None:
             about = json.loads(path.read_text(encoding="utf-8"))
         if about["schema"] != SCHEMA:
             raise InputError(f"{ABOUT} has schema {about['schema']!r}, not {SCHEMA}", "update meshmatch")
-        return {name: about[name] for name in ("schema", "template", "model", "only", "without", "fit")}
+        return {name: about[name] for name in ("schema", "template", "model", "only", "without", "sequence", "fit")}
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{store.location}/{ABOUT} is damaged", "remove the folder, and fit again") from error
 

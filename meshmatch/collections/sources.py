@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
@@ -37,6 +38,12 @@ def find_sources(shapes: str | Path | Sequence[str | Path], output: Store) -> li
             both = " and ".join(each.file for each in found if each.name == source.name)
             raise InputError(f"two shapes are called {source.name}: {both}", "rename one, or put them into two folders")
     return found
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """A key that sorts names as people do: frame2 before frame10."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _sources(given: str | Path, output: Store) -> Iterable[Source]:

@@ -39,6 +39,14 @@ FAILED = "failed"
 """In place of a verdict, for a shape that could not be fitted."""
 
 
+def digest_of(*parts: str | bytes) -> str:
+    """A digest of words or bytes, 32 hex digits."""
+    found = hashlib.blake2b(digest_size=16)
+    for part in parts:
+        found.update(part if isinstance(part, bytes) else f"{part}\n".encode())
+    return found.hexdigest()
+
+
 @dataclass(frozen=True)
 class Source:
     """One shape of a collection: its name there, the folder where its file lies, and the file's name in it."""
@@ -61,7 +69,7 @@ class Source:
         """Of the file's bytes."""
         with self.folder.reading(self.file) as path:
             try:
-                return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+                return digest_of(path.read_bytes())
             except OSError as error:
                 raise InputError(f"cannot read {path}: {error.strerror}", "check the name") from error
 
@@ -95,6 +103,7 @@ class Setting:
     config: FitConfig
     only: tuple[str, ...] = ()  # of a glb or gltf file, see `load_shape`
     without: tuple[str, ...] = ()
+    sequence: bool = False  # shapes of a folder are frames, in the natural order of their names
 
     @property
     def trained(self) -> TrainedModel:
@@ -108,13 +117,13 @@ class Setting:
 
     def choices(self) -> dict[str, Any]:
         """How shapes are read and fitted, as JSON has it."""
-        chosen = {"model": self.model, "only": self.only, "without": self.without, "fit": asdict(self.config)}
+        chosen: dict[str, Any] = {"model": self.model, "only": self.only, "without": self.without}
+        chosen |= {"sequence": self.sequence, "fit": asdict(self.config)}
         return dict(json.loads(json.dumps(chosen)))
 
     def digest(self) -> str:
         """Of all that decides how a shape is fitted."""
-        words = f"{self.trained.template.hash} {sorted(self.choices().items())}"
-        return hashlib.blake2b(words.encode(), digest_size=16).hexdigest()
+        return digest_of(self.trained.template.hash, json.dumps(self.choices(), sort_keys=True))
 
 
 @dataclass(frozen=True)
@@ -123,18 +132,24 @@ class FitTask:
 
     setting: Setting
     source: Source
+    last: Record | None = None  # of the frame before, in a sequence
 
 
 def fit_alone(task: FitTask) -> Record:
-    """Fit one shape, unless that was done before. A shape that cannot be fitted is a record, not an error."""
+    """Fit one shape, unless that was done before; a frame of a sequence from where the last one's fit ended.
+
+    A shape that cannot be fitted is a record, not an error.
+    """
     source, setting = task.source, task.setting
     file, began = f"{ALONE}/{source.name}{SUFFIX}", time.monotonic()
     try:
-        digest = f"{source.digest()} {setting.digest()}"
+        digest = digest_of(source.digest(), setting.digest(), "" if task.last is None else task.last.digest)
         known = _known(setting.store, file, digest)
         if known is not None:
             return known
-        fit = Matcher(setting.trained, setting.config, 1).fit(source.load(setting.only, setting.without))
+        matcher, shape = Matcher(setting.trained, setting.config, 1), source.load(setting.only, setting.without)
+        last = None if task.last is None else setting.read(ALONE, task.last.name).fit
+        fit = matcher.fit(shape) if last is None else matcher.follow(shape, last)
         assert fit.repaired is not None
         samples = None
         if _agrees(setting):

@@ -74,7 +74,7 @@ class Fitter:
                 doubts.append(Reason("side", "it fits nearly as well in the mirror: left and right may be exchanged"))
         if not card.correspondence:
             doubts.append(Reason("unsupervised", f"{card.name} was learned without correspondence: near may be wrong"))
-        fit = replace(_as_fit(found, partial, began), notes=notes)
+        fit = replace(as_fit(found, partial, began), notes=notes)
         verdict: Verdict = "fair" if doubts and fit.verdict == "good" else fit.verdict
         return replace(fit, verdict=verdict, reasons=(*fit.reasons, *doubts))
 
@@ -116,7 +116,7 @@ def may_show_part(shape: Shape, config: FitConfig) -> bool:
     return shape.is_cloud or boundary_length(shape) >= _OPEN * np.sqrt(shape.area)
 
 
-def _as_fit(found: Registration, partial: bool, began: float) -> Fit:
+def as_fit(found: Registration, partial: bool, began: float) -> Fit:
     task, frame, points = found.task, found.core_frame, found.surface.points
     verdict, reasons = judge_registration(found, partial)
     return Fit(

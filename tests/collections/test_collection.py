@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from meshmatch.cli import main
 from meshmatch.collections.fit_files import load_fit, load_words, save_fit
 from meshmatch.collections.tasks import Record
 from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 
@@ -203,3 +205,37 @@ def test_poor_fits_are_left_out_of_an_atlas(
     assert capsys.readouterr().err == "warning: turned: left out, for its fit is poor\n"
     assert meshmatch.Atlas.load(output).names == ("again", "climber", "dancer")
     assert main(["atlas", str(tmp_path / "gone"), "-o", str(tmp_path / "b"), "-q"]) == 1
+
+
+def test_a_sequence_is_followed_and_a_lost_frame_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A body walks; in one frame it is somebody else, standing on his head."""
+    dancer, climber = (load_shape(SAMPLES / f"{name}.ply") for name in ("dancer", "climber"))
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    step = 0.02 * dancer.diagonal
+    for number in range(1, 12):
+        verts = dancer.verts + number * step * np.array([0, 0, 1.0])
+        save_shape(folder / f"frame{number}.ply", Shape(verts, dancer.faces))
+    save_shape(
+        folder / "frame6.ply", Shape(np.sqrt(dancer.area / climber.area) * climber.verts * [1, -1, -1], climber.faces)
+    )
+    order: list[str] = []
+    anew: list[str] = []
+    fit = Fitter.fit
+
+    def counted(self: Fitter, shape: Shape, *rest: Any) -> Any:
+        anew.append(shape.name)
+        return fit(self, shape, *rest)
+
+    monkeypatch.setattr(Fitter, "fit", counted)
+    collection = meshmatch.Collection(tmp_path / "fits", workers=1)
+    made = collection.fit(
+        folder, model="human", sequence=True, agree=False, tell=lambda record: order.append(record.name)
+    )
+    assert order == [f"frame{number}" for number in range(1, 12)]
+    assert {record.verdict for record in made.records} == {"good"}
+    assert (collection.map("frame5", "frame7").index == np.arange(dancer.V)).mean() > 0.5
+    assert anew == ["frame1", "frame6", "frame7"]
+    assert [made.records[number].up for number in (6, 7, 8)] == ["+y", "-z", "+y"]  # frame5, 6 and 7 by name
+    places = [collection.fit_of(f"frame{number}").points_in_file.mean(0)[2] for number in (3, 4, 5)]
+    assert np.allclose(np.diff(places), step, rtol=0.1)
