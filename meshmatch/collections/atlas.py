@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from meshmatch.arrays import Float, Floats, Int, Ints, as_numbers, frozen
 from meshmatch.collections.groups import Comparison, Statistic, compare_groups
-from meshmatch.collections.modes import inner_products, principal, weighted_sums
+from meshmatch.collections.modes import components
 from meshmatch.collections.superimpose import Poses, Scale, Shapes, Superimposed, blocks, superimpose
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import replace_on_success
@@ -84,11 +84,12 @@ class Atlas:
     ) -> Atlas:
         """The atlas of S shapes with the same vertices and faces.
 
-        ``points`` (S, V, 3) may be a list, or a memory-mapped array: only some shapes are in memory at a time, beside an
-        S x S matrix. They are laid over one another by rotation and translation (generalised Procrustes analysis, each
-        vertex weighted with its share of the surface), and with ``scale="remove"`` scaled to one size. At most ``modes``
-        are kept, of S - 1. ``robust``: the mean is the spatial median, the modes are spherical principal components
-        (Locantore et al. 1999), which a few shapes that are nothing like the others hardly change.
+        ``points`` (S, V, 3) may be a list, or a memory-mapped array: only some shapes are in memory at a time, beside the
+        modes and, of up to 3,000 shapes, an S x S matrix. They are laid over one another by rotation and translation
+        (generalised Procrustes analysis, each vertex weighted with its share of the surface), and with
+        ``scale="remove"`` scaled to one size. At most ``modes`` are kept, of S - 1. ``robust``: the mean is the spatial
+        median, the modes are spherical principal components (Locantore et al. 1999), which a few shapes that are nothing
+        like the others hardly change.
 
         `InputError`: fewer than three shapes, shapes that do not have the same vertices or do not differ, names that are
         not one for each or not different. `OptionError`: another ``scale``, no modes.
@@ -102,16 +103,11 @@ class Atlas:
             raise InputError(f"{len(points)} shapes need as many different names", "one for each, in their order")
         faces = np.array(faces, np.int64)
         laid = superimpose(points, faces, scale, robust)
-        products = inner_products(points, laid)
-        found = principal(products, modes, robust)
-        sums = weighted_sums(points, laid, np.concatenate([found.center[None], found.modes]))
-        center, kept = sums[0], sums[1:]
-        sign = _outward(kept, laid.consensus + center, laid.weights)
-        moved = products - found.center @ products
-        scores = sign * (moved @ found.modes.T) / found.deviations
+        found = components(points, laid, modes, robust)
+        mean = laid.consensus + found.center
+        sign = _outward(found.modes, mean, laid.weights)
+        kept, scores = sign[:, None, None] * found.modes, sign * found.scores
         sizes = np.concatenate([laid.poses(some).sizes for _, some in blocks(points)])
-        mean = laid.consensus + center
-        kept = sign[:, None, None] * kept
         for array in (mean, kept, found.deviations, scores, sizes, faces, laid.weights):
             frozen(array)
         return cls(mean, kept, found.deviations, scores, sizes, faces, laid.weights, called, found.total, scale, robust)

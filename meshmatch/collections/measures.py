@@ -8,14 +8,14 @@ surfaces do not know correspondences, and so are given beside them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.atlas import Atlas
-from meshmatch.collections.modes import inner_products, principal, weighted_sums
+from meshmatch.collections.modes import inner_products, principal, rounding, weighted_sums
 from meshmatch.collections.superimpose import Shapes, Superimposed
 from meshmatch.errors import InputError
 from meshmatch.progress import ProgressCallback
@@ -26,6 +26,8 @@ COUNTS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 """Numbers of modes that are measured, as far as there are so many, and the largest that can be."""
 FOLDS = 100
 """Of more shapes than these, several are left out at a time."""
+MOST_SHAPES = 1000
+"""Of a larger collection so many random shapes are measured, as if they were all."""
 _POINTS = 300  # of a surface whose distance to the other one is measured
 _KEPT = 100  # surfaces in memory
 _LONGER = 0.6  # of the time, for generalisation
@@ -75,15 +77,22 @@ def measure_atlas(
     """Measure an atlas on the shapes (S, V, 3) that it was made of; see `Measures`.
 
     ``surfaces`` are the shapes themselves, each in the frame of its points, if they are to be compared with these rather
-    than with the registered template. Shapes are left out one at a time, of large collections in `FOLDS` parts, the mean
-    and the modes are made of the others, and the shape is laid over that mean. ``samples`` random shapes have normal
-    scores. Between surfaces a random shape is compared with the two nearest by points.
+    than with the registered template. Of more than 1,000 shapes so many are measured. They are left out one at a time, or
+    of more than 100 in 100 parts; the mean and the modes are made of the others, and the shape is laid over that mean.
+    ``samples`` random shapes have normal scores. Between surfaces a random shape is compared with the two nearest by
+    points.
 
     `InputError` where the shapes are not those of the atlas, or fewer than four: a model of what is left needs three.
     """
     S = len(points)
     if S != len(atlas.names) or (surfaces is not None and len(surfaces) != S):
         raise InputError(f"the atlas is of {len(atlas.names)} shapes, not of {S}", "give those that it was made of")
+    if S > MOST_SHAPES:
+        some = np.sort(np.random.default_rng(seed).permutation(S)[:MOST_SHAPES]).tolist()
+        atlas = replace(atlas, names=tuple(atlas.names[k] for k in some), scores=atlas.scores[some])
+        points = [points[k] for k in some]
+        surfaces = None if surfaces is None else [surfaces[k] for k in some]
+        S = MOST_SHAPES
     if S < 4:
         raise InputError(f"the measures of an atlas need four shapes or more, not {S}")
     folds = np.array_split(np.random.default_rng(seed).permutation(S), min(S, FOLDS))
@@ -135,7 +144,7 @@ class _Collection:
         """How far shapes are from what a model of all others makes of them, between points and between surfaces."""
         atlas, S = self._atlas, len(self._shapes)
         kept = np.setdiff1d(np.arange(S), out)
-        found = principal(self._products[np.ix_(kept, kept)], int(counts[-1]), atlas.robust)
+        found = principal(self._products[np.ix_(kept, kept)], int(counts[-1]), atlas.robust, rounding(atlas.laid))
         shares = np.zeros((1 + len(found.modes), S))
         shares[:, kept] = np.concatenate([found.center[None], found.modes])
         sums = weighted_sums(self._shapes, atlas.laid, shares)

@@ -298,3 +298,21 @@ def test_nothing_of_the_callers_is_changed() -> None:
     assert points.flags.writeable
     assert faces.flags.writeable
     assert not atlas.mean.flags.writeable
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_a_sketch_of_many_shapes_is_enough(monkeypatch: pytest.MonkeyPatch, robust: bool) -> None:
+    """No matrix of all inner products, and still the same modes."""
+    given = ellipsoids(60, splits=1)
+    points = moved(given.points + 0.005 * np.random.default_rng(1).standard_normal(given.points.shape))
+    plain = Atlas.of(points, given.faces, modes=3, robust=robust)
+    monkeypatch.setattr("meshmatch.collections.modes._SKETCHED", 20)
+    monkeypatch.setattr("meshmatch.collections.superimpose._BLOCK", 7 * points[0].size)
+    sketch = Atlas.of(points, given.faces, modes=3, robust=robust)
+    assert np.allclose(sketch.mean, plain.mean, atol=1e-5)
+    assert sketch.deviations == pytest.approx(plain.deviations, rel=1e-4)
+    assert np.allclose(sketch.scores, plain.scores, atol=2e-3)
+    assert np.allclose(sketch.modes, plain.modes, atol=2e-3)
+    assert sketch.total == pytest.approx(plain.total, rel=0.1 if robust else 1e-6)
+    with pytest.raises(InputError, match="do not differ"):
+        Atlas.of([points[0]] * 30, given.faces)

@@ -124,6 +124,30 @@ def test_large_collections_are_measured_in_parts(monkeypatch: pytest.MonkeyPatch
     assert seen[-1] == 1
 
 
+def test_some_of_very_many_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, faces = rough_ellipsoids(12)
+    atlas = Atlas.of(points, faces)
+    monkeypatch.setattr("meshmatch.collections.measures.MOST_SHAPES", 6)
+    found = measure_atlas(atlas, points, samples=2)
+    assert found.counts[-1] == 4
+    assert np.isfinite(found.generalisation).all()
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_shapes_that_are_the_same_without_one(robust: bool) -> None:
+    """Left out, it is as far from the others as it is: they have no mode."""
+    given = ellipsoids(2, splits=1)
+    points = np.stack([given.points[0]] * 3 + [given.points[1]])
+    if robust:
+        with pytest.raises(InputError, match="most of the shapes do not differ"):
+            Atlas.of(points, given.faces, robust=True)
+        return
+    atlas = Atlas.of(points, given.faces)
+    found = measure_atlas(atlas, points, samples=2)
+    apart = atlas.weights @ np.linalg.norm(given.points[1] - given.points[0], axis=1)
+    assert found.generalisation[0] == pytest.approx(apart / 4, rel=1e-3)
+
+
 def test_what_cannot_be_measured() -> None:
     points, faces = rough_ellipsoids(5)
     atlas = Atlas.of(points, faces)
