@@ -70,7 +70,6 @@ def atlas(
     Writes the arrays, tables, pictures, the modes as morph targets, and page.html, on which sliders vary the shape.
     With --groups also where two groups differ, by a permutation test with correction for the number of vertices.
     """
-    from meshmatch.collections.atlas import Atlas
     from meshmatch.collections.atlas_files import record, write_folder
 
     how.check()
@@ -79,9 +78,7 @@ def atlas(
     with folder_on_success(output) as folder, _shapes(fits, how.poor) as shapes, thread_limit(threads):
         for name, verdict in shapes.left_out.items():
             console.warn(f"{name}: left out, for its fit is {verdict}")
-        made = Atlas.of(
-            shapes.points, shapes.faces, shapes.names, modes=how.modes, scale=how.scale, robust=how.robust
-        )  # fmt: skip
+        made = shapes.atlas(modes=how.modes, scale=how.scale, robust=how.robust)
         _warn(console, made, how)
         found = _find(console, made, shapes, how)
         names = write_folder(folder, made, found, rotation=shapes.rotation, title=output.name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
@@ -17,6 +17,7 @@ from meshmatch.collections.groups import Comparison, Statistic, compare_groups
 from meshmatch.collections.modes import components
 from meshmatch.collections.superimpose import Poses, Scale, Shapes, Superimposed, blocks, superimpose
 from meshmatch.errors import InputError, OptionError
+from meshmatch.fitting.fit import Fit, facing_out
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.shape import Shape
 
@@ -57,6 +58,7 @@ class Atlas:
     total : variance along all modes, also those that are not kept
     scale : whether the shapes keep their sizes, or all have been scaled to one
     robust : whether outliers were kept from mattering
+    template : hash of the template whose fits the shapes are; empty if that is not known
     """
 
     mean: Float[Floats, "V 3"]
@@ -70,6 +72,7 @@ class Atlas:
     total: float
     scale: Scale = "keep"
     robust: bool = False
+    template: str = ""
 
     @classmethod
     def of(
@@ -81,6 +84,7 @@ class Atlas:
         modes: int = 100,
         scale: Scale = "keep",
         robust: bool = False,
+        template: str = "",
     ) -> Atlas:
         """The atlas of S shapes with the same vertices and faces.
 
@@ -110,7 +114,20 @@ class Atlas:
         sizes = np.concatenate([laid.poses(some).sizes for _, some in blocks(points)])
         for array in (mean, kept, found.deviations, scores, sizes, faces, laid.weights):
             frozen(array)
-        return cls(mean, kept, found.deviations, scores, sizes, faces, laid.weights, called, found.total, scale, robust)
+        return cls(
+            mean,
+            kept,
+            found.deviations,
+            scores,
+            sizes,
+            faces,
+            laid.weights,
+            called,
+            found.total,
+            scale,
+            robust,
+            template,
+        )
 
     @property
     def variances(self) -> Float[Floats, " M"]:
@@ -168,11 +185,19 @@ class Atlas:
         poses = self.laid.poses(points)
         return poses.apply(points), poses
 
-    def project(self, points: ArrayLike) -> Projection:
-        """A further shape (V, 3), registered like the others: its scores, and how much the modes cannot say of it.
+    def project(self, points: ArrayLike | Fit) -> Projection:
+        """A further shape, registered like the others: its scores, and how much the modes cannot say of it.
 
-        `InputError` for points that are not an array (V, 3), or not finite.
+        ``points`` are the template's vertices (V, 3) on the shape, or a fit; of a fit the result is in the shape's file.
+        `InputError` for points that are not an array (V, 3), or not finite; `OptionError` for a fit of another template.
         """
+        if isinstance(points, Fit):
+            if self.template:
+                points.check_template(self.template)
+            frame, scale = points.frame, points.frame.scale
+            found = self.project(scale * points.points)  # as the mirror image that the template knows, if it is one
+            verts = frame.undo(found.shape.verts / scale)
+            return replace(found, shape=Shape(verts, facing_out(self.faces, frame)))
         given = as_numbers(points, "points", finite=True)
         if given.shape != self.mean.shape:
             hint = "register the shape with the model of the atlas"
@@ -258,12 +283,13 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
     if "version" not in given or int(given.pop("version")) != VERSION:
         raise InputError(f"{file} is not an atlas of version {VERSION}", "make it again with this meshmatch")
     kinds = {each.name: "f" for each in fields(Atlas)} | {"faces": "i", "names": "U", "scale": "U", "robust": "b"}
+    kinds["template"] = "U"
     wrong = [name for name in kinds if name not in given or given[name].dtype.kind != kinds[name]]
     if wrong or len(given) != len(kinds):
         raise InputError(f"{file} is damaged: {', '.join(wrong) or 'it holds something else'}", "make it again")
     M, V, S = len(given["modes"]), len(given["mean"]), len(given["names"])
     sizes = {"mean": (V, 3), "modes": (M, V, 3), "deviations": (M,), "scores": (S, M), "sizes": (S,)}
-    sizes |= {"weights": (V,), "names": (S,), "total": (), "scale": (), "robust": ()}
+    sizes |= {"weights": (V,), "names": (S,), "total": (), "scale": (), "robust": (), "template": ()}
     wrong = [name for name, size in sizes.items() if given[name].shape != size]
     wrong += [name for name, kind in kinds.items() if kind == "f" and not np.isfinite(given[name]).all()]
     faces = given["faces"]
@@ -273,6 +299,7 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
         raise InputError(f"{file} is damaged: {', '.join(wrong) or 'scale'}", "make it again")
     found: dict[str, Any] = {name: frozen(array) for name, array in given.items()}
     found |= {"names": tuple(str(name) for name in given["names"]), "scale": str(given["scale"])}
+    found["template"] = str(given["template"])
     return found | {"total": float(given["total"]), "robust": bool(given["robust"])}
 
 

@@ -143,7 +143,7 @@ class Collection:
     def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False, poor: bool = False) -> Atlas:
         """The mean and the modes of the fitted shapes, see `Atlas.of`; poor fits count only if asked for."""
         with self.registered(poor) as shapes:
-            return Atlas.of(shapes.points, shapes.faces, shapes.names, modes=modes, scale=scale, robust=robust)
+            return shapes.atlas(modes=modes, scale=scale, robust=robust)
 
     @contextmanager
     def registered(self, poor: bool = False) -> Iterator[Registered]:
@@ -166,7 +166,7 @@ class Collection:
 
         faces = np.asarray(self.template.shape.faces)
         with held(len(names), self.template.shape.V, read) as points:
-            yield Registered(points, faces, names, np.eye(3), left_out)
+            yield Registered(points, faces, names, np.eye(3), left_out, self.template.hash)
 
     def _load(self, name: str) -> StoredFit:
         file = f"{FITS}/{name}{SUFFIX}"

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.collections.atlas import Atlas
+from meshmatch.collections.superimpose import Scale
 from meshmatch.errors import InputError
 from meshmatch.maps.table_files import read_by_suffix
 from meshmatch.shapes.files import SUFFIXES, load_shape
@@ -26,7 +28,7 @@ class Registered:
     """S shapes with the same vertices and faces, and their names.
 
     ``rotation`` leads into y up, z to the front, where it is known. ``left_out`` are names of shapes that are not to be
-    trusted, and why.
+    trusted, and why. ``template`` is the hash of the template, if they are fits.
     """
 
     points: Float[Floats, "S V 3"]
@@ -34,6 +36,13 @@ class Registered:
     names: tuple[str, ...]
     rotation: Float[Floats, "3 3"] | None
     left_out: dict[str, str]
+    template: str = ""
+
+    def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False) -> Atlas:
+        """Their atlas; see `Atlas.of`."""
+        return Atlas.of(
+            self.points, self.faces, self.names, modes=modes, scale=scale, robust=robust, template=self.template
+        )
 
 
 @contextmanager

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from meshmatch.collections.atlas import FILE, Atlas
 from meshmatch.errors import InputError, OptionError
+from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.triangles import vertex_areas
 from tests.collections.ellipsoids import AXES, SPREAD, ellipsoids, moved
-from tests.conftest import icosphere
+from tests.conftest import icosphere, some_fit
 
 OCTAHEDRON = np.array([[1, 0, 0], [-1, 0, 0], [0, 2, 0], [0, -2, 0], [0, 0, 3], [0, 0, -3]], float)
 OCTAHEDRON_FACES = np.array([[i, j, k] for i in (0, 1) for j in (2, 3) for k in (4, 5)])
@@ -186,6 +188,22 @@ def test_a_further_shape_is_projected() -> None:
     assert found.residual > 1e-3
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_fit_is_projected_in_its_file(mirrored: bool) -> None:
+    """Wherever the file has it, whatever its unit, and as its mirror image if it is one."""
+    given = ellipsoids(20)
+    points = given.points + 0.05 * np.sin(7 * given.points[..., ::-1])  # with a left and a right
+    atlas = Atlas.of(points, given.faces, template="abc")
+    rotation = Rotation.random(rng=1).as_matrix() * ([[-1], [1], [1]] if mirrored else 1)
+    fit = some_fit(points[4] / 50, given.faces, frame=Frame(50.0, rotation, np.array([7.0, 8, 9])), template_hash="abc")
+    found = atlas.project(fit)
+    assert np.allclose(found.scores, atlas.scores[4], atol=1e-4)
+    assert np.allclose(found.shape.verts, fit.points_in_file)
+    assert np.array_equal(found.shape.faces, fit.shape.faces)
+    with pytest.raises(OptionError, match="another template"):
+        atlas.project(some_fit(points[4], given.faces, template_hash="abd"))
+
+
 def test_few_modes_are_the_first_of_all() -> None:
     given = ellipsoids(20)
     atlas, few = Atlas.of(given.points, given.faces), Atlas.of(given.points, given.faces, modes=1)
@@ -210,7 +228,9 @@ def test_random_shapes_vary_like_the_collection() -> None:
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     given = ellipsoids(5)
-    atlas = Atlas.of(given.points, given.faces, [f"é-{k}.ply" for k in range(5)], scale="remove", robust=True)
+    atlas = Atlas.of(
+        given.points, given.faces, [f"é-{k}.ply" for k in range(5)], scale="remove", robust=True, template="abc"
+    )
     atlas.save(tmp_path / FILE)
     for path in (tmp_path, tmp_path / FILE, str(tmp_path)):
         again = Atlas.load(path)

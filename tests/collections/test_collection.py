@@ -180,6 +180,8 @@ def test_a_collection_has_an_atlas(made: tuple[Path, tuple[Record, ...]], tmp_pa
     assert atlas.names == tuple(NAMES)
     apart = np.linalg.norm((atlas.scores[:, None] - atlas.scores) * atlas.deviations, axis=2)
     assert apart[1, 2] < 0.1 * apart[0, 1]
+    found = atlas.project(meshmatch.register(SAMPLES / "dancer.ply", model="human"))
+    assert found.scores[0] == pytest.approx(atlas.scores[1, 0], abs=0.1)  # the second mode is next to nothing
     assert atlas.sizes[2] == pytest.approx(10 * atlas.sizes[1], rel=0.02)
     output = tmp_path / "atlas"
     assert main(["atlas", str(made[0]), "-o", str(output), "--scale", "remove", "-q"]) == 0
