@@ -3,8 +3,9 @@
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Literal
 
 from meshmatch.errors import InputError, OutputError
 
@@ -25,6 +26,18 @@ def as_path(path: str | Path) -> Path:
         raise InputError(f"expected a path, not {type(path).__name__}", hint) from error
 
 
+def home_folder(kind: Literal["data", "cache"]) -> Path:
+    """The user's folder of what is theirs, or of what can be made again; one that cannot be, where they have no home."""
+    import platformdirs
+
+    find = platformdirs.user_data_path if kind == "data" else platformdirs.user_cache_path
+    with suppress(RuntimeError):
+        path = find("meshmatch", appauthor=False)
+        if path.is_absolute():  # else it would appear wherever the process happens to be
+            return path
+    return Path(os.devnull, "meshmatch")
+
+
 def make_folder(path: Path) -> None:
     """Make a folder if it is not there; before long work, so that one that cannot be made is told at once.
 
@@ -34,6 +47,18 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot make the folder {path}: {error.strerror}", "choose another folder") from error
+
+
+def _reached(path: Path) -> Path:
+    """The path, or what it leads to if it is a link; `OutputError` for a name that no file can have."""
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        return path
+    except (OSError, ValueError) as error:  # too long; through a file; a NUL
+        why = getattr(error, "strerror", None) or str(error)
+        raise OutputError(f"cannot write {path}: {why}", "choose another name") from error
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 @contextmanager
@@ -47,7 +72,7 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
     `OutputError` if the folder is missing or cannot be written, `path` is a folder or write-protected, or the disk refuses.
     """
     path = Path(path)
-    final = Path(os.path.realpath(path)) if path.is_symlink() else path
+    final = _reached(path)
     folder = final.parent
     if path.is_dir():
         raise OutputError(f"cannot write {path}: it is a folder", "give the name of a file")
@@ -70,6 +95,13 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
         if error.filename in (None, str(temporary), temporary):
             raise OutputError(f"cannot write {path}: {error.strerror or error}", "is the disk full?") from error
         raise
+    except Exception as error:
+        if "(os error " not in str(
+            error
+        ):  # as libraries of Rust say what the system refuses; their classes are their own
+            raise
+        why = str(error).rpartition(": ")[2].partition(" (os error")[0]
+        raise OutputError(f"cannot write {path}: {why}", "is the disk full?") from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -83,8 +115,7 @@ def folder_on_success(path: str | Path) -> Iterator[Path]:
 
     `OutputError` if `path` is a file or holds something, its folder is missing or cannot be written, or the disk refuses.
     """
-    path = Path(path)
-    path = Path(os.path.realpath(path)) if path.is_symlink() else path
+    path = _reached(Path(path))
     folder = path.parent
     if path.exists() and not path.is_dir():
         raise OutputError(f"cannot make the folder {path}: it is a file", "choose another name")

@@ -41,7 +41,7 @@ OWNERS = {
     "jaxtyping": {"arrays"},
     "matplotlib": {"render"},
     "meshmonk": {"experiments"},
-    "platformdirs": {"generators", "models", "experiments"},
+    "platformdirs": {"outputs", "experiments"},
     "pyFM": {"experiments"},
     "pydantic": {"models"},
     "pymeshlab": {"shapes"},

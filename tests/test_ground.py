@@ -10,7 +10,9 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 import meshmatch
 from meshmatch import errors
@@ -85,6 +87,14 @@ def test_output_folder_is_checked_before_the_work(tmp_path: Path) -> None:
         pytest.fail("the block must not run")
 
 
+@pytest.mark.parametrize("name", ["x" * 300 + ".npy", "file/a.npy", "a\0.npy"])
+def test_names_that_no_output_can_have(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    for claim in (replace_on_success, folder_on_success):
+        with pytest.raises(OutputError, match=r"cannot write|cannot make|there is no folder"), claim(tmp_path / name):
+            pytest.fail("the block must not run")
+
+
 def test_folder_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(self: Path, **_: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied", str(self))
@@ -99,6 +109,22 @@ def test_full_disk_is_an_output_error_but_a_missing_input_is_not(tmp_path: Path)
         raise OSError(errno.ENOSPC, "No space left on device", str(temporary))
     with pytest.raises(FileNotFoundError), replace_on_success(tmp_path / "a.npy"):
         (tmp_path / "other").read_bytes()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit on the size of files")
+def test_a_disk_that_is_full_for_a_library_of_rust(tmp_path: Path) -> None:
+    """It has an error of its own, which is no OSError."""
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with pytest.raises(OutputError, match="File too large") as caught, replace_on_success(tmp_path / "a") as temporary:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+        try:
+            save_file({"a": np.zeros(100_000)}, temporary)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert caught.value.hint == "is the disk full?"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_threads(monkeypatch: pytest.MonkeyPatch) -> None:

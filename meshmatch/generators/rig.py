@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import platformdirs
 import torch
 from safetensors import safe_open
 from safetensors.numpy import save_file
@@ -24,7 +23,7 @@ from torch import Tensor
 
 from meshmatch.arrays import Float, Int, Ints
 from meshmatch.errors import OptionError
-from meshmatch.outputs import make_folder, replace_on_success
+from meshmatch.outputs import home_folder, make_folder, replace_on_success
 from meshmatch.progress import Progress
 
 RIG_VERSION = 1
@@ -176,7 +175,7 @@ def cached_rig(identities: int, seed: int, progress: Progress | None = None) -> 
 
 def kept_rig(name: str, build: Callable[[], Rig]) -> Rig:
     """The rig of that name from the cache, or built into it."""
-    path = Path(platformdirs.user_cache_dir("meshmatch")) / f"{name}.safetensors"
+    path = home_folder("cache") / f"{name}.safetensors"
     if not path.is_file():
         make_folder(path.parent)
         save_rig(build(), path)

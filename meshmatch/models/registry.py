@@ -20,7 +20,7 @@ from meshmatch.models.card import ModelCard, check_name, read_card
 from meshmatch.models.implicit_card import IMPLICIT, ImplicitCard, is_implicit, read_implicit_card
 from meshmatch.models.tensor_file import read_header
 from meshmatch.models.unfinished import changing, copy_for, needs_settling, put, settle
-from meshmatch.outputs import as_path
+from meshmatch.outputs import as_path, home_folder
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
@@ -55,9 +55,7 @@ def user_folder() -> Path:
     home = os.environ.get(HOME_VARIABLE)
     if home:
         return _expanded(home) / "models"
-    from platformdirs import user_data_path
-
-    return user_data_path("meshmatch", appauthor=False) / "models"
+    return home_folder("data") / "models"
 
 
 def list_models() -> tuple[Entry, ...]:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.errors import OutputError
-from meshmatch.outputs import make_folder, replace_on_success
+from meshmatch.outputs import home_folder, make_folder, replace_on_success
 
 _LAYOUT = "meshmatch weights 1"  # another number wherever the same weights would give other bytes
 _HEAD, _STEP = 256, 64  # bytes before the first tensor, and at multiples of how many each of them begins
@@ -24,9 +24,7 @@ _HEAD, _STEP = 256, 64  # bytes before the first tensor, and at multiples of how
 
 def shared_file(name: str) -> Path:
     """The file of a model of the registry."""
-    from platformdirs import user_cache_path
-
-    return user_cache_path("meshmatch", appauthor=False) / "weights" / f"{name}.float32"
+    return home_folder("cache") / "weights" / f"{name}.float32"
 
 
 def shared_weights(
@@ -34,8 +32,6 @@ def shared_weights(
 ) -> dict[str, np.ndarray]:
     """What ``expand()`` gives, mapped and read-only where possible, for the weights with a hash that was checked."""
     path = shared_file(name)
-    if not path.is_absolute():  # without a home: it would appear wherever the process happens to be
-        return expand()
     key = hashlib.sha256(f"{sha256} {sorted(shapes.items())}".encode()).hexdigest()
     found = _mapped(path, key, shapes)
     if found is not None:

@@ -36,7 +36,7 @@ def test_clutter_touches_the_shape_and_comes_last() -> None:
 
 @pytest.mark.skipif(importlib.util.find_spec("anny") is None, reason="anny is not installed")
 def test_hands_have_other_triangles_and_lose_landmarks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rigs.platformdirs, "user_cache_dir", lambda name: str(tmp_path))
+    monkeypatch.setattr(rigs, "home_folder", lambda kind: tmp_path)
     scans = make_scans("hand", 4, 1)
     assert len({scan.shape.F for scan in scans}) == 4
     assert len({np.median(scan.shape.verts) for scan in make_scans("hand", 4, 1) + scans}) == 4  # seeded

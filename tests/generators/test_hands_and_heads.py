@@ -77,7 +77,7 @@ def test_there_are_no_other_kinds() -> None:
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Generator]:
     cache = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rigs.platformdirs, "user_cache_dir", lambda name: str(cache))
+        patch.setattr(rigs, "home_folder", lambda kind: cache)
         yield Kind(request.param, 3).generator(0)
 
 

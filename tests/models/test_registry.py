@@ -220,6 +220,18 @@ def test_a_registry_that_cannot_be_written_is_told(blob: Path, tmp_path: Path, m
     assert "MESHMATCH_HOME" in caught.value.hint
 
 
+def test_a_user_without_a_home_has_the_models_that_ship(blob: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a container runs for a user that it does not know."""
+    for name in ("HOME", "MESHMATCH_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # the user has no entry either
+    assert names() == ["human"]
+    assert verify_model("human").name == "human"
+    with pytest.raises(OutputError, match="cannot write") as caught:
+        add_model(blob)
+    assert "MESHMATCH_HOME" in caught.value.hint
+
+
 def test_a_model_that_changes_while_it_is_copied_is_refused(blob: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy = registry.shutil.copyfile
 

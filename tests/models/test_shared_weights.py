@@ -1,5 +1,6 @@
 """Weights that processes share: the same numbers, never those of a damaged file, and never in the way."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -132,11 +133,13 @@ def test_a_full_disk_leaves_nothing(ask: Ask, file: Path) -> None:
 
 def test_without_a_home_nothing_appears_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(shared_weights, "shared_file", lambda name: Path("~/.cache") / name)
-    (tmp_path / "~" / ".cache").mkdir(parents=True)
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
+    monkeypatch.setattr(shared_weights, "shared_file", SHARED_FILE)
     found = shared_weights.shared_weights("blob", "ab" * 32, SHAPES, numbers)
     assert not any(map(is_mapped, found.values()))
-    assert list((tmp_path / "~" / ".cache").iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_file_is_in_the_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -271,7 +271,7 @@ def test_the_rig_is_built_once_and_kept(monkeypatch: pytest.MonkeyPatch, tmp_pat
         return stick_figure(identities)
 
     monkeypatch.setattr(rigs, "build_rig", build)
-    monkeypatch.setattr(rigs.platformdirs, "user_cache_dir", lambda name: str(tmp_path / "cache"))
+    monkeypatch.setattr(rigs, "home_folder", lambda kind: tmp_path / "cache")
     first = rigs.cached_rig(3, 0)
     second = rigs.cached_rig(3, 0)
     assert built == [3]
