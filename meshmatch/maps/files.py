@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import csv
 import io
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -102,7 +103,13 @@ def _write_txt(path: Path, m: VertexMap) -> None:
 
 def _read_txt(path: Path) -> dict[str, Any]:
     with io.StringIO(read_text(path, _VERTEX)) as file:
-        return _bare(np.loadtxt(file, dtype=np.int64, ndmin=1))
+        return _bare(_numbers(file, dtype=np.int64, ndmin=1))
+
+
+def _numbers(file: io.StringIO, **how: Any) -> NDArray[Any]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of a file without numbers, which is refused as a map
+        return np.loadtxt(file, **how)
 
 
 def _write_npz(path: Path, m: VertexMap) -> None:
@@ -125,7 +132,7 @@ def _read_csv(path: Path) -> dict[str, Any]:
         names = [name.strip() for name in next(csv.reader(file))]
         if "target_vertex" not in names:
             raise InputError("there is no column 'target_vertex'", f"the columns are {','.join(CSV_COLUMNS)}")
-        table = np.loadtxt(file, delimiter=",", ndmin=2)
+        table = _numbers(file, delimiter=",", ndmin=2)
     column = {name: table[:, k] for k, name in enumerate(names)}
     if "source_vertex" in column:
         table_files.check_numbered(column["source_vertex"])

@@ -297,7 +297,7 @@ def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None
 
 def _whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
     array = np.asarray(values)
-    if array.dtype.kind == "f" and np.isfinite(array).all() and (array == np.round(array)).all():
+    if array.dtype.kind == "f" and (np.abs(array) < 2**53).all() and (array == np.round(array)).all():
         return array.astype(np.int64)  # MATLAB's numbers are doubles
     if array.dtype.kind not in "iu":
         raise InputError(f"{label} must be whole numbers, not {array.dtype}")

@@ -6,9 +6,12 @@ for it. Faces and vertices are those of `load_shape`, in the same order.
 
 from __future__ import annotations
 
+import os
 import struct
 import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from io import BytesIO
 from typing import Literal
@@ -118,7 +121,8 @@ class ImageReader:
                     self.left -= image.width * image.height
                     if self.left < 0:
                         raise _too_large(label, f"{size}, and the others before it nearly as many")
-                    return _rgba(image)
+                    with _silent() if image.format == "TIFF" else nullcontext():
+                        return _rgba(image)
         except Image.DecompressionBombError as error:
             raise _too_large(label, "over 179 million pixels") from error
         except Image.UnidentifiedImageError as error:
@@ -126,6 +130,23 @@ class ImageReader:
         except _DAMAGE as error:
             what = (str(error) or type(error).__name__).strip().splitlines()[0][:80]
             raise InputError(f"{label} is a damaged image ({what})", "export it or copy it again") from error
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Let nothing be written to stderr: libtiff, a library in C, tells there what is wrong with a file."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is none
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _rgba(image: Image.Image) -> Pixels:

@@ -230,6 +230,8 @@ def _table(key: str, values: ArrayLike, kind: type) -> np.ndarray:
             raise ValueError(f"an array of {array.shape} {array.dtype}")
         if kind is np.int64 and (array != np.round(array)).any():
             raise ValueError("its numbers are not whole")
+        if kind is np.int64 and (np.abs(array.astype(np.float64)) >= 2**53).any():
+            raise ValueError("its numbers are too large")
     except ValueError as error:
         raise InputError(f"'{key}' is not a table of numbers: {error}", _WEIGHTS_HINT) from error
     return array.astype(kind)

@@ -1,15 +1,18 @@
 """What files say about the look of their surfaces."""
 
+import os
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from meshmatch.errors import InputError
 from meshmatch.shapes import appearance
-from meshmatch.shapes.appearance import Appearance
+from meshmatch.shapes.appearance import Appearance, ImageReader
 from meshmatch.shapes.colors import LINEAR_OF_BYTE, bytes_of, to_linear, to_srgb
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.obj_look import second_index
@@ -326,6 +329,19 @@ def test_damaged_and_foreign_images(tmp_path: Path) -> None:
                        (whole[:40] + b"\0" * 40, "")):  # fmt: skip
         (tmp_path / "b.png").write_bytes(data)
         assert word in refused(tmp_path / "a.obj", tmp_path / "b.png").message
+
+
+def test_a_damaged_tiff_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    """The library that reads it is of C, and would."""
+    out = BytesIO()
+    Image.fromarray(quarters(16)[..., :3]).save(out, "TIFF", compression="tiff_lzw")
+    data = bytearray(out.getvalue())
+    data[8:40] = b"\xff" * 32
+    with pytest.raises(InputError, match="is a damaged image"):
+        ImageReader().decode(bytes(data), "a.tif")
+    assert capfd.readouterr().err == ""
+    os.write(2, b"heard again")
+    assert capfd.readouterr().err == "heard again"
 
 
 def test_a_huge_image_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

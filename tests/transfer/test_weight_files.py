@@ -148,6 +148,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "ragged": ("a.json", lambda path: path.write_text('{"weights": [[1], [1, 2]]}'), "not a table of numbers"),
     "joints of a word": ("a.json", json_of(joints="x"), "'joints' is not a table"),
     "joints of words": ("a.json", json_of(joints=[["a"]] * SHAPE.V), "'joints' is not a table"),
+    "huge joints": ("a.json", json_of(joints=[[1e300]] * SHAPE.V), "too large"),
     "no joints": ("a.json", json_of(joints=None), "'joints' is not a table"),
     "ragged names": ("a.json", json_of(names=[["a"], ["b", "c"]]), "can be read"),
     "a suffix": ("a.fbx", lambda path: path.write_text("x"), "not read from '.fbx'"),

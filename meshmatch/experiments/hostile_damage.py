@@ -1,0 +1,272 @@
+"""Ways to damage a file: its bytes, its words and numbers, and what lies inside JSON, zip archives and headers."""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+import zipfile
+from collections.abc import Callable
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+
+Damage = Callable[[bytes, np.random.Generator], bytes]
+WORDS = (
+    *(
+        b"nan",
+        b"inf",
+        b"-inf",
+        b"-1",
+        b"0",
+        b"1",
+        b"1e308",
+        b"-1e308",
+        b"1e-320",
+        b"1e59",
+        b"4294967295",
+        b"2147483648",
+    ),
+    *(
+        b"9223372036854775808",
+        b"99999999999999999999999",
+        b"9" * 5000,
+        b"x" * 300,
+        b"",
+        b"-nan(ind)",
+        b"1_000",
+        b"0x10",
+    ),
+    *(
+        b"\x1b]0;pwned\x07\x1b[31m",
+        b"\xc2\x9b31m",
+        b"\xff\xfe",
+        b"\0",
+        b"\n",
+        b"\r",
+        b"\xe2\x80\xae",
+        b"../../etc/passwd",
+    ),
+    *(
+        b"/dev/zero",
+        b"%2e%2e/x",
+        b"file:///etc/passwd",
+        b"~nobody",
+        b"end_header",
+        b"list",
+        b"uchar",
+        b"double",
+        b"null",
+    ),
+    *(
+        b"true",
+        b"[" * 2000,
+        b"{" * 2000,
+        b'"',
+        b"<a>",
+        b"<!ENTITY",
+        b"</script>",
+        b"\xed\xa0\x80",
+        b"1e400",
+        b"\xd9\xa3",
+    ),
+)
+VALUES: tuple[Any, ...] = (
+    *(None, True, False, -1, 0, 1, 2, 3, 255, 2**31, 2**32, 2**63, 10**30, -(2**63), 0.5, -0.5, 1e308, 1e-320, "", "x"),
+    *("x" * 400, "\x1b]0;pwned\x07", "\u202e", "a\nb", "\ud800", [], {}, [[]], [1, 2], [None], {"a": 1}, [[1], [1, 2]]),
+    *(["a"], [1e308] * 4, [0.5] * 3, [[0.5] * 3] * 3, "../x", "/dev/zero", "data:,", "data:;base64,AAAA", "~nobody/x"),
+)
+NUMBERS = (0, 1, 2, 3, 127, 128, 255, 256, 65535, 2**24, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)
+_NUMBER = re.compile(rb"-?\d+\.?\d*(?:e[+-]?\d+)?")
+_WORD = re.compile(rb"[^\s,;\"]+")
+
+
+def damaged(data: bytes, other: bytes, rng: np.random.Generator) -> bytes:
+    """The bytes after one to three damages; `other` are those of another file of the family."""
+    for _ in range(int(rng.integers(1, 4))):
+        if rng.random() < 0.05:
+            cut, resume = rng.integers(len(data) + 1), rng.integers(len(other) + 1)
+            data = data[:cut] + other[resume:]
+            continue
+        ways = WAYS + STRUCTURED if rng.random() < 0.6 else WAYS
+        data = ways[int(rng.integers(len(ways)))](data, rng)[:4_000_000]
+    return data
+
+
+def _place(data: bytes, rng: np.random.Generator) -> int:
+    """Somewhere; half of the time near the beginning, where headers are."""
+    most = len(data) + 1
+    return int(rng.integers(min(most, 600) if rng.random() < 0.5 else most))
+
+
+def _flip(data: bytes, rng: np.random.Generator) -> bytes:
+    changed = bytearray(data)
+    for _ in range(int(rng.integers(1, 9))):
+        at = _place(data, rng)
+        if at < len(changed):
+            changed[at] ^= 1 << int(rng.integers(8)) if rng.random() < 0.5 else int(rng.integers(1, 256))
+    return bytes(changed)
+
+
+def _cut(data: bytes, rng: np.random.Generator) -> bytes:
+    return data[: _place(data, rng)]
+
+
+def _remove(data: bytes, rng: np.random.Generator) -> bytes:
+    at = _place(data, rng)
+    return data[:at] + data[at + int(rng.integers(1, 200)) :]
+
+
+def _repeat(data: bytes, rng: np.random.Generator) -> bytes:
+    at = _place(data, rng)
+    end = at + int(rng.integers(1, 200))
+    return data[:end] + data[at:end] * int(rng.choice([1, 2, 50, 2000])) + data[end:]
+
+
+def _insert(data: bytes, rng: np.random.Generator) -> bytes:
+    at = _place(data, rng)
+    return data[:at] + rng.bytes(int(rng.integers(1, 50))) + data[at:]
+
+
+def _integer(data: bytes, rng: np.random.Generator) -> bytes:
+    kind = str(rng.choice(["<u2", "<u4", "<u8", ">u4", "u1"]))
+    number = NUMBERS[int(rng.integers(len(NUMBERS)))] % (1 << 8 * np.dtype(kind).itemsize)
+    at = _place(data, rng) // (1 if rng.random() < 0.5 else 4) * (1 if rng.random() < 0.5 else 4)
+    written = np.array(number, kind).tobytes()
+    return data[:at] + written + data[at + len(written) :]
+
+
+def _number_of(pattern: re.Pattern[bytes]) -> Damage:
+    def change(data: bytes, rng: np.random.Generator) -> bytes:
+        found = pattern.search(data, _place(data, rng))
+        if found is None:
+            return _flip(data, rng)
+        return data[: found.start()] + WORDS[int(rng.integers(len(WORDS)))] + data[found.end() :]
+
+    return change
+
+
+def _line(data: bytes, rng: np.random.Generator) -> bytes:
+    """A line is left out, doubled, moved, or repeated many times."""
+    lines = data.split(b"\n")
+    at, to = (int(rng.integers(len(lines))) for _ in range(2))
+    one = lines.pop(at)
+    for _ in range(int(rng.choice([0, 1, 2, 3000]))):
+        lines.insert(to, one)
+        if len(one) > 1000:
+            break
+    return b"\n".join(lines)
+
+
+WAYS: list[Damage] = [_flip, _cut, _remove, _repeat, _insert, _integer, _number_of(_NUMBER), _number_of(_WORD), _line]
+
+
+def _json(data: bytes, rng: np.random.Generator) -> bytes:
+    """A value somewhere in the JSON of a file, of a glb or of a safetensors header becomes another one, or goes."""
+    for part in (_whole, _glb, _tensors):
+        try:
+            text, put_back = part(data)
+            found = json.loads(text)
+        except (ValueError, struct.error, IndexError):
+            continue
+        if isinstance(found, dict | list) and found:
+            return put_back(json.dumps(_changed(found, rng)).encode("utf-8", "surrogatepass"))
+    return _flip(data, rng)
+
+
+def _changed(found: Any, rng: np.random.Generator) -> Any:
+    inner = found
+    while True:
+        keys = list(inner) if isinstance(inner, dict) else list(range(len(inner)))
+        key = keys[int(rng.integers(len(keys)))]
+        below = inner[key]
+        if not (isinstance(below, dict | list) and below) or rng.random() < 0.15:
+            break
+        inner = below
+    way = rng.random()
+    if way < 0.1:
+        del inner[key]
+    elif way < 0.2 and isinstance(inner, dict):
+        inner[str(rng.choice(["x", "matrix", "sparse", "uri", "extensions", "mode", "\x1b[31m"]))] = inner.pop(key)
+    elif way < 0.25:
+        for _ in range(500):
+            inner[key] = [inner[key]]
+    else:
+        inner[key] = VALUES[int(rng.integers(len(VALUES)))]
+    return found
+
+
+def _whole(data: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:
+    return data, lambda text: text
+
+
+def _glb(data: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:
+    if data[:4] != b"glTF":
+        raise ValueError
+    size = int.from_bytes(data[12:16], "little")
+    rest = data[20 + size :]
+
+    def put_back(text: bytes) -> bytes:
+        text += b" " * (-len(text) % 4)
+        head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON")
+        return head + text + rest
+
+    return data[20 : 20 + size], put_back
+
+
+def _tensors(data: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:
+    size = int.from_bytes(data[:8], "little")
+    return data[8 : 8 + size], lambda text: len(text).to_bytes(8, "little") + text + data[8 + size :]
+
+
+def _archive(data: bytes, rng: np.random.Generator) -> bytes:
+    """A member of a zip archive is damaged, and packed again with the right checksum; or all of them are zeros."""
+    try:
+        with zipfile.ZipFile(BytesIO(data)) as archive:
+            held = [(name, archive.read(name)) for name in archive.namelist()]
+    except Exception:  # no archive, or damaged already
+        return _flip(data, rng)
+    chosen = int(rng.integers(max(len(held), 1)))
+    out = BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for number, (name, content) in enumerate(held):
+            if number == chosen:
+                content = bytes(3_000_000) if rng.random() < 0.05 else _inside(content, rng)
+            archive.writestr(name, content)
+    return out.getvalue()
+
+
+def _inside(content: bytes, rng: np.random.Generator) -> bytes:
+    return (_header if rng.random() < 0.6 else WAYS[int(rng.integers(len(WAYS)))])(content, rng)
+
+
+def _header(data: bytes, rng: np.random.Generator) -> bytes:
+    """Another shape or kind of numbers in the header of an npy array."""
+    end = data.find(b"\n")
+    if data[:6] != b"\x93NUMPY" or not 10 < end < 1000:
+        return _flip(data, rng)
+    kinds = ["<f8", "|i1", "<i8", "|O", "<U9", "|S3", "<c16", "|b1", "<f2", ">i4", "<M8[s]", "|V8"]
+    shapes = [
+        "(1,)",
+        "()",
+        "(0,)",
+        "(2, 3)",
+        "(-1,)",
+        "(99999999999,)",
+        "(1, 1, 1)",
+        "(300000000, 0)",
+        "3",
+        "(4294967296,)",
+    ]
+    kind, shape = str(rng.choice(kinds)), str(rng.choice(shapes))
+    old = data[10:end]
+    if rng.random() < 0.6:
+        new = re.sub(rb"'descr': '[^']*'", f"'descr': '{kind}'".encode(), old)
+    else:
+        new = re.sub(rb"'shape': \([^)]*\)", f"'shape': {shape}".encode(), old)
+    new = new.strip().ljust(len(old))
+    return data[:8] + len(new + b"\n").to_bytes(2, "little") + new + data[end:]
+
+
+STRUCTURED: list[Damage] = [_json, _archive, _header, _json]
