@@ -39,7 +39,7 @@ API = {
         *("MeshmatchError",),
     ),
     "Sequences, pictures and pages": ("interpolate", "InterpolationOptions", "Interpolation", "picture", "view"),
-    "Collections": ("Atlas", "measure_atlas"),
+    "Collections": ("Collection", "Atlas", "measure_atlas"),
     "Own categories": ("prepare", "train"),
     "Implicit surfaces": (
         *("train_implicit", "load_implicit", "fit_implicit", "implicit_sequence", "ImplicitModel", "ImplicitFit"),

@@ -8,6 +8,9 @@ import meshmatch
 from meshmatch import FitConfig, Matcher
 from meshmatch.api.pictures import Page
 from meshmatch.arrays import Floats
+from meshmatch.collections.atlas import Projection
+from meshmatch.collections.groups import Comparison
+from meshmatch.collections.measures import Measures
 from meshmatch.maps.evaluate import Evaluation
 from meshmatch.models.trained import TrainedModel
 from meshmatch.transfer.label_files import Labels
@@ -31,3 +34,8 @@ assert_type(meshmatch.view("a.ply", "b.ply", "ab.html", result), Page)
 assert_type(meshmatch.load_shape("a.ply"), meshmatch.Shape)
 assert_type(meshmatch.load_map("ab.npz"), meshmatch.VertexMap)
 assert_type(meshmatch.load_model("human"), TrainedModel)
+atlas = meshmatch.Collection("fits").atlas(scale="remove")
+assert_type(atlas, meshmatch.Atlas)
+assert_type(atlas.project(fits[0]), Projection)
+assert_type(meshmatch.Atlas.of(np.stack([verts] * 3), faces).compare(["a", "b"], ["c", "d"]), Comparison)
+assert_type(meshmatch.measure_atlas(atlas, [verts] * 3), Measures)
