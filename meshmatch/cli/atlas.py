@@ -92,8 +92,8 @@ def atlas(
 def _shapes(fits: str, poor: bool) -> AbstractContextManager["Registered"]:
     """The shapes of a folder, whichever kind it is."""
     from meshmatch.collections.collection import Collection
-    from meshmatch.collections.fit_all import read_about
     from meshmatch.collections.registered import registered_meshes
+    from meshmatch.collections.settle import read_about
 
     collection = Collection(fits)
     if not collection.store.remote and read_about(collection.store) is None:

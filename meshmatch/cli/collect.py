@@ -44,12 +44,15 @@ def fit(
     """Fit every shape of a collection once, for maps between any two of them and for atlases.
 
     A shape that cannot be fitted is told, and stops nobody. What a run that was stopped had finished is kept, and shapes
-    that were added since are fitted when it is run again. FITS/fits.csv says what became of each shape.
+    that were added since are fitted when it is run again. With --model none the template is made of the shapes themselves,
+    which must be complete. FITS/fits.csv says what became of each shape.
     """
-    from meshmatch.collections.tasks import FAILED
+    from meshmatch.collections.setting import FAILED
+    from meshmatch.fitting.viscous import NO_MODEL
 
     how.check()
-    check_model(how.model)
+    if how.model != NO_MODEL:
+        check_model(how.model)
     console = Console(quiet)
 
     def tell(record: Any) -> None:

@@ -13,14 +13,15 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
-from meshmatch.collections.fit_all import TEMPLATE, Fitted, fit_all, read_about, settled
+from meshmatch.collections.fit_all import Fitted, fit_all
 from meshmatch.collections.fit_files import StoredFit, load_fit, load_words
 from meshmatch.collections.map_all import Pair, map_all
 from meshmatch.collections.registered import Registered, held
+from meshmatch.collections.setting import FITS, SUFFIX, TEMPLATE, Record, Setting
+from meshmatch.collections.settle import read_about, settled
 from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
 from meshmatch.collections.superimpose import Scale
-from meshmatch.collections.tasks import FITS, SUFFIX, Record, Setting
 from meshmatch.collections.workers import hired
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
@@ -70,6 +71,9 @@ class Collection:
         tell: Callable[[Record], None] | None = None,
     ) -> Fitted:
         """Fit every shape once, and let all fits agree on how the template stretches.
+
+        With the model "none" the shapes themselves make a template: one of them is fitted to all others, and then their
+        mean. They must be complete, and of one kind; nothing agrees then, and no fit is better than fair.
 
         ``shapes`` are files, folders, patterns such as ``scans/*.ply``, or URLs of folders; ``only`` and ``without`` as in
         `load_shape`. With ``sequence`` the shapes of a folder are frames, in the natural order of their names, and each

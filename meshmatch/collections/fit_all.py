@@ -4,51 +4,37 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
-from meshmatch.api.inputs import as_model, check_config, validated
-from meshmatch.api.kinds import choose_model
 from meshmatch.arrays import Floats
+from meshmatch.collections.setting import AGREEING, ALONE, FAILED, FIRST, Record, Setting, Source, digest_of
+from meshmatch.collections.settle import on_the_mean, save_text
 from meshmatch.collections.sources import natural
 from meshmatch.collections.stores import Store
 from meshmatch.collections.tasks import (
-    AGREEING,
-    FAILED,
     AgreeTask,
     FinishTask,
     FitTask,
     Group,
-    Record,
-    Setting,
-    Source,
     agree_a_little,
     common_file,
-    digest_of,
     finish,
     fit_alone,
     is_finished,
     save_array,
 )
 from meshmatch.collections.workers import Died, Item, Result, Workers
-from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.errors import InputError
 from meshmatch.fitting.agree import AgreeConfig, stretch_of
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.viscous import NO_MODEL
 from meshmatch.maps.vertex_map import VERDICTS
-from meshmatch.models.registry import AUTO
-from meshmatch.outputs import replace_on_success
 from meshmatch.progress import ProgressCallback
-from meshmatch.templates.template import save_template
 
-SCHEMA = 1
-ABOUT, TEMPLATE, TABLE = "collection.json", "template.safetensors", "fits.csv"
+TABLE = "fits.csv"
 COLUMNS = ("name", "file", "verdict", "reasons", "residual", "up", "front", "vertices", "seconds")
 _GROUP = 4  # fits that one task of the agreement takes a step with: fixed, for sums must not depend on the workers
-_READ_AHEAD = 20  # shapes that are asked for their kind before none is known
 
 
 @dataclass(frozen=True)
@@ -75,15 +61,18 @@ def fit_all(
     tell: Callable[[Record], None] | None = None,
 ) -> Fitted:
     """Fit all shapes of a collection; see `Collection.fit`."""
-    run = _Run(setting, sources, crew, progress or (lambda stage, name, share: None))
+    report = progress or (lambda stage, name, share: None)
+    if setting.model == NO_MODEL:
+        first = _Run(setting, sources, crew, report).fit_alone(None, FIRST)
+        setting = on_the_mean(setting, [record.name for record in first if record.verdict not in ("poor", FAILED)])
+    run = _Run(setting, sources, crew, report)
     records = run.fit_alone(tell)
     fitted = [number for number, record in enumerate(records) if record.fitted]
     if not fitted:
         _write_table(setting.store, records)
         raise InputError(f"none of {len(records)} shapes could be fitted: {records[0].name}: {records[0].reasons}")
     agreeing = [number for number in fitted if records[number].verdict != "poor"]
-    moves = setting.config.for_model(setting.trained).moves_nodes
-    groups = run.groups(agreeing) if agree and moves and len(agreeing) > 1 else []
+    groups = run.groups(agreeing) if agree and setting.agrees and len(agreeing) > 1 else []
     tasks = run.last_tasks({number: records[number] for number in fitted}, groups)
     if groups and not all(is_finished(setting.store, task) for task in tasks.values()):
         run.agree(groups, len(agreeing))
@@ -111,7 +100,7 @@ class _Run:
             self.report(stage, self.setting.store.location, (done + 1) / len(items))
             yield number, result
 
-    def fit_alone(self, tell: Callable[[Record], None] | None) -> list[Record]:
+    def fit_alone(self, tell: Callable[[Record], None] | None, folder: str = ALONE) -> list[Record]:
         """Fit every shape on its own; the frames of a sequence one after the other, of several sequences beside each
         other.
         """
@@ -121,8 +110,8 @@ class _Run:
             numbers = [chain[turn] for chain in chains if turn < len(chain)]
             before = [self._last(chain[:turn], found) for chain in chains if turn < len(chain)]
             places = zip(numbers, before, strict=True)
-            tasks = [FitTask(self.setting, self.sources[number], last) for number, last in places]
-            for at, result in self._each(fit_alone, tasks, "fitting"):
+            tasks = [FitTask(self.setting, self.sources[number], last, folder) for number, last in places]
+            for at, result in self._each(fit_alone, tasks, "fitting" if folder == ALONE else "fitting one to all"):
                 source = self.sources[numbers[at]]
                 if isinstance(result, Died):
                     result = Record(source.name, source.path, reasons=result.message)
@@ -154,7 +143,7 @@ class _Run:
         """What finishes each fit; a digest of all that agree tells whether that was done before."""
         parts = [f"{record.name} {record.digest} {record.verdict}" for record in records.values()]
         digest = digest_of(*parts)
-        steps = AgreeConfig.for_model(self.setting.trained).steps
+        steps = AgreeConfig.for_model(self.setting.trained).steps if groups else 0
         group_of = {name: group for group in groups for name in group.names}
         found = {}
         for number, record in records.items():
@@ -190,66 +179,10 @@ class _Run:
                 yield numbers[at], trouble
 
 
-def settled(wish: Setting, sources: Sequence[Source]) -> Setting:
-    """What all tasks share: a model that is named. What a folder of fits says of itself is written, or checked if it was
-    there before.
-
-    `OptionError` if it holds fits of another model, or made in another way; or as `choose_model`.
-    """
-    check_config(wish.config)
-    store, about, model = wish.store, read_about(wish.store), wish.model
-    if model == AUTO:
-        model = _chosen(sources, wish.config) if about is None else str(about["model"])
-    trained = as_model(model)
-    setting = replace(wish, model=model if model == trained.card.name else str(Path(model).resolve()))
-    wanted = {"schema": SCHEMA, "template": trained.template.hash} | setting.choices()
-    if about is None:
-        with store.writing(TEMPLATE) as path:
-            save_template(trained.template, path)
-        _write(store, ABOUT, json.dumps(wanted, indent=2) + "\n")  # last: a folder without it is no collection
-    elif differs := [name for name in wanted if about[name] != wanted[name]]:
-        other = f"the fits in {store.location} were made with another {differs[0]}"
-        raise OptionError(other, "choose another folder, or the options of before")
-    return setting
-
-
-def _chosen(sources: Sequence[Source], config: FitConfig) -> str:
-    """The installed model that knows the kind of the first shape which can be read and is of a known kind."""
-    trouble: MeshmatchError | None = None
-    for source in sources[:_READ_AHEAD]:
-        try:
-            chosen = choose_model([validated(source.load())], [config])[0]
-        except MeshmatchError as error:
-            trouble = trouble or error
-        else:
-            return chosen.card.name
-    assert trouble is not None
-    raise trouble
-
-
-def read_about(store: Store) -> dict[str, Any] | None:
-    """What a folder says of its fits; None if it is no folder of fits."""
-    if not store.exists(ABOUT):
-        return None
-    try:
-        with store.reading(ABOUT) as path:
-            about = json.loads(path.read_text(encoding="utf-8"))
-        if about["schema"] != SCHEMA:
-            raise InputError(f"{ABOUT} has schema {about['schema']!r}, not {SCHEMA}", "update meshmatch")
-        return {name: about[name] for name in ("schema", "template", "model", "only", "without", "sequence", "fit")}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{store.location}/{ABOUT} is damaged", "remove the folder, and fit again") from error
-
-
 def _write_table(store: Store, records: Sequence[Record]) -> None:
     """``fits.csv``: a row for each shape."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
     table.writerows([getattr(record, name) for name in COLUMNS] for record in records)
-    _write(store, TABLE, text.getvalue())
-
-
-def _write(store: Store, name: str, text: str) -> None:
-    with store.writing(name) as path, replace_on_success(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    save_text(store, TABLE, text.getvalue())

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from meshmatch.collections.fit_all import TEMPLATE
 from meshmatch.collections.fit_files import load_fit
+from meshmatch.collections.setting import FITS, SUFFIX, TEMPLATE
 from meshmatch.collections.stores import Store
-from meshmatch.collections.tasks import FITS, SUFFIX
 from meshmatch.collections.workers import Died, Workers
 from meshmatch.errors import InputError
 from meshmatch.maps.build import build_map

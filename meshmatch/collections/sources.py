@@ -8,8 +8,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
+from meshmatch.collections.setting import Source
 from meshmatch.collections.stores import Store, is_url
-from meshmatch.collections.tasks import Source
 from meshmatch.errors import InputError
 from meshmatch.outputs import as_path
 from meshmatch.shapes.files import SUFFIXES

@@ -6,124 +6,24 @@ anybody, with the same result bit for bit.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from meshmatch.api.inputs import as_model, validated
-from meshmatch.api.matching import Matcher
+from meshmatch.api.inputs import validated
 from meshmatch.arrays import Float, Floats
-from meshmatch.collections.fit_files import StoredFit, load_fit, load_words, save_fit
+from meshmatch.collections.fit_files import StoredFit, load_words, save_fit
+from meshmatch.collections.setting import AGREEING, ALONE, FITS, SUFFIX, Record, Setting, Source, digest_of
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.fitting.agree import AgreeConfig, Member, agree_step, log_stretch, member_of
-from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.system import node_system
 from meshmatch.maps.places import Places
-from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.input_files import read_npy
-from meshmatch.shapes.shape import Shape
-
-ALONE, AGREEING, FITS = "alone", "agreeing", "fits"
-"""Folders of a collection: fits before they agree, what they agree on so far, and finished fits."""
-SUFFIX = ".safetensors"
-FAILED = "failed"
-"""In place of a verdict, for a shape that could not be fitted."""
-
-
-def digest_of(*parts: str | bytes) -> str:
-    """A digest of words or bytes, 32 hex digits."""
-    found = hashlib.blake2b(digest_size=16)
-    for part in parts:
-        found.update(part if isinstance(part, bytes) else f"{part}\n".encode())
-    return found.hexdigest()
-
-
-@dataclass(frozen=True)
-class Source:
-    """One shape of a collection: its name there, the folder where its file lies, and the file's name in it."""
-
-    name: str
-    folder: Store
-    file: str
-
-    def load(self, only: Sequence[str] = (), without: Sequence[str] = ()) -> Shape:
-        """The shape, under its name in the collection, as `load_shape`; `InputError` if it cannot be read."""
-        with self.folder.reading(self.file) as path:
-            return replace(load_shape(path, only=only, without=without), name=self.name)
-
-    @property
-    def path(self) -> str:
-        """Where the file lies."""
-        return f"{self.folder.location}/{self.file}"
-
-    def digest(self) -> str:
-        """Of the file's bytes."""
-        with self.folder.reading(self.file) as path:
-            try:
-                return digest_of(path.read_bytes())
-            except OSError as error:
-                raise InputError(f"cannot read {path}: {error.strerror}", "check the name") from error
-
-
-@dataclass(frozen=True)
-class Record:
-    """What became of one shape: a row of ``fits.csv``."""
-
-    name: str
-    file: str
-    verdict: str = FAILED  # or that of the fit
-    reasons: str = ""
-    residual: float = float("nan")  # units of sqrt(area)
-    up: str = ""
-    front: str = ""
-    vertices: int = 0
-    seconds: float = 0.0
-    digest: str = ""
-
-    @property
-    def fitted(self) -> bool:
-        return self.verdict != FAILED
-
-
-@dataclass(frozen=True)
-class Setting:
-    """What all tasks of a collection share."""
-
-    store: Store
-    model: str  # name or folder
-    config: FitConfig
-    only: tuple[str, ...] = ()  # of a glb or gltf file, see `load_shape`
-    without: tuple[str, ...] = ()
-    sequence: bool = False  # shapes of a folder are frames, in the natural order of their names
-
-    @property
-    def trained(self) -> TrainedModel:
-        """The model, loaded once in each process."""
-        return as_model(self.model)
-
-    def read(self, folder: str, name: str) -> StoredFit:
-        """A fit of the collection."""
-        with self.store.reading(f"{folder}/{name}{SUFFIX}") as path:
-            return load_fit(path, self.trained.template)
-
-    def choices(self) -> dict[str, Any]:
-        """How shapes are read and fitted, as JSON has it."""
-        chosen: dict[str, Any] = {"model": self.model, "only": self.only, "without": self.without}
-        chosen |= {"sequence": self.sequence, "fit": asdict(self.config)}
-        return dict(json.loads(json.dumps(chosen)))
-
-    def digest(self) -> str:
-        """Of all that decides how a shape is fitted."""
-        return digest_of(self.trained.template.hash, json.dumps(self.choices(), sort_keys=True))
 
 
 @dataclass(frozen=True)
@@ -133,6 +33,7 @@ class FitTask:
     setting: Setting
     source: Source
     last: Record | None = None  # of the frame before, in a sequence
+    folder: str = ALONE
 
 
 def fit_alone(task: FitTask) -> Record:
@@ -141,18 +42,17 @@ def fit_alone(task: FitTask) -> Record:
     A shape that cannot be fitted is a record, not an error.
     """
     source, setting = task.source, task.setting
-    file, began = f"{ALONE}/{source.name}{SUFFIX}", time.monotonic()
+    file, began = f"{task.folder}/{source.name}{SUFFIX}", time.monotonic()
     try:
         digest = digest_of(source.digest(), setting.digest(), "" if task.last is None else task.last.digest)
         known = _known(setting.store, file, digest)
         if known is not None:
             return known
-        matcher, shape = Matcher(setting.trained, setting.config, 1), source.load(setting.only, setting.without)
-        last = None if task.last is None else setting.read(ALONE, task.last.name).fit
-        fit = matcher.fit(shape) if last is None else matcher.follow(shape, last)
+        last = None if task.last is None else setting.read(task.folder, task.last.name).fit
+        fit = setting.fit(source.load(setting.only, setting.without), last)
         assert fit.repaired is not None
         samples = None
-        if _agrees(setting):
+        if setting.agrees:
             how = AgreeConfig.for_model(setting.trained)
             samples = member_of(node_system(setting.trained), fit.repaired.shape, fit, setting.config, how).samples
         record = Record(
@@ -173,11 +73,6 @@ def fit_alone(task: FitTask) -> Record:
     except MeshmatchError as error:
         return Record(source.name, source.path, reasons=str(error.message))
     return record
-
-
-def _agrees(setting: Setting) -> bool:
-    """Whether fits of this model, refined so, can agree."""
-    return setting.config.for_model(setting.trained).moves_nodes
 
 
 def _known(store: Store, file: str, digest: str) -> Record | None:

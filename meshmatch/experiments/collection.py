@@ -1,9 +1,6 @@
 """A collection of aligned shapes registered to each other without training: each is the template once.
 
-Node vectors of a template are fitted to every other shape by Gauss-Newton. Its prior differs from that of a fit by a
-trained model, which keeps the template's stretch: here the deformation gradient at every strain point is held near the
-mean of its neighbours' in the step before, so that the stretch may be any, but changes slowly from place to place, and
-what a step has gained is kept (a viscous prior, as in meshmonk's registration of surfaces). Of the maps of a pair
+Each template is fitted to all others without a network (`meshmatch.fitting.viscous`). Of the maps of a pair
 through all templates the median is taken on the target, where errors along the surface are partly independent, and then
 the nearest vertex that faces the same way.
 """
@@ -16,17 +13,15 @@ from itertools import permutations
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.sets import Pair
 from meshmatch.fields.shape_functions import build_field
-from meshmatch.fitting.fit_config import NodeRefineConfig, geometric_between
-from meshmatch.fitting.nodes import pair_terms
 from meshmatch.fitting.system import NodeSystem
-from meshmatch.geometry.oriented import OrientedPoints, with_normals
+from meshmatch.fitting.viscous import ViscousConfig, viscous_vectors
+from meshmatch.geometry.oriented import with_normals
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.maps.footpoints import Footpoints, Surface
 from meshmatch.maps.vertex_map import VertexMap
@@ -39,27 +34,6 @@ Shapes = Mapping[str, Shape]
 _ALIGNED_BY = 2400  # samples
 _NORMAL_WEIGHT = 0.0075  # of normals where the nearest vertex is looked for, units of sqrt(area)
 _FOOT_NORMALS = 0.5  # how much normals count where footpoints are, beside a map of bodies
-
-
-@dataclass(frozen=True)
-class CollectionConfig:
-    """Nodes of a template, and the schedule of its fits; lengths in units of sqrt(area). Tuned on three of the hearts."""
-
-    nodes: int = 600
-    radius: float = 0.085
-    faces: int = 10_000  # of a template
-    samples: int = 16_000  # of a shape
-    steps: int = 24
-    strain_first: float = 1e-3
-    strain_last: float = 1e-6
-    scale_first: float = 0.1  # of the robust weight
-    scale_last: float = 0.02
-    point_share: float = 0.01
-    pair_normals: float = 0.012  # of normals in the search for pairs
-    back_points: int = 8000
-    near: int = 5  # strain points, itself included, whose gradients are averaged
-    damping: float = 1e-6
-    seed: int = 0
 
 
 def aligned(shapes: Shapes, first: str, seed: int = 0) -> dict[str, Shape]:
@@ -84,30 +58,10 @@ def thinned(shape: Shape, faces: int) -> Shape:
     return Shape(shape.verts[keep], corners, shape.name)
 
 
-def system_of(thin: Shape, config: CollectionConfig) -> NodeSystem:
+def system_of(thin: Shape, config: ViscousConfig) -> NodeSystem:
     """A template with nodes anywhere near its surface."""
     nodes = choose_nodes(thin, NodeConfig("uniform", config.nodes, config.radius, 0.01, seed=config.seed))
     return NodeSystem(thin, build_field(thin.verts, nodes, config.radius, "smooth"))
-
-
-def fit(system: NodeSystem, samples: OrientedPoints, config: CollectionConfig) -> Float[Floats, "V 3"]:
-    """Where the template's vertices lie on the shape of the samples."""
-    places = system.verts[system.strain_points]
-    near = cKDTree(places).query(places, config.near)[1]
-    rows = np.repeat(np.arange(len(places)), config.near)
-    mean = csr_matrix((np.full(near.size, 1 / config.near), (rows, near.reshape(-1))), (len(places),) * 2)
-    vectors = np.zeros((system.K, 3))
-    pairing = NodeRefineConfig(
-        point_share=config.point_share, pair_normals=config.pair_normals, back_points=config.back_points
-    )
-    for step in range(config.steps):
-        t = step / max(config.steps - 1, 1)
-        strain = geometric_between(config.strain_first, config.strain_last, t)
-        scale = geometric_between(config.scale_first, config.scale_last, t)
-        terms = pair_terms(system, samples, vectors, scale, pairing)
-        wanted = (mean @ system.deformation_gradient(vectors).reshape(-1, 9)).reshape(-1, 3, 3)
-        vectors = system.solve(*terms, strain / len(places), wanted, config.damping / system.K, vectors)
-    return system.moved(vectors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +86,7 @@ class Registered:
         return self.feet[source].values(self.faces, self.places[target])
 
 
-def registered(shapes: Shapes, template: str, config: CollectionConfig, kept: Path) -> Registered:
+def registered(shapes: Shapes, template: str, config: ViscousConfig, kept: Path) -> Registered:
     """One shape as the template of all, each fit kept as a file."""
     runner.once(kept / f"{template}.json", asdict(config), lambda: runner.circumstances(1))
     thin = thinned(shapes[template], config.faces)
@@ -143,13 +97,13 @@ def registered(shapes: Shapes, template: str, config: CollectionConfig, kept: Pa
             runner.tell(f"fitting {template} to {name}")
             system = system or system_of(thin, config)
             samples = sample_surface(shapes[name], config.samples, np.random.default_rng(config.seed + 1))
-            np.save(file, fit(system, samples, config))
+            np.save(file, system.moved(viscous_vectors(system, samples, config)))
         places[name] = np.load(file, allow_pickle=False)
     return Registered.of(shapes, places, np.asarray(thin.faces))
 
 
 def collection_maps(
-    shapes: Shapes, first: str, config: CollectionConfig, kept: Path, templates: Sequence[str] = ()
+    shapes: Shapes, first: str, config: ViscousConfig, kept: Path, templates: Sequence[str] = ()
 ) -> dict[Pair, VertexMap]:
     """Maps of all ordered pairs: the median over templates (by default all shapes) of where each vertex goes."""
     there = aligned(shapes, first, config.seed)

@@ -26,9 +26,10 @@ from meshmatch.collections.atlas_files import Findings, write_folder
 from meshmatch.collections.measures import Measures, measure_atlas
 from meshmatch.experiments import category, runner
 from meshmatch.experiments.classical_baselines import viscoelastic
-from meshmatch.experiments.collection import CollectionConfig, aligned, fit, system_of, thinned
+from meshmatch.experiments.collection import aligned, system_of, thinned
 from meshmatch.experiments.hearts import TRUTH, registered
 from meshmatch.experiments.sets import load_folder
+from meshmatch.fitting.viscous import ViscousConfig, viscous_vectors
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.outputs import make_folder
 from meshmatch.render.facing import facing
@@ -41,12 +42,14 @@ WAYS = ("nodes", "meshmonk", "truth")
 Places = Mapping[str, Floats]
 
 
-def by_nodes(thin: Shape, shapes: Mapping[str, Shape], config: CollectionConfig) -> Places:
+def by_nodes(thin: Shape, shapes: Mapping[str, Shape], config: ViscousConfig) -> Places:
     """The template's vertices on every heart, by node vectors."""
     system, found = system_of(thin, config), {}
     for name, shape in shapes.items():
         samples = sample_surface(shape, config.samples, np.random.default_rng(config.seed + 1))
-        found[name] = thin.verts if name == thin.name else fit(system, samples, config)
+        found[name] = thin.verts
+        if name != thin.name:
+            found[name] = system.moved(viscous_vectors(system, samples, config))
         runner.tell(f"nodes: {name}")
     return found
 
@@ -86,7 +89,7 @@ def main(
     given, truth = load_folder(data / "heart", TRUTH)
     given = {name: given[name] for name in runner.spread(list(given), hearts)}
     template = list(given)[medoid([validated(shape) for shape in given.values()], "near", "area", seed)]
-    shapes, config = aligned(given, template, seed), CollectionConfig(seed=seed)
+    shapes, config = aligned(given, template, seed), ViscousConfig(seed=seed)
     thin = thinned(shapes[template], config.faces)
     rows, notes = [], []
     for way in asked:

@@ -44,9 +44,10 @@ from meshmatch.errors import InputError
 from meshmatch.experiments import category, runner
 from meshmatch.experiments.category import Maps, Shapes
 from meshmatch.experiments.classical_baselines import ZoomOut, viscoelastic
-from meshmatch.experiments.collection import CollectionConfig, collection_maps
+from meshmatch.experiments.collection import collection_maps
 from meshmatch.experiments.sets import Pair, load_folder
 from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig
+from meshmatch.fitting.viscous import ViscousConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.maps.footpoints import Surface
@@ -241,7 +242,7 @@ def main(
                 began = time.process_time()
                 used = runner.spread(list(measured), templates)
                 upright = template if template in measured else used[0]
-                maps = collection_maps(measured, upright, CollectionConfig(seed=seed), here.work, used)
+                maps = collection_maps(measured, upright, ViscousConfig(seed=seed), here.work, used)
                 spent = round((time.process_time() - began) / 60, 2)
                 rows.append({"method": "collection, no training", **errors(maps), "cpu_minutes": spent})
                 continue

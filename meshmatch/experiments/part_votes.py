@@ -16,15 +16,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.experiments.collection import CollectionConfig, fit, system_of, thinned
+from meshmatch.experiments.collection import system_of, thinned
 from meshmatch.experiments.furniture import furniture
 from meshmatch.experiments.furniture_models import Learned
 from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.viscous import ViscousConfig, viscous_vectors
 from meshmatch.geometry.oriented import OrientedPoints, with_normals
 from meshmatch.shapes.shape import Shape
 
 _NORMALS = 0.1  # how much normals count beside positions, of shapes of radius 1
-_FITS = CollectionConfig(
+_FITS = ViscousConfig(
     **{"nodes": 320, "radius": 0.2, "faces": 6000, "samples": 6000, "steps": 10, "back_points": 3000},  # type: ignore[arg-type]
     **{"strain_last": 1e-5, "point_share": 0.1, "pair_normals": 0.06, "near": 12},  # type: ignore[arg-type]
 )
@@ -40,7 +41,7 @@ class VoteConfig:
     compared: int = 400  # points
     margin: float = 0.01  # a fit whose residual is so much larger than the best one's counts e times less
     reach: float = 0.05  # a point so far from the fit counts e times less
-    fits: CollectionConfig = field(default_factory=lambda: _FITS)
+    fits: ViscousConfig = field(default_factory=lambda: _FITS)
 
 
 def boxed(shape: OrientedPoints, center: Floats, half: Floats) -> OrientedPoints:
@@ -84,10 +85,10 @@ class Voter:
 
     shape: Shape
     labels: Int[Ints, " V"]
-    config: CollectionConfig
+    config: ViscousConfig
 
     @classmethod
-    def of(cls, kind: str, seed: int, number: int, config: CollectionConfig) -> Voter:
+    def of(cls, kind: str, seed: int, number: int, config: ViscousConfig) -> Voter:
         """A generated shape at area 1."""
         made = furniture(kind, seed, number)
         thin = thinned(made.surface, config.faces)
@@ -102,7 +103,8 @@ class Voter:
     def on(self, samples: OrientedPoints) -> OrientedPoints:
         """Its vertices on a shape of boxed samples, boxed too."""
         half = box_of(self.shape.verts)[1]
-        moved = fit(self.system, boxed(samples, np.zeros(3), 1 / half), self.config)
+        vectors = viscous_vectors(self.system, boxed(samples, np.zeros(3), 1 / half), self.config)
+        moved = self.system.moved(vectors)
         return boxed(OrientedPoints(moved, self.system.normals(moved)), np.zeros(3), half)
 
 

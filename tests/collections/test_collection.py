@@ -13,7 +13,7 @@ import pytest
 import meshmatch
 from meshmatch.cli import main
 from meshmatch.collections.fit_files import load_fit, load_words, save_fit
-from meshmatch.collections.tasks import Record
+from meshmatch.collections.setting import Record
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.shapes.files import load_shape, save_shape
@@ -136,7 +136,7 @@ def test_what_is_wrong_is_said(made: tuple[Path, tuple[Record, ...]], shapes: Pa
         collection.save_maps(tmp_path / "maps", suffix=".png")
     with pytest.raises(OptionError, match="another fit"):
         collection.fit(shapes, config=meshmatch.FitConfig(seed=1))
-    with pytest.raises(OptionError, match="another template"):
+    with pytest.raises(OptionError, match="another model"):
         collection.fit(shapes, model="quadruped")
     with pytest.raises(InputError, match="not a folder of fits"):
         meshmatch.Collection(tmp_path).names  # noqa: B018
@@ -241,3 +241,44 @@ def test_a_sequence_is_followed_and_a_lost_frame_found_again(tmp_path: Path, mon
     assert [made.records[number].up for number in (6, 7, 8)] == ["+y", "-z", "+y"]  # frame5, 6 and 7 by name
     places = [collection.fit_of(f"frame{number}").points_in_file.mean(0)[2] for number in (3, 4, 5)]
     assert np.allclose(np.diff(places), step, rtol=0.1)
+
+
+def test_without_a_model_the_shapes_make_their_template(tmp_path: Path) -> None:
+    """Eggs of four shapes, meshed apart and tipped a little: their poles are found, and nothing is called good."""
+    folder = tmp_path / "eggs"
+    folder.mkdir()
+    eggs = {}
+    for number, squash in enumerate((0.8, 0.9, 1.1, 1.2)):
+        verts, faces = egg(10 + number)
+        eggs[f"egg{number}"] = Shape(verts * [1, squash, 1.4], faces)
+        save_shape(folder / f"egg{number}.ply", eggs[f"egg{number}"])
+    collection = meshmatch.Collection(tmp_path / "fits", workers=1)
+    made = collection.fit(folder, model="none")
+    assert {record.verdict for record in made.records} == {"fair"} and made.agreed == 0
+    assert "without a model" in made.records[0].reasons
+    for source, target in collection.pairs():
+        found, here, there = collection.map(source, target), eggs[source], eggs[target]
+        place, matched = here.verts / np.abs(here.verts).max(0), there.verts[found.index] / np.abs(there.verts).max(0)
+        assert np.linalg.norm(place - matched, axis=1).mean() < 0.15
+    template = collection.template.hash
+    collection.fit(folder, model="none")
+    assert collection.template.hash == template
+    with pytest.raises(OptionError, match="another model"):
+        collection.fit(folder, model="human")
+
+
+def egg(rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """A sphere whose one end is pointed, of so many rings, 2 * rings vertices each, with bumps that tell its sides."""
+    polar = np.linspace(0, np.pi, rings + 2)[1:-1]
+    around = np.linspace(0, 2 * np.pi, 2 * rings, endpoint=False)
+    a, b = (each.reshape(-1) for each in np.meshgrid(polar, around, indexing="ij"))
+    radius = 1 + 0.15 * np.cos(a) + 0.1 * np.cos(b) * np.sin(a)
+    verts = radius[:, None] * np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], 1)
+    verts = np.concatenate([verts, [[0, 0, 1.15], [0, 0, -0.85]]])
+    n, count = 2 * rings, rings * 2 * rings
+    ring = np.arange(count).reshape(rings, n)
+    p, q = ring[:-1].reshape(-1), ring[1:].reshape(-1)
+    r, t = np.roll(ring[1:], -1, 1).reshape(-1), np.roll(ring[:-1], -1, 1).reshape(-1)
+    top = np.stack([np.full(n, count), ring[0], np.roll(ring[0], -1)], 1)
+    low = np.stack([np.full(n, count + 1), np.roll(ring[-1], -1), ring[-1]], 1)
+    return verts, np.concatenate([np.stack([p, q, r], 1), np.stack([p, r, t], 1), top, low])

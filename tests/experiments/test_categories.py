@@ -12,6 +12,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.experiments import animals, category, collection, hearts, keypoint_parts, segments
 from meshmatch.experiments.category import RIGID, nearest_maps, ordered_pairs
 from meshmatch.experiments.sets import load_folder
+from meshmatch.fitting.viscous import ViscousConfig
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -251,8 +252,8 @@ def test_hearts_from_end_to_end(
 ) -> None:
     balls(tmp_path / "heart", ".truth.npy", 3)
     monkeypatch.setattr(hearts, "find_spec", lambda name: None)
-    small = collection.CollectionConfig(nodes=60, radius=0.35, steps=2, samples=500)
-    monkeypatch.setattr(hearts, "CollectionConfig", lambda seed: small)
+    small = ViscousConfig(nodes=60, radius=0.35, steps=2, samples=500)
+    monkeypatch.setattr(hearts, "ViscousConfig", lambda seed: small)
     drawn = []
     monkeypatch.setattr(category, "render_shapes", lambda panels, path, look: drawn.append(len(panels)))
     words = [
@@ -333,7 +334,7 @@ def test_a_collection_is_registered_without_training(tmp_path: Path, monkeypatch
     for n in range(3):
         bent = ball.verts * [1, 1.2 + 0.1 * n, 1.5] + 0.1 * n * ball.verts[:, [1, 2, 0]] ** 2
         shapes[str(n)] = Shape((10 + n) * bent + n, ball.faces, str(n))
-    config = collection.CollectionConfig(nodes=120, radius=0.3, samples=4000, steps=6)
+    config = ViscousConfig(nodes=120, radius=0.3, samples=4000, steps=6)
     nearest = nearest_maps(shapes, "near", "area", [("0", "2")])["0", "2"]
     for _ in range(2):
         maps = collection.collection_maps(shapes, "0", config, tmp_path)
@@ -341,7 +342,7 @@ def test_a_collection_is_registered_without_training(tmp_path: Path, monkeypatch
         rigid = shapes["2"].verts[nearest.index] - shapes["2"].verts
         assert np.linalg.norm(apart, axis=1).mean() < 0.85 * np.linalg.norm(rigid, axis=1).mean()
         assert len(maps) == 6
-        monkeypatch.setattr(collection, "fit", None)  # it is not asked again
+        monkeypatch.setattr(collection, "viscous_vectors", None)  # it is not asked again
     with pytest.raises(OptionError, match="other choices"):
         collection.collection_maps(shapes, "0", replace(config, steps=7), tmp_path)
 

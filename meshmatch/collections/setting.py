@@ -1,0 +1,156 @@
+"""What all tasks of a collection share: its shapes, the way in which they are fitted, and what becomes of each."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.matching import Matcher
+from meshmatch.collections.fit_files import StoredFit, load_fit
+from meshmatch.collections.stores import Store
+from meshmatch.errors import InputError
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.viscous import NO_MODEL, fit_viscously, viscous_system
+from meshmatch.models.trained import TrainedModel
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.template import Template, load_template
+from meshmatch.threads import thread_limit
+
+FIRST, ALONE, AGREEING, FITS = "first", "alone", "agreeing", "fits"
+"""Folders of a collection: without a model, fits of the shape that is the first template; fits before they agree; what
+they agree on so far; and finished fits."""
+TEMPLATE = "template.safetensors"
+SUFFIX = ".safetensors"
+FAILED = "failed"
+"""In place of a verdict, for a shape that could not be fitted."""
+
+
+def digest_of(*parts: str | bytes) -> str:
+    """A digest of words or bytes, 32 hex digits."""
+    found = hashlib.blake2b(digest_size=16)
+    for part in parts:
+        found.update(part if isinstance(part, bytes) else f"{part}\n".encode())
+    return found.hexdigest()
+
+
+@dataclass(frozen=True)
+class Source:
+    """One shape of a collection: its name there, the folder where its file lies, and the file's name in it."""
+
+    name: str
+    folder: Store
+    file: str
+
+    def load(self, only: Sequence[str] = (), without: Sequence[str] = ()) -> Shape:
+        """The shape, under its name in the collection, as `load_shape`; `InputError` if it cannot be read."""
+        with self.folder.reading(self.file) as path:
+            return replace(load_shape(path, only=only, without=without), name=self.name)
+
+    @property
+    def path(self) -> str:
+        """Where the file lies."""
+        return f"{self.folder.location}/{self.file}"
+
+    def digest(self) -> str:
+        """Of the file's bytes."""
+        with self.folder.reading(self.file) as path:
+            try:
+                return digest_of(path.read_bytes())
+            except OSError as error:
+                raise InputError(f"cannot read {path}: {error.strerror}", "check the name") from error
+
+
+@dataclass(frozen=True)
+class Record:
+    """What became of one shape: a row of ``fits.csv``."""
+
+    name: str
+    file: str
+    verdict: str = FAILED  # or that of the fit
+    reasons: str = ""
+    residual: float = float("nan")  # units of sqrt(area)
+    up: str = ""
+    front: str = ""
+    vertices: int = 0
+    seconds: float = 0.0
+    digest: str = ""
+
+    @property
+    def fitted(self) -> bool:
+        return self.verdict != FAILED
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all tasks of a collection share."""
+
+    store: Store
+    model: str  # name or folder; or `NO_MODEL`
+    config: FitConfig
+    only: tuple[str, ...] = ()  # of a glb or gltf file, see `load_shape`
+    without: tuple[str, ...] = ()
+    sequence: bool = False  # shapes of a folder are frames, in the natural order of their names
+    template_file: str = TEMPLATE
+    template_hash: str = ""
+
+    @property
+    def trained(self) -> TrainedModel:
+        """The model, loaded once in each process."""
+        return as_model(self.model)
+
+    @property
+    def template(self) -> Template:
+        """The template, read once in each process."""
+        return _template(self.store, self.template_file, self.template_hash)
+
+    @property
+    def agrees(self) -> bool:
+        """Whether fits made so can agree: they have nodes, which a trained model moves."""
+        return self.model != NO_MODEL and self.config.for_model(self.trained).moves_nodes
+
+    def read(self, folder: str, name: str) -> StoredFit:
+        """A fit of the collection."""
+        with self.store.reading(f"{folder}/{name}{SUFFIX}") as path:
+            return load_fit(path, self.template)
+
+    def fit(self, shape: Shape, last: Fit | None = None) -> Fit:
+        """Fit one shape; a frame of a sequence from the last one's fit."""
+        if self.model == NO_MODEL:
+            part, template = validated(shape), self.template
+            with thread_limit(1):
+                found = fit_viscously(template, _system(self.store, self.template_file, self.template_hash), part.shape)
+            return replace(found, repaired=part)
+        matcher = Matcher(self.trained, self.config, 1)
+        return matcher.fit(shape) if last is None else matcher.follow(shape, last)
+
+    def choices(self) -> dict[str, Any]:
+        """How shapes are read and fitted, as JSON has it."""
+        chosen: dict[str, Any] = {"model": self.model, "only": self.only, "without": self.without}
+        chosen |= {"sequence": self.sequence, "fit": asdict(self.config)}
+        return dict(json.loads(json.dumps(chosen)))
+
+    def digest(self) -> str:
+        """Of all that decides how a shape is fitted."""
+        return digest_of(self.template_hash, json.dumps(self.choices(), sort_keys=True))
+
+
+@lru_cache(maxsize=4)
+def _template(store: Store, file: str, digest: str) -> Template:
+    with store.reading(file) as path:
+        found = load_template(path)
+    if found.hash != digest:
+        raise InputError(f"{store.location}/{file} has changed", "run `meshmatch fit` again, and one at a time")
+    return found
+
+
+@lru_cache(maxsize=2)
+def _system(store: Store, file: str, digest: str) -> NodeSystem:
+    return viscous_system(_template(store, file, digest))

@@ -1,0 +1,131 @@
+"""What all fits of a collection share: the model that knows its shapes, or a template that is made of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshmatch.api.inputs import as_model, check_config, validated
+from meshmatch.api.kinds import choose_model
+from meshmatch.collections.setting import FIRST, TEMPLATE, Setting, Source
+from meshmatch.collections.stores import Store
+from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.viscous import NO_MODEL, ViscousConfig, template_of
+from meshmatch.geometry.frames import kabsch
+from meshmatch.models.registry import AUTO
+from meshmatch.outputs import replace_on_success
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.prepared_folder import medoid
+from meshmatch.templates.template import Template, load_template, save_template
+
+SCHEMA = 1
+ABOUT, FIRST_TEMPLATE = "collection.json", "first.safetensors"
+_READ_AHEAD = 20  # shapes that are asked for their kind before none is known
+_COMPARED = 40  # shapes among which the first template is looked for
+
+
+def settled(wish: Setting, sources: Sequence[Source]) -> Setting:
+    """What all tasks share: a model that is named. What a folder of fits says of itself is written, or checked if it was
+    there before.
+
+    `OptionError` if it holds fits of another model, or made in another way; or as `choose_model`.
+    """
+    check_config(wish.config)
+    store, about, model = wish.store, read_about(wish.store), wish.model
+    if model == AUTO:
+        model = _chosen(sources, wish.config) if about is None else str(about["model"])
+    if model == NO_MODEL:
+        template, file = _first_template(store, sources, about is None), FIRST_TEMPLATE
+    else:
+        trained = as_model(model)
+        template, file = trained.template, TEMPLATE
+        model = model if model == trained.card.name else str(Path(model).resolve())
+    setting = replace(wish, model=model, template_file=file, template_hash=template.hash)
+    wanted = {"schema": SCHEMA} | setting.choices() | {"template": template.hash}
+    if about is None:
+        with store.writing(file) as path:
+            save_template(template, path)
+        save_text(store, ABOUT, json.dumps(wanted, indent=2) + "\n")  # last: a folder without it is no collection
+    elif differs := [name for name in wanted if about[name] != wanted[name]]:
+        other = f"the fits in {store.location} were made with another {differs[0]}"
+        raise OptionError(other, "choose another folder, or the options of before")
+    return setting
+
+
+def _first_template(store: Store, sources: Sequence[Source], new: bool) -> Template:
+    """Without a model, the shape that is nearest to some others, as a template; the one of before, if there is one."""
+    if not new:
+        with store.reading(FIRST_TEMPLATE) as path:
+            return load_template(path)
+    some = np.unique(np.linspace(0, len(sources) - 1, min(len(sources), _COMPARED)).astype(int))
+    found = []
+    for number in some:
+        with suppress(MeshmatchError):
+            found.append(validated(sources[number].load()))
+    if not found:
+        raise InputError(f"none of {len(some)} shapes can be a template", "are they meshes?")
+    chosen = found[medoid(found, "near", "area", 0)]
+    return template_of(chosen.shape, chosen.shape.name, ViscousConfig())
+
+
+def on_the_mean(setting: Setting, names: Sequence[str]) -> Setting:
+    """The same with the mean of the shapes that the first template was fitted to as the template of all.
+
+    A template that lies in the middle has less far to go. The mean is taken after rotation and translation to the first
+    mean, twice; each shape at area 1.
+    """
+    first = setting.template
+    if not names:
+        return setting
+    reference = np.asarray(first.shape.verts)
+    for _ in range(2):
+        total = np.zeros_like(reference)
+        for name in names:
+            points = setting.read(FIRST, name).fit.points
+            total += kabsch(points, reference).to_world(points)
+        reference = total / len(names)
+    mean = template_of(Shape(reference, first.shape.faces), "mean", ViscousConfig())
+    with setting.store.writing(TEMPLATE) as path:
+        save_template(mean, path)
+    return replace(setting, template_file=TEMPLATE, template_hash=mean.hash)
+
+
+def _chosen(sources: Sequence[Source], config: FitConfig) -> str:
+    """The installed model that knows the kind of the first shape which can be read and is of a known kind."""
+    trouble: MeshmatchError | None = None
+    for source in sources[:_READ_AHEAD]:
+        try:
+            chosen = choose_model([validated(source.load())], [config])[0]
+        except MeshmatchError as error:
+            trouble = trouble or error
+        else:
+            return chosen.card.name
+    assert trouble is not None
+    raise trouble
+
+
+def read_about(store: Store) -> dict[str, Any] | None:
+    """What a folder says of its fits; None if it is no folder of fits."""
+    if not store.exists(ABOUT):
+        return None
+    try:
+        with store.reading(ABOUT) as path:
+            about = json.loads(path.read_text(encoding="utf-8"))
+        if about["schema"] != SCHEMA:
+            raise InputError(f"{ABOUT} has schema {about['schema']!r}, not {SCHEMA}", "update meshmatch")
+        return {name: about[name] for name in ("schema", "template", "model", "only", "without", "sequence", "fit")}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{store.location}/{ABOUT} is damaged", "remove the folder, and fit again") from error
+
+
+def save_text(store: Store, name: str, text: str) -> None:
+    """Write a file; it appears whole."""
+    with store.writing(name) as path, replace_on_success(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,129 @@
+"""A template fitted without a network, to a shape that stands as it does: one of a collection of scans.
+
+Node vectors are found by Gauss-Newton. The prior differs from that of a fit by a trained model, which keeps the template's
+stretch: here the deformation gradient at every strain point is held near the mean of its neighbours' in the step before.
+So the stretch may be any, but changes slowly from place to place, and what a step has gained is kept (a viscous prior, as
+in meshmonk's registration of surfaces).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from meshmatch.arrays import Float, Floats
+from meshmatch.fields.shape_functions import build_field
+from meshmatch.fitting.fit import Fit, Reason, axis_name
+from meshmatch.fitting.fit_config import NodeRefineConfig, geometric_between
+from meshmatch.fitting.network_fit import two_way_residual
+from meshmatch.fitting.nodes import pair_terms
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.task import take_samples
+from meshmatch.fitting.verdict import judge
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.shapes.normalise import align
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import NodeConfig, low_mesh, make_template
+from meshmatch.templates.template import Template
+
+NO_MODEL = "none"
+"""In place of a model's name."""
+_ALIGNED_BY = 2400  # samples
+_TURNED = (
+    0.12  # a residual (units of sqrt(area)) beyond which a shape does not stand as the template does: it is turned
+)
+
+
+@dataclass(frozen=True)
+class ViscousConfig:
+    """Nodes of a template, and the schedule of its fits; lengths in units of sqrt(area). Tuned on three hearts."""
+
+    nodes: int = 600
+    radius: float = 0.085
+    faces: int = 10_000  # of a template
+    samples: int = 16_000  # of a shape
+    steps: int = 24
+    strain_first: float = 1e-3
+    strain_last: float = 1e-6
+    scale_first: float = 0.1  # of the robust weight
+    scale_last: float = 0.02
+    point_share: float = 0.01
+    pair_normals: float = 0.012  # of normals in the search for pairs
+    back_points: int = 8000
+    near: int = 5  # strain points, itself included, whose gradients are averaged
+    damping: float = 1e-6
+    seed: int = 0
+
+
+def template_of(shape: Shape, name: str, config: ViscousConfig) -> Template:
+    """A template of one shape, with nodes anywhere near its surface."""
+    nodes = NodeConfig("uniform", config.nodes, config.radius, 0.01, seed=config.seed)
+    return make_template(shape, name, nodes, low=low_mesh(shape, config.faces))
+
+
+def viscous_system(template: Template) -> NodeSystem:
+    """The least-squares system of a template without a model."""
+    verts = template.shape.verts
+    return NodeSystem(template.shape, build_field(verts, template.nodes, template.radius, "smooth"))
+
+
+def viscous_vectors(system: NodeSystem, samples: OrientedPoints, config: ViscousConfig) -> Float[Floats, "K 3"]:
+    """Node vectors that move the template onto the shape of the samples, which stands as it does."""
+    places = system.verts[system.strain_points]
+    near = cKDTree(places).query(places, config.near)[1]
+    rows = np.repeat(np.arange(len(places)), config.near)
+    mean = csr_matrix((np.full(near.size, 1 / config.near), (rows, near.reshape(-1))), (len(places),) * 2)
+    vectors = np.zeros((system.K, 3))
+    pairing = NodeRefineConfig(
+        point_share=config.point_share, pair_normals=config.pair_normals, back_points=config.back_points
+    )
+    for step in range(config.steps):
+        t = step / max(config.steps - 1, 1)
+        strain = geometric_between(config.strain_first, config.strain_last, t)
+        scale = geometric_between(config.scale_first, config.scale_last, t)
+        terms = pair_terms(system, samples, vectors, scale, pairing)
+        wanted = (mean @ system.deformation_gradient(vectors).reshape(-1, 9)).reshape(-1, 3, 3)
+        vectors = system.solve(*terms, strain / len(places), wanted, config.damping / system.K, vectors)
+    return vectors
+
+
+def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: ViscousConfig | None = None) -> Fit:
+    """Fit a template to a repaired shape, turned to it if they do not stand alike; a mesh, or a cloud.
+
+    Such a fit is fair at best, for nothing was learned of what corresponds.
+    """
+    config, began = config or ViscousConfig(), time.monotonic()
+    frame, samples = take_samples(shape, config.samples, np.random.default_rng(config.seed + 1))
+    resting = sample_surface(template.shape, _ALIGNED_BY, np.random.default_rng(config.seed))
+    (found,) = align(samples.first(_ALIGNED_BY), resting, "near")
+    if found.residual > _TURNED:
+        found = align(samples.first(_ALIGNED_BY), resting, "rigid")[0]
+    core = frame.compose(found.pose.frame)
+    local = samples.to_local(found.pose).facing(system.surface(np.zeros((system.K, 3))))
+    vectors = viscous_vectors(system, local, config)
+    points = system.moved(vectors)
+    residual = two_way_residual(system, local, vectors)
+    verdict, reasons = judge(residual, local, points)
+    unsure = Reason("unsupervised", "fitted without a model that was learned: near may be wrong")
+    return Fit(
+        template_hash=template.hash,
+        frame=core,
+        points=points,
+        vectors=vectors,
+        resting=system.verts,
+        faces=system.faces,
+        residual=residual,
+        verts=shape.verts,
+        verdict="fair" if verdict == "good" else verdict,
+        reasons=(*reasons, unsure),
+        up=axis_name(core.rotation[1]),
+        front=axis_name(core.rotation[2]),
+        seconds=time.monotonic() - began,
+        seed=config.seed,
+        model=NO_MODEL,
+    )
