@@ -17,7 +17,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.modes import inner_products, principal, rounding, weighted_sums
 from meshmatch.collections.superimpose import Shapes, Superimposed
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, OptionError
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import MappedMesh
@@ -83,10 +83,13 @@ def measure_atlas(
     points.
 
     `InputError` where the shapes are not those of the atlas, or fewer than four: a model of what is left needs three.
+    `OptionError` for fewer than two random shapes.
     """
     S = len(points)
     if S != len(atlas.names) or (surfaces is not None and len(surfaces) != S):
         raise InputError(f"the atlas is of {len(atlas.names)} shapes, not of {S}", "give those that it was made of")
+    if samples < 2:
+        raise OptionError(f"specificity needs two random shapes or more, not {samples}", "50 are usual")
     if S > MOST_SHAPES:
         some = np.sort(np.random.default_rng(seed).permutation(S)[:MOST_SHAPES]).tolist()
         atlas = replace(atlas, names=tuple(atlas.names[k] for k in some), scores=atlas.scores[some])

@@ -71,6 +71,17 @@ def test_every_pose_is_the_best() -> None:
         assert np.abs(atlas.weights @ np.cross(atlas.mean, offset)).max() < 1e-8
 
 
+def test_a_mirror_image_is_another_shape() -> None:
+    """It is turned to lie as well as it can, and never reflected."""
+    given = ellipsoids(4, spread=np.full(3, 0.01))
+    handed = given.points + 0.4 * np.prod(given.points, axis=2)[..., None] * [1, 0.5, 0.2]
+    handed[3] = handed[0] * [-1, 1, 1]
+    atlas = Atlas.of(handed, given.faces)
+    assert np.allclose(np.linalg.det(atlas.align(handed)[1].rotations), 1)
+    assert atlas.distances.argmax() == 3
+    assert atlas.distances[3] > 5 * np.abs(handed[1] - handed[0]).max()
+
+
 def test_known_modes_are_found() -> None:
     given = ellipsoids(400, splits=1)
     atlas = Atlas.of(moved(given.points), given.faces)

@@ -9,7 +9,7 @@ import pytest
 
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.measures import measure_atlas
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.shape import Shape
 from tests.collections.ellipsoids import ellipsoids, moved
 from tests.conftest import icosphere
@@ -109,6 +109,23 @@ def test_the_shapes_themselves_may_be_given() -> None:
     assert found.generalisation_surface[0] == pytest.approx(0.1, rel=0.03)
 
 
+def test_what_the_registration_misses_counts() -> None:
+    """Half of every shape is a second ball, 5 away, where no registered point lies: it is 4 away from the first."""
+    ball = icosphere(2)
+    radii = np.array([0.98, 0.99, 1.0, 1.01, 1.02])
+    points = ball.verts * radii[:, None, None]
+    atlas = Atlas.of(points, ball.faces)
+    faces = np.concatenate([ball.faces, ball.faces + ball.V])
+    away = np.array([5.0, 0, 0])
+    surfaces = [Shape(np.concatenate([verts, verts + away]), faces) for verts in points]
+    found = measure_atlas(atlas, points, surfaces=surfaces, samples=2)
+    far = np.linalg.norm(ball.verts + away, axis=1).mean() - 1
+    assert found.generalisation[0] < 1e-9
+    assert found.generalisation_surface[0] == pytest.approx(
+        far / 2 / 2, rel=0.05
+    )  # half of the surface, one of two ways
+
+
 def test_large_collections_are_measured_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     points, faces = rough_ellipsoids(10)
     atlas = Atlas.of(points, faces)
@@ -153,5 +170,7 @@ def test_what_cannot_be_measured() -> None:
     atlas = Atlas.of(points, faces)
     with pytest.raises(InputError, match="5 shapes, not of 4"):
         measure_atlas(atlas, points[:4])
+    with pytest.raises(OptionError, match="two random shapes"):
+        measure_atlas(atlas, points, samples=1)
     with pytest.raises(InputError, match="four shapes"):
         measure_atlas(Atlas.of(points[:3], faces), points[:3])

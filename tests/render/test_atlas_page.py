@@ -98,6 +98,9 @@ def test_sliders_change_the_shape(tmp_path: Path, make_sphere: Callable[[int], S
         seen.page.click("#mean")
         assert seen.state()["scores"] == [0, 0]
         assert height(seen.picture(tmp_path / "2.png")) == mean
+        for vertex in (0, 7, 300):
+            normal = seen.page.evaluate("v => meshmatch.normal(v)", vertex)
+            assert normal == pytest.approx(ball.vertex_normals[vertex].tolist(), abs=1e-3)
         seen.page.click("#random")
         assert any(seen.settled()["scores"])
         assert seen.page.eval_on_selector("#shape", "e => e.selectedOptions[0].textContent") == "by the sliders"

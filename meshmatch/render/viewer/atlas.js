@@ -222,6 +222,7 @@ async function begin() {
 window.meshmatch = {
   state: () => ({ ...state, farthest }),
   place: (vertex) => [...place.subarray(3 * vertex, 3 * vertex + 3)].map((at) => at * words.unit),
+  normal: (vertex) => [...normal.subarray(3 * vertex, 3 * vertex + 3)],
   setScore,
   choose,
 };
