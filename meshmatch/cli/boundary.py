@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -29,10 +29,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with _kills_as_interrupts() as killed:
         try:
             status = _run(arguments)
+            killed.over = True
         except (KeyboardInterrupt, Exception) as error:
+            killed.over = True
             if debug:
                 raise
-            if isinstance(error, KeyboardInterrupt) or killed():  # a process killed with this one may be missed first
+            if isinstance(error, KeyboardInterrupt) or killed.number:  # what is killed beside it may be missed first
                 status = INTERRUPTED
             elif isinstance(error, MeshmatchError):
                 Console().trouble("error", error.message, error.hint)
@@ -42,9 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return 1
             else:
                 raise
-    if killed() and status:
-        status = 128 + killed()
-    if status == INTERRUPTED or (killed() and status):
+    if killed.number and status:
+        status = 128 + killed.number
+    if status == INTERRUPTED or (killed.number and status):
         with suppress(OSError):  # of a hang-up: the terminal may be gone
             Console().trouble("interrupted" if status == INTERRUPTED else "killed", "no file is half-written")
     return status
@@ -55,13 +57,17 @@ def _no_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "can't allocate memory" in str(error))
 
 
+class _Killed:
+    """Which signal came first, 0 if none did; and whether it is too late to stop anything."""
+
+    number, over = 0, False
+
+
 @contextmanager
-def _kills_as_interrupts() -> Iterator[Callable[[], int]]:
-    """Inside, SIGTERM and SIGHUP end the program as Ctrl-C does (unless they have another handler); gives which came
-    first, 0 if none did.
-    """
+def _kills_as_interrupts() -> Iterator["_Killed"]:
+    """Inside, SIGTERM and SIGHUP end the program as Ctrl-C does (unless they have another handler), until it is over."""
+    killed = _Killed()
     came: list[float] = []
-    first: list[int] = []
     owner = os.getpid()
 
     def stop(number: int, frame: Any) -> None:
@@ -71,8 +77,8 @@ def _kills_as_interrupts() -> Iterator[Callable[[], int]]:
             return
         again = bool(came) and time.monotonic() - came[0] < _TWICE
         came.append(time.monotonic())
-        first.append(number)
-        if not again:
+        killed.number = killed.number or number
+        if not again and not killed.over:
             raise KeyboardInterrupt
 
     ours = threading.current_thread() is threading.main_thread()
@@ -80,7 +86,7 @@ def _kills_as_interrupts() -> Iterator[Callable[[], int]]:
     for number in borrowed:
         signal.signal(number, stop)
     try:
-        yield lambda: first[0] if first else 0
+        yield killed
     finally:
         for number in borrowed:
             signal.signal(number, signal.SIG_DFL)

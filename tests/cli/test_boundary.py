@@ -158,6 +158,22 @@ def test_a_second_kill_later_counts(run: Run, monkeypatch: pytest.MonkeyPatch) -
     assert told == ["lost"]
 
 
+def test_a_kill_that_comes_too_late_changes_nothing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All is written, and the program about to leave: its status stands."""
+
+    def leaving(number: int, handler: object) -> None:
+        if handler is signal.SIG_DFL and not told:
+            told.append(number)
+            signal.raise_signal(signal.SIGTERM)
+        return real(number, handler)
+
+    told: list[int] = []
+    real = signal.signal
+    monkeypatch.setattr("meshmatch.cli.boundary.signal.signal", leaving)
+    assert run("--version").status == 0
+    assert told == [signal.SIGTERM]
+
+
 def test_what_a_kill_breaks_is_no_bug(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def load(path: Path) -> None:
         try:
