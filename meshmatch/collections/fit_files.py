@@ -26,7 +26,7 @@ from meshmatch.templates.template import Template, save_arrays
 SCHEMA = 1
 _HINT = "fit the shape again: remove the file, and run `meshmatch fit` as before"
 _FIT_WORDS = ("template_hash", "residual", "verdict", "up", "front", "seed", "partial", "model")
-_PLACES = ("resting", "distance", "stands", "faces", "fitted")
+_PLACES = ("resting", "height", "distance", "stands", "faces", "fitted")
 _OPTIONAL = ("shift", "spread")
 Words = dict[str, Any]
 
@@ -117,7 +117,7 @@ def _places(arrays: dict[str, np.ndarray], about: Words, fit: Fit) -> Places | N
         return None
     V, F = len(arrays["resting"]), len(arrays["faces"])
     kinds: dict[str, tuple[Any, tuple[int, ...]]] = {
-        **dict.fromkeys(("distance", *_OPTIONAL), (np.float32, (V,))),
+        **dict.fromkeys(("height", "distance", *_OPTIONAL), (np.float32, (V,))),
         **{"resting": (np.float32, (V, 3)), "stands": (np.int32, (V,))},
         **{"faces": (np.int32, (F, 3)), "fitted": (np.bool_, (F,))},
     }

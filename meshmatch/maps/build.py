@@ -27,7 +27,8 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
         both = f"{source.template_hash}, {target.template_hash}"
         raise OptionError(f"the fits use different templates ({both})", "fit both shapes with the same model")
     found = target.nearest(source.resting, workers)
-    apart = np.square(source.distance) + np.square(target.distance[found.vertex]) + np.square(found.distance)
+    along = np.square(found.distance) - np.square(source.height - target.height[found.vertex])
+    apart = np.square(source.distance) + np.square(target.distance[found.vertex]) + np.maximum(along, 0.0)
     confidence = np.exp(-apart / _DISTANCE_SCALE**2)
     if source.shift is not None and target.shift is not None:
         stretched = source.shift + target.shift[found.vertex]

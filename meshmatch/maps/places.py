@@ -1,5 +1,8 @@
 """Where the vertices of a shape belong on the template: what one fit knows, and all that maps need of it.
 
+A vertex belongs to its footpoint on the fitted template, and as high above the resting one as it lies above the fitted
+one: what a fit smooths away tells points apart, and the two sides of a thin wall.
+
 Of a noisy cloud no place is known for a point, but how likely each is. Noise moves points across the surface and along it
 alike. Taking the closest point of the template undoes the first and keeps the second. Here a point belongs to all of the
 template within reach, with Gaussian weights; its place is the expectation, and its spread says how well it is known.
@@ -17,11 +20,12 @@ from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Ints32
 from meshmatch.fitting.fit import Fit
-from meshmatch.geometry.triangles import blend, triangle_areas, vertex_areas
+from meshmatch.geometry.triangles import blend, triangle_areas, vertex_areas, vertex_normals
 from meshmatch.maps.footpoints import Footpoints, Surface, closest_footpoints, in_core_frame, template_footpoints
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 
+_HIGH = 0.03  # units of sqrt(area): what lies further off is something else than the template's surface. Set by hand.
 # Of noisy clouds, set by hand:
 _ROUGH = 0.5  # from this `Shape.roughness` on, noise is larger than the template's triangles
 _SAMPLES = 48  # of the template that share a point
@@ -39,7 +43,8 @@ class Places:
     ----------
     name, hash : of the shape, see `Shape.hash`
     template_hash : which template
-    resting : (V, 3) where each vertex belongs on the resting template, template frame
+    resting : (V, 3) where each vertex belongs on, or just above, the resting template, template frame
+    height : (V,) how far above it
     distance : (V,) how far each vertex lies from the fitted template
     shift : (V,) how far the template moved there when it had to agree with other fits; None if it had not
     spread : (V,) of a noisy cloud, standard deviation of the place; None for other shapes
@@ -52,6 +57,7 @@ class Places:
     hash: str
     template_hash: str
     resting: Float[Floats32, "V 3"]
+    height: Float[Floats32, " V"]
     distance: Float[Floats32, " V"]
     shift: Float[Floats32, " V"] | None
     spread: Float[Floats32, " V"] | None
@@ -66,11 +72,15 @@ class Places:
         """The places of a repaired shape; ``before`` is its fit before it agreed with others."""
         foot, resting = template_footpoints(part.shape, fit, workers)
         distance, spread, shift = foot.distance, None, None
+        height = heights(part.shape, fit, foot)
         if is_noisy(part.shape):
             distance = closest_footpoints(part.shape, fit, workers).distance
             points = in_core_frame(part.shape, fit)[0]
             (_, resting), variance = expectation(points, fit, noise_level(distance), [fit.points, fit.resting])
-            spread = np.sqrt(variance)
+            spread, height = np.sqrt(variance), np.zeros(len(points))
+        else:
+            normals = vertex_normals(fit.resting, fit.faces)
+            resting += height[:, None] * foot.values(fit.faces, normals)
         if before is not None:
             shift = np.linalg.norm(foot.values(fit.faces, fit.points - before.points), axis=1)
 
@@ -85,6 +95,7 @@ class Places:
             original.hash,
             fit.template_hash,
             of_file(resting),
+            of_file(height),
             of_file(distance),
             None if shift is None else of_file(shift),
             None if spread is None else of_file(spread),
@@ -129,6 +140,13 @@ class Places:
         """Of a cloud. The expected squared distance is that of the means, plus the variance of this shape's point."""
         columns = [self.resting] if self.spread is None else [self.resting, self.spread[:, None]]
         return cKDTree(np.concatenate(columns, 1)[self._points])
+
+
+def heights(shape: Shape, fit: Fit, foot: Footpoints) -> Float[Floats, " V"]:
+    """How far the vertices of a shape lie above their footpoints on the fitted template, at most `_HIGH` either way."""
+    above = in_core_frame(shape, fit)[0] - foot.values(fit.faces, fit.points)
+    above *= foot.values(fit.faces, vertex_normals(fit.points, fit.faces))
+    return np.clip(above.sum(1), -_HIGH, _HIGH)
 
 
 def is_noisy(shape: Shape) -> bool:

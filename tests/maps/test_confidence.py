@@ -80,7 +80,7 @@ def test_distance_from_the_template_costs_confidence_on_both_sides(side: str) ->
     large = replace(fit, points=1.05 * unit.verts)
     distance, _ = brute_force(unit.verts, large.points, unit.faces)
     near = Places.of(part, fit)
-    far = replace(Places.of(part, large), resting=near.resting)  # the same places: these cost nothing
+    far = replace(Places.of(part, large), resting=near.resting, height=near.height)  # the same places cost nothing
     found = build_map(far, near) if side == "source" else build_map(near, far)
     assert distance.max() > 0.01
     assert np.allclose(found.confidence, np.exp(-((distance / 0.03) ** 2)), atol=0.02)

@@ -65,7 +65,7 @@ def test_of_two_points_as_near_the_better_known_one_is_chosen() -> None:
     """Both belong to the same place on the average, but one of them might as well be elsewhere."""
     cloud = Shape(np.array([[0.5, 0.5, 0.0], [0.5, 0.5, 0.01]]), NO_FACES)
     known = Places.of(repair(cloud), plate())
-    unsure = replace(known, spread=np.array([0.05, 0.01], np.float32))
+    unsure = replace(known, resting=known.resting * np.float32([1, 1, 0]), spread=np.array([0.05, 0.01], np.float32))
     found = unsure.nearest(np.array([[0.5, 0.52, 0.0]], np.float32))
     assert found.vertex.tolist() == [1]
     assert found.distance == pytest.approx(np.hypot(0.01, 0.02), rel=1e-5)
