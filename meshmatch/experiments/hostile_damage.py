@@ -168,7 +168,7 @@ def _json(data: bytes, rng: np.random.Generator) -> bytes:
         try:
             text, put_back = part(data)
             found = json.loads(text)
-        except (ValueError, struct.error, IndexError):
+        except (ValueError, struct.error, IndexError, RecursionError):
             continue
         if isinstance(found, dict | list) and found:
             return put_back(json.dumps(_changed(found, rng)).encode("utf-8", "surrogatepass"))

@@ -216,7 +216,7 @@ def _listen(ready: int, child: int, first: int) -> tuple[int, list[Failure]]:
             if "begun" in record:
                 family = record["begun"]
                 continue
-            at = record["number"]
+            at, family = record["number"], "unknown"
             if record["kind"]:
                 found.append(Failure(**record))
     if late:

@@ -88,7 +88,8 @@ class VertexMap:
         faces = np.full(size, -1) if self.face is None else _whole_numbers(self.face, f"{label}: face")
         first = self.barycentric is None
         weights = np.tile([1.0, 0.0, 0.0], (size, 1)) if first else np.array(self.barycentric, np.float64)
-        trust = np.array(np.ones(size) if self.confidence is None else self.confidence, np.float32)
+        with np.errstate(over="ignore"):  # what is too large becomes infinite, and is refused
+            trust = np.array(np.ones(size) if self.confidence is None else self.confidence, np.float32)
         arrays: dict[str, NDArray[Any]] = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
         for name, array in arrays.items():
             shape = (size, 3) if name == "barycentric" else (size,)
