@@ -19,7 +19,8 @@ from meshmatch.errors import MeshmatchError
 
 DEBUG_VARIABLE = "MESHMATCH_DEBUG"
 INTERRUPTED = 130
-_SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+_USUAL = (signal.SIG_DFL, signal.default_int_handler)
 _TWICE = 1.0  # seconds within which a second signal is the same one: `timeout` sends two
 
 
@@ -65,7 +66,10 @@ class _Killed:
 
 @contextmanager
 def _kills_as_interrupts() -> Iterator["_Killed"]:
-    """Inside, SIGTERM and SIGHUP end the program as Ctrl-C does (unless they have another handler), until it is over."""
+    """Inside, SIGTERM and SIGHUP end the program as Ctrl-C does (unless they have another handler), until it is over.
+
+    All three are remembered: where they hit an import, say, another exception may come of it.
+    """
     killed = _Killed()
     came: list[float] = []
     owner = os.getpid()
@@ -82,14 +86,15 @@ def _kills_as_interrupts() -> Iterator["_Killed"]:
             raise KeyboardInterrupt
 
     ours = threading.current_thread() is threading.main_thread()
-    borrowed = [number for number in _SIGNALS if ours and signal.getsignal(number) is signal.SIG_DFL]
+    before = {number: signal.getsignal(number) for number in _SIGNALS if ours}
+    borrowed = {number: handler for number, handler in before.items() if handler in _USUAL}
     for number in borrowed:
         signal.signal(number, stop)
     try:
         yield killed
     finally:
-        for number in borrowed:
-            signal.signal(number, signal.SIG_DFL)
+        for number, handler in borrowed.items():
+            signal.signal(number, handler)
 
 
 def _run(arguments: Sequence[str] | None) -> int:

@@ -10,6 +10,7 @@ import shutil
 import signal
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
@@ -211,6 +212,8 @@ def _start(case: Case) -> int:
         status = _run(case.folder, case.words)
     except KeyboardInterrupt:
         status = 130  # before the command begins
+    except BaseException:
+        traceback.print_exc()
     finally:
         os._exit(status)
 

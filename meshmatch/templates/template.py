@@ -32,6 +32,9 @@ _ONE_RADIUS = 1  # the schema of bundles whose nodes share one radius, which is 
 _ARRAYS = ("verts", "faces", "dense_verts", "dense_faces", "nodes", "labels", "core")
 
 
+_WHOLE = ("faces", "dense_faces", "labels", "core")
+
+
 @dataclass(frozen=True, eq=False)
 class Template:
     """The reference shape of a category.
@@ -129,6 +132,8 @@ def load_template(path: str | Path) -> Template:
             if schema in (_ONE_RADIUS, SCHEMA) and set(file.keys()) != expected:
                 raise KeyError("arrays")
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
+            if any(arrays[name].dtype.kind not in "iu" for name in _WHOLE if name in arrays):
+                raise KeyError("whole numbers")
     except (SafetensorError, KeyError, ValueError, OSError, RecursionError) as error:
         raise TemplateError(f"{path.name} is not a template bundle", "make one with `meshmatch prepare`") from error
     if schema not in (_ONE_RADIUS, SCHEMA):

@@ -174,16 +174,17 @@ def test_a_kill_that_comes_too_late_changes_nothing(run: Run, monkeypatch: pytes
     assert told == [signal.SIGTERM]
 
 
-def test_what_a_kill_breaks_is_no_bug(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("number", "word"), [(signal.SIGTERM, "killed"), (signal.SIGINT, "interrupted")])
+def test_what_a_kill_breaks_is_no_bug(run: Run, monkeypatch: pytest.MonkeyPatch, number: int, word: str) -> None:
     def load(path: Path) -> None:
         try:
-            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(number)
         except KeyboardInterrupt:
             raise RuntimeError("a worker is gone") from None
 
     monkeypatch.setattr("meshmatch.shapes.files.load_shape", load)
     answer = run("info", "a.ply")
-    assert (answer.status, answer.err) == (143, "killed: no file is half-written\n")
+    assert (answer.status, answer.err) == (128 + number, f"{word}: no file is half-written\n")
 
 
 def test_the_signal_is_only_borrowed(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

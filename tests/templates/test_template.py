@@ -193,6 +193,7 @@ def rewrite(path: Path, arrays: dict | None = None, words: dict | None = None, d
         ({"drop": "nodes"}, "not a template bundle"),
         ({"arrays": {"extra": np.zeros(3)}}, "not a template bundle"),
         ({"arrays": {"faces": np.full((4, 3), 99_999, np.int32)}}, "not a template bundle"),
+        ({"arrays": {"dense_faces": np.full((4, 3), np.nan)}}, "not a template bundle"),
         ({"arrays": {"verts": np.full((600, 3), np.nan)}}, "not a template bundle"),
         ({"arrays": {"nodes": np.zeros((60, 3))}}, "does not match its hash"),
     ],
