@@ -80,7 +80,7 @@ def test_two_processes_train_one_model(prepared: Path, tmp_path: Path) -> None:
     assert done.stderr.count("step 3 of 3") == 1
     assert done.stderr.count("wrote model") == 1
     # one writes, once
-    assert [path.name for path in (output / "checkpoint").iterdir()] == ["last.safetensors"]
+    assert sorted(path.name for path in (output / "checkpoint").iterdir()) == ["last.safetensors", "lock"]
     with safe_open(str(output / "checkpoint" / "last.safetensors"), framework="np") as file:
         assert file.metadata()["step"] == "3"
         held = [name for name in file.keys() if name.startswith("model.")]  # noqa: SIM118 (it is no dictionary)
