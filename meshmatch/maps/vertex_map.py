@@ -88,8 +88,8 @@ class VertexMap:
         faces = np.full(size, -1) if self.face is None else _whole_numbers(self.face, f"{label}: face")
         first = self.barycentric is None
         weights = np.tile([1.0, 0.0, 0.0], (size, 1)) if first else np.array(self.barycentric, np.float64)
-        with np.errstate(over="ignore"):  # what is too large becomes infinite, and is refused
-            trust = np.array(np.ones(size) if self.confidence is None else self.confidence, np.float32)
+        given = np.ones(size) if self.confidence is None else np.array(self.confidence, np.float64)
+        trust = np.clip(given, -1, 2).astype(np.float32)  # a short float holds no 1e300, which is refused below
         arrays: dict[str, NDArray[Any]] = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}
         for name, array in arrays.items():
             shape = (size, 3) if name == "barycentric" else (size,)
@@ -298,7 +298,8 @@ def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None
 
 def _whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
     array = np.asarray(values)
-    if array.dtype.kind == "f" and (np.abs(array) < 2**53).all() and (array == np.round(array)).all():
+    whole = array.dtype.kind == "f" and np.array_equal(array, np.round(array))
+    if whole and (np.abs(array.astype(np.float64)) < 2**53).all():
         return array.astype(np.int64)  # MATLAB's numbers are doubles
     if array.dtype.kind not in "iu":
         raise InputError(f"{label} must be whole numbers, not {array.dtype}")

@@ -83,6 +83,7 @@ def test_mat_counts_from_one_too(tmp_path: Path) -> None:
 def test_maps_of_other_programs(tmp_path: Path) -> None:
     expected = [2, 0, 1]
     np.save(tmp_path / "column.npy", np.array(expected, dtype=np.uint16)[:, None])
+    np.save(tmp_path / "half.npy", np.array(expected, dtype=np.float16))
     savemat(tmp_path / "double.mat", {"index": np.array(expected, dtype=float)})
     (tmp_path / "spaces.txt").write_text("# from somewhere\n2\n0\n\n1\n")
     (tmp_path / "excel.csv").write_text("﻿source_vertex, target_vertex\r\n0,2\r\n1,0\r\n2,1\r\n", encoding="utf-8")
