@@ -296,6 +296,7 @@ def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None
         raise InputError(f"{matched}, but the target has only {target_vertices} vertices", hint)
 
 
+@np.errstate(invalid="ignore")  # of a nan that is rounded; it is refused
 def _whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
     array = np.asarray(values)
     whole = array.dtype.kind == "f" and np.array_equal(array, np.round(array))

@@ -115,6 +115,7 @@ def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], words: dict[str
         save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, words)
 
 
+@np.errstate(invalid="ignore")  # of a nan that is cast; it is refused
 def load_template(path: str | Path) -> Template:
     """Read a bundle; `TemplateError` if it is missing, damaged, of another schema, or does not match its hash."""
     path = Path(path)

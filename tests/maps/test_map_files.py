@@ -176,6 +176,13 @@ def test_arrays_that_would_take_too_much_memory(tmp_path: Path, monkeypatch: pyt
         load_map(path)
 
 
+def test_a_signalling_nan_prints_no_warning(tmp_path: Path) -> None:
+    """Warnings are errors here. NumPy's own nan is quiet; a damaged file may hold the other kind."""
+    np.save(tmp_path / "a.npy", np.full(4, 0x7D01, np.uint16).view(np.float16))
+    with pytest.raises(InputError, match="whole numbers"):
+        load_map(tmp_path / "a.npy")
+
+
 def test_a_truncated_npy_and_a_pickle(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.arange(1000))
     whole = (tmp_path / "a.npy").read_bytes()

@@ -195,6 +195,7 @@ def rewrite(path: Path, arrays: dict | None = None, words: dict | None = None, d
         ({"arrays": {"faces": np.full((4, 3), 99_999, np.int32)}}, "not a template bundle"),
         ({"arrays": {"dense_faces": np.full((4, 3), np.nan)}}, "not a template bundle"),
         ({"arrays": {"verts": np.full((600, 3), np.nan)}}, "not a template bundle"),
+        ({"arrays": {"dense_verts": np.full((9, 3), 0x7FA00001, np.uint32).view(np.float32)}}, "not a template bundle"),
         ({"arrays": {"nodes": np.zeros((60, 3))}}, "does not match its hash"),
     ],
 )
