@@ -1,6 +1,7 @@
 """Output files and folders appear whole or not at all."""
 
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -8,6 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from meshmatch.errors import InputError, OutputError
+
+_TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")  # the names that `replace_on_success` gives
 
 
 def plain_text(text: str) -> str:
@@ -104,6 +107,15 @@ def replace_on_success(path: str | Path) -> Iterator[Path]:
         raise OutputError(f"cannot write {path}: {why}", "is the disk full?") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what `replace_on_success` left in a folder, or below it, when its process was killed; nobody else may be
+    writing there.
+    """
+    for path in folder.rglob(".*"):
+        if _TEMPORARY.fullmatch(path.name) and path.is_file():
+            path.unlink(missing_ok=True)
 
 
 @contextmanager

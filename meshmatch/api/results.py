@@ -63,7 +63,8 @@ class MatchResult:
 class MapPair:
     """The maps between two shapes in both directions.
 
-    ``forward`` is from source to target. Without a ``match`` of the shapes the backward map is the inverse of it.
+    ``forward`` is from source to target. Without a ``match`` of the shapes the backward map is the inverse of it,
+    unless there is an ``opposite`` map already.
     """
 
     source: Shape
@@ -71,6 +72,7 @@ class MapPair:
     forward: VertexMap
     match: MatchResult | None = None
     threads: int = 1
+    opposite: VertexMap | None = None
 
     @property
     def rotations(self) -> tuple[Floats | None, Floats | None]:
@@ -80,6 +82,8 @@ class MapPair:
     @cached_property
     def backward(self) -> VertexMap:
         """From target to source."""
+        if self.opposite is not None:
+            return self.opposite
         if self.match is not None:
             return self.match.backward()
         with thread_limit(1):

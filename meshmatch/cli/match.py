@@ -202,7 +202,7 @@ def _register_implicit(
 
 def evaluate(
     *,
-    map_file: Path = Argument(..., metavar="MAP", help="A map that `meshmatch match` wrote."),
+    map_file: Path = Argument(..., metavar="MAP", help="A map that `meshmatch match` wrote, or a folder of fits."),
     source: Path = Argument(..., metavar="SOURCE", help="The shape that it maps."),
     target: Path = Argument(..., metavar="TARGET", help="The shape that it maps to."),
     truth: options.Truth = None,
@@ -228,7 +228,10 @@ def evaluate(
             raise OptionError(f"a {what} of errors needs the truth", "give it with --truth or --points")
     check_outputs([map_file, source, target, truth, *(points or ())], chart=curve, picture=picture)
     shapes = meshmatch.load_shape(source), meshmatch.load_shape(target)
-    found = meshmatch.load_map(map_file, *shapes)
+    if map_file.is_dir():
+        found = meshmatch.Collection(map_file).maps_between(*shapes).forward
+    else:
+        found = meshmatch.load_map(map_file, *shapes)
     known = options.load_truth(truth, points, shapes[0])
     result = meshmatch.evaluate(found, *shapes, known, seed=seed)
     if known is not None and result.errors is not None:

@@ -33,7 +33,11 @@ class MapOptions(PairOptions):
     """A map from a file, or how the shapes are matched."""
 
     map: Path | None = Option(
-        None, "--map", metavar="MAP", help="Map from SRC to TGT that `meshmatch match` wrote. Default: match them."
+        None,
+        "--map",
+        metavar="MAP",
+        help="Map from SRC to TGT that `meshmatch match` wrote, or the folder of their fits that `meshmatch fit` made. "
+        "Default: match them.",
     )
 
 
@@ -94,7 +98,10 @@ class Transfer:
                 a, b = self.options.load(self.source), self.options.load(self.target)
             return self.options.match(a, b, self.run, self.console)
 
-        maps = meshmatch.find_maps(source, target, self.options.map or matched)
+        if self.options.map is not None and self.options.map.is_dir():
+            maps = meshmatch.Collection(self.options.map).maps_between(source, target)
+        else:
+            maps = meshmatch.find_maps(source, target, self.options.map or matched)
         found = maps.forward
         words.refuse_poor(self.run.strict, found.verdict, found.reasons)
         a, b = self.names

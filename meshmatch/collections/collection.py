@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from meshmatch.api.results import MapPair
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.fit_all import Fitted, fit_all
@@ -31,6 +32,7 @@ from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import AUTO
 from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.templates.template import Template, load_template
 
 _KEPT = 64  # fits in memory
@@ -82,12 +84,13 @@ class Collection:
         each shape, as they come in.
 
         A shape that cannot be read or fitted is a record, and stops nobody. `MeshmatchError`: there is no shape, two have
-        the same name, none could be fitted, or the folder holds fits of another model or made in another way.
+        the same name, none could be fitted, or the folder holds fits of another model or made in another way, or is
+        written to by somebody else.
         """
         sources = find_sources(shapes, self.store)
         wish = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without), sequence)
-        setting = settled(wish, sources)
-        with hired(self.workers) as crew:
+        with self.store.alone(), hired(self.workers) as crew:
+            setting = settled(wish, sources)
             made = fit_all(setting, sources, crew, agree, self.progress, tell)
         self._read.cache_clear()
         return made
@@ -122,6 +125,24 @@ class Collection:
     def map(self, source: str, target: str) -> VertexMap:
         """The map between two shapes, by their names: nothing is fitted, only looked up."""
         return build_map(self.places_of(source), self.places_of(target))
+
+    def maps_between(self, source: ShapeLike, target: ShapeLike) -> MapPair:
+        """The maps between two shapes themselves, in both directions, for transfers and `evaluate`.
+
+        They are found among the fits by their vertices and faces; `InputError` if one is not there.
+        """
+        shapes = as_shape(source, "source"), as_shape(target, "target")
+        names = {self._hash_of(name): name for name in self.names}
+        for shape in shapes:
+            if shape.hash not in names:
+                hint = "fit it with `meshmatch fit`; its vertices and faces must be those of the fitted file"
+                raise InputError(f"{self.store.location} holds no fit of {shape.name or 'this shape'}", hint)
+        a, b = (names[shape.hash] for shape in shapes)
+        return MapPair(*shapes, self.map(a, b).for_shapes(*shapes), opposite=self.map(b, a).for_shapes(*shapes[::-1]))
+
+    def _hash_of(self, name: str) -> str:
+        with self.store.reading(f"{FITS}/{name}{SUFFIX}") as path:
+            return str(load_words(path)[0].get("shape_hash", ""))
 
     def pairs(self, to: str | None = None) -> list[Pair]:
         """All ordered pairs of names, or those that lead to one."""

@@ -12,7 +12,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from meshmatch.errors import InputError, OutputError, needs
-from meshmatch.outputs import make_folder
+from meshmatch.locks import locked
+from meshmatch.outputs import make_folder, sweep
+
+LOCK = ".lock"
 
 
 def is_url(location: str | Path) -> bool:
@@ -68,6 +71,22 @@ class Store:
                 files.put_file(str(local), f"{root}/{name}")
             except OSError as error:
                 raise OutputError(f"cannot write {self.location}/{name}: {error}", "may you write there?") from error
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep others from writing here (`OutputError` if somebody does), and remove what killed ones left half-written.
+
+        A remote folder is not locked.
+        """
+        if self.remote:
+            yield
+            return
+        folder = Path(self.location)
+        make_folder(folder)
+        busy = f"another process writes to {self.location}"
+        with locked(folder / LOCK, busy, "let it end, or choose another folder"):
+            sweep(folder)
+            yield
 
     def exists(self, name: str) -> bool:
         """Whether there is such a file or folder."""

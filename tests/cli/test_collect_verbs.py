@@ -4,9 +4,12 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from meshmatch.collections.collection import Collection
 from meshmatch.maps.files import load_map
+from meshmatch.shapes.files import load_shape
 from tests.cli.conftest import Run
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
@@ -74,3 +77,19 @@ def test_what_cannot_be_mapped(fits: Path, run: Run, tmp_path: Path) -> None:
 def test_a_model_that_is_not_there_is_told_before_the_work(fits: Path, run: Run, tmp_path: Path) -> None:
     answer = run("fit", fits.parent / "shapes", "-o", tmp_path / "new", "--model", "humann")
     assert answer.status == 1 and not (tmp_path / "new").exists()
+
+
+def test_transfers_and_measures_follow_fits(fits: Path, run: Run, tmp_path: Path) -> None:
+    """Without matching again, and to the same end as along the map that was written."""
+    climber, dancer = SAMPLES / "climber.ply", SAMPLES / "dancer.ply"
+    values = tmp_path / "values.npy"
+    np.save(values, load_shape(climber).verts[:, 2])
+    words = "transfer-color", climber, dancer, "--values", values, "-o", tmp_path / "there.npy"
+    answer = run(*words, "--map", fits, "--json")
+    assert answer.status == 0, answer.err
+    followed = Collection(fits).map("dancer", "climber").apply(np.load(values))
+    assert np.allclose(np.load(tmp_path / "there.npy"), followed)
+    assert run("evaluate", fits, climber, dancer, "--json").status == 0
+    stranger = run(*words[:2], SAMPLES / "child.ply", *words[3:], "--map", fits)
+    assert stranger.status == 1 and "holds no fit of child" in stranger.err
+    assert run(*words, "--map", tmp_path).status == 1

@@ -261,7 +261,6 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
     bad = {
         "version": good | {"version": np.int64(2)},
         "missing": {name: array for name, array in good.items() if name != "modes"},
-        "more": good | {"other": np.zeros(3)},
         "sizes": good | {"scores": good["scores"][:-1]},
         "nan": good | {"mean": good["mean"] * np.nan},
         "faces": good | {"faces": good["faces"] + 10_000},
@@ -274,7 +273,7 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
             Atlas.load(file)
         assert "\n" not in str(refused.value), what
     file.write_bytes((tmp_path / FILE).read_bytes()[:200])
-    with pytest.raises(InputError, match="damaged"):
+    with pytest.raises(InputError, match="can be read"):
         Atlas.load(file)
     with pytest.raises(InputError, match="no atlas"):
         Atlas.load(tmp_path / "nowhere")

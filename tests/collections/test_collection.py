@@ -14,7 +14,7 @@ import meshmatch
 from meshmatch.cli import main
 from meshmatch.collections.fit_files import load_fit, load_words, save_fit
 from meshmatch.collections.setting import Record
-from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.errors import InputError, MeshmatchError, OptionError, OutputError
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -103,6 +103,25 @@ def test_nothing_is_done_twice_and_more_may_come(shapes: Path, tmp_path: Path) -
     meshmatch.Collection(whole, workers=1).fit(shapes, model="human")
     assert contents(first) == contents(whole) != before and set(before) < set(contents(first))
     assert not (first / "agreeing").exists()
+
+
+def test_what_a_killed_run_left_is_swept_and_two_at_once_are_refused(
+    shapes: Path, made: tuple[Path, tuple[Record, ...]]
+) -> None:
+    folder, _ = made
+    left = [folder / "fits" / ".dancer.0a1b2c3d.safetensors", folder / ".fits.00000000.csv"]
+    for path in left:
+        path.write_bytes(b"half")
+    mine = folder / ".mine.safetensors"
+    mine.write_bytes(b"somebody's own")
+    collection = meshmatch.Collection(folder, workers=1)
+
+    def again(_: Record) -> None:
+        with pytest.raises(OutputError, match="another process writes"):
+            meshmatch.Collection(folder, workers=1).fit(shapes)
+
+    collection.fit(shapes, tell=again)
+    assert not any(path.exists() for path in left) and mine.exists()
 
 
 def test_fits_alone_do_not_move(shapes: Path, tmp_path: Path) -> None:

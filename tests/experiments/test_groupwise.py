@@ -1,0 +1,29 @@
+"""Collections as experiments: fits of whole sets, and of bodies whose fitting is killed."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from meshmatch.experiments import disturbed, groupwise
+
+
+def last_row(capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
+    return dict(json.loads(capsys.readouterr().out.splitlines()[-1])["rows"][0])
+
+
+def test_hearts_without_a_model(bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--data", str(bench), "--sets", "heart", "--limit-shapes", "2", "--work", str(tmp_path / "work")]
+    assert groupwise.main(words) == 0
+    row = last_row(capsys)
+    assert (row["shapes"], row["maps"], row["same"]) == (2, 2, True)
+    assert isinstance(row["error"], float) and 0.1 < row["error"] < 0.7
+    assert isinstance(row["largest_gb"], float) and row["largest_gb"] > 0.05
+
+
+def test_a_run_that_is_killed_ends_as_one_that_is_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("anny")
+    words = ["--bodies", "3", "--every", "8", "--jobs", "1", "--work", str(tmp_path / "work")]
+    assert disturbed.main(words) == 0
+    row = last_row(capsys)
+    assert (row["same"], row["left_over"], row["bodies"]) == (True, 0, 3)
