@@ -183,7 +183,12 @@ def test_what_a_kill_breaks_is_no_bug(run: Run, monkeypatch: pytest.MonkeyPatch,
             raise RuntimeError("a worker is gone") from None
 
     monkeypatch.setattr("meshmatch.shapes.files.load_shape", load)
-    answer = run("info", "a.ply")
+    usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+    before = signal.signal(number, usual)  # a shell lets what runs in its background ignore Ctrl-C
+    try:
+        answer = run("info", "a.ply")
+    finally:
+        signal.signal(number, before)
     assert (answer.status, answer.err) == (128 + number, f"{word}: no file is half-written\n")
 
 
