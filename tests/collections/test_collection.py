@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 import meshmatch
 from meshmatch.cli import main
@@ -175,6 +176,16 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
         broken.write_bytes(data)
         with pytest.raises(InputError):
             load_fit(broken, template)
+    for words in ("[" * 100_000, "[1]", '{"schema": 1, "fit": [], "more": 3}'):
+        save_file({"a": np.zeros(3)}, broken, {"fit": words})
+        with pytest.raises(InputError):
+            load_fit(broken, template)
+    about = tmp_path / "about"
+    about.mkdir()
+    for text in ("[" * 100_000, "{}", "\x00", '{"schema": 2}'):
+        (about / "collection.json").write_text(text)
+        with pytest.raises(InputError, match=r"damaged|schema 2"):
+            meshmatch.Collection(about).names  # noqa: B018
     numbers = whole.replace(b'\\"schema\\": 1', b'\\"schema\\": 9')
     assert numbers != whole
     broken.write_bytes(numbers)
