@@ -1,10 +1,11 @@
 """Atlases of ten hearts by the registration that they are made of, measured on the hearts' own surfaces.
 
 One heart, thinned, is the template of all, laid on each from the same alignment: by node vectors without any training
-(`experiments.collection`), by meshmonk with its defaults, and by the truth, which knows where a fifth of the vertices are
-and lets a thin plate spline say where the others go (`experiments.hearts`). Hearts are scaled to area 1; distances are
-means over the surface x 100, from hearts that were left out to what a model of the others makes of them, and from random
-hearts to the nearest. Between points a registration is compared with itself; between surfaces with the heart.
+(`fitting.viscous`), by the same from the mean of these, by meshmonk with its defaults, and by the truth, which knows where
+a fifth of the vertices are and lets a thin plate spline say where the others go (`experiments.hearts`). Hearts are scaled
+to area 1; distances are means over the surface x 100, from hearts that were left out to what a model of the others makes
+of them, and from random hearts to the nearest. Between points a registration is compared with itself; between surfaces
+with the heart.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import low_mesh
 from meshmatch.templates.prepared_folder import medoid
 
-WAYS = ("nodes", "meshmonk", "truth")
+WAYS = ("nodes", "mean", "meshmonk", "truth")
 Places = Mapping[str, Floats]
 
 
@@ -52,6 +53,13 @@ def by_nodes(thin: Shape, shapes: Mapping[str, Shape], config: ViscousConfig) ->
             found[name] = system.moved(viscous_vectors(system, samples, config))
         runner.tell(f"nodes: {name}")
     return found
+
+
+def by_mean(thin: Shape, shapes: Mapping[str, Shape], config: ViscousConfig) -> Places:
+    """The same with the mean of these as the template, as `meshmatch fit --model none` does."""
+    first = by_nodes(thin, shapes, config)
+    mean = Atlas.of(np.stack([first[name] for name in shapes]), np.asarray(thin.faces), list(shapes)).mean
+    return by_nodes(Shape(mean, thin.faces, "mean"), shapes, config)
 
 
 def by_meshmonk(thin: Shape, shapes: Mapping[str, Shape]) -> Places:
@@ -99,6 +107,8 @@ def main(
             continue
         if way == "nodes":
             places = by_nodes(thin, shapes, config)
+        elif way == "mean":
+            places = by_mean(thin, shapes, config)
         elif way == "meshmonk":
             places = by_meshmonk(thin, shapes)
         else:

@@ -42,8 +42,9 @@ def test_the_truth_gives_one_mode_and_small_errors(data: Path, capsys: pytest.Ca
     assert atlas.names == tuple("01234")
 
 
-def test_nodes_lie_on_the_surfaces(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--data", str(data), "--ways", "nodes", "--hearts", "4"]
+@pytest.mark.parametrize("way", ["nodes", "mean"])
+def test_nodes_lie_on_the_surfaces(data: Path, capsys: pytest.CaptureFixture[str], way: str) -> None:
+    words = ["--data", str(data), "--ways", way, "--hearts", "4"]
     assert heart_atlas.main(words) == 0
     (row,) = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
     assert row["generalisation_surface_x100"] < 1.5
