@@ -72,7 +72,9 @@ def fit_all(
         _write_table(setting.store, records)
         raise InputError(f"none of {len(records)} shapes could be fitted: {records[0].name}: {records[0].reasons}")
     agreeing = [number for number in fitted if records[number].verdict != "poor"]
-    groups = run.groups(agreeing) if agree and setting.agrees and len(agreeing) > 1 else []
+    parts = [f"{records[number].name} {records[number].digest} {records[number].verdict}" for number in fitted]
+    everybody = digest_of(*parts)
+    groups = run.groups(agreeing, everybody) if agree and setting.agrees and len(agreeing) > 1 else []
     tasks = run.last_tasks({number: records[number] for number in fitted}, groups)
     if groups and not all(is_finished(setting.store, task) for task in tasks.values()):
         run.agree(groups, len(agreeing))
@@ -133,29 +135,32 @@ class _Run:
         """The last frame that was fitted."""
         return next((found[number] for number in reversed(before) if found[number].fitted), None)
 
-    def groups(self, numbers: Sequence[int]) -> list[Group]:
+    def groups(self, numbers: Sequence[int], agreement: str) -> list[Group]:
         """Who takes part in the agreement, a few together."""
         names = [self.sources[number].name for number in numbers]
         parts = [tuple(names[first : first + _GROUP]) for first in range(0, len(names), _GROUP)]
-        return [Group(number, part) for number, part in enumerate(parts)]
+        return [Group(number, part, agreement) for number, part in enumerate(parts)]
 
     def last_tasks(self, records: Mapping[int, Record], groups: Sequence[Group]) -> dict[int, FinishTask]:
         """What finishes each fit; a digest of all that agree tells whether that was done before."""
-        parts = [f"{record.name} {record.digest} {record.verdict}" for record in records.values()]
-        digest = digest_of(*parts)
         steps = AgreeConfig.for_model(self.setting.trained).steps if groups else 0
         group_of = {name: group for group in groups for name in group.names}
         found = {}
         for number, record in records.items():
             own = group_of.get(record.name)
-            agreed_with = "nobody" if own is None else digest
+            agreed_with = "nobody" if own is None else own.agreement
             found[number] = FinishTask(self.setting, self.sources[number], record.digest, agreed_with, own, steps)
         return found
 
     def agree(self, groups: Sequence[Group], count: int) -> None:
-        """All steps of the agreement; the cost grows as the number of fits. Sums are taken in the order of the groups."""
-        steps = AgreeConfig.for_model(self.setting.trained).steps
+        """All steps of the agreement that were not taken before; the cost grows as the number of fits. Sums are taken in
+        the order of the groups.
+        """
+        steps, store = AgreeConfig.for_model(self.setting.trained).steps, self.setting.store
         for step in range(steps + 1):
+            common = common_file(groups[0].agreement, step + 1)
+            if store.exists(common):
+                continue
             total, next_one = None, 0
             waiting: dict[int, Floats] = {}
             tasks = [AgreeTask(self.setting, group, step) for group in groups]
@@ -168,7 +173,7 @@ class _Run:
                     total, next_one = here if total is None else total + here, next_one + 1
             assert total is not None
             if step < steps:
-                save_array(self.setting.store, common_file(step + 1), stretch_of(total / count))
+                save_array(store, common, stretch_of(total / count))
 
     def finish(self, tasks: Mapping[int, FinishTask]) -> Iterator[tuple[int, str]]:
         """Place the vertices of every shape; gives the numbers of those where that failed, and why."""

@@ -89,14 +89,15 @@ def _known(store: Store, file: str, digest: str) -> Record | None:
 
 @dataclass(frozen=True)
 class Group:
-    """A few fits that one task takes a step with."""
+    """A few fits that one task takes a step with; ``agreement`` is a digest of all that agree."""
 
     number: int
     names: tuple[str, ...]
+    agreement: str
 
     def file(self, step: int) -> str:
         """Where their node vectors are after a step."""
-        return f"{AGREEING}/{step}/{self.number}.npy"
+        return f"{AGREEING}/{self.agreement}/{step}/{self.number}.npy"
 
 
 @dataclass(frozen=True)
@@ -108,9 +109,9 @@ class AgreeTask:
     step: int
 
 
-def common_file(step: int) -> str:
-    """Where the common stretch is that a step pulls to."""
-    return f"{AGREEING}/{step}/common.npy"
+def common_file(agreement: str, step: int) -> str:
+    """Where the common stretch is that a step of an agreement pulls to."""
+    return f"{AGREEING}/{agreement}/{step}/common.npy"
 
 
 def save_array(store: Store, name: str, array: Floats) -> None:
@@ -125,26 +126,27 @@ def _array(store: Store, name: str) -> Floats:
 
 
 def agree_a_little(task: AgreeTask) -> Float[Floats, "G 3 3"]:
-    """Take a step with some fits; the sum of the logarithms of their stretches where the next step begins.
+    """Take a step with some fits, unless that was done before; the sum of the logarithms of their stretches where the
+    next step begins.
 
     Step 0 only gives the sum.
     """
     setting, group, store = task.setting, task.group, task.setting.store
     system, how = node_system(setting.trained), AgreeConfig.for_model(setting.trained)
     members = [_member(setting.read(ALONE, name), how) for name in group.names]
-    now = before = np.array([member.vectors for member in members])
-    if task.step > 0:
-        common = _array(store, common_file(task.step))
+
+    def after(step: int) -> Floats:
+        return _array(store, group.file(step)) if step > 0 else np.array([member.vectors for member in members])
+
+    now, before = after(0), after(max(task.step - 1, 0))
+    if task.step > 0 and store.exists(group.file(task.step)):
+        now = after(task.step)
+    elif task.step > 0:
+        common = _array(store, common_file(group.agreement, task.step))
         nodes = setting.config.for_model(setting.trained).nodes
-        if task.step > 1:
-            now = before = _array(store, group.file(task.step - 1))
-        if task.step > 2:
-            before = _array(store, group.file(task.step - 2))
-        elif task.step == 2:
-            before = np.array([member.vectors for member in members])
-        starts = _starts(members, now, before)
+        starts = _starts(members, before, after(max(task.step - 2, 0)))
         gradients = [system.deformation_gradient(start) for start in starts]
-        before, steps = now, zip(members, starts, gradients, strict=True)
+        steps = zip(members, starts, gradients, strict=True)
         now = np.array([agree_step(system, nodes, *each, common) for each in steps])
         save_array(store, group.file(task.step), now)
     gradients = [system.deformation_gradient(start) for start in _starts(members, now, before)]

@@ -16,6 +16,7 @@ from meshmatch.cli import main
 from meshmatch.collections.fit_files import load_fit, load_words, save_fit
 from meshmatch.collections.setting import Record
 from meshmatch.errors import InputError, MeshmatchError, OptionError, OutputError
+from meshmatch.fitting.agree import agree_step
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -104,6 +105,29 @@ def test_nothing_is_done_twice_and_more_may_come(shapes: Path, tmp_path: Path) -
     meshmatch.Collection(whole, workers=1).fit(shapes, model="human")
     assert contents(first) == contents(whole) != before and set(before) < set(contents(first))
     assert not (first / "agreeing").exists()
+
+
+def test_an_agreement_goes_on_where_it_was_stopped(
+    shapes: Path, made: tuple[Path, tuple[Record, ...]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whole steps and parts of steps are not taken again."""
+    taken: list[int] = []
+
+    def counted(*arguments: Any) -> Any:
+        taken.append(1)
+        if len(taken) == 15:  # of three fits in groups of two: the second group of the fifth step
+            raise KeyboardInterrupt
+        return agree_step(*arguments)
+
+    monkeypatch.setattr("meshmatch.collections.tasks.agree_step", counted)
+    monkeypatch.setattr("meshmatch.collections.fit_all._GROUP", 2)
+    stopped, straight = tmp_path / "stopped", tmp_path / "straight"
+    with pytest.raises(KeyboardInterrupt):
+        meshmatch.Collection(stopped, workers=1).fit(shapes, model="human")
+    meshmatch.Collection(stopped, workers=1).fit(shapes)
+    assert len(taken) == 3 * 8 + 1  # the one that was interrupted is taken twice
+    meshmatch.Collection(straight, workers=1).fit(shapes, model="human")
+    assert contents(stopped) == contents(straight) and not (stopped / "agreeing").exists()
 
 
 def test_what_a_killed_run_left_is_swept_and_two_at_once_are_refused(
