@@ -107,8 +107,11 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
             seconds=0.0,
             **{name: about[name] for name in _FIT_WORDS},
         )
+        with np.errstate(over="ignore", invalid="ignore"):
+            if not np.isfinite(fit.points_in_file).all():
+                raise ValueError("it lies beyond all numbers")
         return StoredFit(fit, _places(arrays, about, fit), _samples(arrays, about), more)
-    except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
+    except (SafetensorError, KeyError, TypeError, ValueError, OverflowError, OSError) as error:
         raise InputError(f"{path.name} is damaged: {error}", _HINT) from error
 
 

@@ -18,12 +18,13 @@ from meshmatch.maps.files import check_suffix, save_map
 from meshmatch.maps.places import Places
 from meshmatch.outputs import as_path
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes.input_files import existing
+from meshmatch.shapes.input_files import read_text
 from meshmatch.templates.template import Template, load_template
 
 Pair = tuple[str, str]
 """Names of a source and of a target."""
 _SOURCES = 64  # of one task: enough to pay for the target's tree
+_LINE = 400  # bytes of memory for a pair
 _KEPT = 64  # shapes' places in memory
 
 
@@ -47,9 +48,13 @@ def load_pairs(path: str | Path) -> list[Pair]:
 
     `InputError` if the file is missing, or a line holds anything else.
     """
-    path = existing(as_path(path))
+    path = as_path(path)
     found = []
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
+    try:
+        lines = read_text(path, _LINE).splitlines()
+    except ValueError as error:
+        raise InputError(f"{path.name} is not text", "save it in UTF-8") from error
+    for number, line in enumerate(lines, 1):
         text = line.partition("#")[0].strip()
         mark = next((each for each in "\t," if each in text), None)
         words = [word.strip() for word in text.split(mark)]

@@ -21,6 +21,7 @@ from meshmatch.fitting.viscous import NO_MODEL, ViscousConfig, template_of
 from meshmatch.geometry.frames import kabsch
 from meshmatch.models.registry import AUTO
 from meshmatch.outputs import replace_on_success
+from meshmatch.shapes.input_files import read_json
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.prepared_folder import medoid
 from meshmatch.templates.template import Template, load_template, save_template
@@ -76,22 +77,22 @@ def _first_template(store: Store, sources: Sequence[Source], new: bool) -> Templ
 
 
 def on_the_mean(setting: Setting, names: Sequence[str]) -> Setting:
-    """The same with the mean of the shapes that the first template was fitted to as the template of all.
+    """The same with the mean of the shapes that the first template was fitted to as the template of all; with the first
+    where there are none.
 
     A template that lies in the middle has less far to go. The mean is taken after rotation and translation to the first
     mean, twice; each shape at area 1.
     """
-    first = setting.template
-    if not names:
-        return setting
-    reference = np.asarray(first.shape.verts)
-    for _ in range(2):
-        total = np.zeros_like(reference)
-        for name in names:
-            points = setting.read(FIRST, name).fit.points
-            total += kabsch(points, reference).to_world(points)
-        reference = total / len(names)
-    mean = template_of(Shape(reference, first.shape.faces), "mean", ViscousConfig())
+    first = mean = setting.template
+    if names:
+        reference = np.asarray(first.shape.verts)
+        for _ in range(2):
+            total = np.zeros_like(reference)
+            for name in names:
+                points = setting.read(FIRST, name).fit.points
+                total += kabsch(points, reference).to_world(points)
+            reference = total / len(names)
+        mean = template_of(Shape(reference, first.shape.faces), "mean", ViscousConfig())
     with setting.store.writing(TEMPLATE) as path:
         save_template(mean, path)
     return replace(setting, template_file=TEMPLATE, template_hash=mean.hash)
@@ -117,11 +118,11 @@ def read_about(store: Store) -> dict[str, Any] | None:
         return None
     try:
         with store.reading(ABOUT) as path:
-            about = json.loads(path.read_text(encoding="utf-8"))
+            about = read_json(path)
         if about["schema"] != SCHEMA:
             raise InputError(f"{ABOUT} has schema {about['schema']!r}, not {SCHEMA}", "update meshmatch")
         return {name: about[name] for name in ("schema", "template", "model", "only", "without", "sequence", "fit")}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{store.location}/{ABOUT} is damaged", "remove the folder, and fit again") from error
 
 

@@ -46,12 +46,15 @@ def _save(path: Path, state: dict[str, Any]) -> None:
         temporary.write_text(json.dumps(state) + "\n", encoding="utf-8")
 
 
-def read_damaged(state: dict[str, Any], seed: int, folder: Path, file: Path, end: float) -> None:
-    """Batches of damaged files until the time is over; the state is kept after each."""
+def read_damaged(state: dict[str, Any], seed: int, folder: Path, file: Path, seconds: float, least: int) -> None:
+    """Batches of damaged files until the time is over, and there were so many of each family; the state is kept after
+    each batch.
+    """
     with tempfile.TemporaryDirectory() as place:
         samples = make_samples(Path(place))
         families = list(dict.fromkeys(sample.family for sample in samples))
-        while time.monotonic() < end:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end or state["next"] < least * len(families):
             numbers = range(state["next"], state["next"] + inputs.BATCH)
             failures = inputs.run_batch(samples, seed, numbers, folder)
             tried = Counter(state["tried"])
@@ -62,12 +65,14 @@ def read_damaged(state: dict[str, Any], seed: int, folder: Path, file: Path, end
             _save(file, state)
 
 
-def kill_commands(state: dict[str, Any], seed: int, folder: Path, file: Path, seconds: float, training: bool) -> None:
-    """Commands killed in turn until the time is over."""
+def kill_commands(
+    state: dict[str, Any], seed: int, folder: Path, file: Path, seconds: float, least: int, training: bool
+) -> None:
+    """Commands killed in turn until the time is over, and so many were."""
     with tempfile.TemporaryDirectory() as place:
         cases = kills.make_cases(Path(place), training)
         end = time.monotonic() + seconds
-        while time.monotonic() < end:
+        while time.monotonic() < end or _killed(state) < least:
             case = cases[state["rounds"] % len(cases)]
             found = kills.kill(case, seed, state["rounds"])
             counted = Counter(state["kills"])
@@ -80,6 +85,10 @@ def kill_commands(state: dict[str, Any], seed: int, folder: Path, file: Path, se
             _save(file, state)
 
 
+def _killed(state: dict[str, Any]) -> int:
+    return sum(count for name, count in state["kills"].items() if not name.endswith(" missed"))
+
+
 @runner.command
 def main(
     minutes: Annotated[float, Option(min=0.0, help="how long; the same command goes on later")] = 2.0,
@@ -87,6 +96,8 @@ def main(
     output: Annotated[Path, Option(help="folder of the counts and of all that failed")] = Path("../shared/hostile"),
     killing: Annotated[float, Option(min=0.0, max=1.0, help="share of the time for kills")] = 0.25,
     training: Annotated[bool, Option("--train/--no-train", help="kill trainings too, which need torch")] = True,
+    inputs_each: Annotated[int, Option("--inputs", min=0, help="go on until so many of each family were read")] = 0,
+    least: Annotated[int, Option("--kills", min=0, help="go on until so many commands were killed")] = 0,
     fresh: Annotated[bool, Option("--fresh", help="begin anew")] = False,
 ) -> runner.Report:
     make_folder(output)
@@ -95,8 +106,8 @@ def main(
         file.unlink(missing_ok=True)
     state = _load(file)
     if killing:
-        kill_commands(state, seed, output, file, 60 * minutes * killing, training)
-    read_damaged(state, seed, output, file, time.monotonic() + 60 * minutes * (1 - killing))
+        kill_commands(state, seed, output, file, 60 * minutes * killing, least, training)
+    read_damaged(state, seed, output, file, 60 * minutes * (1 - killing), inputs_each)
     rows = [
         {"family": family, "tried": count} | {kind: state["failed"].get(f"{family} {kind}", 0) for kind in inputs.KINDS}
         for family, count in state["tried"].items()

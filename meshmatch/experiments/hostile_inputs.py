@@ -13,28 +13,49 @@ import tempfile
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import IO
 
 import numpy as np
+import torch
 
-from meshmatch.cli import main as command
+from meshmatch.cli.info import info
+from meshmatch.collections.atlas import Atlas
+from meshmatch.collections.collection import Collection
+from meshmatch.collections.fit_files import load_fit
+from meshmatch.collections.map_all import load_pairs as load_names
+from meshmatch.collections.registered import Registered, read_group
 from meshmatch.errors import LONGEST, MeshmatchError, visible
 from meshmatch.experiments.hostile_damage import damaged
+from meshmatch.experiments.hostile_learned import sign, trainers
 from meshmatch.experiments.hostile_samples import Sample, small_shape
+from meshmatch.generators.pose_files import load_poses
+from meshmatch.implicit.model import load_implicit
+from meshmatch.implicit.samples import samples_of
 from meshmatch.maps.files import load_map
 from meshmatch.maps.table_files import load_pairs, load_points
 from meshmatch.models.card import read_card
 from meshmatch.models.checkpoint import load_weights as load_network
 from meshmatch.models.implicit_card import IMPLICIT, read_implicit_card
+from meshmatch.models.registry import TEMPLATE, verify_model
 from meshmatch.shapes.appearance import ImageReader
 from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_coordinates
+from meshmatch.templates.prepared_folder import (
+    frame_of,
+    has_sides,
+    is_registered,
+    read_landmarks,
+    read_registered,
+    read_samples,
+)
 from meshmatch.templates.template import load_template
+from meshmatch.training.datasets import registered_source
 from meshmatch.transfer.label_files import load_labels
 from meshmatch.transfer.landmarks import load_landmarks
 from meshmatch.transfer.vertex_files import load_values, load_weights
@@ -44,6 +65,14 @@ KINDS = ("traceback", "crash", "time", "memory", "printed", "message")
 file and a gigabyte, something printed that is no message, and a message that is long or could command a terminal."""
 SECONDS = 20.0
 BATCH = 200  # inputs of one process
+_SIGNED = (
+    "models",
+    "implicit models",
+    "templates",
+)  # with hashes that whoever damages a file on purpose would write too
+_EGGS = Registered(
+    np.empty((0, 0, 3)), np.empty((0, 3), np.int64), ("egg0", "egg1", "egg 2", "egg3"), None, {"egg4": "poor"}
+)
 _PATIENCE = 15.0  # seconds beyond, for a library that hears no signal
 _ROOM = 1 << 30
 
@@ -70,10 +99,13 @@ def make_input(samples: Sequence[Sample], seed: int, number: int, folder: Path) 
     ours = [sample for sample in samples if sample.family == family]
     sample, other = (ours[int(rng.integers(len(ours)))] for _ in range(2))
     for name in sample.files:
+        (folder / name).parent.mkdir(exist_ok=True)
         shutil.copyfile(sample.folder / name, folder / name)
     chosen = sample.files[0] if rng.random() < 0.8 else sample.files[int(rng.integers(len(sample.files)))]
     data = (sample.folder / chosen).read_bytes()
     (folder / chosen).write_bytes(damaged(data, (other.folder / other.files[0]).read_bytes(), rng))
+    if family in _SIGNED and rng.random() < 0.5:
+        sign(folder)
     return sample, folder / sample.files[0]
 
 
@@ -83,13 +115,20 @@ def readers(family: str, path: Path, shape: Shape) -> Iterator[Callable[[], obje
         yield lambda: _look_at(path)
         if path.suffix in (".glb", ".gltf"):
             yield lambda: load_weights(path, load_shape(path))
-        if path.suffix == ".ply":
-            yield lambda: load_labels(path, shape)
-            yield lambda: load_values(path, shape)
     simple: dict[str, tuple[Callable[[], object], ...]] = {
         "maps": (lambda: load_map(path), lambda: load_map(path, shape, shape)),
         "tables": (lambda: load_values(path, shape),),
         "lists": (lambda: load_pairs(path), lambda: load_points(path)),
+        "known points": (lambda: read_landmarks(path, repair(shape)),),
+        "names": (lambda: read_group(path, _EGGS) if path.stem == "group" else load_names(path),),
+        "poses": (lambda: load_poses(path),),
+        "samples": (lambda: samples_of(path, 64, np.random.default_rng(0)),),
+        "fits": (lambda: Collection(path.parents[1], 1).atlas(poor=True), lambda: _map_all(path)),
+        "atlases": (lambda: _look_at_atlas(path),),
+        "prepared": tuple(partial(read, path.parent) for read in (_learn_from, is_registered, frame_of, has_sides)),
+        "checkpoints": (lambda: trainers()[path.stem == "chair"].load(path),),
+        "models": (lambda: verify_model(path.parent),),
+        "implicit models": (lambda: verify_model(path.parent), lambda: load_implicit(path.parent)),
         "labels": (lambda: load_labels(path, shape, "vertices"), lambda: load_labels(path, shape)),
         "weights": (lambda: load_weights(path, shape),),
         "landmarks": (lambda: load_landmarks(path, shape),),
@@ -100,7 +139,7 @@ def readers(family: str, path: Path, shape: Shape) -> Iterator[Callable[[], obje
     }
     yield from simple.get(family, ())
     if family in ("shapes", "maps", "templates"):
-        yield lambda: _command("info", str(path))
+        yield lambda: _info(path)
 
 
 def _look_at(path: Path) -> None:
@@ -113,17 +152,33 @@ def _look_at(path: Path) -> None:
             _check(error.message, error.hint)
 
 
-def _command(*words: str) -> None:
-    """Run a verb; what it says is judged, and kept from where failures are looked for."""
-    out, told = io.StringIO(), io.StringIO()
-    with redirect_stdout(out), redirect_stderr(told):
-        status = command(words)
-    lines = told.getvalue().splitlines()
-    if status not in (0, 1) or len(lines) > 2:
-        raise AssertionError(f"status {status}, and {len(lines)} lines: {told.getvalue()[:2000]}")
-    _check(*lines, *out.getvalue().splitlines())
-    if any(len(line) > LONGEST + 10 for line in lines):
-        raise _BadMessage(told.getvalue())
+def _map_all(path: Path) -> None:
+    fits = path.parents[1]
+    if path.parent.name == "alone":
+        load_fit(path, load_template(fits / TEMPLATE))
+    Collection(fits, 1).save_maps(fits / "maps")
+
+
+def _look_at_atlas(path: Path) -> None:
+    atlas = Atlas.load(path)
+    atlas.sample(1)
+    atlas.project(atlas.mean)
+    _check(*atlas.names)
+
+
+def _learn_from(folder: Path) -> None:
+    """Draw shapes of a prepared folder, as a training does."""
+    template = load_template(folder / TEMPLATE)
+    read_samples(folder, template)
+    registered_source(torch.from_numpy(read_registered(folder, template)))(2, torch.Generator().manual_seed(0))
+
+
+def _info(path: Path) -> None:
+    """What the verb says is judged, and kept from where failures are looked for."""
+    out = io.StringIO()
+    with redirect_stdout(out):
+        info(path, False)
+    _check(*out.getvalue().splitlines())
 
 
 class _BadMessage(Exception):
@@ -170,7 +225,7 @@ def run_batch(samples: Sequence[Sample], seed: int, numbers: range, keep: Path) 
     """Judge the inputs of some numbers; each failure is kept as a folder with the file and what it said."""
     failures: list[Failure] = []
     left = numbers
-    _shape()  # once, for all processes forked from this one
+    _shape(), trainers()  # once, for all processes forked from this one
     while left:
         ready, say = os.pipe()
         child = os.fork()

@@ -19,10 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.cli import main as command
+from meshmatch.collections.stores import LOCK
 from meshmatch.errors import MeshmatchError
+from meshmatch.experiments.hostile_learned import write_eggs
 from meshmatch.experiments.hostile_samples import small_shape, write_small_model
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.implicit_card import IMPLICIT
 from meshmatch.models.registry import HOME_VARIABLE
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.formats import Textured
@@ -38,8 +41,8 @@ class Case:
     """A command in a folder of its own.
 
     Before each kill `reset` brings back the old. `outputs` are the files that are looked at afterwards, and `states` what
-    they may be: the old and the new. Then a command follows, `after`, which goes on with what was begun or clears up what
-    was left. `seconds` is what a run takes.
+    they may be: the old and the new; `apart` if each file appears by itself. Then a command follows, `after`, which goes on
+    with what was begun or clears up what was left. `seconds` is what a run takes.
     """
 
     name: str
@@ -50,6 +53,7 @@ class Case:
     after: tuple[str, ...] = ()
     states: list[dict[str, str]] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
+    apart: bool = False
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,12 @@ def make_cases(folder: Path, training: bool) -> list[Case]:
     shape = small_shape()
 
     def case(
-        name: str, words: str, files: Callable[[Path], None], outputs: Callable[[Path], list[Path]], after: str = ""
+        name: str,
+        words: str,
+        files: Callable[[Path], None],
+        outputs: Callable[[Path], list[Path]],
+        after: str = "",
+        apart: bool = False,
     ) -> Case:
         place = folder / name.replace(" ", "-")
         place.mkdir(parents=True)
@@ -81,7 +90,7 @@ def make_cases(folder: Path, training: bool) -> list[Case]:
             held = {str(path.relative_to(place)): path for path in outputs(place) if path.is_file()}
             return {name: _digest(path) for name, path in held.items() if "/." not in f"/{name}"}
 
-        one = Case(name, place, tuple(words.split()), reset, found, tuple(after.split()))
+        one = Case(name, place, tuple(words.split()), reset, found, tuple(after.split()), apart=apart)
         one.states.append(found())
         for _ in range(2):  # the second run is as quick as those that are killed
             reset()
@@ -135,19 +144,33 @@ def make_cases(folder: Path, training: bool) -> list[Case]:
         collection(place)
         shutil.copytree(prepare.folder / "out", place / "out")
 
+    def fitted(place: Path) -> None:
+        shutil.copytree(fit.folder / "fits", place / "fits")
+
+    def learned(place: Path) -> list[Path]:
+        return [place / "m" / "weights.safetensors"] if (place / "m" / IMPLICIT).exists() else []
+
     add = case(
         "models add", "models add new/blob --replace", model, all_of("home/models"), "models add new/blob"
     )  # fmt: skip
     obj = case(
         "transfer-texture", "transfer-texture a.obj b.ply --map m.npz -o o.obj --size 64 -q", texture,
-        lambda place: [place / name for name in ("o.obj", "o.mtl", "o.png")],
+        lambda place: [place / name for name in ("o.obj", "o.mtl", "o.png")], apart=True,
     )  # fmt: skip
     prepare = case("prepare", "prepare in -o out --nodes 40 --radius 0.4 --strategy uniform -q", collection, prepared)
     match = case("match", "match a.ply b.ply -o m.npz -q", pair, lambda place: [place / "m.npz"])
-    turn = [add, add, add, obj, add, add, add, obj, prepare, add, add, add, obj, match]
+    fits = "fit in -o fits --model none --jobs 1 -q"
+    fit = case("fit", fits, lambda place: write_eggs(place / "in", 3), all_of("fits/fits"), fits, True)
+    maps = "map fits -o maps --all --jobs 1 -q"
+    mapping = case("map", maps, fitted, all_of("maps"), maps, True)
+    atlas = case("atlas", "atlas fits -o out --no-measures --modes 2 -q", fitted, all_of("out"))
+    turn = [add, obj, mapping, add, prepare, add, mapping, add, obj, mapping, add, atlas, add, mapping, match]
+    turn += [add, mapping, obj] * 5 + [prepare, fit]
     if training:
         learn = "train --shapes out -o m --steps 3 --workers 0 -q"
         turn.append(case("train", learn, ready, trained, learn))
+        implicit = "train --implicit --shapes in -o m --steps 3 -q"
+        turn.append(case("train --implicit", implicit, lambda place: write_eggs(place / "in"), learned, implicit))
     return turn
 
 
@@ -168,21 +191,26 @@ def kill(case: Case, seed: int, number: int) -> Outcome:
         time.sleep(0.002)
     status = os.waitstatus_to_exitcode(ended[1])
     allowed = {0, -sign, 128 + sign}
-    hidden = [path.name for path in case.folder.rglob(".*") if sign != signal.SIGKILL]
+    hidden = [] if sign == signal.SIGKILL else _hidden(case)
     _quietly(case.folder, ("models", "list"))  # what any next command does
     found = case.outputs()
     what = f"{case.name} after {sign.name}: status {status}, hidden {hidden}, found {found}, not {case.states}"
     what += f"\n{_said(case).read_text(errors='replace')}"
-    case.seconds[0] *= 0.9 if status == 0 else 1.05  # most should be hit
+    case.seconds[0] *= 0.85 if status == 0 else 1.03  # most should be hit
     if status not in allowed or (hidden and not case.after) or not _old_or_new(case, found):
         return Outcome("broken", what)
     if case.after:
         _quietly(case.folder, case.after)
-        hidden = [path.name for path in case.folder.rglob(".*")]
+        hidden = _hidden(case)
         then = case.outputs()
         if hidden or then != (case.states[1] if case.after == case.words else found):
             return Outcome("broken", f"{what}; then {' '.join(case.after)} left hidden {hidden}, found {then}")
     return Outcome("missed" if status == 0 else "fine")
+
+
+def _hidden(case: Case) -> list[str]:
+    """What is left half-written; a lock is not."""
+    return [path.name for path in case.folder.rglob(".*") if path.name != LOCK]
 
 
 def _old_or_new(case: Case, found: dict[str, str]) -> bool:
@@ -190,8 +218,7 @@ def _old_or_new(case: Case, found: dict[str, str]) -> bool:
     if found in case.states:
         return True
     old, new = case.states
-    single = case.name == "transfer-texture"  # three files, renamed one after the other
-    return single and all(found.get(name) in (old.get(name), new.get(name)) for name in {*old, *new, *found})
+    return case.apart and all(found.get(name) in (old.get(name), new.get(name)) for name in {*old, *new, *found})
 
 
 def _start(case: Case) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import shutil
@@ -15,6 +16,7 @@ import numpy as np
 from PIL import Image
 from scipy.sparse import csr_array
 
+from meshmatch.experiments.hostile_learned import learned_samples
 from meshmatch.maps import MAP_SUFFIXES
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
@@ -32,13 +34,15 @@ from meshmatch.transfer.label_files import Labels, save_labels
 from meshmatch.transfer.landmarks import at_vertices, save_landmarks
 from meshmatch.transfer.vertex_files import SkinWeights, Values, save_colors, save_values, save_weights
 
-LABEL_SUFFIXES = (".npy", ".txt", ".csv", ".json", ".ply")
+LABEL_SUFFIXES = (".npy", ".txt", ".csv", ".json")
 IMAGES = {"png": "PNG", "jpg": "JPEG", "webp": "WEBP", "bmp": "BMP", "tga": "TGA", "tif": "TIFF"}
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A folder with a file of a family; the first of its files is the one that is read, all may be damaged."""
+    """A folder with a file of a family, maybe among others and in folders of its own; the first of its files is the one
+    that is read, all may be damaged.
+    """
 
     family: str
     folder: Path
@@ -74,6 +78,7 @@ def make_samples(folder: Path) -> list[Sample]:
         add("shapes", f"{name}.ply", Path.write_bytes, data)
     add("shapes", "a.pcd", lambda path: path.write_bytes(_pcd()))
     add("shapes", "skin.gltf", lambda path: path.write_text(json.dumps(_skinned())))
+    add("shapes", "apart.gltf", _write_apart)
     paint = np.random.default_rng(0).integers(0, 256, (16, 16, 4)).astype(np.uint8)
     uv = np.random.default_rng(1).random((shape.F, 3, 2))
     for suffix in (".obj", ".glb"):
@@ -89,10 +94,19 @@ def make_samples(folder: Path) -> list[Sample]:
     add("tables", "c.csv", lambda path: save_colors(path, shape, colors))
     add("lists", "p.txt", lambda path: path.write_text("# pairs\n" + "".join(f"{k} {k + 1}\n" for k in range(40))))
     add("lists", "p.npy", lambda path: np.save(path, np.arange(60).reshape(-1, 2)))
+    add("known points", "k.npy", lambda path: np.save(path, shape.verts[:9]))
+    add("known points", "k.txt", lambda path: np.savetxt(path, shape.verts[:9]))
+    add("names", "pairs.txt", Path.write_text, "# source, target\negg 1,egg 2\negg0\tegg3\negg4 egg5\n")
+    for suffix in (".txt", ".csv"):
+        add("names", f"group{suffix}", Path.write_text, "egg0\negg1.ply\negg 2\n")
+    for suffix in (".npz", ".json", ".csv"):
+        add("poses", f"p{suffix}", _write_poses)
+    for known in ("distances", "normals"):
+        add("samples", "s.npz", _write_distances, known)
     for words in (False, True):
         names = ("arm", "leg", "head") if words else (3, 5, 9)
         labels = Labels(np.arange(shape.V) % 3, names, "vertices")
-        for suffix in LABEL_SUFFIXES[:-1]:
+        for suffix in LABEL_SUFFIXES:
             add("labels", f"l{suffix}", save_labels, labels, shape)
     matrix = csr_array(np.random.default_rng(3).dirichlet(np.ones(4), shape.V))
     for suffix in (".npz", ".json"):
@@ -108,6 +122,9 @@ def make_samples(folder: Path) -> list[Sample]:
     for storage in ("int8", "float16", "float32"):
         add("safetensors", "w.safetensors", _save_network, storage)
     add("templates", "t.safetensors", lambda path: _small_template(path, built_in / "template.safetensors"))
+    for family, place, name in learned_samples(folder / "learned"):
+        held = sorted(str(path.relative_to(place)) for path in place.rglob("*") if path.is_file())
+        found.append(Sample(family, place, (name, *(other for other in held if other != name))))
     return found
 
 
@@ -164,6 +181,37 @@ def _plys() -> dict[str, bytes]:
     }  # fmt: skip
 
 
+def _write_poses(path: Path) -> None:
+    joints, vectors = ["root", "head"], np.random.default_rng(9).uniform(-1, 1, (3, 2, 3))
+    if path.suffix == ".npz":
+        np.savez(path, joints=np.array(joints), rotations=vectors)
+    elif path.suffix == ".json":
+        path.write_text(json.dumps({"joints": joints, "rotations": vectors.tolist()}))
+    else:
+        rows = [[p, joint, *vectors[p, j]] for p in range(3) for j, joint in enumerate(joints)]
+        path.write_text("pose,joint,x,y,z\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
+
+
+def _write_distances(path: Path, known: str) -> None:
+    """Points in and around a ball, or on it."""
+    points = np.random.default_rng(10).standard_normal((200, 3))
+    length = np.linalg.norm(points, axis=1)
+    if known == "distances":
+        np.savez(path, points=points, distances=length - 1)
+    else:
+        ball = points / length[:, None]
+        np.savez(path, points=ball, normals=ball)
+
+
+def _write_apart(path: Path) -> None:
+    """A gltf whose buffer and image are files beside it."""
+    words = _skinned()
+    for part, name in ((words["buffers"][0], "apart.bin"), (words["images"][0], "apart.png")):
+        path.with_name(name).write_bytes(base64.b64decode(part["uri"].partition("base64,")[2]))
+        part["uri"] = name
+    path.write_text(json.dumps(words))
+
+
 def _pcd() -> bytes:
     head = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 8\nHEIGHT 1\nPOINTS 8\nDATA {}\n"
     return head.format("binary").encode() + np.random.default_rng(6).random((8, 4)).astype("<f4").tobytes()
@@ -171,8 +219,6 @@ def _pcd() -> bytes:
 
 def _skinned() -> dict[str, Any]:
     """A square with two joints, a texture, and a mesh that stands twice."""
-    import base64
-
     parts = [
         np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "<f4"), np.array([0, 1, 2, 1, 3, 2], "<u2"),
         np.array([[0, 1, 0, 0]] * 4, "<u2"), np.array([[0.75, 0.25, 0, 0]] * 4, "<f4"), np.ones((4, 3), "<f4"),

@@ -60,7 +60,8 @@ class GivenPoses:
         if len(set(self.joints)) < len(self.joints):
             twice = next(name for name in self.joints if self.joints.count(name) > 1)
             raise InputError(f"joint {twice[:80]!r} is named twice", _HINT)
-        vectors = vectors.astype(np.float32)
+        with np.errstate(over="ignore"):  # to infinity, which is refused
+            vectors = vectors.astype(np.float32)
         if not np.isfinite(vectors).all():
             pose, joint, _ = np.argwhere(~np.isfinite(vectors))[0]
             raise InputError(f"pose {pose} has a rotation of {self.joints[joint][:80]!r} that is not a number", _HINT)

@@ -27,7 +27,8 @@ class Frame:
             raise InputError(f"a frame needs a (3, 3) rotation and a (3,) center, not {rotation.shape}, {center.shape}")
         if not (np.isfinite(self.scale) and self.scale > 0 and np.isfinite(center).all()):
             raise InputError(f"a frame's scale must be positive and finite, not {self.scale}", "has it any size?")
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+        small = (np.abs(rotation) < 2).all()  # else the product could overflow
+        if not (small and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)):
             raise InputError("a frame's rotation must be orthonormal")
         for name, value in (("scale", float(self.scale)), ("rotation", rotation), ("center", center)):
             object.__setattr__(self, name, value)

@@ -28,6 +28,7 @@ FAR = 0.05
 """From the surface, in the cube: where a distance of zero is an error."""
 ARRAYS = ("points", "distances", "normals")
 _DENSE, _MOST, _ALL = 40_000, 16_384, 40_000_000  # surface points; samples of a shape, and of a folder
+_HUGE = 1e100  # whose square is a number
 _NEAR = 0.05  # deviation of the free points that lie near a surface
 _KINDS = {*SUFFIXES, ".npz"} - {".npy"}  # arrays beside shapes are labels or landmarks
 
@@ -107,9 +108,10 @@ def _arrays(file: Path) -> tuple[Floats, Floats, Floats]:
     if not (points.ndim == 2 and points.shape[1] == 3 and alike and len(points)):
         what = f"{file.name} needs points (N, 3), and distances (N,) or normals (N, 3)"
         raise InputError(what, "see docs/formats.md")
-    if any(each.dtype.kind not in "fiu" or not np.isfinite(each).all() for each in (points, distances, normals)):
-        raise InputError(f"{file.name} holds what is no finite number", "leave these points out")
-    points, distances, normals = (each.astype(np.float64) for each in (points, distances, normals))
+    found = (points, distances, normals)
+    if any(each.dtype.kind not in "fiu" or not (np.abs(each.astype(np.float64)) < _HUGE).all() for each in found):
+        raise InputError(f"{file.name} holds what is no finite number, or is huge", "leave these points out")
+    points, distances, normals = (each.astype(np.float64) for each in found)
     if not len(distances):
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return points, distances, normals

@@ -24,6 +24,7 @@ from meshmatch.outputs import replace_on_success
 from meshmatch.training.losses import CorrespondenceLoss, Objective
 
 _OF_TEMPLATE = ("nodes", "anchors")  # what a checkpoint must share with the training that goes on from it
+_MOMENTS, _COUNT = ("exp_avg", "exp_avg_sq"), {"step": torch.Size()}  # of Adam: what it knows of each parameter
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,11 @@ class Trainer:
     def load(self, path: Path) -> None:
         """Go on where `save` was called; `ModelError` if the file is none, or of another seed, network or template."""
         hint = "train into another folder, or start afresh"
+        here = self.model.state_dict()
+        of_parameters = {name: tensor.shape for name, tensor in self.average.items()}
+        expected = {"model": {name: tensor.shape for name, tensor in here.items()}, "average": of_parameters}
         parts: dict[str, dict[str, Tensor]] = {"model": {}, "average": {}, "optimiser": {}}
+        state: dict[int, dict[str, Tensor]] = {}
         try:
             with safe_open(str(path), framework="pt") as file:
                 words = file.metadata() or {}
@@ -134,23 +139,27 @@ class Trainer:
                 for name in file.keys():  # noqa: SIM118 (it is no dictionary)
                     part, _, key = name.partition(".")
                     parts[part][key] = file.get_tensor(name)
-        except (SafetensorError, OSError, KeyError, ValueError) as error:
+            for name, tensor in parts["optimiser"].items():
+                index, key = name.split(".")
+                state.setdefault(int(index), {})[key] = tensor
+            if not (0 <= step and 0 <= seconds < math.inf):
+                raise ValueError("no such step")
+        except (SafetensorError, OSError, LookupError, ValueError) as error:
             raise ModelError(f"{path} is not a checkpoint of a training", hint) from error
         if seed != self.config.seed:
             raise ModelError(f"{path} is a checkpoint of a training with seed {seed}", hint)
-        weights, here = parts["model"], self.model.state_dict()
-        if {n: t.shape for n, t in weights.items()} != {n: t.shape for n, t in here.items()}:
+        if any({name: t.shape for name, t in parts[part].items()} != expected[part] for part in expected):
             raise ModelError(f"{path} is a checkpoint of another network", hint)
+        known = {n: dict.fromkeys(_MOMENTS, p.shape) | _COUNT for n, p in enumerate(self.model.parameters())}
+        if any({key: t.shape for key, t in state[n].items()} != known.get(n) for n in state):
+            raise ModelError(f"{path} is not a checkpoint of a training", hint)
+        weights = parts["model"]
         if not all(torch.equal(weights[n], here[n].cpu()) for n in here if n.endswith(_OF_TEMPLATE)):
             raise ModelError(f"{path} is a checkpoint for another template", hint)
         self.step, self.seconds = step, seconds
         self.model.load_state_dict(weights)
         for name, tensor in parts["average"].items():
             self.average[name].copy_(tensor)
-        state: dict[int, dict[str, Tensor]] = {}
-        for name, tensor in parts["optimiser"].items():
-            index, key = name.split(".")
-            state.setdefault(int(index), {})[key] = tensor
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
 

@@ -1,6 +1,7 @@
 """A collection is fitted, stopped, gone on with and mapped."""
 
 import csv
+import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,6 +17,7 @@ from meshmatch.cli import main
 from meshmatch.collections.fit_files import load_fit, load_words, save_fit
 from meshmatch.collections.setting import Record
 from meshmatch.errors import InputError, MeshmatchError, OptionError, OutputError
+from meshmatch.experiments.hostile_learned import write_eggs
 from meshmatch.fitting.agree import agree_step
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.shapes.files import load_shape, save_shape
@@ -210,6 +212,19 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
         (about / "collection.json").write_text(text)
         with pytest.raises(InputError, match=r"damaged|schema 2"):
             meshmatch.Collection(about).names  # noqa: B018
+    size = 8 + int.from_bytes(whole[:8], "little")
+    header = json.loads(whole[8:size])
+    about_fit = json.loads(header["__metadata__"]["fit"])
+    about_fit["fit"]["scale"] = 10**400
+    text = json.dumps(header | {"__metadata__": {"fit": json.dumps(about_fit)}}).encode()
+    broken.write_bytes(len(text).to_bytes(8, "little") + text + whole[size:])
+    with pytest.raises(InputError, match="too large"):
+        load_fit(broken, template)
+    broken.write_bytes(whole)
+    fit = load_fit(broken, template).fit
+    save_fit(broken, replace(fit, frame=replace(fit.frame, scale=1e308), points=1e10 * fit.points))
+    with pytest.raises(InputError, match="beyond all numbers"):
+        load_fit(broken, template)
     numbers = whole.replace(b'\\"schema\\": 1', b'\\"schema\\": 9')
     assert numbers != whole
     broken.write_bytes(numbers)
@@ -319,6 +334,16 @@ def test_without_a_model_the_shapes_make_their_template(tmp_path: Path) -> None:
     assert collection.template.hash == template
     with pytest.raises(OptionError, match="another model"):
         collection.fit(folder, model="human")
+
+
+def test_where_no_fit_is_to_be_trusted_maps_can_be_made(tmp_path: Path) -> None:
+    """Triangles that are too large for a close fit: the first template remains that of all."""
+    write_eggs(tmp_path / "eggs", 3, splits=2)
+    collection = meshmatch.Collection(tmp_path / "fits", workers=1)
+    made = collection.fit(tmp_path / "eggs", model="none")
+    assert {record.verdict for record in made.records} == {"poor"}
+    assert collection.map("egg0", "egg2").verdict == "poor"
+    assert collection.save_maps(tmp_path / "maps") == 6
 
 
 def egg(rings: int) -> tuple[np.ndarray, np.ndarray]:

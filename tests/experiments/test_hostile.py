@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -10,9 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from meshmatch.errors import ModelError
 from meshmatch.experiments import hostile, hostile_inputs, hostile_kills
 from meshmatch.experiments.hostile_inputs import Sample, make_input, run_batch
+from meshmatch.experiments.hostile_learned import sign
 from meshmatch.experiments.hostile_samples import make_samples
+from meshmatch.models.registry import verify_model
+from meshmatch.templates.template import load_template
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 
@@ -33,7 +38,7 @@ def test_samples_are_read_undamaged(samples: list[Sample]) -> None:
         except Exception as error:
             refused.append(f"{path.name}: {error}")
     assert refused == []
-    assert len({sample.family for sample in samples}) == 11
+    assert len({sample.family for sample in samples}) == 21
 
 
 def test_a_number_gives_the_same_file_again(samples: list[Sample], tmp_path: Path) -> None:
@@ -109,6 +114,42 @@ def test_it_goes_on_where_it_was_stopped(
     assert [numbers.start for numbers in seen] == [k * hostile_inputs.BATCH for k in range(len(seen))]
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert (record["failures"], record["inputs"]) == (0, seen[-1].stop)
+
+
+def test_it_goes_on_until_there_were_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However little time there is."""
+    samples = [Sample(family, tmp_path, ("a",)) for family in ("maps", "lists")]
+    monkeypatch.setattr(hostile, "make_samples", lambda folder: samples)
+    monkeypatch.setattr(hostile_inputs, "run_batch", lambda samples, seed, numbers, keep: [])
+    outcomes = iter(["fine", "missed", "fine", "fine"])
+    monkeypatch.setattr(hostile_kills, "make_cases", lambda folder, training: [small_case(folder, False)])
+    monkeypatch.setattr(hostile_kills, "kill", lambda *rest: hostile_kills.Outcome(next(outcomes)))
+    words = ["--minutes", "0", "--inputs", "1000", "--kills", "3", "--output", str(tmp_path / "out")]
+    assert hostile.main(words) == 0
+    state = json.loads((tmp_path / "out" / "hostile-0.json").read_text())
+    assert state["tried"] == {"maps": 1000, "lists": 1000}
+    assert state["kills"] == {"a command fine": 3, "a command missed": 1} and next(outcomes, None) is None
+
+
+def test_what_somebody_signs_is_read(samples: list[Sample], tmp_path: Path) -> None:
+    """Weights and a template that were changed pass for whole ones once their hashes are written anew."""
+    model = next(sample for sample in samples if sample.family == "models")
+    for name in ("weights", "template"):
+        folder = tmp_path / name
+        shutil.copytree(model.folder, folder)
+        data = bytearray((folder / f"{name}.safetensors").read_bytes())
+        size = 8 + int.from_bytes(data[:8], "little")
+        tensors = {key: at for key, at in json.loads(data[8:size]).items() if key != "__metadata__"}
+        first = tensors["nodes" if name == "template" else min(tensors)]
+        data[size + first["data_offsets"][0]] ^= 1
+        (folder / f"{name}.safetensors").write_bytes(data)
+        with pytest.raises(ModelError, match=r"not those of its card|does not match its hash"):
+            verify_model(folder)
+        sign(folder)
+        if name == "weights":
+            assert verify_model(folder).name == "model"
+        else:
+            assert load_template(folder / "template.safetensors").K == 36
 
 
 def small_case(folder: Path, half: bool) -> hostile_kills.Case:

@@ -43,6 +43,7 @@ def test_frame_laws(scale: float) -> None:
         (-1.0, np.eye(3), np.zeros(3)),
         (np.nan, np.eye(3), np.zeros(3)),
         (1.0, 2 * np.eye(3), np.zeros(3)),
+        (1.0, 1e200 * np.eye(3), np.zeros(3)),
         (1.0, np.eye(4), np.zeros(3)),
         (1.0, np.eye(3), [0, 0, np.inf]),
     ],

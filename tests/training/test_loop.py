@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -220,6 +221,34 @@ def test_a_checkpoint_that_does_not_fit_is_refused(egg: Template, tmp_path: Path
     assert same(before, state(run))  # untouched
     with pytest.raises(OutputError):
         run.save(tmp_path / "nowhere" / "last.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda held, about: held.update({"average.other": torch.zeros(1)}), "another network"),
+        (lambda held, about: held.update({"optimiser.0.step": torch.zeros(2)}), "not a checkpoint"),
+        (lambda held, about: held.pop("optimiser.0.exp_avg"), "not a checkpoint"),
+        (lambda held, about: held.update({"optimiser.first.step": torch.zeros(())}), "not a checkpoint"),
+        (lambda held, about: held.update({"optimiser.9999.step": torch.zeros(())}), "not a checkpoint"),
+        (lambda held, about: about.update({"step": "-1"}), "not a checkpoint"),
+        (lambda held, about: about.update({"seconds": "inf"}), "not a checkpoint"),
+    ],
+)
+def test_a_damaged_checkpoint_changes_nothing(
+    egg: Template, tmp_path: Path, change: Callable[[dict, dict], object], words: str
+) -> None:
+    path = tmp_path / "last.safetensors"
+    run = trainer(egg, replace(CONFIG, steps=1))
+    run.run(small_data(egg, run.model, length=1), path)
+    held, about = load_file(path), {"step": "1", "seconds": "2.0", "seed": str(CONFIG.seed)}
+    trainer(egg, CONFIG).load(path)
+    change(held, about)
+    save_file(held, path, about)
+    before = state(run)
+    with pytest.raises(ModelError, match=words):
+        run.load(path)
+    assert same(before, state(run))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,158 @@
+"""Samples of what is learned from shapes, for `experiments.hostile`: fits, atlases, prepared folders, models, checkpoints.
+
+All of it is made of a few eggs in seconds, so that the files are small.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.numpy import load as tensors
+from trimesh.creation import icosphere
+
+from meshmatch.collections.collection import Collection
+from meshmatch.implicit.network import ImplicitConfig
+from meshmatch.implicit.samples import read_implicit_samples
+from meshmatch.implicit.training import TRAINING, build_implicit, train_implicit
+from meshmatch.models.implicit_card import IMPLICIT
+from meshmatch.models.network import NetworkConfig
+from meshmatch.models.registry import CARD, TEMPLATE, WEIGHTS
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.make import NodeConfig
+from meshmatch.templates.prepare import PrepareConfig, prepare
+from meshmatch.templates.prepared_folder import read_registered
+from meshmatch.templates.template import load_template
+from meshmatch.training.alone import CHECKPOINT
+from meshmatch.training.datasets import registered_source
+from meshmatch.training.loop import TrainConfig, Trainer
+from meshmatch.training.recipes import Recipe
+from meshmatch.training.scans import ScanConfig
+from meshmatch.training.train import build_deformer, train
+
+_NETWORK = NetworkConfig(
+    code=16, width=32, depth=1, basis=24, align_basis=16, align_width=16, corrections=2, correct_width=16
+)
+RECIPE = Recipe(
+    _NETWORK,
+    TrainConfig(steps=2, shapes=4, scans_per_shape=1, workers=0, warm_up=1),
+    ScanConfig(points=96, noise=0.012, outliers=0, partial=0),
+    "smooth",
+)
+"""A network that is trained in a second."""
+IMPLICIT_TRAINING = replace(TRAINING, steps=2, shapes=2, warm_up=1)
+_IMPLICIT_NETWORK = ImplicitConfig("mls", code=8, width=24, depth=2, inner=8, nodes=20)
+
+
+def write_eggs(folder: Path, count: int = 4, splits: int = 3) -> None:
+    """Eggs that share their triangles, an icosahedron's split so often."""
+    folder.mkdir(parents=True)
+    ball, rng = icosphere(splits), np.random.default_rng(8)
+    for number in range(count):
+        verts = ball.vertices * [0.8, 1.5, 1.0] @ (np.eye(3) + 0.02 * rng.normal(size=(3, 3)))
+        save_shape(folder / f"egg{number}.ply", Shape(verts, np.asarray(ball.faces, np.int64)))
+
+
+def prepare_eggs(eggs: Path, output: Path) -> None:
+    """Make them ready to learn from."""
+    prepare(eggs, output, PrepareConfig(NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)))
+
+
+def learn_eggs(prepared: Path, output: Path, training: TrainConfig = RECIPE.train) -> None:
+    """A model of a prepared folder."""
+    train(output, shapes=prepared, recipe=replace(RECIPE, train=training))
+
+
+def learn_implicitly(eggs: Path, output: Path, training: TrainConfig = IMPLICIT_TRAINING) -> None:
+    """An implicit model."""
+    train_implicit(output, eggs, config=_IMPLICIT_NETWORK, training=training)
+
+
+@cache
+def trainers() -> tuple[Trainer, Trainer]:
+    """What reads the checkpoints of both kinds."""
+    with tempfile.TemporaryDirectory() as place:
+        eggs, ready = Path(place, "eggs"), Path(place, "ready")
+        write_eggs(eggs)
+        prepare_eggs(eggs, ready)
+        template = load_template(ready / TEMPLATE)
+        source = registered_source(torch.from_numpy(read_registered(ready, template)))
+        network = build_implicit(read_implicit_samples(eggs), _IMPLICIT_NETWORK, 0)
+    model = build_deformer(template, source, RECIPE.network, RECIPE.scan, RECIPE.kernel, 0)
+    return Trainer(model, None, RECIPE.train), Trainer(network, None, IMPLICIT_TRAINING)
+
+
+def learned_samples(folder: Path) -> Iterator[tuple[str, Path, str]]:
+    """Family, folder and the file in it that is read, of everything that is learned."""
+    eggs = folder / "eggs"
+    write_eggs(eggs)
+    collection = Collection(folder / "fits", workers=1)
+    collection.fit(eggs, model="none")
+    for unused in ("first", "first.safetensors", ".lock", "fits.csv"):
+        path = folder / "fits" / unused
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for state in ("fits", "alone"):
+        yield "fits", folder / "fits", f"{state}/egg0.safetensors"
+    (folder / "atlas").mkdir()
+    collection.atlas(modes=2).save(folder / "atlas" / "atlas.npz")
+    yield "atlases", folder / "atlas", "atlas.npz"
+    prepare_eggs(eggs, folder / "prepared")
+    for unused in ("nodes.png", "normalised"):
+        path = folder / "prepared" / unused
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    for name in ("prepared.json", "points.safetensors", "shapes.safetensors"):
+        yield "prepared", folder / "prepared", name
+    learn_eggs(folder / "prepared", folder / "model")
+    learn_implicitly(eggs, folder / "chair")
+    for model in ("model", "chair"):
+        checkpoint = folder / model / CHECKPOINT
+        kept = folder / f"{model}-checkpoint"
+        kept.mkdir()
+        os.replace(checkpoint, kept / f"{model}.safetensors")
+        shutil.rmtree(checkpoint.parent)
+        yield "checkpoints", kept, f"{model}.safetensors"
+    for name in (WEIGHTS, CARD, TEMPLATE):
+        yield "models", folder / "model", name
+    for name in (WEIGHTS, IMPLICIT):
+        yield "implicit models", folder / "chair", name
+
+
+def sign(folder: Path) -> None:
+    """Write the hash of damaged weights on the card, and that of a damaged template into it, as somebody would who means
+    harm; nothing where they are too damaged for that.
+    """
+    for card in (folder / CARD, folder / IMPLICIT):
+        try:
+            words = json.loads(card.read_bytes())
+            words["weights_sha256"] = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+            card.write_text(json.dumps(words))
+        except (OSError, ValueError, TypeError, RecursionError):
+            continue
+    for path in folder.glob("*.safetensors"):
+        data = path.read_bytes()
+        size = int.from_bytes(data[:8], "little")
+        try:
+            header = json.loads(data[8 : 8 + size])
+            words = json.loads(header["__metadata__"]["template"])
+            arrays = tensors(data)
+            radius = arrays.get("radii", np.atleast_1d(float(words["radius"])))
+            digest = hashlib.sha256()
+            for name, kind in (("verts", "<f8"), ("faces", "<i8"), ("nodes", "<f8"), ("", "<f8"), ("core", "<i8")):
+                digest.update((arrays[name] if name else radius).astype(kind).tobytes())
+            words["hash"] = digest.hexdigest()[:16]
+            header["__metadata__"]["template"] = json.dumps(words)
+        except (SafetensorError, ValueError, TypeError, LookupError, RecursionError, AttributeError):
+            continue
+        text = json.dumps(header).encode()
+        path.write_bytes(len(text).to_bytes(8, "little") + text + data[8 + size :])
