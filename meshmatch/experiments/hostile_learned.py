@@ -17,8 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.numpy import load as tensors
 from trimesh.creation import icosphere
 
 from meshmatch.collections.collection import Collection
@@ -52,6 +50,7 @@ RECIPE = Recipe(
 )
 """A network that is trained in a second."""
 IMPLICIT_TRAINING = replace(TRAINING, steps=2, shapes=2, warm_up=1)
+_KINDS = {"F64": "<f8", "F32": "<f4", "I32": "<i4", "I64": "<i8"}
 _IMPLICIT_NETWORK = ImplicitConfig("mls", code=8, width=24, depth=2, inner=8, nodes=20)
 
 
@@ -141,18 +140,21 @@ def sign(folder: Path) -> None:
             continue
     for path in folder.glob("*.safetensors"):
         data = path.read_bytes()
-        size = int.from_bytes(data[:8], "little")
+        size = 8 + int.from_bytes(data[:8], "little")
         try:
-            header = json.loads(data[8 : 8 + size])
+            header = json.loads(data[8:size])
             words = json.loads(header["__metadata__"]["template"])
-            arrays = tensors(data)
-            radius = arrays.get("radii", np.atleast_1d(float(words["radius"])))
             digest = hashlib.sha256()
-            for name, kind in (("verts", "<f8"), ("faces", "<i8"), ("nodes", "<f8"), ("", "<f8"), ("core", "<i8")):
-                digest.update((arrays[name] if name else radius).astype(kind).tobytes())
+            for name, kind in (("verts", "<f8"), ("faces", "<i8"), ("nodes", "<f8"), ("radii", "<f8"), ("core", "<i8")):
+                if name == "radii" and name not in header:
+                    array = np.array(float(words["radius"]))
+                else:
+                    first, end = (size + int(offset) for offset in header[name]["data_offsets"])
+                    array = np.frombuffer(data[first:end], _KINDS[header[name]["dtype"]])
+                digest.update(array.astype(kind).tobytes())
             words["hash"] = digest.hexdigest()[:16]
             header["__metadata__"]["template"] = json.dumps(words)
-        except (SafetensorError, ValueError, TypeError, LookupError, RecursionError, AttributeError):
+        except (ValueError, TypeError, LookupError, RecursionError, AttributeError, OverflowError):
             continue
         text = json.dumps(header).encode()
-        path.write_bytes(len(text).to_bytes(8, "little") + text + data[8 + size :])
+        path.write_bytes(len(text).to_bytes(8, "little") + text + data[size:])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import ModelError
-from meshmatch.experiments import hostile, hostile_inputs, hostile_kills
+from meshmatch.experiments import hostile, hostile_inputs, hostile_kills, hostile_readers
 from meshmatch.experiments.hostile_inputs import Sample, make_input, run_batch
 from meshmatch.experiments.hostile_learned import sign
 from meshmatch.experiments.hostile_samples import make_samples
@@ -71,7 +71,7 @@ def hoard(path: Path) -> None:
         (lambda path: time.sleep(9), "time"),
         (hoard, "memory"),
         (chatter, "printed"),
-        (lambda path: hostile_inputs._check("\x1b[31m"), "message"),
+        (lambda path: hostile_readers.check("\x1b[31m"), "message"),
     ],
 )
 def test_what_is_wrong_is_found(
