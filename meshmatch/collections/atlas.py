@@ -275,14 +275,15 @@ class Atlas:
 
 def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
     """The arrays of a file as an `Atlas` has them; `InputError` for anything else."""
-    if "version" not in given or int(given.pop("version")) != VERSION:
+    version = given.pop("version", np.empty(0))
+    if version.dtype.kind not in "iu" or version.shape != () or version != VERSION:
         raise InputError(f"{file} is not an atlas of version {VERSION}", "make it again with this meshmatch")
     kinds = {each.name: "f" for each in fields(Atlas)} | {"faces": "i", "names": "U", "scale": "U", "robust": "b"}
     kinds["template"] = "U"
     wrong = [name for name in kinds if name not in given or given[name].dtype.kind != kinds[name]]
     if wrong:
         raise InputError(f"{file} is damaged: {', '.join(wrong)}", "make it again")
-    M, V, S = len(given["modes"]), len(given["mean"]), len(given["names"])
+    M, V, S = (len(given[name]) if given[name].ndim else -1 for name in ("modes", "mean", "names"))
     sizes = {"mean": (V, 3), "modes": (M, V, 3), "deviations": (M,), "scores": (S, M), "sizes": (S,)}
     sizes |= {"weights": (V,), "names": (S,), "total": (), "scale": (), "robust": (), "template": ()}
     wrong = [name for name, size in sizes.items() if given[name].shape != size]
