@@ -19,7 +19,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit, facing_out
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_npz
-from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.shape import LARGEST, Shape
 
 VERSION = 1
 """Of the arrays in ``atlas.npz``."""
@@ -287,7 +287,7 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
     sizes = {"mean": (V, 3), "modes": (M, V, 3), "deviations": (M,), "scores": (S, M), "sizes": (S,)}
     sizes |= {"weights": (V,), "names": (S,), "total": (), "scale": (), "robust": (), "template": ()}
     wrong = [name for name, size in sizes.items() if given[name].shape != size]
-    wrong += [name for name, kind in kinds.items() if kind == "f" and not np.isfinite(given[name]).all()]
+    wrong += [name for name, kind in kinds.items() if kind == "f" and not (np.abs(given[name]) < LARGEST).all()]
     faces = given["faces"]
     if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or faces.min() < 0 or faces.max() >= V:
         wrong.append("faces")

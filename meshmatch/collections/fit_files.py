@@ -21,12 +21,14 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.places import Places
 from meshmatch.models.tensor_file import read_header
+from meshmatch.shapes.shape import LARGEST
 from meshmatch.templates.template import Template, save_arrays
 
 SCHEMA = 1
 _HINT = "fit the shape again: remove the file, and run `meshmatch fit` as before"
 _FIT_WORDS = ("template_hash", "residual", "verdict", "up", "front", "seed", "partial", "model")
 _PLACES = ("resting", "height", "distance", "stands", "faces", "fitted")
+_FAR = 1e6  # units of sqrt(area)
 _OPTIONAL = ("shift", "spread")
 Words = dict[str, Any]
 
@@ -107,9 +109,8 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
             seconds=0.0,
             **{name: about[name] for name in _FIT_WORDS},
         )
-        with np.errstate(over="ignore", invalid="ignore"):
-            if not np.isfinite(fit.points_in_file).all():
-                raise ValueError("it lies beyond all numbers")
+        if not (1 / LARGEST < fit.frame.scale < LARGEST and (np.abs(fit.frame.center) < LARGEST).all()):
+            raise ValueError("its frame cannot be")
         return StoredFit(fit, _places(arrays, about, fit), _samples(arrays, about), more)
     except (SafetensorError, KeyError, TypeError, ValueError, OverflowError, OSError) as error:
         raise InputError(f"{path.name} is damaged: {error}", _HINT) from error
@@ -147,6 +148,6 @@ def _checked(arrays: dict[str, np.ndarray], name: str, kind: Any, shape: tuple[i
     array = arrays[name]
     if array.dtype != kind or array.shape != shape:
         raise ValueError(f"{name} is an array of {array.shape} {array.dtype}, not of {shape} {np.dtype(kind)}")
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"{name} has numbers that are not finite")
+    if array.dtype.kind == "f" and not (np.abs(array) < _FAR).all():
+        raise ValueError(f"{name} has numbers that cannot be")
     return array

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import vertex_areas
+from meshmatch.shapes.shape import LARGEST
 
 Scale = Literal["keep", "remove"]
 Shapes: TypeAlias = Sequence[ArrayLike] | Floats
@@ -90,8 +91,8 @@ def _checked(points: ArrayLike, number: int, first: tuple[int, ...]) -> Float[Fl
     if found.ndim != 2 or found.shape[1] != 3 or found.shape != first:
         hint = "all shapes are fits of one template"
         raise InputError(f"shape {number} is an array of {found.shape}, the first one of {first}; not (V, 3)", hint)
-    if not np.isfinite(found).all():
-        raise InputError(f"shape {number} has vertices that are not finite", "leave it out")
+    if not (np.abs(found) < LARGEST).all():
+        raise InputError(f"shape {number} has vertices that are not finite, or huge", "leave it out")
     return found
 
 

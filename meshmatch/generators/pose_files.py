@@ -65,7 +65,7 @@ class GivenPoses:
         if not np.isfinite(vectors).all():
             pose, joint, _ = np.argwhere(~np.isfinite(vectors))[0]
             raise InputError(f"pose {pose} has a rotation of {self.joints[joint][:80]!r} that is not a number", _HINT)
-        angle = np.linalg.norm(vectors, axis=2)
+        angle = np.linalg.norm(vectors.astype(np.float64), axis=2)  # the square of 1e30 is no float32
         if angle.max() > 2 * math.pi + 1e-3:
             pose, joint = np.unravel_index(int(angle.argmax()), angle.shape)
             turned = f"pose {pose} turns {self.joints[joint][:80]!r} by {angle[pose, joint]:.4g}"

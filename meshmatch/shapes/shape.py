@@ -19,6 +19,9 @@ from meshmatch.shapes.cloud import estimate_normals, local_areas, roughness
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
+LARGEST = 1e60
+"""Positions from here on are invalid: squared areas must not overflow."""
+
 
 @dataclass(frozen=True, eq=False)
 class Shape:
@@ -87,8 +90,7 @@ class Shape:
         """
         if len(verts) == 0:
             raise InputError(f"{name or 'the shape'} holds no vertices", "is it a mesh or a point cloud at all?")
-        # Squared areas must not overflow: a position of 1e60 is invalid too.
-        usable = np.asarray((np.abs(verts) < 1e60).all(axis=1))
+        usable = np.asarray((np.abs(verts) < LARGEST).all(axis=1))
         if usable.all():
             return cls(verts, faces, name, colors)
         if not usable.any():

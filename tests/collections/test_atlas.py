@@ -262,6 +262,7 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
         "version": good | {"version": np.int64(2)},
         "versions": good | {"version": np.array([1, 1])},
         "word": good | {"version": np.array("1")},
+        "huge": good | {"deviations": good["deviations"] * 1e200},
         "one": good | {"modes": np.array(1.0)},
         "missing": {name: array for name, array in good.items() if name != "modes"},
         "sizes": good | {"scores": good["scores"][:-1]},

@@ -129,6 +129,7 @@ def test_a_joint_that_the_body_lacks_is_told_with_its_neighbours(rig: Rig, monke
     ("changes", "told"),
     [
         ({"vectors": VECTORS * 57.3}, "more than a full turn"),
+        ({"vectors": VECTORS * 1e30}, "more than a full turn"),
         ({"vectors": np.where(VECTORS == 0.5, np.nan, VECTORS)}, "pose 0 has a rotation of 'head'"),
         ({"vectors": np.where(VECTORS == 0.5, 1e308, VECTORS)}, "pose 0 has a rotation of 'head'"),
         ({"vectors": VECTORS[:, :2]}, "not numbers of"),
