@@ -164,14 +164,13 @@ def make_cases(folder: Path, training: bool) -> list[Case]:
     maps = "map fits -o maps --all --jobs 1 -q"
     mapping = case("map", maps, fitted, all_of("maps"), maps, True)
     atlas = case("atlas", "atlas fits -o out --no-measures --modes 2 -q", fitted, all_of("out"))
-    turn = [add, obj, mapping, add, prepare, add, mapping, add, obj, mapping, add, atlas, add, mapping, match]
-    turn += [add, mapping, obj] * 5 + [prepare, fit]
+    long = [prepare, match, fit, atlas]
     if training:
         learn = "train --shapes out -o m --steps 3 --workers 0 -q"
-        turn.append(case("train", learn, ready, trained, learn))
+        long.append(case("train", learn, ready, trained, learn))
         implicit = "train --implicit --shapes in -o m --steps 3 -q"
-        turn.append(case("train --implicit", implicit, lambda place: write_eggs(place / "in"), learned, implicit))
-    return turn
+        long.append(case("train --implicit", implicit, lambda place: write_eggs(place / "in"), learned, implicit))
+    return [one for last in long for one in (*[add, obj, mapping, add, mapping, add] * 2, last)]
 
 
 def kill(case: Case, seed: int, number: int) -> Outcome:
