@@ -287,13 +287,14 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
     sizes = {"mean": (V, 3), "modes": (M, V, 3), "deviations": (M,), "scores": (S, M), "sizes": (S,)}
     sizes |= {"weights": (V,), "names": (S,), "total": (), "scale": (), "robust": (), "template": ()}
     wrong = [name for name, size in sizes.items() if given[name].shape != size]
-    wrong += [name for name, kind in kinds.items() if kind == "f" and not (np.abs(given[name]) < LARGEST).all()]
+    numbers = {name: given[name].astype(np.float64) for name, kind in kinds.items() if kind == "f"}  # any float is read
+    wrong += [name for name, array in numbers.items() if not (np.abs(array) < LARGEST).all()]
     faces = given["faces"]
     if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or faces.min() < 0 or faces.max() >= V:
         wrong.append("faces")
     if wrong or str(given["scale"]) not in get_args(Scale):
         raise InputError(f"{file} is damaged: {', '.join(wrong) or 'scale'}", "make it again")
-    found: dict[str, Any] = {name: frozen(array) for name, array in given.items()}
+    found: dict[str, Any] = {name: frozen(array) for name, array in (given | numbers).items()}
     found |= {"names": tuple(str(name) for name in given["names"]), "scale": str(given["scale"])}
     found["template"] = str(given["template"])
     return found | {"total": float(given["total"]), "robust": bool(given["robust"])}

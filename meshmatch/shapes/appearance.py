@@ -6,6 +6,7 @@ for it. Faces and vertices are those of `load_shape`, in the same order.
 
 from __future__ import annotations
 
+import logging
 import os
 import struct
 import warnings
@@ -32,6 +33,7 @@ MAX_PIXELS = 8192 * 8192
 """Of one image. Pillow's own alarm stands a little higher."""
 MAX_ALL_PIXELS = 2 * MAX_PIXELS
 """Of all images of one shape together."""
+logging.getLogger("PIL").addHandler(logging.NullHandler())  # else Python prints what nobody listens to
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")
 _DAMAGE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, TypeError, IndexError)
 

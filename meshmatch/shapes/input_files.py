@@ -192,6 +192,9 @@ def _array(file: IO[bytes], name: str, most: int, size: int) -> NDArray[Any]:
         codes = characters.view(np.uint32)
         if ((codes > _LAST_CHARACTER) | ((codes >= 0xD800) & (codes < 0xE000))).any():  # the latter are halves
             raise ValueError(f"{name} holds invalid characters")
+    if array.dtype.kind in "fc" and np.isnan(array).any():
+        with np.errstate(invalid="ignore"):
+            array = np.asarray(array * array.dtype.type(1))  # no nan signals later
     return array
 
 

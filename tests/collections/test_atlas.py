@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -250,6 +251,15 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
                 assert np.array_equal(getattr(again, name), value), name
     atlas.save(tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / FILE).read_bytes()
+
+
+def test_short_numbers_become_long_ones(tmp_path: Path) -> None:
+    given = ellipsoids(5)
+    atlas = Atlas.of(given.points, given.faces)
+    short = {each.name: np.asarray(getattr(atlas, each.name)) for each in fields(atlas)}
+    np.savez(tmp_path / FILE, **short | {"weights": short["weights"].astype(np.float16), "version": np.int64(1)})
+    found = Atlas.load(tmp_path)
+    assert found.weights.dtype == np.float64 and np.allclose(found.weights, atlas.weights, rtol=1e-2)
 
 
 def test_another_file_is_refused(tmp_path: Path) -> None:

@@ -1,6 +1,9 @@
 """What files say about the look of their surfaces."""
 
 import os
+import struct
+import subprocess
+import sys
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -342,6 +345,23 @@ def test_a_damaged_tiff_prints_nothing(capfd: pytest.CaptureFixture[str]) -> Non
     assert capfd.readouterr().err == ""
     os.write(2, b"heard again")
     assert capfd.readouterr().err == "heard again"
+
+
+def test_nothing_is_logged_where_nobody_listens(tmp_path: Path) -> None:
+    """A tiff with more samples for a pixel than there are."""
+    out = BytesIO()
+    Image.fromarray(quarters(16)[..., :3]).save(out, "TIFF")
+    samples = struct.pack("<HHIH", 277, 3, 1, 3)
+    data = out.getvalue().replace(samples, samples[:-2] + struct.pack("<H", 60163))
+    assert data != out.getvalue()
+    (tmp_path / "a.tif").write_bytes(data)
+    code = "import sys; from meshmatch.shapes.appearance import ImageReader\n"
+    code += (
+        "try: ImageReader().decode(open(sys.argv[1], 'rb').read(), 'a.tif')\nexcept Exception as error: print(error)"
+    )
+    words = [sys.executable, "-c", code, tmp_path / "a.tif"]
+    told = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert (told.stderr, told.stdout) == ("", "a.tif cannot be read as an image\n")
 
 
 def test_a_huge_image_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

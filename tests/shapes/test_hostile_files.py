@@ -128,6 +128,28 @@ def test_damaged_stl_says_nothing_else(tmp_path: Path) -> None:
         assert told.stderr.count("\n") == (2 if told.returncode else 0)
 
 
+SIGNALLING = np.array([0x7F800001, 0x3F800000, 0x80000000], np.uint32).view(np.float32)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_npy_with_nans_that_signal(tmp_path: Path, order: str) -> None:
+    """Warnings are errors here; a zero keeps its sign."""
+    np.save(tmp_path / "a.npy", SIGNALLING.astype(SIGNALLING.dtype.newbyteorder(order), copy=False))
+    found = read_npy(tmp_path / "a.npy").astype(np.float64)
+    assert np.isnan(found[0]) and found[1] == 1 and np.signbit(found[2])
+
+
+def test_gltf_with_nans_that_signal(tmp_path: Path) -> None:
+    path = broken(tmp_path)
+    words = json.loads(path.read_text())
+    view = words["bufferViews"][words["accessors"][3]["bufferView"]]
+    data = bytearray(base64.b64decode(words["buffers"][0]["uri"].partition("base64,")[2]))
+    data[view.get("byteOffset", 0) : view.get("byteOffset", 0) + 4] = SIGNALLING[:1].tobytes()
+    words["buffers"][0]["uri"] = f"data:;base64,{base64.b64encode(data).decode()}"
+    path.write_text(json.dumps(words))
+    assert np.isfinite(read_skin(path, path.read_bytes())[0].data).all()
+
+
 @pytest.mark.parametrize("code", [0x110000, 0xD800])
 def test_npy_with_characters_that_do_not_exist(tmp_path: Path, code: int) -> None:
     np.save(tmp_path / "a.npy", np.array(["ab", "cd"]))

@@ -231,7 +231,8 @@ class Document:
             rows = self._view(where, many, 1, np.dtype(_COMPONENTS[where["componentType"]]))
             values = values.copy()
             values[rows[:, 0]] = self._view(sparse["values"], many, width, kind)
-        out = values.astype(np.float64)
+        with np.errstate(invalid="ignore"):  # of a signalling nan
+            out = values.astype(np.float64)
         if accessor.get("normalized") and not whole and kind.kind in "iu":
             out = np.maximum(out / np.iinfo(kind).max, -1.0)
         return out
