@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from meshmatch.errors import OptionError
+from meshmatch.maps.parts import kept_together
 from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VERDICTS, VertexMap
 
@@ -19,6 +20,7 @@ _POOR = 0.5
 def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
     """Map every source vertex through the resting template to the point of the target that belongs nearest to its place.
 
+    Where both shapes are put together from separate parts, parts go to their counterparts (`meshmatch.maps.parts`).
     Confidence is low where a vertex, or the one that it is matched to, lies far from its fitted template; where the
     places are far apart, as on what one shape lacks; and where fits moved much to agree. `OptionError` if the places are
     on different templates.
@@ -26,7 +28,7 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
     if source.template_hash != target.template_hash:
         both = f"{source.template_hash}, {target.template_hash}"
         raise OptionError(f"the fits use different templates ({both})", "fit both shapes with the same model")
-    found = target.nearest(source.resting, workers)
+    found = kept_together(source, target, target.nearest(source.resting, workers), workers)
     along = np.square(found.distance) - np.square(source.height - target.height[found.vertex])
     apart = np.square(source.distance) + np.square(target.distance[found.vertex]) + np.maximum(along, 0.0)
     confidence = np.exp(-apart / _DISTANCE_SCALE**2)

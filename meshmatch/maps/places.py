@@ -106,15 +106,20 @@ class Places:
             fit.reasons,
         )
 
-    def nearest(self, resting: Float[Floats32, "N 3"], workers: int = 1) -> Footpoints:
-        """The points of this shape that belong nearest to N places on the resting template."""
+    def nearest(
+        self, resting: Float[Floats32, "N 3"], workers: int = 1, among: Int[Ints, " F"] | None = None
+    ) -> Footpoints:
+        """The points of this shape that belong nearest to N places on the resting template; of a mesh, ``among`` some of
+        the faces that were fitted."""
         asked = resting.astype(np.float64)
         if len(self._used):
-            found = self._surface.query(asked, None, workers)
-            corners = self.faces[self._used].take(found.face, 0)
+            used = self._used if among is None else among
+            surface = self._surface if among is None else self._surface_of(among)
+            found = surface.query(asked, None, workers)
+            corners = self.faces[used].take(found.face, 0)
             nearest = np.take_along_axis(corners, found.barycentric.argmax(1)[:, None], 1)[:, 0]
             vertex = self.stands[nearest].astype(np.int64)
-            return Footpoints(vertex, self._used[found.face], found.barycentric, found.distance)
+            return Footpoints(vertex, used[found.face], found.barycentric, found.distance)
         known = np.zeros((len(asked), 0 if self.spread is None else 1))
         distance, index = self._tree.query(np.column_stack([asked, known]), workers=workers)
         weights = np.tile([1.0, 0.0, 0.0], (len(asked), 1))
@@ -128,7 +133,10 @@ class Places:
     @cached_property
     def _surface(self) -> Surface:
         """The faces as they lie on the resting template."""
-        return Surface(self.resting.astype(np.float64), self.stands[self.faces[self._used]].astype(np.int64))
+        return self._surface_of(self._used)
+
+    def _surface_of(self, faces: Int[Ints, " F"]) -> Surface:
+        return Surface(self.resting.astype(np.float64), self.stands[self.faces[faces]].astype(np.int64))
 
     @cached_property
     def _points(self) -> Ints:
