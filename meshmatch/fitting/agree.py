@@ -5,6 +5,9 @@ stretch the template alike: a few more Gauss-Newton steps on each fit pull its s
 mean of all. The mean is taken of logarithms, so that doubling and halving cancel (the log-Euclidean mean of Arsigny,
 Fillard, Pennec and Ayache, 2006). Pairs of points hold tighter across the surface than along it, where the stretch
 decides.
+
+Shapes that are not alike, such as people in different clothes, do not stretch the template alike: the more the fits
+differ, the more each keeps the stretch that it had alone.
 """
 
 from __future__ import annotations
@@ -28,18 +31,21 @@ from meshmatch.shapes.shape import Shape
 
 _PAIRING = ("point_share", "pair_normals", "back_points", "shared")
 _MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
+_STEEP = 8  # how suddenly shapes cease to be alike; set by hand
+_SAME = 0.99  # shapes so much alike share the stretch
 
 
 @dataclass(frozen=True)
 class AgreeConfig:
-    """How fits are refined together. Set by hand, on 24 pairs each of SCAPE and FAUST; the last four as in
-    `NodeRefineConfig`.
+    """How fits are refined together. Set by hand, on 24 pairs each of SCAPE and FAUST, ``alike`` on generated people in
+    clothes; the last four as in `NodeRefineConfig`.
     """
 
     steps: int = 8
     strain: float = 0.0001  # weight of the common stretch
     scale: float = 0.05  # of the robust weight (units of sqrt(area))
     momentum: float = 0.6  # how far each step goes on along the last: what slides along the surface has far to go
+    alike: float = 0.4  # two whose logarithms of stretch lie so far apart (median) follow their mean half way
     point_share: float = 0.01
     pair_normals: float = 0.012
     back_points: int = 8000
@@ -56,6 +62,7 @@ class AgreeConfig:
             self,
             strain=geometric_between(self.strain, 80 * self.strain, roughness),
             momentum=self.momentum * (1 - roughness),
+            alike=self.alike / max(1 - roughness, 1e-9),  # noise stretches too
             point_share=geometric_between(self.point_share, max(self.point_share, 3.0), roughness),
             pair_normals=geometric_between(self.pair_normals, 5 * self.pair_normals, roughness),
             back_points=round(self.back_points * (1 + roughness)),
@@ -130,16 +137,33 @@ def agree(
     """
 
     refined = before = [member.vectors for member in members]
+    own = [log_stretch(system.deformation_gradient(vectors)) for vectors in refined]
+    follows = [likeness(log, own, member.config.alike) for log, member in zip(own, members, strict=True)]
     with ThreadPoolExecutor(threads) as pool:
         for _ in range(members[0].config.steps):
             paths = zip(members, refined, before, strict=True)
             before, refined = refined, [now + each.config.momentum * (now - last) for each, now, last in paths]
             gradients = [system.deformation_gradient(vectors) for vectors in refined]
-            common = [mean_stretch(gradients)] * len(members)
+            mean = mean_log([log_stretch(F) for F in gradients])
+            shared = stretch_of(mean)
+            wanted = [
+                shared if share > _SAME else stretch_of(log + share * (mean - log))
+                for log, share in zip(own, follows, strict=True)
+            ]
             refined = list(
-                pool.map(lambda *each: agree_step(system, nodes, *each), members, refined, gradients, common)
+                pool.map(lambda *each: agree_step(system, nodes, *each), members, refined, gradients, wanted)
             )
     return refined
+
+
+def likeness(log: Float[Floats, "G 3 3"], others: Sequence[Float[Floats, "G 3 3"]], half: float) -> float:
+    """How much (0..1) one of several shapes is like all of them, by the logarithms of their stretches.
+
+    It is a half where it differs by ``half``, at the median over the template; of two, their distance from one another.
+    """
+    apart = 2 * (log - mean_log(others))
+    distance = float(np.median(np.linalg.norm(apart.reshape(len(log), -1), axis=1)))
+    return 1 / (1 + (distance / half) ** _STEEP)
 
 
 def agree_step(
@@ -160,12 +184,12 @@ def agree_step(
     return system.solve(*terms, config.strain / len(F), targets, nodes.damping / system.K, vectors)
 
 
-def mean_stretch(gradients: Sequence[Float[Floats, "G 3 3"]]) -> Float[Floats, "G 3 3"]:
-    """Log-Euclidean mean of the right stretches sqrt(F^T F): exp of the mean of their logarithms."""
-    total = np.zeros_like(gradients[0])
-    for F in gradients:
-        total += log_stretch(F)
-    return stretch_of(total / len(gradients))
+def mean_log(logs: Sequence[Float[Floats, "G 3 3"]]) -> Float[Floats, "G 3 3"]:
+    """Mean of logarithms of stretches; its exponential is the log-Euclidean mean of the stretches."""
+    total = np.zeros_like(logs[0])
+    for log in logs:
+        total += log
+    return total / len(logs)
 
 
 def log_stretch(F: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:

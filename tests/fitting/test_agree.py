@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from meshmatch.fitting.agree import AgreeConfig, Member, agree, agreed_fits, mean_stretch
+from meshmatch.fitting.agree import AgreeConfig, Member, agree, agreed_fits, likeness, log_stretch, mean_log, stretch_of
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.nodes import NodeRefineConfig
@@ -36,6 +36,10 @@ def system(model: TrainedModel) -> NodeSystem:
 def stretches(*factors: float) -> np.ndarray:
     """(4, 3, 3) the same stretch along the axes, each under another rotation from the left."""
     return TURNS @ np.diag(factors)
+
+
+def mean_stretch(gradients: list[np.ndarray]) -> np.ndarray:
+    return stretch_of(mean_log([log_stretch(F) for F in gradients]))
 
 
 def test_doubling_and_halving_cancel() -> None:
@@ -89,6 +93,32 @@ def test_two_that_are_equal_stay_so_and_the_same_twice(system: NodeSystem, model
     first, again = (agree(system, [member, member], NodeRefineConfig()) for _ in range(2))
     assert np.array_equal(first[0], first[1])
     assert np.array_equal(first[0], again[0])
+
+
+def test_two_are_alike_by_how_far_their_stretches_are_apart() -> None:
+    one, other = (log_stretch(stretches(np.exp(x), 1.0, 1.0)) for x in (0.1, 0.5))
+    assert likeness(one, [one, one], 0.4) == 1.0
+    assert likeness(one, [one, other], 0.4) == pytest.approx(0.5)
+    assert likeness(other, [one, other], 0.8) == pytest.approx(1 / (1 + 0.5**8))
+    assert likeness(other, [one, other], 0.2) == pytest.approx(1 / (1 + 2.0**8))
+
+
+def test_a_thick_and_a_thin_one_keep_their_stretch(system: NodeSystem, model: TrainedModel) -> None:
+    """An egg, and one half as thick again: made to agree they come closer in stretch; by themselves they do not."""
+    scan, nodes = scan_of(system), model.template.nodes
+    thick = OrientedPoints(scan.points * [1.5, 1, 1.5], scan.normals)
+    vectors = [np.zeros_like(nodes), nodes * [0.5, 0, 0.5]]
+
+    def apart(alike: float) -> float:
+        config = AgreeConfig(steps=6, strain=1.0, alike=alike)
+        members = [Member(each, start, config) for each, start in zip((scan, thick), vectors, strict=True)]
+        one, other = (
+            log_stretch(system.deformation_gradient(each)) for each in agree(system, members, NodeRefineConfig())
+        )
+        return float(np.linalg.norm((one - other).reshape(len(one), -1), axis=1).mean())
+
+    assert AgreeConfig().alike < 0.5
+    assert apart(AgreeConfig().alike) > 1.5 * apart(np.inf)
 
 
 def test_landmarks_hold(system: NodeSystem, model: TrainedModel) -> None:
