@@ -21,7 +21,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates import prepared_folder
 from meshmatch.templates.make import LOW_FACES, NodeConfig, low_mesh, make_template
 from meshmatch.templates.prepared_folder import MAX_RESIDUAL, find_landmarks
-from meshmatch.templates.sides import mirrored, other_side
+from meshmatch.templates.sides import is_other_side, mirrored, other_side
 from meshmatch.templates.template import Scale, Template, save_arrays, save_template
 
 MIN_FACES = 50
@@ -45,7 +45,7 @@ class PrepareConfig:
     template: str | Path | None = None
     align: Align | None = None
     scale: Scale = "area"  # which size of every shape is made that of the template
-    mirror: Mirroring = "auto"  # mirror those that are mirror images of most others, or never
+    mirror: Mirroring = "auto"  # mirror those of the other side than most, or than a named template; or never
     landmarks: str | Path | None = None  # a folder or suffix: where they are, see `find_landmarks`
     labels: Int[Ints, " V"] | None = None  # part of every vertex of a single shape's file, from 0; for "parts"
 
@@ -110,8 +110,9 @@ def prepare(
 def _prepare_folder(folder: Path, output: Path, config: PrepareConfig, progress: Progress) -> Prepared:
     notes: list[str] = []
     found, marks = _read_shapes(folder, output, config, notes, progress.between(0.0, 0.5))
-    flags = _mirror_some(found, marks, config, notes, progress.between(0.5, 0.6))
-    first, own = _template_shape(folder, config, found, notes)
+    named = _named_template(folder, config, found)
+    flags = _mirror_some(found, marks, config, named, notes, progress.between(0.5, 0.6))
+    first, own = _template_shape(named, config, found, notes)
     low = low_mesh(first.shape, config.faces, config.decimate)
     vertices = first.kept_vertex[low[0]]
     stack = prepared_folder.registered_stack(first, found, vertices, notes)
@@ -189,22 +190,31 @@ def _mirror_some(
     found: list[Repaired],
     marks: list[Float[Floats, "L 3"] | None],
     config: PrepareConfig,
+    named: Repaired | int | None,
     notes: list[str],
     progress: Progress,
 ) -> list[bool]:
-    """Mirror the shapes that are mirror images of most others, in place, with their landmarks; which they are."""
+    """Mirror the shapes that are of the other side than most, or than the ``named`` template (a shape, or the number of
+    one), in place, with their landmarks; which they are."""
     if config.mirror == "no" or len(found) > _MOST_SIDES or prepared_folder.same_faces(found[0], found):
         return [False] * len(found)
-    flags = other_side(found, config.scale, config.nodes.seed, progress).tolist()
+    flags = other_side(found, config.scale, config.nodes.seed, progress)
+    if flags.any() and named is not None:
+        if isinstance(named, int):
+            other = bool(flags[named])
+        else:
+            one_side = [clean for clean, flag in zip(found, flags, strict=True) if not flag]
+            other = is_other_side(named, one_side, config.scale, config.nodes.seed)
+        flags = flags ^ other
     for number in np.flatnonzero(flags):
         found[number] = repair(mirrored(found[number].original))
         if (known := marks[number]) is not None:
             marks[number] = known * [-1, 1, 1]
-    if any(flags):
+    if flags.any():
         names = [clean.original.name for clean, flag in zip(found, flags, strict=True) if flag]
         shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
         notes.append(f"{len(names)} of {len(found)} shapes are mirror images of the others, and were mirrored: {shown}")
-    return flags
+    return flags.tolist()
 
 
 def _template_file(path: Path) -> Repaired:
@@ -217,18 +227,27 @@ def _template_file(path: Path) -> Repaired:
         raise InputError(f"{path.name} cannot be a template: {error.message}", error.hint) from error
 
 
+def _named_template(folder: Path, config: PrepareConfig, found: list[Repaired]) -> Repaired | int | None:
+    """The template that the config names: the number of one of the shapes that were found, or a shape of its own."""
+    if config.template is None:
+        return None
+    path = Path(config.template)
+    same = path.is_file() and path.resolve().parent == folder.resolve()
+    wanted = {str(config.template)} | ({path.name} if same else set())
+    for number, clean in enumerate(found):
+        if wanted & {clean.original.name, Path(clean.original.name).stem}:
+            return number
+    return _template_file(path)
+
+
 def _template_shape(
-    folder: Path, config: PrepareConfig, found: list[Repaired], notes: list[str]
+    named: Repaired | int | None, config: PrepareConfig, found: list[Repaired], notes: list[str]
 ) -> tuple[Repaired, int | None]:
     """The template's shape, and its number if it is one of those that were found."""
-    if config.template is not None:
-        path = Path(config.template)
-        same = path.is_file() and path.resolve().parent == folder.resolve()
-        wanted = {str(config.template)} | ({path.name} if same else set())
-        for number, clean in enumerate(found):
-            if wanted & {clean.original.name, Path(clean.original.name).stem}:
-                return clean, number
-        return _template_file(path), None
+    if isinstance(named, int):
+        return found[named], named
+    if named is not None:
+        return named, None
     number, why = next((k for k, clean in enumerate(found) if not clean.shape.is_cloud), 0), ""
     if len(found) > 1 and not prepared_folder.same_faces(found[number], found):
         number = prepared_folder.medoid(found, config.align or "rigid", config.scale, config.nodes.seed)

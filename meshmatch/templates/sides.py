@@ -67,6 +67,17 @@ def other_side(shapes: Sequence[Repaired], scale: Scale, seed: int, progress: Pr
     return np.asarray(sides < 0) if (sides < 0).sum() <= N / 2 else np.asarray(sides > 0)
 
 
+def is_other_side(shape: Repaired, others: Sequence[Repaired], scale: Scale, seed: int) -> bool:
+    """Whether a shape is the mirror image of what some shapes of one side are."""
+    part = _samples(shape.shape, scale, [seed, len(others)])
+    image, evidence = _image(part), 0.0
+    for number in np.unique(np.linspace(0, len(others) - 1, min(len(others), _COMPARED)).astype(int)):
+        one = _samples(others[number].shape, scale, [seed, int(number)])
+        same, other = (align(each, one, "rigid")[0].residual for each in (part, image))
+        evidence += float(np.log(other / same))
+    return evidence < 0
+
+
 def _samples(shape: Shape, scale: Scale, seed: list[int]) -> OrientedPoints:
     return sample_surface(shape, _SAMPLES, np.random.default_rng(seed)).in_frame(unit_frame(shape, scale, 0.5))
 

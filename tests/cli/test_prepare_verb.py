@@ -15,6 +15,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import load_template
 from tests.cli.conftest import Answer, Run
+from tests.templates.test_sides import LEFT, hook
 
 # A sphere of area 1 has a radius of 0.28: a few nodes with a wide reach support it.
 FEW = ("--nodes", "60", "--radius", "0.3")
@@ -190,3 +191,21 @@ def test_an_output_folder_that_cannot_be(run: Run, two: tuple[Path, Path]) -> No
 def test_quiet(run: Run, two: tuple[Path, Path], tmp_path: Path) -> None:
     answer = run("prepare", two[0], "-o", tmp_path / "out", *FEW, "--quiet")
     assert (answer.status, answer.out, answer.err) == (0, "", "")
+
+
+def test_mirror_images_are_found_and_said_unless_forbidden(run: Run, tmp_path: Path) -> None:
+    shapes = tmp_path / "hooks"
+    shapes.mkdir()
+    for number, left in enumerate(LEFT):
+        shape = hook(number, left)
+        order = np.random.default_rng(number).permutation(shape.F)  # not registered
+        save_shape(shapes / f"{number}.ply", Shape(shape.verts, shape.faces[order]))
+    usual = (*FEW, "--faces", "500", "--template", "0", "--json")
+    answer = run("prepare", shapes, "-o", tmp_path / "out", *usual)
+    assert made(answer)["mirrored"] == ["1.ply", "4.ply"]
+    assert "2 of 6 shapes are mirror images of the others, and were mirrored: 1.ply, 4.ply" in answer.err
+    answer = run("prepare", shapes, "-o", tmp_path / "as_given", *usual, "--mirror", "no")
+    assert made(answer)["mirrored"] == []
+    assert "mirror images" not in answer.err
+    answer = run("prepare", shapes, "-o", tmp_path / "none", *usual, "--mirror", "yes")
+    assert answer.status == 2

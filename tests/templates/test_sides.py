@@ -12,7 +12,7 @@ from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.prepared_folder import has_sides
-from meshmatch.templates.sides import mirrored, other_side
+from meshmatch.templates.sides import is_other_side, mirrored, other_side
 from tests.conftest import icosphere
 
 
@@ -82,3 +82,23 @@ def test_prepare_mirrors_them_with_their_landmarks(hooks: Path, tmp_path: Path) 
         known = load_file(tmp_path / folder / "points.safetensors")["landmarks"]
         spread.append(np.linalg.norm(known - known[:1], axis=2).mean(1))
     assert spread[0].max() < 0.1 < spread[1][[1, 4]].min()
+
+
+@pytest.mark.parametrize("named", ["1", "4.ply", "file"])
+def test_a_template_of_the_rarer_side_is_the_side(hooks: Path, tmp_path: Path, named: str) -> None:
+    """By its name in the folder, or a file of its own: the four others are mirrored then."""
+    if named == "file":
+        save_shape(tmp_path / "another.ply", hook(9, left=True))
+        named = str(tmp_path / "another.ply")
+    made = prepare(hooks, tmp_path / "made", PrepareConfig(faces=500, template=named))
+    assert made.mirrored == ("0.ply", "2.ply", "3.ply", "5.ply")
+    made = prepare(hooks, tmp_path / "as_given", PrepareConfig(faces=500, template=named, mirror="no"))
+    assert made.mirrored == ()
+
+
+def test_a_template_of_the_usual_side_changes_nothing(hooks: Path, tmp_path: Path) -> None:
+    save_shape(tmp_path / "another.ply", hook(9, left=False))
+    made = prepare(hooks, tmp_path / "made", PrepareConfig(faces=500, template=tmp_path / "another.ply"))
+    assert made.mirrored == ("1.ply", "4.ply")
+    usual = [repair(hook(number, left=False)) for number in range(3)]
+    assert [is_other_side(repair(hook(9, left)), usual, "area", 0) for left in (False, True)] == [False, True]
