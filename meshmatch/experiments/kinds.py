@@ -165,7 +165,13 @@ def measured_scans(
         sides["wrong_called_good"] = good
         columns = {"shapes": "shapes:d", "left": "left:d", "right side found": "found:.1%"}
         tables.append(runner.table("Sides", [sides], columns | {"wrong pairs called good": "wrong_called_good:d"}))
-        record["sides"] = sides
+
+        def side(name: str) -> str:
+            return "left" if scans[name].mirrored else "right"
+
+        each = rows_of(errors, lambda pair: f"{side(pair[0])} to {side(pair[1])}")
+        tables.append(runner.table("By the sides of a pair", each, {"sides": "of", **_COLUMNS}))
+        record["sides"] = sides | {"by_side": each, "wrong": sorted(wrong)}
     return record, tables
 
 
