@@ -72,8 +72,11 @@ def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caps
     human = as_model("human")
     both = TrainedModel(replace(human.card, mirror="auto"), human.template, human.inference)
     record, tables = kinds.measured_scans("hand", 3, kinds.Matcher(both), "no", tmp_path / "cache")
-    assert len(tables) == 2
+    assert len(tables) == 3
     sides = record["sides"]
+    assert {row["of"]: row["pairs"] for row in sides["by_side"]} == {
+        "left to right": 2, "right to left": 2, "right to right": 2,
+    }  # fmt: skip
     assert (sides["shapes"], sides["left"], sides["found"]) == (3, 1, pytest.approx(2 / 3))
     good = [name for name, verdict in record["verdicts"].items() if verdict == "good"]
     pairs = [1 for name in good for other in good if name != other and balls[1].name in (name, other)]
