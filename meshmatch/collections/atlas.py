@@ -24,6 +24,7 @@ from meshmatch.shapes.shape import LARGEST, Shape
 VERSION = 1
 """Of the arrays in ``atlas.npz``."""
 FILE = "atlas.npz"
+_ROUNDED = 0.01  # a sum of weights in half precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,6 +290,9 @@ def _strict(file: Path, given: dict[str, Any]) -> dict[str, Any]:
     wrong = [name for name, size in sizes.items() if given[name].shape != size]
     numbers = {name: given[name].astype(np.float64) for name, kind in kinds.items() if kind == "f"}  # any float is read
     wrong += [name for name, array in numbers.items() if not (np.abs(array) < LARGEST).all()]
+    wrong += [name for name in ("deviations", "sizes") if not (numbers[name] > 0).all()]
+    if (numbers["weights"] < 0).any() or abs(numbers["weights"].sum() - 1) > _ROUNDED:
+        wrong.append("weights")
     faces = given["faces"]
     if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or faces.min() < 0 or faces.max() >= V:
         wrong.append("faces")

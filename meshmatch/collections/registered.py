@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -102,7 +103,7 @@ def read_group(path: str | Path, shapes: Registered) -> list[str]:
         word = line.strip()
         if not word:
             continue
-        meant = [name for name in (word, str(Path(word).with_suffix(""))) if name in known or name in shapes.left_out]
+        meant = [name for name in (word, os.path.splitext(word)[0]) if name in known or name in shapes.left_out]
         if not meant:
             close = get_close_matches(word, shapes.names, n=1)
             hint = f"did you mean {close[0]}?" if close else "write one name a line"

@@ -88,7 +88,7 @@ def make_cases(folder: Path, training: bool) -> list[Case]:
 
         def found() -> dict[str, str]:
             held = {str(path.relative_to(place)): path for path in outputs(place) if path.is_file()}
-            return {name: _digest(path) for name, path in held.items() if "/." not in f"/{name}"}
+            return {name: digest(path) for name, path in held.items() if "/." not in f"/{name}"}
 
         one = Case(name, place, tuple(words.split()), reset, found, tuple(after.split()), apart=apart)
         one.states.append(found())
@@ -265,7 +265,8 @@ def _run(place: Path, words: tuple[str, ...]) -> int:
         sys.stdout.flush()
 
 
-def _digest(path: Path) -> str:
+def digest(path: Path) -> str:
+    """Of what a file says."""
     data = path.read_bytes()
     if path.suffix == ".safetensors":  # its writer shuffles the words in the header
         size = 8 + int.from_bytes(data[:8], "little")

@@ -95,7 +95,7 @@ def trainers() -> tuple[Trainer, Trainer]:
 def learned_samples(folder: Path) -> Iterator[tuple[str, Path, str]]:
     """Family, folder and the file in it that is read, of everything that is learned."""
     eggs = folder / "eggs"
-    write_eggs(eggs)
+    write_eggs(eggs, 3)
     collection = Collection(folder / "fits", workers=1)
     collection.fit(eggs, model="none")
     for unused in ("first", "first.safetensors", ".lock", "fits.csv"):

@@ -29,6 +29,7 @@ FAR = 0.05
 ARRAYS = ("points", "distances", "normals")
 _DENSE, _MOST, _ALL = 40_000, 16_384, 40_000_000  # surface points; samples of a shape, and of a folder
 _HUGE = 1e100  # whose square is a number
+_BEYOND = 1e30  # half sides of the cube, still a float32
 _NEAR = 0.05  # deviation of the free points that lie near a surface
 _KINDS = {*SUFFIXES, ".npz"} - {".npy"}  # arrays beside shapes are labels or landmarks
 
@@ -88,9 +89,12 @@ def samples_of(
         raise InputError(what, "distances are negative inside")
     low, high = inside.min(0), inside.max(0)
     frame = Frame(float((high - low).max()) / (2 * FILLED), np.eye(3), (low + high) / 2)
-    points = frame.apply(points)
+    with np.errstate(over="ignore"):
+        points, distances = frame.apply(points), distances / frame.scale
+    if not all((np.abs(each) < _BEYOND).all() for each in (points, distances)):
+        raise InputError(f"{_name(source)} has points far beyond the shape", "leave these points out")
     if len(distances):
-        rows = _nearer_first(points, distances / frame.scale, N, rng)
+        rows = _nearer_first(points, distances, N, rng)
     else:
         rows = free_and_surface(points, normals, N, rng) if solid else off_surface(points, normals, N, rng)
     return frame, rows.astype(np.float32)

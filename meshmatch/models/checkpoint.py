@@ -83,11 +83,11 @@ def load_weights(path: str | Path, expected: Mapping[str, tuple[int, ...]]) -> d
     found: dict[str, np.ndarray] = {}
     for name in expected:
         array = arrays[name]
-        if array.dtype == np.int8:
-            with np.errstate(invalid="ignore"):  # a scale that is not finite is refused below
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused below
+            if array.dtype == np.int8:
                 array = array.astype(np.float32) * arrays[name + SCALE][:, None]
-        elif array.dtype.kind == "f":
-            array = array.astype(np.float32)
+            elif array.dtype.kind == "f":
+                array = array.astype(np.float32)
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise _mismatch(path, f"{name} is not finite")
         found[name] = array

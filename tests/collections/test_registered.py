@@ -75,6 +75,9 @@ def test_a_group_is_a_list_of_names(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no shape called é d") as refused:
         read_group(file, shapes)
     assert refused.value.hint == "did you mean é c?"
+    file.write_text("/\n")
+    with pytest.raises(InputError, match="no shape called /"):
+        read_group(file, shapes)
     with pytest.raises(InputError):
         read_group(tmp_path / "gone.txt", shapes)
 
