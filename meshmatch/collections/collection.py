@@ -28,6 +28,7 @@ from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.build import build_map
+from meshmatch.maps.files import check_suffix
 from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import AUTO
@@ -156,14 +157,16 @@ class Collection:
         """Write the maps of pairs of names, by default of all, and return how many there are.
 
         The one from A to B is ``output/A/B`` with the suffix, which chooses the format. Maps that are as new as the fits
-        are kept. `MeshmatchError`: an unknown name or format, or the folder cannot be written.
+        are kept. `MeshmatchError`: an unknown name or format, or the folder cannot be written, or is by somebody else.
         """
+        check_suffix(Path(f"map{suffix}"))
         wanted = self.pairs() if pairs is None else list(pairs)
         known = set(self.names)
         for name in (name for pair in wanted for name in pair if name not in known):
             self._read(name)  # says what is wrong
-        with hired(self.workers) as crew:
-            return map_all(self.store, Store.of(output), wanted, suffix, crew, self.progress)
+        maps = Store.of(output)
+        with maps.alone(), hired(self.workers) as crew:
+            return map_all(self.store, maps, wanted, suffix, crew, self.progress)
 
     def atlas(self, *, modes: int = 100, scale: Scale = "keep", robust: bool = False, poor: bool = False) -> Atlas:
         """The mean and the modes of the fitted shapes, see `Atlas.of`; poor fits count only if asked for."""

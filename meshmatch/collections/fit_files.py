@@ -20,13 +20,17 @@ from meshmatch.fitting.fit import Fit, Reason
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.places import Places
+from meshmatch.maps.vertex_map import VERDICTS
 from meshmatch.models.tensor_file import read_header
 from meshmatch.shapes.shape import LARGEST
 from meshmatch.templates.template import Template, save_arrays
 
 SCHEMA = 1
 _HINT = "fit the shape again: remove the file, and run `meshmatch fit` as before"
-_FIT_WORDS = ("template_hash", "residual", "verdict", "up", "front", "seed", "partial", "model")
+_FIT_WORDS = {
+    **dict.fromkeys(("template_hash", "verdict", "up", "front", "model"), str),
+    **{"residual": float, "seed": int, "partial": bool},
+}
 _PLACES = ("resting", "height", "distance", "stands", "faces", "fitted")
 _FAR = 1e6  # units of sqrt(area)
 _OPTIONAL = ("shift", "spread")
@@ -97,6 +101,9 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
         if about["template_hash"] != template.hash:
             wrong = f"{path.name} is a fit of another template ({about['template_hash']}, not {template.hash})"
             raise InputError(wrong, "a collection holds fits of one model")
+        odd = [name for name, kind in _FIT_WORDS.items() if type(about[name]) is not kind]
+        if odd or about["verdict"] not in VERDICTS:
+            raise ValueError(f"its {odd[0] if odd else 'verdict'} cannot be")
         V = template.shape.V
         fit = Fit(
             frame=Frame(float(about["scale"]), arrays["rotation"], arrays["center"]),
@@ -105,7 +112,7 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
             resting=np.asarray(template.shape.verts),
             faces=np.asarray(template.shape.faces),
             verts=np.empty((0, 3)),
-            reasons=tuple(Reason(code, sentence) for code, sentence in about["reasons"]),
+            reasons=tuple(Reason(code, str(sentence)) for code, sentence in about["reasons"]),
             seconds=0.0,
             **{name: about[name] for name in _FIT_WORDS},
         )

@@ -14,7 +14,7 @@ from meshmatch.collections.stores import Store
 from meshmatch.collections.workers import Died, Workers
 from meshmatch.errors import InputError
 from meshmatch.maps.build import build_map
-from meshmatch.maps.files import check_suffix, save_map
+from meshmatch.maps.files import save_map
 from meshmatch.maps.places import Places
 from meshmatch.outputs import as_path
 from meshmatch.progress import ProgressCallback
@@ -87,7 +87,6 @@ def map_all(
     progress: ProgressCallback | None = None,
 ) -> int:
     """Maps of pairs of fits; see `Collection.save_maps`."""
-    check_suffix(Path(f"map{suffix}"))
     sources: dict[str, list[str]] = defaultdict(list)
     for source, target in pairs:
         sources[target].append(source)

@@ -160,7 +160,7 @@ def make_cases(folder: Path, training: bool) -> list[Case]:
     prepare = case("prepare", "prepare in -o out --nodes 40 --radius 0.4 --strategy uniform -q", collection, prepared)
     match = case("match", "match a.ply b.ply -o m.npz -q", pair, lambda place: [place / "m.npz"])
     fits = "fit in -o fits --model none --jobs 1 -q"
-    fit = case("fit", fits, lambda place: write_eggs(place / "in", 3), all_of("fits/fits"), fits, True)
+    fit = case("fit", fits, lambda place: write_eggs(place / "in"), all_of("fits/fits"), fits, True)
     maps = "map fits -o maps --all --jobs 1 -q"
     mapping = case("map", maps, fitted, all_of("maps"), maps, True)
     atlas = case("atlas", "atlas fits -o out --no-measures --modes 2 -q", fitted, all_of("out"))

@@ -1,6 +1,6 @@
 """Samples of what is learned from shapes, for `experiments.hostile`: fits, atlases, prepared folders, models, checkpoints.
 
-All of it is made of a few eggs in seconds, so that the files are small.
+All of it is made of three eggs in seconds, so that the files are small.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _KINDS = {"F64": "<f8", "F32": "<f4", "I32": "<i4", "I64": "<i8"}
 _IMPLICIT_NETWORK = ImplicitConfig("mls", code=8, width=24, depth=2, inner=8, nodes=20)
 
 
-def write_eggs(folder: Path, count: int = 4, splits: int = 3) -> None:
+def write_eggs(folder: Path, count: int = 3, splits: int = 3) -> None:
     """Eggs that share their triangles, an icosahedron's split so often."""
     folder.mkdir(parents=True)
     ball, rng = icosphere(splits), np.random.default_rng(8)
@@ -95,7 +95,7 @@ def trainers() -> tuple[Trainer, Trainer]:
 def learned_samples(folder: Path) -> Iterator[tuple[str, Path, str]]:
     """Family, folder and the file in it that is read, of everything that is learned."""
     eggs = folder / "eggs"
-    write_eggs(eggs, 3)
+    write_eggs(eggs)
     collection = Collection(folder / "fits", workers=1)
     collection.fit(eggs, model="none")
     for unused in ("first", "first.safetensors", ".lock", "fits.csv"):

@@ -1,6 +1,6 @@
 """Trainings that are killed at random moments and gone on with: are their weights those of one that nobody disturbed?
 
-Small networks learn from four eggs, with nodes and implicitly in turn, and write a checkpoint after every step. Each is
+Small networks learn from three eggs, with nodes and implicitly in turn, and write a checkpoint after every step. Each is
 ended by SIGKILL at a random moment, up to three times and mostly after a step, then goes on to its end. Its weights must be
 equal bit for bit.
 """

@@ -23,7 +23,7 @@ from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.input_files import read_bytes, read_json, read_npy, read_npz
-from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.shape import LARGEST, Shape
 
 VALUE_SUFFIXES = (".npy", ".csv", ".ply")
 _COLOR_SUFFIXES = (".ply", ".glb", ".obj", ".off", ".npy", ".csv")
@@ -242,13 +242,16 @@ def _normalized(name: str, matrix: csr_array, shape: Shape) -> csr_array:
     if matrix.shape[0] != shape.V:
         problem = f"{name} has weights of {matrix.shape[0]} vertices, but {shape.name or 'the source'} has {shape.V}"
         raise InputError(problem, "one row is needed for each vertex of the source, in the order of its file")
+    if matrix.nnz and not np.abs(matrix.data).max() < LARGEST:
+        raise InputError(f"{name}: a weight is too large ({matrix.data.max():g})", "weights are shares from 0 to 1")
     matrix.sum_duplicates()
     if matrix.nnz and matrix.data.min() < 0:
         raise InputError(f"{name}: a weight is negative ({matrix.data.min():g})", "weights are shares from 0 to 1")
     total = np.asarray(matrix.sum(axis=1)).ravel()
-    if not (total > 0).any():
+    some = total > 1 / LARGEST
+    if not some.any():
         raise InputError(f"{name}: all weights are 0", "is it the right file?")
-    scale = np.where(total > 0, 1.0 / np.where(total > 0, total, 1.0), 0.0)
+    scale = np.where(some, 1.0 / np.where(some, total, 1.0), 0.0)
     matrix = csr_array(matrix * scale[:, None])
     matrix.eliminate_zeros()
     return matrix

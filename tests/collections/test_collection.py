@@ -20,6 +20,7 @@ from meshmatch.errors import InputError, MeshmatchError, OptionError, OutputErro
 from meshmatch.experiments.hostile_learned import write_eggs
 from meshmatch.fitting.agree import agree_step
 from meshmatch.fitting.fitter import Fitter
+from meshmatch.locks import locked
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 
@@ -163,13 +164,27 @@ def test_fits_alone_do_not_move(shapes: Path, tmp_path: Path) -> None:
 def test_maps_are_written_once(made: tuple[Path, tuple[Record, ...]], tmp_path: Path) -> None:
     collection, folder = meshmatch.Collection(made[0], workers=1), tmp_path / "maps"
     assert collection.save_maps(folder) == 6
-    written = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
+    written = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.npz"))
     assert written == [f"{a}/{b}.npz" for a in NAMES for b in NAMES if a != b]
     read = meshmatch.load_map(folder / "dancer" / "turned.npz", SAMPLES / "dancer.ply")
     assert np.array_equal(read.index, collection.map("dancer", "turned").index)
     times = [path.stat().st_mtime_ns for path in sorted(folder.rglob("*.npz"))]
     assert collection.save_maps(folder, [("dancer", "turned")]) == 1
     assert [path.stat().st_mtime_ns for path in sorted(folder.rglob("*.npz"))] == times
+
+
+def test_what_a_killed_map_left_is_swept_and_two_at_once_are_refused(
+    made: tuple[Path, tuple[Record, ...]], tmp_path: Path
+) -> None:
+    collection, maps = meshmatch.Collection(made[0], workers=1), tmp_path / "maps"
+    half = maps / "climber" / ".dancer.0123abcd.npz"
+    half.parent.mkdir(parents=True)
+    half.write_bytes(b"half")
+    with locked(maps / ".lock", "", ""), pytest.raises(OutputError, match="another process writes to"):
+        collection.save_maps(maps, [("climber", "dancer")])
+    assert half.exists()
+    assert collection.save_maps(maps, [("climber", "dancer")]) == 1
+    assert [path.name for path in half.parent.iterdir()] == ["dancer.npz"]
 
 
 def test_what_is_wrong_is_said(made: tuple[Path, tuple[Record, ...]], shapes: Path, tmp_path: Path) -> None:
@@ -222,7 +237,12 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
         load_fit(broken, template)
     broken.write_bytes(whole)
     fit = load_fit(broken, template).fit
-    for wrong in (replace(fit, frame=replace(fit.frame, scale=1e70)), replace(fit, points=1e200 * fit.points)):
+    for wrong in (
+        replace(fit, verdict="fine"),
+        replace(fit, seed="0"),
+        replace(fit, frame=replace(fit.frame, scale=1e70)),
+        replace(fit, points=1e200 * fit.points),
+    ):
         save_fit(broken, wrong)
         with pytest.raises(InputError, match="cannot be"):
             load_fit(broken, template)

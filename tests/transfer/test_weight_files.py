@@ -129,6 +129,8 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "flat": ("a.npz", table(weights=np.ones(SHAPE.V)), "not a table of numbers"),
     "nan": ("a.npz", table(weights=np.full((SHAPE.V, 2), np.nan)), "not a table of numbers"),
     "negative": ("a.npz", table(weights=np.tile([2.0, -1.0], (SHAPE.V, 1))), "negative"),
+    "huge": ("a.npz", table(weights=np.full((SHAPE.V, 2), 1e308)), "a weight is too large"),
+    "tiny": ("a.npz", table(weights=np.full((SHAPE.V, 2), 1e-320)), "all weights are 0"),
     "all zero": ("a.npz", table(weights=np.zeros((SHAPE.V, 2))), "all weights are 0"),
     "wrong length": ("a.npz", table(weights=np.ones((9, 2))), "9 vertices, but sphere1 has 42"),
     "unlike": (
