@@ -84,7 +84,11 @@ def load_words(path: str | Path) -> tuple[Words, Words]:
             header = json.loads((file.metadata() or {})["fit"])
         if header["schema"] != SCHEMA:
             raise InputError(f"{path.name} has fit schema {header['schema']!r}, not {SCHEMA}", "update meshmatch")
-        return dict(header["fit"]), dict(header["more"])
+        about, more = dict(header["fit"]), dict(header["more"])
+        odd = [name for name, kind in _FIT_WORDS.items() if type(about[name]) is not kind]
+        if odd or about["verdict"] not in VERDICTS:
+            raise InputError(f"{path.name}: its {odd[0] if odd else 'verdict'} cannot be", _HINT)
+        return about, more
     except ModelError as error:
         raise InputError(error.message, _HINT) from error
     except (SafetensorError, KeyError, TypeError, ValueError, OSError, RecursionError) as error:
@@ -101,9 +105,6 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
         if about["template_hash"] != template.hash:
             wrong = f"{path.name} is a fit of another template ({about['template_hash']}, not {template.hash})"
             raise InputError(wrong, "a collection holds fits of one model")
-        odd = [name for name, kind in _FIT_WORDS.items() if type(about[name]) is not kind]
-        if odd or about["verdict"] not in VERDICTS:
-            raise ValueError(f"its {odd[0] if odd else 'verdict'} cannot be")
         V = template.shape.V
         fit = Fit(
             frame=Frame(float(about["scale"]), arrays["rotation"], arrays["center"]),

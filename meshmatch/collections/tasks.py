@@ -154,9 +154,10 @@ def agree_a_little(task: AgreeTask) -> Float[Floats, "G 3 3"]:
 
 
 def _member(read: StoredFit, how: AgreeConfig) -> Member:
-    if read.samples is None:
+    roughness = read.words.get("roughness")
+    if read.samples is None or type(roughness) is not float:
         raise InputError("a fit that should agree has no samples", "remove the folder of fits, and make it again")
-    return Member(read.samples, read.fit.vectors, how.for_noise(float(read.words["roughness"])), None, read.fit.partial)
+    return Member(read.samples, read.fit.vectors, how.for_noise(roughness), None, read.fit.partial)
 
 
 def _starts(members: Sequence[Member], now: Floats, before: Floats) -> list[Floats]:

@@ -171,7 +171,10 @@ def _json(data: bytes, rng: np.random.Generator) -> bytes:
         except (ValueError, struct.error, IndexError, RecursionError):
             continue
         if isinstance(found, dict | list) and found:
-            return put_back(json.dumps(_changed(found, rng)).encode("utf-8", "surrogatepass"))
+            try:
+                return put_back(json.dumps(_changed(found, rng)).encode("utf-8", "surrogatepass"))
+            except RecursionError:  # it was nested twice
+                break
     return _flip(data, rng)
 
 

@@ -235,6 +235,11 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
     broken.write_bytes(len(text).to_bytes(8, "little") + text + whole[size:])
     with pytest.raises(InputError, match="too large"):
         load_fit(broken, template)
+    del about_fit["fit"]["verdict"]
+    text = json.dumps(header | {"__metadata__": {"fit": json.dumps(about_fit)}}).encode()
+    broken.write_bytes(len(text).to_bytes(8, "little") + text + whole[size:])
+    with pytest.raises(InputError, match="not a fit's file"):
+        load_words(broken)
     broken.write_bytes(whole)
     fit = load_fit(broken, template).fit
     for wrong in (

@@ -13,6 +13,7 @@ import pytest
 
 from meshmatch.errors import ModelError
 from meshmatch.experiments import hostile, hostile_inputs, hostile_kills, hostile_readers
+from meshmatch.experiments.hostile_damage import damaged
 from meshmatch.experiments.hostile_inputs import Sample, make_input, run_batch
 from meshmatch.experiments.hostile_learned import sign
 from meshmatch.experiments.hostile_samples import make_samples
@@ -49,6 +50,12 @@ def test_a_number_gives_the_same_file_again(samples: list[Sample], tmp_path: Pat
     assert made[0] == made[1]
     whole = {(sample.folder / sample.files[0]).read_bytes() for sample in samples}
     assert sum(data not in whole for data in made[0]) > 40
+
+
+def test_what_is_nested_deeply_is_damaged_otherwise() -> None:
+    deep = b"[" * 980 + b"]" * 980
+    found = {damaged(deep, deep, np.random.default_rng(seed)) for seed in range(60)}
+    assert len(found) > 20
 
 
 def crash(path: Path) -> None:
