@@ -12,7 +12,7 @@ import pytest
 
 from meshmatch.errors import InputError
 from meshmatch.shapes import formats, input_files
-from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.files import load_shape, mesh_names, save_shape
 from meshmatch.shapes.formats import gltf, ply_rows
 from meshmatch.shapes.formats.gltf_attributes import read_skin
 from meshmatch.shapes.input_files import read_npy
@@ -194,6 +194,7 @@ def test_gltf_nodes_that_stand_nowhere(tmp_path: Path, key: str, value: float) -
     path = broken(tmp_path, (("nodes", 0, key), [value] * four), (("nodes", 4, key), [value] * four))
     shape = load_shape(path)
     assert shape.V == 10
+    assert sum(mesh_names(path).values()) == 10
     find_appearance(path, shape)
     read_skin(path, path.read_bytes())
 

@@ -39,9 +39,12 @@ def read(path: Path, data: bytes) -> Raw:
 
 
 def understood(path: Path, data: bytes, what: str, reader: Callable[[Document], Found]) -> Found:
-    """What a reader makes of a file; `InputError` for what a description that is not as it should be can cause."""
+    """What a reader makes of a file; `InputError` for what a description that is not as it should be can cause. Numbers
+    that are not finite are judged by who asked for them.
+    """
     try:
-        return reader(Document(path, data))
+        with np.errstate(all="ignore"):
+            return reader(Document(path, data))
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
         raise damaged(path.name, f"its {what} no sense ({type(error).__name__}: {error})") from error
 
@@ -148,8 +151,7 @@ class Document:
             node, parent = stack.pop()
             if node in self.world:
                 raise damaged(self.name, f"node {node} has two parents")
-            with np.errstate(all="ignore"):  # what is not finite is judged with the positions
-                self.world[node] = parent @ _local(self.nodes[node])
+            self.world[node] = parent @ _local(self.nodes[node])
             stack += [(child, self.world[node]) for child in reversed(self.nodes[node].get("children", []))]
         return list(self.world)
 
@@ -231,8 +233,7 @@ class Document:
             rows = self._view(where, many, 1, np.dtype(_COMPONENTS[where["componentType"]]))
             values = values.copy()
             values[rows[:, 0]] = self._view(sparse["values"], many, width, kind)
-        with np.errstate(invalid="ignore"):  # of a signalling nan
-            out = values.astype(np.float64)
+        out = values.astype(np.float64)
         if accessor.get("normalized") and not whole and kind.kind in "iu":
             out = np.maximum(out / np.iinfo(kind).max, -1.0)
         return out

@@ -143,9 +143,8 @@ class _Look:
             return uv
         # Counter-clockwise with v down, as the extension's words and its example have it (its listing does not).
         angle = float(transform.get("rotation", 0.0))
-        with np.errstate(all="ignore"):  # what is not finite is refused by the appearance
-            u, v = (uv * np.array(transform.get("scale", (1.0, 1.0)), np.float64)).T
-            turned = np.stack([np.cos(angle) * u + np.sin(angle) * v, np.cos(angle) * v - np.sin(angle) * u], axis=1)
+        u, v = (uv * np.array(transform.get("scale", (1.0, 1.0)), np.float64)).T
+        turned = np.stack([np.cos(angle) * u + np.sin(angle) * v, np.cos(angle) * v - np.sin(angle) * u], axis=1)
         return np.asarray(turned + np.array(transform.get("offset", (0.0, 0.0)), np.float64))
 
 
