@@ -73,6 +73,9 @@ def _read(path: Path) -> VertexMap:
     record = _FORMATS[path.suffix.lower()][1](path)
     if not isinstance(record, dict) or "index" not in record:
         raise InputError("there is no 'index' in it")
+    texts = {name: [record.get(name, "")] for name in _WORDS} | {"reasons": list(record.get("reasons", ()))}
+    if odd := [name for name, found in texts.items() if not all(isinstance(each, str) for each in found)]:
+        raise InputError(f"'{odd[0]}' is not text")
     others = sum(np.size(record[name]) for name in _ARRAYS if isinstance(record.get(name), np.ndarray | list))
     check_memory(path.name, path.stat().st_size, _VERTEX * np.size(record["index"]) + 16 * others)
     return VertexMap(**{"source": "", "target": "", **{k: v for k, v in record.items() if k in _KNOWN}})

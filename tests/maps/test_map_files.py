@@ -106,6 +106,8 @@ def test_maps_of_other_programs(tmp_path: Path) -> None:
         ("a.json", b'{"map": [1]}', "no 'index'"),
         ("a.json", b'{"index": ["a"]}', "whole numbers"),
         ("a.json", b'"index"', "no 'index'"),
+        ("a.json", b'{"index": [1], "target": ' + b"[" * 500 + b"]" * 500 + b"}", "'target' is not text"),
+        ("a.json", b'{"index": [1], "reasons": [["it lies far"]]}', "'reasons' is not text"),
         ("a.json", b'{"index": [1e300]}', "whole numbers"),
         ("a.csv", b"target_vertex,confidence\n0,1e300\n", "0..1"),
         ("a.csv", b"target_vertex\n", "index must be a list"),
