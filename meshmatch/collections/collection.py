@@ -15,7 +15,7 @@ from meshmatch.api.results import MapPair
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.fit_all import Fitted, fit_all
-from meshmatch.collections.fit_files import StoredFit, load_fit, load_words
+from meshmatch.collections.fit_files import load_finished, load_words
 from meshmatch.collections.map_all import Pair, map_all
 from meshmatch.collections.registered import Registered, held
 from meshmatch.collections.setting import FITS, SUFFIX, TEMPLATE, Record, Setting
@@ -115,13 +115,11 @@ class Collection:
 
     def fit_of(self, name: str) -> Fit:
         """The fit of a shape, after all have agreed. It does not know the shape itself: its ``verts`` are none."""
-        return self._read(name).fit
+        return self._read(name)[0]
 
     def places_of(self, name: str) -> Places:
         """Where the vertices of a shape belong on the template."""
-        found = self._read(name).places
-        assert found is not None
-        return found
+        return self._read(name)[1]
 
     def map(self, source: str, target: str) -> VertexMap:
         """The map between two shapes, by their names: nothing is fitted, only looked up."""
@@ -196,13 +194,10 @@ class Collection:
         with held(len(names), self.template.shape.V, read) as points:
             yield Registered(points, faces, names, np.eye(3), left_out, self.template.hash)
 
-    def _load(self, name: str) -> StoredFit:
+    def _load(self, name: str) -> tuple[Fit, Places]:
         file = f"{FITS}/{name}{SUFFIX}"
         if not self.store.exists(file):
             close = get_close_matches(name, self.names, n=1)
             raise InputError(f"the collection has no fit of {name}", f"did you mean {close[0]}?" if close else "")
         with self.store.reading(file) as path:
-            found = load_fit(path, self.template)
-        if found.places is None:
-            raise InputError(f"the fit of {name} is not finished", "run `meshmatch fit` to its end")
-        return found
+            return load_finished(path, self.template)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from meshmatch.collections.fit_files import load_fit
+from meshmatch.collections.fit_files import load_finished
 from meshmatch.collections.setting import FITS, SUFFIX, TEMPLATE
 from meshmatch.collections.stores import Store
 from meshmatch.collections.workers import Died, Workers
@@ -117,9 +117,7 @@ def _is_new(task: MapTask, source: str) -> bool:
 @lru_cache(maxsize=_KEPT)
 def _places(fits: Store, name: str) -> Places:
     with fits.reading(f"{FITS}/{name}{SUFFIX}") as path:
-        found = load_fit(path, _template(fits)).places
-    assert found is not None
-    return found
+        return load_finished(path, _template(fits))[1]
 
 
 @lru_cache(maxsize=1)

@@ -262,6 +262,19 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
         load_fit(broken, other)
 
 
+def test_maps_of_unfinished_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_path: Path) -> None:
+    folder = tmp_path / "fits"
+    shutil.copytree(made[0], folder)
+    collection = meshmatch.Collection(folder)
+    save_fit(folder / "fits" / "turned.safetensors", collection.fit_of("turned"))
+    for read in (
+        lambda: collection.save_maps(tmp_path / "maps"),
+        lambda: meshmatch.Collection(folder).fit_of("turned"),
+    ):
+        with pytest.raises(InputError, match="turned is not finished"):
+            read()
+
+
 def test_a_collection_has_an_atlas(made: tuple[Path, tuple[Record, ...]], tmp_path: Path) -> None:
     """In the axes of the template and the unit of the files: a body on its side, ten times as large, is the same body."""
     collection = meshmatch.Collection(made[0])
