@@ -1,10 +1,11 @@
 """A hostile user: damaged files of every kind that is read, and commands killed at random moments.
 
 Samples of all formats are made, damaged at random (bytes, numbers, words, JSON, archives, headers) and read as the product
-reads them, each within 20 s and a gigabyte; commands are ended by SIGKILL, SIGTERM, SIGHUP and SIGINT. A failure is anything
-but a result or one of our errors: a traceback, the end of the interpreter, too much time or memory, something printed raw, a
-message that is long or commands a terminal; after a kill anything that is neither the old nor the new. Each failure is kept
-in the output folder, with the file. The same seed gives the same inputs; the same command goes on where it was stopped.
+reads them, each within 20 s and a gigabyte; commands are ended by SIGKILL, SIGTERM, SIGHUP and SIGINT, or find the disk full
+after some bytes. A failure is anything but a result or one of our errors: a traceback, the end of the interpreter, too much
+time or memory, something printed raw, a message that is long or commands a terminal; after a kill anything that is neither
+the old nor the new. Each failure is kept in the output folder, with the file. The same seed gives the same inputs; the same
+command goes on where it was stopped.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from meshmatch.experiments import runner
 from meshmatch.experiments.hostile_samples import make_samples
 from meshmatch.outputs import make_folder, replace_on_success
 
+_FULL = 9  # of so many commands one is not killed, but finds the disk full; no divisor of the commands of a turn
+_DISK = ", disk full"
 _COLUMNS = {"family": "family", "tried": "tried:,d", **{kind: f"{kind}:d" for kind in inputs.KINDS}}
 _KILL_COLUMNS = {
     "command": "command",
@@ -68,25 +71,27 @@ def read_damaged(state: dict[str, Any], seed: int, folder: Path, file: Path, sec
 def kill_commands(
     state: dict[str, Any], seed: int, folder: Path, file: Path, seconds: float, least: int, training: bool
 ) -> None:
-    """Commands killed in turn until the time is over, and so many were."""
+    """Commands killed in turn, and now and then run on a full disk, until the time is over, and so many were killed."""
     with tempfile.TemporaryDirectory() as place:
         cases = kills.make_cases(Path(place), training)
         end = time.monotonic() + seconds
         while time.monotonic() < end or _killed(state) < least:
-            case = cases[state["rounds"] % len(cases)]
-            found = kills.kill(case, seed, state["rounds"])
+            number = state["rounds"]
+            case, full = cases[number % len(cases)], number % _FULL == _FULL - 1
+            found = (kills.fill if full else kills.kill)(case, seed, number)
+            name = f"{case.name}{_DISK if full else ''}"
             counted = Counter(state["kills"])
-            counted[f"{case.name} {found.outcome}"] += 1
+            counted[f"{name} {found.outcome}"] += 1
             if found.outcome == "broken":
-                kept = folder / f"kill-{case.name.replace(' ', '-')}-{state['rounds']}"
+                kept = folder / f"kill-{name.replace(' ', '-')}-{number}"
                 shutil.copytree(case.folder, kept, dirs_exist_ok=True)
                 (kept / "what.txt").write_text(found.what, encoding="utf-8")
-            state |= {"kills": dict(counted), "rounds": state["rounds"] + 1}
+            state |= {"kills": dict(counted), "rounds": number + 1}
             _save(file, state)
 
 
 def _killed(state: dict[str, Any]) -> int:
-    return sum(count for name, count in state["kills"].items() if not name.endswith(" missed"))
+    return sum(count for name, count in state["kills"].items() if not name.endswith(" missed") and _DISK not in name)
 
 
 @runner.command

@@ -1,4 +1,6 @@
-"""Commands that are killed at random moments: afterwards the old or the new is there, whole, and nothing else."""
+"""Commands that are killed at random moments, or find the disk full: afterwards the old or the new is there, whole, and
+nothing else.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import hashlib
 import io
 import json
 import os
+import resource
 import shutil
 import signal
 import sys
@@ -207,6 +210,21 @@ def kill(case: Case, seed: int, number: int) -> Outcome:
     return Outcome("missed" if status == 0 else "fine")
 
 
+def fill(case: Case, seed: int, number: int) -> Outcome:
+    """Run a command where no file may be larger than a random size, as on a full disk; it must say so in words."""
+    rng = np.random.default_rng([seed, 2, number])
+    case.reset()
+    largest = max(path.stat().st_size for path in case.folder.rglob("*") if path.is_file())
+    limit = int(rng.integers(1000, max(2000, largest)))
+    status = os.waitstatus_to_exitcode(os.waitpid(_start(case, limit), 0)[1])
+    said, found = _said(case).read_text(errors="replace"), case.outputs()
+    what = f"{case.name} with {limit} bytes a file: status {status}, hidden {_hidden(case)}, found {found}\n{said}"
+    told = said.startswith("error: cannot write") and said.count("\n") <= 2
+    if not (status == 0 or (status == 1 and told)) or _hidden(case) or not _old_or_new(case, found):
+        return Outcome("broken", what)
+    return Outcome("missed" if status == 0 else "fine")
+
+
 def _hidden(case: Case) -> list[str]:
     """What is left half-written; a lock is not."""
     return [path.name for path in case.folder.rglob(".*") if path.name != LOCK]
@@ -220,8 +238,8 @@ def _old_or_new(case: Case, found: dict[str, str]) -> bool:
     return case.apart and all(found.get(name) in (old.get(name), new.get(name)) for name in {*old, *new, *found})
 
 
-def _start(case: Case) -> int:
-    """The command in a process forked from this one, where all is imported."""
+def _start(case: Case, limit: int | None = None) -> int:
+    """The command in a process forked from this one, where all is imported; maybe with a limit on the size of files."""
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS[1:])  # none may unwind the copy of what called this
     child = os.fork()
     if child:
@@ -235,6 +253,8 @@ def _start(case: Case) -> int:
         for sign in SIGNALS[1:]:
             signal.signal(sign, signal.default_int_handler if sign == signal.SIGINT else signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS[1:])
+        if limit is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
         status = _run(case.folder, case.words)
     except KeyboardInterrupt:
         status = 130  # before the command begins

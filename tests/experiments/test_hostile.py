@@ -192,3 +192,24 @@ def test_half_of_a_file_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     found = {hostile_kills.kill(case, 0, number).outcome for number in range(6)}
     assert ("broken" in found) == half
     assert found <= {"fine", "broken"}
+
+
+@pytest.mark.parametrize(
+    ("said", "status", "outcome"), [("error: cannot write out", 1, "fine"), ("Errno 27", 1, "broken")]
+)
+def test_a_full_disk_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str, status: int, outcome: str
+) -> None:
+    """A command that writes a megabyte beside its output, where files may not be so large."""
+
+    def write(place: Path, words: tuple[str, ...]) -> int:
+        try:
+            (place / "new").write_bytes(bytes(10**6))
+        except OSError:
+            (place / "new").unlink()
+            os.write(2, said.encode())
+            return status
+        return 0
+
+    monkeypatch.setattr(hostile_kills, "_run", write)
+    assert hostile_kills.fill(small_case(tmp_path, False), 0, 0).outcome == outcome
