@@ -208,7 +208,8 @@ def implicit_record(name: str, fit: meshmatch.ImplicitFit) -> Json:
 
 def fit_record(name: str, fit: meshmatch.Fit) -> Json:
     """A fit for --json."""
-    record = {"shape": name, "verdict": fit.verdict, "reasons": fit.reasons, "residual": float(fit.residual)}
+    record = {"shape": name, "verdict": fit.verdict, "reasons": fit.reasons, "trust": round(fit.trust, 4)}
+    record["residual"] = float(fit.residual)
     return record | {"up": fit.up, "front": fit.front, "seconds": round(fit.seconds, 3), "seed": fit.seed}
 
 

@@ -29,7 +29,7 @@ SCHEMA = 1
 _HINT = "fit the shape again: remove the file, and run `meshmatch fit` as before"
 _FIT_WORDS = {
     **dict.fromkeys(("template_hash", "verdict", "up", "front", "model"), str),
-    **{"residual": float, "seed": int, "partial": bool},
+    **{"residual": float, "trust": float, "seed": int, "partial": bool},
 }
 _PLACES = ("resting", "height", "distance", "stands", "faces", "fitted")
 _FAR = 1e6  # units of sqrt(area)
@@ -86,6 +86,8 @@ def load_words(path: str | Path) -> tuple[Words, Words]:
             raise InputError(f"{path.name} has fit schema {header['schema']!r}, not {SCHEMA}", "update meshmatch")
         about, more = dict(header["fit"]), dict(header["more"])
         odd = [name for name, kind in _FIT_WORDS.items() if type(about[name]) is not kind]
+        if not odd and not 0 <= about["trust"] <= 1:
+            odd = ["trust"]
         if odd or about["verdict"] not in VERDICTS:
             raise InputError(f"{path.name}: its {odd[0] if odd else 'verdict'} cannot be", _HINT)
         return about, more
@@ -148,7 +150,8 @@ def _places(arrays: dict[str, np.ndarray], about: Words, fit: Fit) -> Places | N
     optional: Words = {name: found.get(name) for name in _OPTIONAL}
     required: Words = {name: found[name] for name in _PLACES}
     words: Words = {"name": str(about["shape"]), "hash": str(about["shape_hash"]), "template_hash": fit.template_hash}
-    return Places(**words, **required, **optional, verdict=fit.verdict, reasons=tuple(map(str, fit.reasons)))
+    judged: Words = {"verdict": fit.verdict, "reasons": tuple(map(str, fit.reasons)), "trust": fit.trust}
+    return Places(**words, **required, **optional, **judged)
 
 
 def _samples(arrays: dict[str, np.ndarray], about: Words) -> OrientedPoints | None:

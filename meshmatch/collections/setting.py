@@ -75,6 +75,7 @@ class Record:
     name: str
     file: str
     verdict: str = FAILED  # or that of the fit
+    trust: float = 0.0
     reasons: str = ""
     residual: float = float("nan")  # units of sqrt(area)
     up: str = ""

@@ -59,6 +59,7 @@ def fit_alone(task: FitTask) -> Record:
             name=source.name,
             file=source.path,
             verdict=fit.verdict,
+            trust=round(fit.trust, 4),
             reasons="; ".join(fit.reasons),
             residual=float(fit.residual),
             up=fit.up,

@@ -23,9 +23,10 @@ from scipy.spatial import cKDTree
 from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
 from meshmatch.fitting.network_fit import Candidate, Predictor, best_first, one_way_residual, sized, two_way_residual
+from meshmatch.fitting.signs import area_share, visible_vertices
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import FitTask, Refine, Registration
-from meshmatch.fitting.verdict import area_share, judge_registration, visible_vertices
+from meshmatch.fitting.verdict import judge_registration
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import vertex_areas
@@ -157,7 +158,7 @@ def fit_part(task: FitTask, refine: Refine) -> Registration:
     ``refine`` turns the network's candidates into one fit, whose residual is from the samples to the template only.
     """
     found = _search(task, refine, wide=False)
-    if judge_registration(found, partial=True)[0] != "poor":
+    if judge_registration(found, partial=True).verdict != "poor":
         return found
     config = replace(task.config, copies=2 * task.config.copies, hypotheses=2 * task.config.hypotheses)
     again = _search(replace(task, config=config), refine, wide=True)

@@ -18,13 +18,16 @@ from meshmatch.shapes.shape import Shape
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
+    from meshmatch.fitting.signs import Signs
     from meshmatch.models.trained import TrainedModel
 
 Verdict = Literal["good", "fair", "poor"]
-ReasonCode = Literal["residual", "unreached", "part", "empty", "side", "unsupervised"]
-"""Template and shape stay apart; some of the shape is not reached; it was taken for a part; template lies where the
-shape has no surface; its mirror image fits as well; the model was learned without
-correspondence."""
+ReasonCode = Literal[
+    "residual", "unreached", "empty", "torn", "crushed", "facing", "doubt", "part", "side", "unsupervised"
+]
+"""Template and shape stay apart; some of the shape is not reached; template lies where the shape has no surface; neighbours
+belong far apart; the template is stretched or crushed; the shape faces the other way; no sign alone, but all together; it
+was taken for a part; its mirror image fits as well; the model was learned without correspondence."""
 
 
 class Reason(str):
@@ -56,6 +59,8 @@ class Fit:
     residual : mean distance, normals included, between template and shape, both ways, in units of sqrt(area)
     verts : (N, 3) vertices of the shape, in the frame and unit of its file
     verdict, reasons : "good", "fair" or "poor", and why it is not good
+    trust : probability (0..1) that the fit is right: on a person, to 8 cm on average
+    signs : by what it was judged; None if it was read from a file
     up, front : the axes of the file that the fit took for up and front, such as "+y" and "-z"
     seconds, seed : how long the fit took, and with which random numbers
     partial : the shape was taken for a part; the residual is from the shape to the template only
@@ -82,6 +87,8 @@ class Fit:
     repaired: Repaired | None = None
     notes: tuple[str, ...] = ()
     model: str = ""
+    trust: float = 1.0
+    signs: Signs | None = None
 
     @cached_property
     def vertex_distance(self) -> Floats:

@@ -18,8 +18,9 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.network_fit import mirror_of
 from meshmatch.fitting.nodes import Landmarks
 from meshmatch.fitting.refinement import REFINEMENTS, Refinement
+from meshmatch.fitting.signs import empty_share
 from meshmatch.fitting.task import FitTask, Registration
-from meshmatch.fitting.verdict import FAIR_RESIDUAL, empty_share, judge_registration
+from meshmatch.fitting.verdict import FAIR_RESIDUAL, FAIR_TRUST, judge_registration
 from meshmatch.geometry.triangles import face_parts
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
@@ -75,8 +76,7 @@ class Fitter:
         if not card.correspondence:
             doubts.append(Reason("unsupervised", f"{card.name} was learned without correspondence: near may be wrong"))
         fit = replace(as_fit(found, partial, began), notes=notes)
-        verdict: Verdict = "fair" if doubts and fit.verdict == "good" else fit.verdict
-        return replace(fit, verdict=verdict, reasons=(*fit.reasons, *doubts))
+        return doubted(fit, doubts)
 
     def _found(
         self, shape: Shape, landmarks: Landmarks | None, progress: Progress, mirrored: bool
@@ -92,6 +92,14 @@ class Fitter:
             partial = closer and part.candidate.share < 1 - _MISSING
             found = part if partial else found
         return found, partial
+
+
+def doubted(fit: Fit, doubts: Sequence[Reason]) -> Fit:
+    """A fit that near says nothing for, in some way: it is fair at best, and as likely wrong as right."""
+    if not doubts:
+        return fit
+    verdict: Verdict = "fair" if fit.verdict == "good" else fit.verdict
+    return replace(fit, verdict=verdict, reasons=(*fit.reasons, *doubts), trust=min(fit.trust, FAIR_TRUST))
 
 
 def _may_be_part(whole: Registration, refinement: Refinement) -> bool:
@@ -118,7 +126,7 @@ def may_show_part(shape: Shape, config: FitConfig) -> bool:
 
 def as_fit(found: Registration, partial: bool, began: float) -> Fit:
     task, frame, points = found.task, found.core_frame, found.surface.points
-    verdict, reasons = judge_registration(found, partial)
+    judged = judge_registration(found, partial)
     return Fit(
         template_hash=task.model.template.hash,
         frame=frame,
@@ -128,8 +136,10 @@ def as_fit(found: Registration, partial: bool, began: float) -> Fit:
         faces=task.system.faces,
         residual=found.candidate.residual,
         verts=task.shape.verts,
-        verdict=verdict,
-        reasons=reasons,
+        verdict=judged.verdict,
+        reasons=judged.reasons,
+        trust=judged.trust,
+        signs=judged.signs,
         up=axis_name(frame.rotation[1]),
         front=axis_name(frame.rotation[2]),
         seconds=time.monotonic() - began,

@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import needs
 from meshmatch.fitting import fit_config
 from meshmatch.fitting.candidates import STAGE, completed
@@ -25,13 +25,12 @@ from meshmatch.fitting.network_fit import Candidate, best_first, one_way_residua
 from meshmatch.fitting.nodes import refine_nodes
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import FitTask, Refine
+from meshmatch.fitting.tears import Pairs, neighbours, torn_share
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.geometry.triangles import is_discontinuous
 from meshmatch.progress import Progress
 from meshmatch.threads import beside
 
 # All of these were set by hand. Lengths and residuals are in units of sqrt(area).
-_NEIGHBOURS = 6
 _DISCONTINUITY_COST = 0.1  # residual that a map discontinuous everywhere is worse by
 _CAP = 0.1  # beyond it a distance says no more
 # Interpretations differ where this share of the template's vertices lies that far apart.
@@ -213,18 +212,15 @@ class CandidateScorer:
         self._system, self.samples, self._roughness = system, samples, roughness
 
     @cached_property
-    def _neighbours(self) -> tuple[Ints, Ints]:
-        """Pairs of samples."""
-        count = min(_NEIGHBOURS + 1, len(self.samples.points))
-        index = self.samples.tree.query(self.samples.tree.data, count)[1]
-        return np.repeat(np.arange(len(index)), index.shape[1] - 1), index[:, 1:].reshape(-1)
+    def _pairs(self) -> Pairs:
+        return neighbours(self.samples)
 
     def score(self, local: OrientedPoints, candidate: Candidate) -> float:
         """Residual of a candidate and a cost for discontinuities; ``local``: the same samples in its core frame."""
         residual, rough = candidate.residual, self._roughness
         if rough > 0:
             residual += rough * (self.scatter(local, candidate.vectors) - residual)
-        return residual + _DISCONTINUITY_COST * self.discontinuous_share(local, candidate.vectors)
+        return residual + _DISCONTINUITY_COST * torn_share(self._system, self._pairs, local, candidate.vectors)
 
     def scatter(self, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
         """Root of the mean squared distance of nearest points, both ways, normals left out (units of sqrt(area))."""
@@ -233,17 +229,6 @@ class CandidateScorer:
         back = cKDTree(moved).query(local.points, distance_upper_bound=_CAP)[0]
         squares = [np.square(np.minimum(distance, _CAP)) for distance in (forward, back)]
         return float(np.sqrt(0.5 * (squares[0].mean() + weighted_mean(squares[1], local.weights))))
-
-    def discontinuous_share(self, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
-        """Share (0..1) of neighbours among the samples that belong far apart on the template."""
-        surface = self._system.surface(vectors)
-        local = local.facing(surface)
-        home = self._system.verts[surface.tree.query(local.features)[1]]
-        start, end = self._neighbours
-        length = np.linalg.norm(local.points[start] - local.points[end], axis=1)
-        apart = is_discontinuous(np.linalg.norm(home[start] - home[end], axis=1), length)
-        weights = None if local.weights is None else local.weights[start] * local.weights[end]
-        return float(weighted_mean(apart, weights))
 
 
 def differ(here: Float[Floats, "V 3"], there: Float[Floats, "V 3"], far: float = _FAR) -> bool:

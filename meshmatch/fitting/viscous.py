@@ -21,9 +21,10 @@ from meshmatch.fitting.fit import Fit, Reason, axis_name
 from meshmatch.fitting.fit_config import NodeRefineConfig, geometric_between
 from meshmatch.fitting.network_fit import two_way_residual
 from meshmatch.fitting.nodes import pair_terms
+from meshmatch.fitting.signs import signs_of
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import take_samples
-from meshmatch.fitting.verdict import judge
+from meshmatch.fitting.verdict import FAIR_TRUST, judge
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.normalise import align
 from meshmatch.shapes.sampling import sample_surface
@@ -108,7 +109,7 @@ def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: 
     vectors = viscous_vectors(system, local, config)
     points = system.moved(vectors)
     residual = two_way_residual(system, local, vectors)
-    verdict, reasons = judge(residual, local, points)
+    judged = judge(signs_of(system, vectors, local, residual))
     unsure = Reason("unsupervised", "fitted without a model that was learned: near may be wrong")
     return Fit(
         template_hash=template.hash,
@@ -119,8 +120,10 @@ def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: 
         faces=system.faces,
         residual=residual,
         verts=shape.verts,
-        verdict="fair" if verdict == "good" else verdict,
-        reasons=(*reasons, unsure),
+        verdict="fair" if judged.verdict == "good" else judged.verdict,
+        reasons=(*judged.reasons, unsure),
+        trust=min(judged.trust, FAIR_TRUST),
+        signs=judged.signs,
         up=axis_name(core.rotation[1]),
         front=axis_name(core.rotation[2]),
         seconds=time.monotonic() - began,

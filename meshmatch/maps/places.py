@@ -50,7 +50,7 @@ class Places:
     spread : (V,) of a noisy cloud, standard deviation of the place; None for other shapes
     stands : (V,) which vertex stands for each: itself, its twin, or the nearest that was fitted
     faces : (F, 3) all triangles; fitted : (F,) whether each was fitted, or dropped as broken
-    verdict, reasons : of the fit
+    verdict, reasons, trust : of the fit
     """
 
     name: str
@@ -66,6 +66,7 @@ class Places:
     fitted: Bool[Bools, " F"]
     verdict: str
     reasons: tuple[str, ...] = ()
+    trust: float = 1.0
 
     @classmethod
     def of(cls, part: Repaired, fit: Fit, before: Fit | None = None, workers: int = 1) -> Places:
@@ -104,6 +105,7 @@ class Places:
             fitted,
             fit.verdict,
             fit.reasons,
+            fit.trust,
         )
 
     def nearest(

@@ -12,6 +12,7 @@ from meshmatch.fitting.network_fit import Candidate, Predictor
 from meshmatch.fitting.refinement import CandidateScorer, averaged, choose, differ
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.task import FitTask
+from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
@@ -86,9 +87,9 @@ def folded(system: NodeSystem, residual: float = 0.03) -> Candidate:
 
 def test_a_right_fit_is_continuous_and_a_folded_one_is_not(system: NodeSystem, scan: OrientedPoints) -> None:
     scorer = CandidateScorer(system, scan)
-    whole = scorer.discontinuous_share(scan, still(system).vectors)
+    whole = torn_share(system, neighbours(scan), scan, still(system).vectors)
     assert whole < 0.02  # a template is coarse: neighbours may have vertices apart
-    cut = scorer.discontinuous_share(scan, folded(system).vectors)
+    cut = torn_share(system, neighbours(scan), scan, folded(system).vectors)
     assert 2 * whole < cut <= 1.0
     assert scorer.score(scan, folded(system)) == pytest.approx(0.03 + 0.1 * cut)
 
@@ -150,7 +151,7 @@ def test_of_a_rough_cloud_positions_alone_are_scorerd_and_squares(system: NodeSy
     wanted = np.sqrt(0.5 * np.square(apart.min(1)).mean() + 0.5 * np.square(apart.min(0)).mean())
     rough, smooth, half = (CandidateScorer(system, scan, share) for share in (1.0, 0.0, 0.5))
     assert rough.scatter(scan, shifted.vectors) == pytest.approx(wanted)
-    cut = 0.1 * rough.discontinuous_share(scan, shifted.vectors)
+    cut = 0.1 * torn_share(system, neighbours(scan), scan, shifted.vectors)
     assert rough.score(scan, shifted) == pytest.approx(wanted + cut)
     assert smooth.score(scan, shifted) == pytest.approx(0.03 + cut)
     assert half.score(scan, shifted) == pytest.approx(0.5 * (0.03 + wanted) + cut)

@@ -12,8 +12,8 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import Candidate, two_way_residual
 from meshmatch.fitting.nodes import pair_terms, refine_nodes
+from meshmatch.fitting.signs import cloud_allowance, unexplained
 from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.fitting.verdict import GOOD_RESIDUAL, cloud_allowance, judge
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.sampling import sample_surface
@@ -149,11 +149,9 @@ def test_noise_has_a_limit(system: NodeSystem) -> None:
     )
 
 
-def test_the_verdict_is_of_what_is_not_explained(system: NodeSystem) -> None:
-    scan = cloud_of(system, 2000)
-    assert judge(0.04, scan, system.verts)[0] == "poor"
-    assert judge(0.04, scan, system.verts, allowance=0.035)[0] == judge(GOOD_RESIDUAL * 0.5, scan, system.verts)[0]
-    assert judge(0.02, scan, system.verts, allowance=0.03)[0] == judge(0.0, scan, system.verts)[0]
+def test_squares_add_up_in_what_is_explained() -> None:
+    assert unexplained(0.05, 0.03) == pytest.approx(0.04)
+    assert unexplained(0.02, 0.03) == 0.0
 
 
 def test_a_repeated_point_is_no_company(system: NodeSystem) -> None:

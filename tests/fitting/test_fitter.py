@@ -1,7 +1,6 @@
 """The whole fit on eggs that an untrained network reads: laws that hold however badly it reads."""
 
 import json
-import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -21,13 +20,12 @@ from meshmatch.fitting.network_fit import Candidate, Mirror, Predictor
 from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import take_samples
-from meshmatch.fitting.verdict import FAIR_RESIDUAL, GOOD_RESIDUAL, SNUG_RESIDUAL, judge
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
-from tests.fitting.eggs import bent_egg, egg_model, scan_of, write_model
+from tests.fitting.eggs import bent_egg, egg_model, write_model
 
 QUICK = FitConfig(
     samples=400, coarse_samples=200, copies=4, variants=3, finalists=2, latent=LatentRefineConfig(steps=5)
@@ -202,47 +200,6 @@ def test_a_landmark_lies_where_the_fits_put_it(model: TrainedModel, fits: dict[R
     assert template_vertices(template, still, mixed).tolist() == [middle]
 
 
-def test_a_verdict_never_improves_while_the_residual_rises(model: TrainedModel) -> None:
-    scan = scan_of(model.template.shape, 500)
-    points = model.template.shape.verts
-    residuals = [0.0, GOOD_RESIDUAL, GOOD_RESIDUAL + 1e-9, FAIR_RESIDUAL, FAIR_RESIDUAL + 1e-9, 0.1]
-    verdicts = [judge(residual, scan, points)[0] for residual in residuals]
-    assert verdicts == ["good", "good", "fair", "fair", "poor", "poor"]
-    assert GOOD_RESIDUAL < FAIR_RESIDUAL
-    for residual, verdict in zip(residuals, verdicts, strict=True):
-        assert bool(judge(residual, scan, points)[1]) == (verdict != "good")
-
-
-def test_a_high_residual_is_fair_where_all_of_a_mesh_lies_close(model: TrainedModel) -> None:
-    scan, points = scan_of(model.template.shape, 500), model.template.shape.verts
-    dense = OrientedPoints(points, model.template.shape.vertex_normals)
-    verdict, reasons = judge(0.04, dense, points)
-    assert (verdict, [reason.code for reason in reasons]) == ("fair", ["residual"])
-    assert judge(SNUG_RESIDUAL + 1e-9, dense, points)[0] == "poor"
-    away = points + np.where(np.arange(len(points)) % 20 < 1, 0.05, 0.0)[:, None]  # 5 % of it, a limb's end
-    assert judge(0.04, OrientedPoints(away, dense.normals), points)[0] == "poor"
-    assert judge(0.04, replace(dense, signed=False), points)[0] == "poor"  # a cloud
-    assert judge(0.04, scan, points)[0] == "poor"  # samples too few to lie near all of the template
-
-
-@pytest.mark.parametrize("lost", ["shape", "template"])
-def test_a_verdict_never_improves_while_less_is_covered(lost: str) -> None:
-    """A flat grid, 0.05 between its points, loses row after row: of the shape or of the template."""
-    x, y = np.meshgrid(np.arange(40) * 0.05, np.arange(20) * 0.05, indexing="ij")
-    grid = np.stack([x.ravel(), y.ravel(), np.zeros(800)], 1)
-    seen = []
-    for rows in range(8):
-        part = grid[20 * rows :]
-        ours, theirs = (part, grid) if lost == "template" else (grid, part)
-        seen.append(judge(0.0, OrientedPoints(theirs, theirs), ours))
-    ranks = [RANK[verdict] for verdict, _ in seen]
-    assert ranks == sorted(ranks)
-    # rows of 2.5 %; the first one is within reach (0.06) of the next
-    assert [verdict for verdict, _ in seen[:5]] == ["good", "good", "fair", "fair", "poor"]
-    what = "is not reached by the template" if lost == "template" else "has no surface"
-    assert all(what in reasons[0] for _, reasons in seen[2:])
-
-
 def test_names_of_directions() -> None:
     assert axis_name(np.array([0.1, -0.9, 0.3])) == "-y"
     assert axis_name(np.array([0.1, 0.2, 0.3])) == "+z"
@@ -304,15 +261,6 @@ def test_two_threads_share_one_fitter_that_is_still_cold(egg: Shape, monkeypatch
     for shape, fit in zip(shapes, together, strict=True):
         assert np.array_equal(fit.vectors, Fitter(model, QUICK).fit(shape).vectors)
     assert built == [NodeSystem, Mirror]
-
-
-def test_reasons_are_sentences_with_codes(model: TrainedModel) -> None:
-    scan = scan_of(model.template.shape, 500)
-    (reason,) = judge(0.1, scan, model.template.shape.verts)[1]
-    assert reason.code == "residual"
-    assert str(reason) == "template and shape stay 10.0 % of sqrt(area) apart on average"
-    again = pickle.loads(pickle.dumps(reason))
-    assert (again, again.code) == (reason, reason.code)
 
 
 def test_every_refinement_has_a_name_that_can_be_listed_without_it() -> None:

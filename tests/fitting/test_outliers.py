@@ -11,9 +11,9 @@ from meshmatch.errors import InputError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import one_way_residual, two_way_residual
-from meshmatch.fitting.refinement import CandidateScorer
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.task import take_samples, without_outliers
+from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape
@@ -105,9 +105,7 @@ def test_residuals_and_tears_ignore_a_side_that_is_not_known(system: NodeSystem)
         assert residual(system, flipped, still) > 2 * right
         assert residual(system, OrientedPoints(scan.points, -scan.normals, signed=False), still) == pytest.approx(right)
     unsure = OrientedPoints(scan.points, -scan.normals, signed=False)
-    right, wrong, turned = (
-        CandidateScorer(system, each).discontinuous_share(each, still) for each in (scan, flipped, unsure)
-    )
+    right, wrong, turned = (torn_share(system, neighbours(each), each, still) for each in (scan, flipped, unsure))
     assert wrong != right == turned
 
 

@@ -18,9 +18,10 @@ from meshmatch.fitting.fitter import boundary_length
 from meshmatch.fitting.initial_frames import frames_of_part, frames_to_try
 from meshmatch.fitting.network_fit import Candidate, one_way_residual
 from meshmatch.fitting.refinement import REFINEMENTS
+from meshmatch.fitting.signs import Signs, empty_share, signs_of
 from meshmatch.fitting.system import node_system
 from meshmatch.fitting.task import FitTask, take_samples
-from meshmatch.fitting.verdict import empty_share, judge
+from meshmatch.fitting.verdict import Judgement, judge
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import unit
@@ -66,11 +67,11 @@ def test_what_is_not_visible_is_not_held_against_a_part() -> None:
     half = samples.points[:, 1] > 0
     scan, still = OrientedPoints(samples.points[half], samples.normals[half]), np.zeros((system.K, 3))
     assert 0.3 < empty_share(scan, system.verts) < 0.6
-    assert judge(0.02, scan, system.verts)[0] == "poor"
-    verdict, reasons = judge(0.02, scan, system.verts, partial=True)
-    assert verdict == "fair"
-    assert "taken for a part" in reasons[0]
-    assert judge(0.05, scan, system.verts, partial=True)[0] == "poor"
+    assert judge(signs_of(system, still, scan, 0.02)).verdict == "poor"
+    judged = judge(signs_of(system, still, scan, 0.02, partial=True), 0.5)
+    assert judged.verdict == "fair"
+    assert judged.reasons == ("taken for a part: 50 % of the template has no counterpart",)
+    assert judge(signs_of(system, still, scan, 0.05, partial=True)).verdict == "poor"
     whole = OrientedPoints(samples.points, samples.normals)
     assert one_way_residual(system, scan, still) == pytest.approx(one_way_residual(system, whole, still), rel=0.1)
 
@@ -134,7 +135,11 @@ def test_a_poor_part_is_searched_again_from_more_sides_and_the_better_fit_kept(
     found = {}
     for verdict in ("fair", "poor"):
         monkeypatch.setattr(candidates, "frames_of_part", frames)
-        monkeypatch.setattr(candidates, "judge_registration", lambda found, partial, verdict=verdict: (verdict, ()))
+        monkeypatch.setattr(
+            candidates,
+            "judge_registration",
+            lambda found, partial, verdict=verdict: Judgement(verdict, (), Signs(0.02)),
+        )
         asked.clear()
         best = candidates.fit_part(task, REFINEMENTS["none"].part)
         found[verdict] = best.candidate.cost

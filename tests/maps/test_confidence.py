@@ -1,4 +1,4 @@
-"""Confidence falls where two fits had to move until they agreed, and nowhere else; and with a poor fit everywhere."""
+"""Confidence falls where two fits had to move until they agreed, and nowhere else; and everywhere without trust."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def test_where_a_fit_moved_it_is_not_believed() -> None:
         before = [fit, fit]
         before[number] = elsewhere
         found = mapped(part, fit, part, fit, (before[0], before[1]))
-        assert np.allclose(found.confidence[high], np.exp(-((moved / 0.065) ** 2)), atol=1e-6)
+        assert np.allclose(found.confidence[high], np.exp(-((moved / 0.081) ** 2)), atol=1e-6)
         assert np.allclose(found.confidence[~high], 1)
         assert np.array_equal(found.index, sure.index)
     assert np.array_equal(mapped(part, fit, part, fit, (fit, fit)).confidence, sure.confidence)
@@ -55,20 +55,20 @@ def test_both_fits_count_where_the_source_lies() -> None:
     before = replace(fit, points=unit.verts + np.where(high, 0.04, 0.0)[:, None] * [1.0, 0, 0])
     before_there = replace(other, points=turned.verts + np.where(high, 0.025, 0.0)[:, None] * [0, 1.0, 0])
     found = mapped(repair(unit), fit, repair(turned), other, (before, before_there))
-    assert np.allclose(found.confidence[high], np.exp(-1.0), atol=1e-6)
+    assert np.allclose(found.confidence[high], np.exp(-((0.065 / 0.081) ** 2)), atol=1e-6)
     assert np.allclose(found.confidence[~high], 1)
 
 
-def test_a_map_by_a_poor_fit_is_believed_half() -> None:
+def test_a_map_is_believed_as_its_fits_are() -> None:
+    """Of a wrong fit, 7 % of the vertices are near by chance."""
     ball = bumpy_sphere()
     unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
     part, fit = repair(unit), lying_on(unit)
-    for verdict, believed in (("good", 1.0), ("fair", 1.0), ("poor", 0.5)):
-        judged = replace(fit, verdict=verdict)
-        for source_fit, target_fit in ((judged, fit), (fit, judged)):
-            found = mapped(part, source_fit, part, target_fit)
-            assert np.allclose(found.confidence, believed)
-            assert found.verdict == verdict
+    half = replace(fit, trust=0.5, verdict="fair")
+    for source, target, believed in ((fit, half, 0.5), (half, fit, 0.5), (half, half, 0.25)):
+        found = mapped(part, source, part, target)
+        assert np.allclose(found.confidence, 0.07 + 0.93 * believed)
+        assert found.verdict == "fair"
 
 
 @pytest.mark.parametrize("side", ["source", "target"])
@@ -83,4 +83,4 @@ def test_distance_from_the_template_costs_confidence_on_both_sides(side: str) ->
     far = replace(Places.of(part, large), resting=near.resting, height=near.height)  # the same places cost nothing
     found = build_map(far, near) if side == "source" else build_map(near, far)
     assert distance.max() > 0.01
-    assert np.allclose(found.confidence, np.exp(-((distance / 0.03) ** 2)), atol=0.02)
+    assert np.allclose(found.confidence, np.exp(-((distance / 0.042) ** 2)), atol=0.02)

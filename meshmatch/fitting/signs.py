@@ -1,0 +1,152 @@
+"""Signs that tell right fits from wrong ones, and how far they let a fit be trusted.
+
+What a fit says of itself is not only how near template and shape come: a template can be crushed onto a plane, or its legs
+both onto one. Each sign alone errs; together they give the probability that a fit is right, that is to say that its
+points are within 8 cm of where they belong on average, on a person. The weights are those of a logistic regression on
+right and wrong fits whose truth is known, other ones than it is measured with (docs/results.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from meshmatch.arrays import Bool, Bools, Float, Floats
+from meshmatch.fitting.network_fit import two_way_residual, weighted_mean
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.fitting.tears import neighbours, torn_share
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.symmetric import entries_of, logarithm, matrices_of
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Shape
+
+# Further from the other surface than this (units of sqrt(area)), a point of shape or template is without counterpart.
+_REACH = 0.06
+# A template vertex is visible if a sample is this near, and if the nearest sample belongs this near to the vertex on the
+# resting template (units of sqrt(area)). Set by hand.
+_NEAR, _HOME = 0.06, 0.06
+# More noise than this (units of sqrt(area), 3.4 cm on a person) is a wrong fit rather than noise.
+_MAX_NOISE = 0.025
+_TEAR_SAMPLES = 4096  # enough to see tears
+_MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
+# Of the logit of a wrong fit, in the order of `Signs.trust`.
+_WEIGHTS, _OFFSET = (1.61, 4.286, 1.569, 0.642, 2.125, 0.332, 2.741), -2.56
+_AGAINST_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
+
+
+@dataclass(frozen=True)
+class Signs:
+    """What tells right fits from wrong ones.
+
+    Attributes
+    ----------
+    residual : mean distance of template and shape, normals included, without what a cloud explains (units of sqrt(area))
+    missed : share (0..1) of the shape that the template does not reach
+    empty : share (0..1) of the template where the shape has no surface; a part has none of it
+    torn : share (0..1) of neighbours on the shape that belong far apart on the template
+    stretch : root mean square of the logarithms of the template's stretches
+    against : share (0..1) of the shape that faces the other way than the template
+    partial : whether the shape was taken for a part
+    """
+
+    residual: float
+    missed: float = 0.0
+    empty: float = 0.0
+    torn: float = 0.0
+    stretch: float = 0.0
+    against: float = 0.0
+    partial: bool = False
+
+    def values(self) -> tuple[float, ...]:
+        """Numbers that grow about as the doubt does."""
+        return (
+            100 * self.residual,
+            10 * min(self.missed, 0.2),
+            10 * min(self.empty, 0.3),
+            float(np.log(self.torn + 0.003)),
+            float(np.log(max(self.stretch, 0.3))),
+            float(np.log(self.against + 0.01)),
+            float(self.partial),
+        )
+
+    @property
+    def trust(self) -> float:
+        """Probability (0..1) that the fit is right."""
+        return float(1 / (1 + np.exp(_OFFSET + np.dot(_WEIGHTS, self.values()))))
+
+
+def signs_of(
+    system: NodeSystem, vectors: Float[Floats, "K 3"], local: OrientedPoints, residual: float, partial: bool = False
+) -> Signs:
+    """The signs of a fit; ``local`` are samples of the shape in the core frame."""
+    surface = system.surface(vectors)
+    gap, nearest = cKDTree(surface.points).query(local.points)
+    some = local.first(_TEAR_SAMPLES)
+    gradient = system.deformation_gradient(vectors)
+    stretches = matrices_of(0.5 * logarithm(entries_of(gradient.transpose(0, 2, 1) @ gradient), _MIN_SQUARE))
+    against = (surface.normals[nearest] * local.normals).sum(1) < 0
+    return Signs(
+        residual,
+        float(weighted_mean(gap > _REACH, local.weights)),
+        0.0 if partial else empty_share(local, surface.points),
+        torn_share(system, neighbours(some), some, vectors),
+        float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
+        float(weighted_mean(against, local.weights)) if local.signed else _AGAINST_IF_UNSIGNED,
+        partial,
+    )
+
+
+def unexplained(residual: float, allowance: float) -> float:
+    """What is left of a residual where squares add up."""
+    return float(np.sqrt(max(residual**2 - allowance**2, 0.0)))
+
+
+def empty_share(local: OrientedPoints, points: Float[Floats, "V 3"]) -> float:
+    """Share (0..1) of the fitted template's vertices without any of the shape near."""
+    return float((cKDTree(local.points).query(points)[0] > _REACH).mean())
+
+
+def cloud_allowance(
+    system: NodeSystem, local: OrientedPoints, V: int, vectors: Float[Floats, "K 3"], seed: int = 0
+) -> float:
+    """The part of the residual that even a right fit has on a cloud of V points as noisy as this one.
+
+    Squares add up: that of a right fit is the root of the squares of this and of a clean mesh's.
+
+    The fitted template itself is sampled, once as densely and noisily as the cloud, with normals estimated as the
+    cloud's are, and once as a mesh is. The noise is read off the median distance of the cloud from the template's
+    tangent planes, which a lost limb does not move.
+    """
+    fitted = system.surface(vectors)
+    nearest = cKDTree(fitted.points).query(local.points)[1]
+    height = np.abs(((local.points - fitted.points[nearest]) * fitted.normals[nearest]).sum(1))
+    noise = min(1.4826 * float(np.median(height)), _MAX_NOISE)  # of a Gaussian with that median
+    rng = np.random.default_rng(seed)
+    surface = Shape(fitted.points, system.faces)
+    clean = sample_surface(surface, len(local.points), rng)
+    drawn = sample_surface(surface, min(V, len(local.points)), rng).points
+    cloud = Shape(drawn + noise * rng.standard_normal(drawn.shape), np.empty((0, 3), np.int64))
+    expected = two_way_residual(system, OrientedPoints(cloud.verts, cloud.vertex_normals, signed=False), vectors)
+    clear = two_way_residual(system, clean, vectors)
+    return unexplained(expected, clear)
+
+
+def visible_vertices(system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> Bool[Bools, " V"]:
+    """Whether samples (core frame) show each vertex of the template as fitted.
+
+    Vertices beyond a cut have the edge of the samples near by, but the edge belongs elsewhere on the template.
+    """
+    surface = system.surface(vectors)
+    local = local.facing(surface)
+    distance, nearest = local.tree.query(surface.features)
+    home = surface.tree.query(local.features)[1]
+    away = np.linalg.norm(system.verts[home[nearest]] - system.verts, axis=1)
+    return np.asarray((distance < _NEAR) & (away < _HOME))
+
+
+def area_share(system: NodeSystem, vertices: Bool[Bools, " V"]) -> float:
+    """Share (0..1) of the resting template's area around some vertices."""
+    area = Shape(system.verts, system.faces).vertex_areas
+    return float(area[vertices].sum() / area.sum())

@@ -1,0 +1,34 @@
+"""Where a map is torn: points that are neighbours on the shape, and belong far apart on the template."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.fitting.network_fit import weighted_mean
+from meshmatch.fitting.system import NodeSystem
+from meshmatch.geometry.oriented import OrientedPoints
+from meshmatch.geometry.triangles import is_discontinuous
+
+Pairs = tuple[Ints, Ints]
+"""Numbers of samples that are neighbours, normals included: two touching limbs face each other, and are none."""
+_NEIGHBOURS = 6  # of a sample; set by hand
+
+
+def neighbours(samples: OrientedPoints) -> Pairs:
+    """Every sample with the few that are nearest to it."""
+    count = min(_NEIGHBOURS + 1, len(samples.points))
+    index = samples.tree.query(samples.tree.data, count)[1]
+    return np.repeat(np.arange(len(index)), index.shape[1] - 1), index[:, 1:].reshape(-1)
+
+
+def torn_share(system: NodeSystem, pairs: Pairs, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
+    """Share (0..1) of pairs of samples (core frame) that belong far apart on the resting template."""
+    surface = system.surface(vectors)
+    local = local.facing(surface)
+    home = system.verts[surface.tree.query(local.features)[1]]
+    start, end = pairs
+    length = np.linalg.norm(local.points[start] - local.points[end], axis=1)
+    apart = is_discontinuous(np.linalg.norm(home[start] - home[end], axis=1), length)
+    weights = None if local.weights is None else local.weights[start] * local.weights[end]
+    return float(weighted_mean(apart, weights))

@@ -1,0 +1,101 @@
+"""Honest verdicts: cases whose truth is known, and what is counted of them."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from meshmatch.experiments import verdicts
+from meshmatch.experiments.verdict_cases import FAMILIES, KEPT, TUNED, Cases
+
+pytest.importorskip("anny")
+
+
+@pytest.fixture(scope="module")
+def cases() -> Cases:
+    return Cases("human", 5)
+
+
+@pytest.mark.parametrize("family", [name for name in FAMILIES if name not in ("dressed", "stylised", "furniture")])
+def test_a_case_is_drawn_again_alike_with_its_truth(cases: Cases, family: str) -> None:
+    case, again = cases.draw(family, 0), cases.draw(family, 0)
+    assert np.array_equal(case.shape.verts, again.shape.verts) and np.array_equal(case.truth, again.truth)
+    assert len(case.truth) == case.shape.V and case.truth.max() < cases.template.shape.V
+    assert (case.truth < 0).all() == (family in ("animal", "solid"))
+    assert not np.array_equal(case.shape.verts, cases.draw(family, 2).shape.verts)
+
+
+def test_families_that_tune_measure_nothing() -> None:
+    assert not set(TUNED) & set(KEPT) and set(FAMILIES) == {*TUNED, *KEPT}
+
+
+def test_a_truth_is_where_the_body_has_it(cases: Cases) -> None:
+    """Of a body with other triangles; and of its mirror image, left and right of which have changed."""
+    rng = np.random.default_rng(0)
+    shape, truth = cases.body(1, rng)
+    body = min(cases.bodies, key=lambda verts: float(cKDTree(verts).query(shape.verts[:50])[0].mean()))
+    assert np.linalg.norm(body[truth] - shape.verts, axis=1).max() < 0.06
+    case = cases.draw("mirrored", 0)
+    resting = cases.template.shape.verts[case.truth]
+    edges = case.shape.faces[:, :2]
+    lengths = np.linalg.norm(resting[edges[:, 0]] - resting[edges[:, 1]], axis=1)
+    assert lengths.mean() < 0.05
+
+
+def case_of(family: str, verdict: str, error: float) -> dict[str, object]:
+    return {"family": family, "verdict": verdict, "error": error}
+
+
+def test_what_is_counted() -> None:
+    found = [
+        case_of("a", "good", 1.0),
+        case_of("a", "good", 9.0),
+        case_of("a", "poor", 4.0),
+        case_of("b", "fair", 6.0),
+        case_of("b", verdicts.REFUSED, math.inf),
+        case_of("b", "poor", math.inf),
+    ]
+    assert verdicts.bars_of(found) == {"good": 2, "good_and_wrong": 1, "right": 2, "right_and_believed": 1}
+    first, second = verdicts.rows_of(found, "family", ["a", "b"])
+    assert (first["maps"], first["good"], first["right"], first["wrong"], first["worst_cm"]) == (3, 2, 2, 1, 9.0)
+    assert (second["refused"], second["right"], second["wrong"], second["mean_cm"]) == (1, 0, 1, 6.0)
+
+
+def test_confidence_that_says_what_is_so() -> None:
+    rng = np.random.default_rng(0)
+    confidence = rng.random(100_000).astype(np.float32)
+    found = [{"bins": verdicts.fine_bins(confidence, rng.random(100_000) < confidence)}]
+    rows, auc = verdicts.calibration(found)
+    assert sum(row["vertices"] for row in rows) == 100_000
+    assert all(abs(row["near"] - row["confidence"]) < 0.02 for row in rows)
+    assert auc == pytest.approx(5 / 6, abs=0.01)  # of such numbers
+    boast = [{"bins": verdicts.fine_bins(confidence, rng.random(100_000) < 0.5 * confidence)}]
+    assert max(row["confidence"] - row["near"] for row in verdicts.calibration(boast)[0]) > 0.4
+
+
+def test_weights_are_found() -> None:
+    rng = np.random.default_rng(0)
+    signs = rng.normal(size=(400, 2))
+    wrong = signs[:, 0] > 0.3
+    found = [
+        {"verdict": "good", "signs": list(sign), "error": 20.0 if bad else 1.0}
+        for sign, bad in zip(signs, wrong, strict=True)
+    ]
+    weights, offset = verdicts.fitted_weights(found)
+    assert weights[0] > 10 * abs(weights[1]) and -offset / weights[0] == pytest.approx(0.3, abs=0.1)
+
+
+@pytest.mark.slow
+def test_the_command_measures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A sound body is good; boxes and balls run together are not called good."""
+    words = ["--families", "sound,solid", "--count", "1", "--seed", "3", "--output", str(tmp_path)]
+    assert verdicts.main(words) == 0
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    rows = {row["of"]: row for row in record["families"]}
+    assert rows["sound"]["good"] == 1 and rows["sound"]["right"] == 1
+    assert rows["solid"]["good"] == 0 and rows["solid"]["wrong"] + rows["solid"]["refused"] == 1
+    assert (tmp_path / "human.png").stat().st_size > 1000
+    assert record["good_and_wrong"] == 0

@@ -1,0 +1,114 @@
+"""Verdicts: each sign of a wrong fit lowers the trust in it, and shapes that nobody could match are not called good."""
+
+import pickle
+from dataclasses import fields, replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from meshmatch.api.matching import Matcher
+from meshmatch.fitting.signs import Signs, signs_of
+from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.verdict import FAIR_TRUST, GOOD_TRUST, judge
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
+from tests.fitting.eggs import egg_model, scan_of
+
+RANK = {"good": 0, "fair": 1, "poor": 2}
+SOUND = Signs(0.023, torn=0.001, stretch=0.5, against=0.015)
+RISING = {
+    "residual": np.linspace(0.02, 0.1, 30),
+    "missed": np.linspace(0, 1, 30),
+    "empty": np.linspace(0, 1, 30),
+    "torn": np.linspace(0, 1, 30),
+    "stretch": np.linspace(0.1, 4, 30),
+    "against": np.linspace(0, 1, 30),
+    "partial": [False, True],
+}
+
+
+def test_all_signs_are_tried() -> None:
+    assert list(RISING) == [each.name for each in fields(Signs)]
+    assert len(SOUND.values()) == len(RISING)
+
+
+@pytest.mark.parametrize("sign", RISING)
+def test_trust_falls_as_a_sign_rises_and_verdicts_never_improve(sign: str) -> None:
+    found = [replace(SOUND, **{sign: value}) for value in RISING[sign]]
+    trust = [each.trust for each in found]
+    assert trust == sorted(trust, reverse=True) and trust[-1] < trust[0]
+    judged = [judge(each) for each in found]
+    ranks = [RANK[each.verdict] for each in judged]
+    assert ranks == sorted(ranks) and ranks[0] == 0
+    assert ranks[-1] > 0 or sign == "against"  # which alone says little
+    for each in judged:
+        assert bool(each.reasons) == (each.verdict != "good")
+        assert each.trust == each.signs.trust
+
+
+def test_where_verdicts_change() -> None:
+    found = [judge(replace(SOUND, residual=value)) for value in np.linspace(0.02, 0.08, 200)]
+    assert {each.verdict for each in found} == {"good", "fair", "poor"}
+    for each in found:
+        expected = "good" if each.trust >= GOOD_TRUST else "fair" if each.trust >= FAIR_TRUST else "poor"
+        assert each.verdict == expected
+    assert judge(replace(SOUND, partial=True), 0.3).verdict == "fair"  # a part is fair at best
+
+
+def test_reasons_are_sentences_with_codes() -> None:
+    (reason,) = judge(replace(SOUND, residual=0.1)).reasons
+    assert reason.code == "residual"
+    assert str(reason) == "template and shape stay 10.0 % of sqrt(area) apart on average"
+    again = pickle.loads(pickle.dumps(reason))
+    assert (again, again.code) == (reason, reason.code)
+
+
+@cache
+def system() -> NodeSystem:
+    return node_system(egg_model())
+
+
+def test_signs_of_a_template_on_itself() -> None:
+    still = np.zeros((system().K, 3))
+    signs = signs_of(system(), still, scan_of(egg_model().template.shape, 2000), 0.02)
+    assert (signs.residual, signs.missed, signs.empty, signs.partial) == (0.02, 0.0, 0.0, False)
+    assert signs.stretch < 0.01 and signs.against < 0.02 and signs.torn < 0.02
+
+
+def test_signs_of_a_template_on_a_part_and_on_more() -> None:
+    still, scan = np.zeros((system().K, 3)), scan_of(egg_model().template.shape, 2000)
+    half = replace(scan.rows(scan.points[:, 1] > 0))
+    assert 0.3 < signs_of(system(), still, half, 0.02).empty < 0.6
+    assert signs_of(system(), still, half, 0.02, partial=True).empty == 0.0
+    more = replace(scan, points=scan.points + np.where(scan.points[:, 1:2] > 0, [0.0, 1.0, 0.0], 0.0))
+    assert 0.3 < signs_of(system(), still, more, 0.02).missed < 0.6
+
+
+def test_signs_of_a_template_pressed_flat() -> None:
+    nodes = egg_model().template.nodes
+    flat = np.zeros_like(nodes)
+    flat[:, 2] = -0.98 * nodes[:, 2]
+    scan = scan_of(egg_model().template.shape, 2000)
+    pressed = replace(scan, points=scan.points * [1, 1, 0.02])
+    signs = signs_of(system(), flat, pressed, 0.025)
+    assert signs.stretch > 2 and judge(signs).verdict == "poor"
+    assert "crushed" in {reason.code for reason in judge(signs).reasons}
+    turned = replace(scan, normals=-scan.normals)
+    assert signs_of(system(), np.zeros_like(flat), turned, 0.025).against > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damage", ["flat", "leg"])
+def test_what_nobody_could_match_is_poor(damage: str) -> None:
+    """A body pressed onto a plane was called good at 32 cm, and a leg alone fair at 35."""
+    body = load_shape(bundled_folder() / "samples" / "dancer.ply")
+    if damage == "flat":
+        shape = Shape(body.verts * [1, 1, 0], body.faces, damage)
+    else:
+        low = body.verts[:, 1] < np.quantile(body.verts[:, 1], 0.35)
+        kept = (low & (body.verts[:, 0] > np.median(body.verts[low, 0])))[body.faces].all(1)
+        used, faces = np.unique(body.faces[kept], return_inverse=True)
+        shape = Shape(body.verts[used], faces.reshape(-1, 3), damage)
+    assert Matcher("human", threads=1).fit(shape).verdict == "poor"
