@@ -190,11 +190,10 @@ def main(
     for name in names:
         asked = {"kind": kind, "family": name, "count": count, "seed": seed}
         kept = runner.once(output / f"{kind}-{name.replace(' ', '-')}.json", asked, partial(family, name))
-        found += kept["found"]
-        rows = rows_of(kept["found"], "family", [name])
+        for each in kept["found"]:  # null is what JSON makes of infinity
+            found.append(each | {"error": np.inf if each["error"] is None else each["error"]})
+        rows = rows_of(found, "family", [name])
         runner.tell(f"{name}: " + ", ".join(f"{rows[0][verdict]} {verdict}" for verdict in (*VERDICTS, REFUSED)))
-    for each in found:  # null is what JSON makes of infinity
-        each["error"] = np.inf if each["error"] is None else each["error"]
     mapped = [each for each in found if each["verdict"] != REFUSED]
     steps, auc = calibration(mapped)
     bars, by_family, by_verdict = bars_of(found), rows_of(found, "family", names), rows_of(found, "verdict", VERDICTS)
