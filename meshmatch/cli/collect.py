@@ -1,7 +1,9 @@
 """``meshmatch fit`` and ``map``: many shapes fitted once, and maps of any two of them."""
 
+from collections.abc import Callable
+from itertools import count
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
@@ -12,6 +14,9 @@ from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import OptionError, PoorFit
 from meshmatch.models.registry import check_model
 
+if TYPE_CHECKING:
+    from meshmatch.collections.setting import Record
+
 Jobs = Annotated[int | None, Option(min=1, metavar="N", help="Number of processes. Default: one a core.")]
 Scheduler = Annotated[
     str | None,
@@ -21,6 +26,10 @@ Scheduler = Annotated[
         "files (needs meshmatch[cluster]).",
     ),
 ]
+
+
+# The residual is in % of sqrt(area).
+_ROW = "{:<28} {:<7} {:>6} {:>9} {:>4} {:>6} {:>11} {:>8}"
 
 
 @grouped
@@ -43,9 +52,9 @@ def fit(
 ) -> None:
     """Fit every shape of a collection once, for maps between any two of them and for atlases.
 
-    A shape that cannot be fitted is told, and stops nobody. What a run that was stopped had finished is kept, and shapes
-    that were added since are fitted when it is run again. With --model none the template is made of the shapes themselves,
-    which must be complete. FITS/fits.csv says what became of each shape.
+    Each shape is a row of a table as it comes in; one that cannot be fitted stops nobody. What a run that was stopped had
+    finished is kept, and shapes that were added since are fitted when it is run again. With --model none the template is
+    made of the shapes themselves, which must be complete. FITS/fits.csv says what became of each shape.
     """
     from meshmatch.collections.setting import FAILED
     from meshmatch.fitting.viscous import NO_MODEL
@@ -55,15 +64,7 @@ def fit(
         check_model(how.model)
     console = Console(quiet)
 
-    def tell(record: Any) -> None:
-        if record.verdict == FAILED:
-            console.warn(f"{record.name}: {record.reasons}")
-        elif record.verdict == "poor":
-            console.warn(f"{record.name}: poor fit: {record.reasons}")
-        else:
-            axes = f"up {record.up}, front {record.front}"
-            console.say(f"{record.name}: {record.verdict} fit, {axes} ({record.seconds:.1f} s)")
-
+    tell = _table(console)
     with console.progress() as progress:
         collection = meshmatch.Collection(output, scheduler or jobs, progress)
         made = collection.fit(
@@ -79,6 +80,22 @@ def fit(
         print_json({"output": output, "model": made.model, "seed": how.seed, "agreed": made.agreed, "verdicts": counts})
     if strict and (counts["poor"] or counts[FAILED]):
         raise PoorFit(f"not every fit is to be trusted: {told}", f"see {output}/fits.csv")
+
+
+def _table(console: Console) -> Callable[["Record"], None]:
+    """Says a row for each shape as it comes in, under a heading; and what is wrong with it."""
+    lines = count()
+
+    def tell(record: "Record") -> None:
+        if not next(lines):
+            console.say(_ROW.format("shape", "verdict", "trust", "residual", "up", "front", "vertices", "seconds"))
+        measured: tuple[str, ...] = (f"{record.trust:.2f}", f"{100 * record.residual:.1f} %", record.up, record.front)
+        measured += (f"{record.vertices:,}", f"{record.seconds:.1f}")
+        console.say(_ROW.format(record.name, record.verdict, *(measured if record.fitted else [""] * 6)).rstrip())
+        if not record.fitted or record.verdict == "poor":
+            console.warn(f"{record.name}: {'' if record.fitted else 'not fitted: '}{record.reasons}")
+
+    return tell
 
 
 def map(

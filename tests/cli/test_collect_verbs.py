@@ -1,6 +1,7 @@
 """``meshmatch fit`` and ``map`` as their users meet them."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -35,8 +36,20 @@ def test_what_is_said(fits: Path, run: Run) -> None:
     words = ["fit", fits.parent / "shapes", "-o", fits, "--jobs", "1"]
     answer = run(*words, "--json")
     assert answer.status == 0
-    assert "dancer: good fit, up +y, front +z" in answer.err
-    assert "warning: empty: empty.obj is empty (0 bytes)" in answer.err
+    assert answer.err.splitlines()[0].split() == [
+        "shape",
+        "verdict",
+        "trust",
+        "residual",
+        "up",
+        "front",
+        "vertices",
+        "seconds",
+    ]
+    assert answer.err.count("verdict") == 1
+    assert re.search(r"^dancer +good +[01]\.\d\d +\d\.\d % +\+y +\+z +4,002 +\d+\.\d$", answer.err, re.MULTILINE)
+    assert re.search("^empty +failed$", answer.err, re.MULTILINE)
+    assert "warning: empty: not fitted: empty.obj is empty (0 bytes)" in answer.err
     assert f"wrote 2 fits to {fits}: 2 good, 1 failed" in answer.err
     record = json.loads(answer.out)
     assert record["verdicts"] == {"good": 2, "fair": 0, "poor": 0, "failed": 1}
