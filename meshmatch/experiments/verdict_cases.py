@@ -22,7 +22,7 @@ from meshmatch.experiments.character_designs import Designer
 from meshmatch.experiments.furniture import KINDS, furniture
 from meshmatch.experiments.human_bodies import unseen_bodies
 from meshmatch.experiments.simulated_scans import scanned
-from meshmatch.experiments.verdict_shapes import direction, faces_kept, grid, joined, solids
+from meshmatch.experiments.verdict_shapes import between, direction, faces_kept, grid, joined, refined, solids
 from meshmatch.generators.generator import Generator
 from meshmatch.generators.kinds import GENERATORS, Kind
 from meshmatch.generators.proportions import CHILD, PLAIN, TOON
@@ -110,9 +110,6 @@ class Cases:
         return other, np.asarray(cKDTree(verts).query(other.verts)[1], dtype=np.int64)
 
     # Right as a rule.
-
-    def _sound(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        return self.body(number, rng)
 
     def _rough(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
@@ -204,8 +201,7 @@ class Cases:
 
     def _cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
-        height = shape.verts[shape.faces].mean(1) @ direction(rng)
-        return faces_kept(shape, truth, np.array(height > np.quantile(height, rng.uniform(0.1, 0.75))))
+        return between(shape, truth, direction(rng), rng.uniform(0.1, 0.75), 1.0)
 
     def _merged(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         (one, first), (other, second) = self.body(number, rng), self.body(number + 1, rng)
@@ -287,15 +283,27 @@ class Cases:
     def _two_cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         """Two cuts: what lies between two parallel planes."""
         shape, truth = self.body(number, rng)
-        height = shape.verts[shape.faces].mean(1) @ direction(rng)
-        low = rng.uniform(0, 0.5)
-        between = np.quantile(height, [low, low + rng.uniform(0.3, 0.5)])
-        return faces_kept(shape, truth, np.asarray((height > between[0]) & (height < between[1])))
+        axis, low = direction(rng), rng.uniform(0, 0.5)
+        return between(shape, truth, axis, low, low + rng.uniform(0.3, 0.5))
+
+    def _dense(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """The same surface in two million triangles."""
+        shape, truth = self.body(number, rng)
+        fine = refined(shape, 2_000_000)
+        return fine, truth[cKDTree(shape.verts).query(fine.verts)[1]]
+
+    def _not_manifold(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """With triangles twice, turned round, and across the body."""
+        shape, truth = self.body(number, rng)
+        some = rng.permutation(shape.F)
+        twice, turned, across = (shape.faces[some[k::3]][: int(0.04 * shape.F)] for k in range(3))
+        across = np.column_stack([across[:20, :2], rng.integers(shape.V, size=20)])
+        return Shape(shape.verts, np.concatenate([shape.faces, twice, turned[:, ::-1], across])), truth
 
 
 Family = Callable[[Cases, int, np.random.Generator], tuple[Shape, Ints]]
 TUNED: dict[str, Family] = {
-    "sound": Cases._sound, "rough": Cases._rough, "cloud": Cases._cloud, "holes": Cases._holes, "scan": Cases._scan,
+    "sound": Cases.body, "rough": Cases._rough, "cloud": Cases._cloud, "holes": Cases._holes, "scan": Cases._scan,
     "dressed": Cases._dressed, "stylised": Cases._stylised, "swollen": Cases._swollen, "inside out": Cases._inside_out,
     "squashed": Cases._squashed, "flattened": Cases._flattened, "pulled": Cases._pulled, "mirrored": Cases._mirrored,
     "limb": Cases._limb, "cut": Cases._cut, "merged": Cases._merged, "floor": Cases._floor, "melted": Cases._melted,
@@ -303,7 +311,7 @@ TUNED: dict[str, Family] = {
 }  # fmt: skip
 KEPT: dict[str, Family] = {
     "twisted": Cases._twisted, "amputated": Cases._amputated, "things beside": Cases._beside, "sheared": Cases._sheared,
-    "lumpy": Cases._lumpy, "cut twice": Cases._two_cut,
+    "lumpy": Cases._lumpy, "cut twice": Cases._two_cut, "two million": Cases._dense, "not manifold": Cases._not_manifold,
 }  # fmt: skip
 FAMILIES = TUNED | KEPT
 

@@ -23,6 +23,13 @@ def faces_kept(shape: Shape, truth: Ints, kept: Bool[Bools, " F"]) -> tuple[Shap
     return Shape(shape.verts[used], faces.reshape(-1, 3)), truth[used]
 
 
+def between(shape: Shape, truth: Ints, axis: Float[Floats, " 3"], low: float, high: float) -> tuple[Shape, Ints]:
+    """Only the faces between two quantiles (0..1) of their places along an axis."""
+    along = shape.verts[shape.faces].mean(1) @ axis
+    first, last = np.quantile(along, [low, high])
+    return faces_kept(shape, truth, np.asarray((along > first) & (along <= last)))
+
+
 def joined(shape: Shape, other: Shape, at: Float[Floats, "W 3"]) -> Shape:
     """Two shapes as one, the second one with its vertices elsewhere."""
     return Shape(np.concatenate([shape.verts, at]), np.concatenate([shape.faces, other.faces + shape.V]))
@@ -35,6 +42,15 @@ def grid(side: float, cells: int) -> Shape:
     a, b, c, d = corner[:-1, :-1].ravel(), corner[:-1, 1:].ravel(), corner[1:, 1:].ravel(), corner[1:, :-1].ravel()
     faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
     return Shape(np.column_stack([x.ravel(), np.zeros(x.size), z.ravel()]), faces)
+
+
+def refined(shape: Shape, F: int) -> Shape:
+    """The same surface in F triangles or a few more; where triangles of two sizes meet there are slits."""
+    verts, faces = np.asarray(shape.verts), np.asarray(shape.faces)
+    while len(faces) < F:
+        some = np.arange(min(len(faces), -(-(F - len(faces)) // 3)))
+        verts, faces = trimesh.remesh.subdivide(verts, faces, some)
+    return Shape(verts, faces)
 
 
 def solids(rng: np.random.Generator) -> Shape:

@@ -46,7 +46,7 @@ def test_a_truth_is_where_the_body_has_it(cases: Cases) -> None:
 
 
 def case_of(family: str, verdict: str, error: float) -> dict[str, object]:
-    return {"family": family, "verdict": verdict, "error": error}
+    return {"family": family, "verdict": verdict, "error": error, "seconds": 2.0}
 
 
 def test_what_is_counted() -> None:
@@ -61,6 +61,7 @@ def test_what_is_counted() -> None:
     assert verdicts.bars_of(found) == {"good": 2, "good_and_wrong": 1, "right": 2, "right_and_believed": 1}
     first, second = verdicts.rows_of(found, "family", ["a", "b"])
     assert (first["maps"], first["good"], first["right"], first["wrong"], first["worst_cm"]) == (3, 2, 2, 1, 9.0)
+    assert first["seconds"] == 2.0
     assert (second["refused"], second["right"], second["wrong"], second["mean_cm"]) == (1, 0, 1, 6.0)
 
 
