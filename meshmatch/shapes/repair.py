@@ -1,11 +1,11 @@
 """Making a shape fit for work without losing sight of any original vertex.
 
-Only what is safe is done: nothing is moved, no hole is closed, no face is invented.
+Only what is safe is done: no hole is closed, no face is invented, and nothing is moved but what noise has moved.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
 from meshmatch.shapes.faces import duplicate_faces, find_parts, flat_faces, seams, turn_faces
+from meshmatch.shapes.noise import without_noise
 from meshmatch.shapes.shape import Shape
 
 _NOT_TRUSTED = "of weight 0 left out"
@@ -25,12 +26,13 @@ _NOT_TRUSTED = "of weight 0 left out"
 class Repaired:
     """A shape that is fit for work, and how it relates to the one that it came from.
 
-    All vertices of `shape` are valid and, in a mesh, used by a face. `original_to_repaired` is the vertex that stands
-    for each original one: itself, its twin at the same position, or if it was dropped the nearest one. The nearest to a
-    vertex without a position is a valid corner of one of its faces, or if there is none the nearest in the file's
-    order. `kept_vertex` and `kept_face` are the original vertex (increasing) or face that each repaired one is; corners
-    may be turned, or stand for twins. `notes` say what was found and done, a line each; none for a shape that was fine.
-    `far_parts` counts big parts that lie far from the largest one: perhaps two objects in one file. They are kept.
+    All vertices of `shape` are valid and, in a mesh, used by a face; they are where they were, unless noise was smoothed.
+    `original_to_repaired` is the vertex that stands for each original one: itself, its twin at the same position, or if it
+    was dropped the nearest one. The nearest to a vertex without a position is a valid corner of one of its faces, or if
+    there is none the nearest in the file's order. `kept_vertex` and `kept_face` are the original vertex (increasing) or
+    face that each repaired one is; corners may be turned, or stand for twins. `notes` say what was found and done, a line
+    each; none for a shape that was fine. `far_parts` counts big parts that lie far from the largest one: perhaps two
+    objects in one file. They are kept.
     """
 
     shape: Shape
@@ -61,7 +63,8 @@ def repair(shape: Shape) -> Repaired:
     `meshmatch.shapes.faces.OUTLIER_SHARE`; unless together they are more than a tenth of the surface: then the shape
     is made of small parts, and only those far from the rest are outliers); vertices that no face uses. Then faces are
     turned so that neighbours agree and the shape is not inside out. Open and non-manifold edges are counted, not
-    mended. Of a cloud: points without a position, double ones, and outliers far from all others.
+    mended. Where noise is as large as the triangles, the surface is smoothed (`meshmatch.shapes.noise`).
+    Of a cloud: points without a position, double ones, and outliers far from all others.
 
     `InputError` if nothing is left: no face of a mesh has any area.
     """
@@ -126,7 +129,11 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     border, crowded = edges.counts
     _note(notes, border, "open edge", "(the surface has holes or a border)")
     _note(notes, crowded, "non-manifold edge", "(more than two faces meet there), left as they are")
-    return _result(shape, kept, twin, faces, which, valid, notes, far)
+    found = _result(shape, kept, twin, faces, which, valid, notes, far)
+    smooth, passes = without_noise(found.shape, parts)
+    if not passes:
+        return found
+    return replace(found, shape=smooth, notes=(*found.notes, f"smoothed {passes} times: noise hid the surface"))
 
 
 def _without(bad: Bools, *arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:
