@@ -89,6 +89,9 @@ class Places:
             return values.astype(np.float32)[part.original_to_repaired]
 
         original = part.original
+        stands = part.kept_vertex[part.original_to_repaired]
+        # What was left out is as near to the template as the vertex that stands for it, and the way there.
+        away = np.linalg.norm(original.verts - original.verts[stands], axis=1) * original.valid / fit.frame.scale
         fitted = np.zeros(original.F, bool)
         fitted[part.kept_face] = True
         return cls(
@@ -97,10 +100,10 @@ class Places:
             fit.template_hash,
             of_file(resting),
             of_file(height),
-            of_file(distance),
+            of_file(distance) + away.astype(np.float32),
             None if shift is None else of_file(shift),
             None if spread is None else of_file(spread),
-            part.kept_vertex[part.original_to_repaired].astype(np.int32),
+            stands.astype(np.int32),
             original.faces.astype(np.int32),
             fitted,
             fit.verdict,

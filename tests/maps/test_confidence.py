@@ -84,3 +84,17 @@ def test_distance_from_the_template_costs_confidence_on_both_sides(side: str) ->
     found = build_map(far, near) if side == "source" else build_map(near, far)
     assert distance.max() > 0.01
     assert np.allclose(found.confidence, np.exp(-((distance / 0.042) ** 2)), atol=0.02)
+
+
+def test_what_was_left_out_is_as_far_away_as_it_lies() -> None:
+    """Vertices of weight 0, which the nearest ones stand for, and one that no face uses."""
+    ball = bumpy_sphere()
+    unit = Shape(ball.verts / np.sqrt(ball.area), ball.faces, "ball")
+    verts = np.concatenate([unit.verts, [1.0, 1.0, 1.05] * unit.verts[:1] + [0, 0, 0.05]])
+    weights = np.append(np.where(unit.verts[:, 2] > 0.2, 0.0, 1.0), 1.0)
+    part, fit = repair(Shape(verts, unit.faces, "part", weights=weights)), lying_on(unit)
+    places, dropped = Places.of(part, fit), np.setdiff1d(np.arange(len(verts)), part.kept_vertex)
+    assert 0 < len(dropped) < 0.4 * len(verts) and len(verts) - 1 in dropped
+    away = np.linalg.norm(verts[dropped] - verts[places.stands[dropped]], axis=1)
+    assert np.allclose(places.distance[dropped], away, atol=1e-6) and away.max() > 0.05
+    assert np.allclose(places.distance[part.kept_vertex], 0, atol=1e-6)
