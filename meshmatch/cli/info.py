@@ -54,6 +54,7 @@ def _shape(file: Path) -> Json:
     from meshmatch.shapes.normalise import guess_unit, long_axis
     from meshmatch.shapes.repair import repair
 
+    names = mesh_names(file)  # first: what it reads is gone before the shape itself needs memory
     shape = load_shape(file)
     size = [float(length) for length in shape.bounds[1] - shape.bounds[0]]
     clean = repair(shape)
@@ -64,7 +65,7 @@ def _shape(file: Path) -> Json:
         # of the repaired mesh: the seams of texture and the corners of an stl are joined
         parts = {"parts": int(face_parts(clean.shape.faces, clean.shape.V).max()) + 1}
     about: Json = {"kind": "point cloud" if shape.is_cloud else "mesh", "vertices": shape.V, "faces": shape.F}
-    if names := mesh_names(file):
+    if names:
         about["meshes"] = [f"{name} ({count:,} vertices)" for name, count in names.items()]
     about |= {"size": size, "area": shape.area, "colors": shape.colors is not None}
     usual = {"longest_along": long_axis(clean.shape), "unit_if_a_person": guess_unit(clean.shape)}

@@ -149,18 +149,17 @@ def same_rows(rows: Float[Floats, "N D"] | Int[Ints, "N D"]) -> Int[Ints, " N"]:
 
 def face_parts(faces: Int[Ints, "F 3"], V: int) -> Int[Ints, " F"]:
     """(F,) number of the connected part that each face is in; faces that share a vertex are connected."""
-    from scipy.sparse import csr_array
+    from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    F = len(faces)
-    # faces x vertices: each face points to its three corners, which needs no sorting
-    indices = np.asarray(faces.ravel() + F, np.int32 if V + F < 2**31 else np.int64)
-    pointers = np.concatenate([np.arange(0, 3 * F + 1, 3), np.full(V, 3 * F)]).astype(indices.dtype)
-    graph = csr_array((np.ones(3 * F, np.int8), indices, pointers), shape=(F + V, F + V))
-    _, label = connected_components(graph, directed=False)
-    used = np.zeros(F + V, np.int64)  # a vertex without a face is no part
-    used[label[:F]] = 1
-    return np.asarray((np.cumsum(used) - 1)[label[:F]])
+    kind = np.int32 if V < 2**31 else np.int64
+    ends = faces[:, :2].ravel().astype(kind), faces[:, 1:].ravel().astype(kind)  # two edges of a face join its corners
+    graph = coo_array((np.ones(len(ends[0]), np.int8), ends), shape=(V, V)).tocsr()
+    del ends  # for millions of faces ask for little memory
+    label = connected_components(graph, directed=False)[1][faces[:, 0]]
+    used = np.zeros(V, np.int64)  # a vertex without a face is no part
+    used[label] = 1
+    return np.asarray((np.cumsum(used) - 1)[label])
 
 
 @dataclass(frozen=True, eq=False)
