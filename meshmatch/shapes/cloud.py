@@ -13,6 +13,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.shapes.faces import agreeing_flips
 
 LARGEST = 20_000
+_CHUNK = 2**18
 
 
 def local_areas(points: Float[Floats, "V 3"]) -> Float[Floats, " V"]:
@@ -78,10 +79,14 @@ def outlier_points(points: Float[Floats, "V 3"], far: float = 3.0) -> Bool[Bools
     if len(part) < 20:
         return np.zeros(len(points), bool)
     tree = cKDTree(part)
-    distance, index = tree.query(points, 9)  # 8 neighbours, and itself
-    own_reach = (distance if part is points else tree.query(part, 9)[0])[:, -1]
-    usual = np.median(own_reach[index[:, 1:]], axis=1)
-    return np.asarray((distance[:, -1] > far * usual) & (distance[:, -1] > far * np.median(own_reach)))
+    own_reach = tree.query(part, 9)[0][:, -1]  # 8 neighbours, and itself
+    limit = far * np.median(own_reach)
+    outlier = np.zeros(len(points), bool)
+    for low in range(0, len(points), _CHUNK):  # nine distances of every point ask for much memory
+        distance, index = tree.query(points[low : low + _CHUNK], 9)
+        usual = np.median(own_reach[index[:, 1:]], axis=1)
+        outlier[low : low + _CHUNK] = (distance[:, -1] > far * usual) & (distance[:, -1] > limit)
+    return outlier
 
 
 def on_a_line(points: Float[Floats, "V 3"]) -> bool:
