@@ -134,13 +134,15 @@ def same_rows(rows: Float[Floats, "N D"] | Int[Ints, "N D"]) -> Int[Ints, " N"]:
     ordered = np.sort(hashed)
     if not (ordered[1:] == ordered[:-1]).any():
         return own
-    order = np.argsort(hashed)
-    ordered = hashed[order]
     begins = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
-    sizes = np.diff(np.append(begins, len(rows)))
+    del ordered, own  # for millions of rows ask for little memory
+    order = np.argsort(hashed)
+    del hashed
     first = np.empty(len(rows), np.int64)
-    first[order] = np.repeat(np.minimum.reduceat(order, begins), sizes)
-    if (rows == rows[first]).all():
+    first[order] = np.repeat(np.minimum.reduceat(order, begins), np.diff(np.append(begins, len(rows))))
+    del order, begins
+    blocks = (slice(low, low + _CHUNK) for low in range(0, len(rows), _CHUNK))
+    if all((rows[block] == rows[first[block]]).all() for block in blocks):
         return first
     # two different rows with one hash: the slow way
     _, index, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
@@ -231,10 +233,9 @@ def is_watertight(faces: Int[Ints, "F 3"]) -> bool:
 
 
 def _hash(rows: Floats | Ints) -> NDArray[np.uint64]:
-    bits = np.ascontiguousarray(rows + 0 if rows.dtype.kind == "i" else rows + 0.0).view(np.uint64)
     total = np.zeros(len(rows), np.uint64)
-    for k in range(rows.shape[1]):
-        total ^= bits[:, k]
+    for k, column in enumerate(rows.T):
+        total ^= (column + 0 if rows.dtype.kind == "i" else column + 0.0).view(np.uint64)
         total *= _MIX[k % 3]
         total ^= total >> np.uint64(29)
     return total

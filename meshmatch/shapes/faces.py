@@ -20,16 +20,18 @@ _NEAR = 0.05  # gap up to which a small part belongs to a shape that is made of 
 def seams(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, " V"]:
     """The vertex to use instead of each: the first at the same position, if both lie on an open edge."""
     twin = same_rows(verts)
-    own = np.arange(len(verts))
-    if (twin == own).all():
+    again = twin != np.arange(len(verts))
+    if not again.any():
         return twin
     shared = np.zeros(len(verts), bool)
-    shared[twin[twin != own]] = True
+    shared[twin[again]] = True
     shared = shared[twin]
+    del twin, again  # for millions of vertices ask for little memory
     border = np.zeros(len(verts), bool)
     border[triangles.edges_of(faces[shared[faces].any(axis=1)]).open] = True
     # the first of a group need not be on the border: number the border alone
     place = np.flatnonzero(border & shared)
+    own = np.arange(len(verts))
     own[place] = place[same_rows(verts[place])]
     return own
 
