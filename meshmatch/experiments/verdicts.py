@@ -4,10 +4,11 @@ Each case (`meshmatch.experiments.verdict_cases`) is matched onto a shape that a
 pose, every fourth of which is cut. The error of a vertex is the straight distance on the target between its partner and the
 true one, in centimetres of a person of 1.9 m2; a map's error is the mean over the vertices that have a partner, and that of
 a shape of another kind is infinite. A map is right below 5 cm and wrong above 8. Confidence is compared, at every vertex,
-with how often the error is within 5 cm; a vertex without a partner never is. The longest fit is in CPU seconds.
+with how often the error is within 5 cm; a vertex without a partner never is. All maps weigh the same, however many
+vertices they have. The longest fit is in CPU seconds.
 
 ``--fit`` prints the weights that tell right from wrong best, of the cases of this run: those in
-`meshmatch.fitting.signs` are of seed 0 and the families that may tune. Measure with another seed.
+`meshmatch.fitting.signs` are of seeds 0 and 1 and the families that may tune. Measure with another seed.
 """
 
 from __future__ import annotations
@@ -111,17 +112,25 @@ def fine_bins(confidence: Float[Floats32, " V"], near: Bool[Bools, " V"]) -> dic
 
 
 def calibration(found: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], float]:
-    """A row for every tenth of confidence: vertices, mean confidence, share near. And how well confidence separates."""
-    total = {name: np.sum([each["bins"][name] for each in found], axis=0) for name in ("count", "sum", "near")}
+    """A row for every tenth of confidence: vertices, mean confidence, share near. And how well confidence separates.
+
+    All maps weigh the same.
+    """
+    vertices = np.sum([each["bins"]["count"] for each in found], axis=0)
+    total = {
+        name: np.sum([np.divide(each["bins"][name], sum(each["bins"]["count"])) for each in found], axis=0)
+        for name in ("count", "sum", "near")
+    }
     rows = []
     for number in range(_COARSE):
         part = slice(number * _FINE // _COARSE, (number + 1) * _FINE // _COARSE)
         count, expected, near = (float(total[name][part].sum()) for name in ("count", "sum", "near"))
-        row: dict[str, Any] = {"of": f"{number / _COARSE:.1f} to {(number + 1) / _COARSE:.1f}", "vertices": int(count)}
-        rows.append(row | ({"confidence": expected / count, "near": near / count} if count >= _OFTEN else {}))
+        many = int(vertices[part].sum())
+        row: dict[str, Any] = {"of": f"{number / _COARSE:.1f} to {(number + 1) / _COARSE:.1f}", "vertices": many}
+        rows.append(row | ({"confidence": expected / count, "near": near / count} if many >= _OFTEN else {}))
     near, far = total["near"], total["count"] - total["near"]
     below = np.cumsum(far) - 0.5 * far
-    return rows, float((near * below).sum() / max(near.sum() * far.sum(), 1))
+    return rows, float((near * below).sum() / max(near.sum() * far.sum(), 1e-12))
 
 
 def rows_of(found: Sequence[Mapping[str, Any]], group: str, names: Sequence[str]) -> list[dict[str, Any]]:

@@ -32,7 +32,7 @@ _MAX_NOISE = 0.025
 _TEAR_SAMPLES = 4096  # enough to see tears
 _MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
 # Of the logit of a wrong fit, in the order of `Signs.trust`.
-_WEIGHTS, _OFFSET = (1.61, 4.286, 1.569, 0.642, 2.125, 0.332, 2.741), -2.56
+_WEIGHTS, _OFFSET = (1.694, 4.025, 0.944, 1.093, 2.051, 0.274, 2.327), -0.744
 _AGAINST_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
 
 

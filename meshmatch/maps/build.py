@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.maps.parts import kept_together
 from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VERDICTS, VertexMap
 
 # The most likely values on the right and wrong fits that `meshmatch.fitting.verdict` learned from, where confidence is the
-# probability that a vertex is within 5 cm of its true partner on a person. Distance (units of sqrt(area)) at which it is
-# 1/e = 0.37:
-_DISTANCE_SCALE = 0.042
-# the same for how far agreement moved the two fits: where it moved them much, one shape alone says something else;
-_AGREEMENT_SCALE = 0.081
-# and of all vertices of a wrong fit, the share that is near nevertheless.
-_BY_CHANCE = 0.07
+# probability that a vertex is within 5 cm of its true partner on a person. Distances, and how far agreement moved the two
+# fits (where it moved them much, one shape alone says something else), at which it is 1/e = 0.37 (units of sqrt(area)):
+_DISTANCE_SCALE, _AGREEMENT_SCALE = 0.042, 0.081
+# the share that is near without distance, of wrong fits and of right ones; and what turns odds of being right to odds of it
+_BY_CHANCE, _MOST, _ODDS, _MAX_TRUST = 0.07, 0.98, 0.135, 0.999
 
 
 def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
@@ -34,12 +33,11 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
     found = kept_together(source, target, target.nearest(source.resting, workers), workers)
     along = np.square(found.distance) - np.square(source.height - target.height[found.vertex])
     apart = np.square(source.distance) + np.square(target.distance[found.vertex]) + np.maximum(along, 0.0)
-    confidence = np.exp(-apart / _DISTANCE_SCALE**2)
+    doubt = apart / _DISTANCE_SCALE**2
     if source.shift is not None and target.shift is not None:
-        stretched = source.shift + target.shift[found.vertex]
-        confidence *= np.exp(-np.square(stretched / _AGREEMENT_SCALE))
+        doubt += np.square((source.shift + target.shift[found.vertex]) / _AGREEMENT_SCALE)
+    confidence = _confidence(doubt, source.trust * target.trust)
     verdict = max(source.verdict, target.verdict, key=VERDICTS.index)
-    confidence *= _BY_CHANCE + (1 - _BY_CHANCE) * source.trust * target.trust
     return VertexMap(
         source.name,
         target.name,
@@ -55,3 +53,13 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
         target.hash,
         target.faces.astype(np.int64),
     )
+
+
+def _confidence(doubt: Float[Floats, " V"], trust: float) -> Float[Floats, " V"]:
+    """Probability that vertices are near, of squared distances in the units above, and of the trust in both fits.
+
+    Far vertices of a doubtful fit are doubted more than either says.
+    """
+    trust = min(trust, _MAX_TRUST)
+    odds = _ODDS * trust / (1 - trust) / np.sqrt(np.expm1(np.clip(doubt, 1e-6, 50.0)))
+    return np.exp(-doubt) * (_BY_CHANCE + (_MOST - _BY_CHANCE) * odds / (1 + odds))

@@ -73,6 +73,9 @@ def test_confidence_that_says_what_is_so() -> None:
     assert sum(row["vertices"] for row in rows) == 100_000
     assert all(abs(row["near"] - row["confidence"]) < 0.02 for row in rows)
     assert auc == pytest.approx(5 / 6, abs=0.01)  # of such numbers
+    many = [{"bins": verdicts.fine_bins(np.full(10, 0.55, np.float32), np.ones(10, bool))}, *found]
+    (row,) = [row for row in verdicts.calibration(many)[0] if row["of"] == "0.5 to 0.6"]
+    assert row["near"] > 0.9  # ten vertices of one map weigh as much as a tenth of a hundred thousand of another
     boast = [{"bins": verdicts.fine_bins(confidence, rng.random(100_000) < 0.5 * confidence)}]
     assert max(row["confidence"] - row["near"] for row in verdicts.calibration(boast)[0]) > 0.4
 
