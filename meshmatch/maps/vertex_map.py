@@ -76,6 +76,7 @@ class VertexMap:
         object.__setattr__(self, "reasons", tuple(str(reason) for reason in self.reasons))
         object.__setattr__(self, "source_vertices", size)
 
+    @np.errstate(invalid="ignore")  # of a nan that signals; it is refused
     def _checked_arrays(self, label: str) -> dict[str, NDArray[Any]]:
         """Copies of the arrays, if they are what the class says."""
         vertex = _whole_numbers(self.index, f"{label}: index")
@@ -86,8 +87,7 @@ class VertexMap:
         check_range(vertex, self.target_vertices, label)
         size = len(vertex)
         faces = np.full(size, -1) if self.face is None else _whole_numbers(self.face, f"{label}: face")
-        first = self.barycentric is None
-        weights = np.tile([1.0, 0.0, 0.0], (size, 1)) if first else np.array(self.barycentric, np.float64)
+        weights = np.array(np.eye(1, 3).repeat(size, 0) if self.barycentric is None else self.barycentric, np.float64)
         given = np.ones(size) if self.confidence is None else np.array(self.confidence, np.float64)
         trust = np.clip(given, -1, 2).astype(np.float32)  # a short float holds no 1e300, which is refused below
         arrays: dict[str, NDArray[Any]] = {"index": vertex, "face": faces, "barycentric": weights, "confidence": trust}

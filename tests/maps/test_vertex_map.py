@@ -81,6 +81,8 @@ def test_arrays_are_its_own_and_read_only() -> None:
         ({"barycentric": np.full((2, 3), np.nan)}, "sum to 1", ""),
         ({"confidence": np.array([0, 1.5])}, "0..1", ""),
         ({"confidence": np.array([0, np.nan])}, "0..1", ""),
+        ({"confidence": np.array([0, 0x7F800001], np.uint32).view(np.float32)}, "0..1", ""),  # a nan that signals
+        ({"barycentric": np.full(6, 0x7F800001, np.uint32).view(np.float32).reshape(2, 3)}, "sum to 1", ""),
         ({"verdict": "splendid"}, "verdict", ""),
     ],
 )
