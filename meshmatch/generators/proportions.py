@@ -17,7 +17,7 @@ from meshmatch.generators.figure import PARTS, SIDED, Figure, part
 from meshmatch.generators.rig import skin
 
 PLAIN, CHILD, FREE, TOON, BUILT = range(5)
-SHARES = (0.28, 0.12, 0.12, 0.32, 0.16)
+SHARES = (0.24, 0.14, 0.1, 0.3, 0.22)
 """Of the characters: as they are, children, freely stretched, stylised, built of parts."""
 # Typical sizes of parts: along and across, and how much they vary (deviation of the logarithm).
 _CHILD = {"head": (1.5, 1.45, 0.14), "neck": (0.75, 1.0, 0.12), "thigh": (0.72, 1.0, 0.12), "shin": (0.72, 1.0, 0.12),
@@ -108,8 +108,13 @@ def rounded(
 
     ends = torch.zeros(P, dtype=torch.bool)
     ends[[k for name in ("head", "hand", "foot") for k in _both(name)]] = True
+    solid = torch.rand(B, 1, generator=generator) < 0.6  # of built bodies: made of solids, like robots
     amount = torch.where(built, draw(0.3, 1.0), torch.where(ends, draw(0.0, 1.0), draw(0.0, 0.8)))
-    girth = torch.where(built, draw(0.85, 1.35), torch.ones(B, P))
+    amount = torch.where(built & solid, draw(0.85, 1.0), amount)
+    girth = torch.where(built, draw(0.85, 1.35), torch.ones(B, P))[..., None].repeat(1, 1, 3)
+    # Solids are wide or narrow, deep or flat, and a little shorter or longer than what they stand for.
+    sizes = torch.stack([draw(0.6, 1.6), draw(0.9, 1.15), draw(0.6, 1.6)], -1)
+    girth = torch.where((built & solid)[..., None], sizes, girth)
     around = torch.where(draw(0, 1) < 0.6, 2.0, draw(3, 9))  # exponents: 2 is round, 8 a box
     along = torch.where(ends & ~built, draw(2, 3), draw(3, 9))
     sharp = torch.where(built, 1 + 5 * torch.rand(B, 1, generator=generator), torch.ones(B, 1))
@@ -124,11 +129,7 @@ def rounded(
         heavy = (mine > 0.5).float() * mine + 1e-6
         middle = (heavy[:, None] * points).sum(1, keepdim=True) / heavy.sum()
         local = (points - middle) @ axes[:, p].transpose(-1, -2)
-        half = (
-            1.55
-            * ((heavy[:, None] * local.square()).sum(1, keepdim=True) / heavy.sum()).sqrt()
-            * girth[:, p, None, None]
-        )
+        half = 1.55 * ((heavy[:, None] * local.square()).sum(1, keepdim=True) / heavy.sum()).sqrt() * girth[:, p, None]
         unit = (local / half).abs().clamp_min(1e-4)
         n, m = around[:, p, None], along[:, p, None]
         ring = (unit[..., 0] ** n + unit[..., 2] ** n) ** (m / n)

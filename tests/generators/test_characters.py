@@ -113,6 +113,18 @@ def test_rounded_parts_lie_nearer_to_balls(figure: Figure) -> None:
     assert roundness(moved).mean() < 0.8 * roundness(rest).mean()
 
 
+def test_solids_are_wide_or_narrow_deep_or_flat(figure: Figure) -> None:
+    rest, heads = resting(figure, 64)
+    own = rows_of(figure, "chest")
+
+    def variety(verts: torch.Tensor) -> float:
+        width, depth = verts[:, own, 0].std(1), verts[:, own, 2].std(1)
+        return float((width / depth).log().std())
+
+    built, plain = (rounded(figure, rest, heads, torch.full((64,), kind), seeded()) for kind in (BUILT, PLAIN))
+    assert variety(built) > 0.12 > 3 * variety(plain)
+
+
 # clothes
 
 
