@@ -32,7 +32,7 @@ _MAX_NOISE = 0.025
 _TEAR_SAMPLES = 4096  # enough to see tears
 _MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
 # Of the logit of a wrong fit, in the order of `Signs.trust`.
-_WEIGHTS, _OFFSET = (1.694, 4.025, 0.944, 1.093, 2.051, 0.274, 2.327), -0.744
+_WEIGHTS, _OFFSET = (1.494, 3.922, 1.154, 2.048, 0.26, 5.404), 0.115
 _AGAINST_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
 
 
@@ -49,6 +49,7 @@ class Signs:
     stretch : root mean square of the logarithms of the template's stretches
     against : share (0..1) of the shape that faces the other way than the template
     partial : whether the shape was taken for a part
+    hidden : share (0..1) of the template that a part does not show
     """
 
     residual: float
@@ -58,17 +59,17 @@ class Signs:
     stretch: float = 0.0
     against: float = 0.0
     partial: bool = False
+    hidden: float = 0.0
 
     def values(self) -> tuple[float, ...]:
-        """Numbers that grow about as the doubt does."""
+        """Numbers that grow about as the doubt does; beside the others ``empty`` and ``partial`` told nothing more."""
         return (
             100 * self.residual,
             10 * min(self.missed, 0.2),
-            10 * min(self.empty, 0.3),
             float(np.log(self.torn + 0.003)),
             float(np.log(max(self.stretch, 0.3))),
             float(np.log(self.against + 0.01)),
-            float(self.partial),
+            self.hidden,
         )
 
     @property
@@ -81,6 +82,7 @@ def signs_of(
     system: NodeSystem, vectors: Float[Floats, "K 3"], local: OrientedPoints, residual: float, partial: bool = False
 ) -> Signs:
     """The signs of a fit; ``local`` are samples of the shape in the core frame."""
+    hidden = 1 - area_share(system, visible_vertices(system, local, vectors)) if partial else 0.0
     surface = system.surface(vectors)
     gap, nearest = cKDTree(surface.points).query(local.points)
     some = local.first(_TEAR_SAMPLES)
@@ -95,6 +97,7 @@ def signs_of(
         float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
         float(weighted_mean(against, local.weights)) if local.signed else _AGAINST_IF_UNSIGNED,
         partial,
+        hidden,
     )
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshmatch.fitting.fit import Reason, ReasonCode, Verdict
-from meshmatch.fitting.signs import Signs, area_share, cloud_allowance, signs_of, unexplained, visible_vertices
+from meshmatch.fitting.signs import Signs, cloud_allowance, signs_of, unexplained
 from meshmatch.fitting.task import Registration
 
 # Trust from which on a fit is good, and fair; a part is fair at best.
-GOOD_TRUST, FAIR_TRUST = 0.95, 0.5
+GOOD_TRUST, FAIR_TRUST = 0.95, 0.65
 # Shares without counterpart up to which a fit is good; and of the template, up to which it is fair. Set by hand.
 _GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
 # A residual (units of sqrt(area)) from which on a fit may be one of a part, and the search for parts goes on. Set by hand.
@@ -35,21 +35,19 @@ class Judgement:
 def judge_registration(found: Registration, partial: bool) -> Judgement:
     """What is thought of a registration."""
     task, vectors = found.task, found.candidate.vectors
-    residual, hidden = found.candidate.residual, None
+    residual = found.candidate.residual
     if task.shape.is_cloud:
         allowance = cloud_allowance(task.system, found.local, task.shape.V, vectors, task.config.seed)
         residual = unexplained(residual, allowance)
-    if partial:
-        hidden = 1 - area_share(task.system, visible_vertices(task.system, found.local, vectors))
-    return judge(signs_of(task.system, vectors, found.local, residual, partial), hidden)
+    return judge(signs_of(task.system, vectors, found.local, residual, partial))
 
 
-def judge(signs: Signs, hidden: float | None = None) -> Judgement:
-    """Verdict, reasons and trust; ``hidden`` is the share (0..1) of the template that a part does not show."""
+def judge(signs: Signs) -> Judgement:
+    """Verdict, reasons and trust."""
     trust, reasons = signs.trust, _reasons(signs)
     if signs.partial:
-        lost = "" if hidden is None else f": {100 * hidden:.0f} % of the template has no counterpart"
-        reasons.append(Reason("part", f"taken for a part{lost}"))
+        lost = f"{100 * signs.hidden:.0f} % of the template has no counterpart"
+        reasons.append(Reason("part", f"taken for a part: {lost}"))
     if trust < FAIR_TRUST or signs.empty > _FAIR_SHARE:
         verdict: Verdict = "poor"
     elif trust < GOOD_TRUST or signs.partial or max(signs.missed, signs.empty) > _GOOD_SHARE:

@@ -68,7 +68,7 @@ def test_what_is_not_visible_is_not_held_against_a_part() -> None:
     scan, still = OrientedPoints(samples.points[half], samples.normals[half]), np.zeros((system.K, 3))
     assert 0.3 < empty_share(scan, system.verts) < 0.6
     assert judge(signs_of(system, still, scan, 0.02)).verdict == "poor"
-    judged = judge(signs_of(system, still, scan, 0.02, partial=True), 0.5)
+    judged = judge(replace(signs_of(system, still, scan, 0.02, partial=True), hidden=0.5))
     assert judged.verdict == "fair"
     assert judged.reasons == ("taken for a part: 50 % of the template has no counterpart",)
     assert judge(signs_of(system, still, scan, 0.05, partial=True)).verdict == "poor"
