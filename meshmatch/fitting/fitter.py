@@ -20,7 +20,7 @@ from meshmatch.fitting.nodes import Landmarks
 from meshmatch.fitting.refinement import REFINEMENTS, Refinement
 from meshmatch.fitting.signs import empty_share
 from meshmatch.fitting.task import FitTask, Registration
-from meshmatch.fitting.verdict import FAIR_RESIDUAL, FAIR_TRUST, judge_registration
+from meshmatch.fitting.verdict import EVEN_TRUST, FAIR_RESIDUAL, judge_registration
 from meshmatch.geometry.triangles import face_parts
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
@@ -99,7 +99,7 @@ def doubted(fit: Fit, doubts: Sequence[Reason]) -> Fit:
     if not doubts:
         return fit
     verdict: Verdict = "fair" if fit.verdict == "good" else fit.verdict
-    return replace(fit, verdict=verdict, reasons=(*fit.reasons, *doubts), trust=min(fit.trust, FAIR_TRUST))
+    return replace(fit, verdict=verdict, reasons=(*fit.reasons, *doubts), trust=min(fit.trust, EVEN_TRUST))
 
 
 def _may_be_part(whole: Registration, refinement: Refinement) -> bool:

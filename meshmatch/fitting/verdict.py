@@ -12,6 +12,7 @@ from meshmatch.fitting.task import Registration
 
 # Trust from which on a fit is good, and fair; a part is fair at best.
 GOOD_TRUST, FAIR_TRUST = 0.95, 0.65
+EVEN_TRUST = 0.5  # at most, where nearness says nothing: as likely wrong as right
 # Shares without counterpart up to which a fit is good; and of the template, up to which it is fair. Set by hand.
 _GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
 # A residual (units of sqrt(area)) from which on a fit may be one of a part, and the search for parts goes on. Set by hand.

@@ -24,7 +24,7 @@ from meshmatch.fitting.nodes import pair_terms
 from meshmatch.fitting.signs import signs_of
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import take_samples
-from meshmatch.fitting.verdict import FAIR_TRUST, judge
+from meshmatch.fitting.verdict import EVEN_TRUST, judge
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.normalise import align
 from meshmatch.shapes.sampling import sample_surface
@@ -122,7 +122,7 @@ def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: 
         verts=shape.verts,
         verdict="fair" if judged.verdict == "good" else judged.verdict,
         reasons=(*judged.reasons, unsure),
-        trust=min(judged.trust, FAIR_TRUST),
+        trust=min(judged.trust, EVEN_TRUST),
         signs=judged.signs,
         up=axis_name(core.rotation[1]),
         front=axis_name(core.rotation[2]),

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from meshmatch.api.matching import Matcher
+from meshmatch.fitting.fit import Reason
+from meshmatch.fitting.fitter import doubted
 from meshmatch.fitting.signs import Signs, signs_of
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.verdict import FAIR_TRUST, GOOD_TRUST, judge
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
+from tests.conftest import some_fit
 from tests.fitting.eggs import egg_model, scan_of
 
 RANK = {"good": 0, "fair": 1, "poor": 2}
@@ -59,6 +62,16 @@ def test_where_verdicts_change() -> None:
         expected = "good" if each.trust >= GOOD_TRUST else "fair" if each.trust >= FAIR_TRUST else "poor"
         assert each.verdict == expected
     assert judge(replace(SOUND, partial=True, hidden=0.3)).verdict == "fair"  # a part is fair at best
+
+
+def test_where_nearness_says_nothing_a_fit_is_as_likely_wrong_as_right() -> None:
+    doubt = Reason("side", "its mirror image fits as well")
+    sound = some_fit(np.eye(3), np.array([[0, 1, 2]]))
+    assert doubted(sound, []) is sound
+    for verdict, trust in (("good", 0.99), ("fair", 0.7), ("poor", 0.2)):
+        found = doubted(replace(sound, verdict=verdict, trust=trust), [doubt])
+        assert found.verdict == ("fair" if verdict == "good" else verdict)
+        assert (found.trust, found.reasons) == (min(trust, 0.5), (doubt,))
 
 
 def test_reasons_are_sentences_with_codes() -> None:
