@@ -10,8 +10,8 @@ from meshmatch.fitting.fit import Reason, ReasonCode, Verdict
 from meshmatch.fitting.signs import Signs, cloud_allowance, signs_of, unexplained
 from meshmatch.fitting.task import Registration
 
-# Trust from which on a fit is good, and fair; a part is fair at best.
-GOOD_TRUST, FAIR_TRUST = 0.95, 0.65
+# Trust from which on a fit is good (of those that tuned, 1 in 100 is then over 5 cm), and fair; a part is fair at best.
+GOOD_TRUST, FAIR_TRUST = 0.97, 0.65
 EVEN_TRUST = 0.5  # at most, where nearness says nothing: as likely wrong as right
 # Shares without counterpart up to which a fit is good; and of the template, up to which it is fair. Set by hand.
 _GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
