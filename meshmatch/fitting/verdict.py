@@ -56,7 +56,8 @@ def judge(signs: Signs) -> Judgement:
     else:
         return Judgement("good", (), signs)
     if trust < GOOD_TRUST and not reasons:
-        reasons.append(Reason("doubt", f"all signs together speak for it with {100 * trust:.0f} %"))
+        short = f"{int(100 * trust)} % likely, short of {100 * GOOD_TRUST:.0f}"
+        reasons.append(Reason("doubt", f"all signs together make it {short}"))
     return Judgement(verdict, tuple(reasons), signs)
 
 
