@@ -143,7 +143,7 @@ class _Run:
 
     def last_tasks(self, records: Mapping[int, Record], groups: Sequence[Group]) -> dict[int, FinishTask]:
         """What finishes each fit; a digest of all that agree tells whether that was done before."""
-        steps = AgreeConfig.for_model(self.setting.trained).steps if groups else 0
+        steps = AgreeConfig.for_collection(self.setting.trained).steps if groups else 0
         group_of = {name: group for group in groups for name in group.names}
         found = {}
         for number, record in records.items():
@@ -156,7 +156,7 @@ class _Run:
         """All steps of the agreement that were not taken before; the cost grows as the number of fits. Sums are taken in
         the order of the groups.
         """
-        steps, store = AgreeConfig.for_model(self.setting.trained).steps, self.setting.store
+        steps, store = AgreeConfig.for_collection(self.setting.trained).steps, self.setting.store
         for step in range(steps + 1):
             common = common_file(groups[0].agreement, step + 1)
             if store.exists(common):

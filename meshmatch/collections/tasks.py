@@ -53,7 +53,7 @@ def fit_alone(task: FitTask) -> Record:
         assert fit.repaired is not None
         samples = None
         if setting.agrees:
-            how = AgreeConfig.for_model(setting.trained)
+            how = AgreeConfig.for_collection(setting.trained)
             samples = member_of(node_system(setting.trained), fit.repaired.shape, fit, setting.config, how).samples
         record = Record(
             name=source.name,
@@ -133,7 +133,7 @@ def agree_a_little(task: AgreeTask) -> Float[Floats, "G 3 3"]:
     Step 0 only gives the sum.
     """
     setting, group, store = task.setting, task.group, task.setting.store
-    system, how = node_system(setting.trained), AgreeConfig.for_model(setting.trained)
+    system, how = node_system(setting.trained), AgreeConfig.for_collection(setting.trained)
     members = [_member(setting.read(ALONE, name), how) for name in group.names]
 
     def after(step: int) -> Floats:

@@ -56,6 +56,11 @@ class AgreeConfig:
         """As stiff as the model's card says."""
         return cls(strain=cls.strain * model.card.stiffness)
 
+    @classmethod
+    def for_collection(cls, model: TrainedModel) -> AgreeConfig:
+        """The same for many shapes, whose mean hardly moves: they come to it later than a pair meets half way."""
+        return replace(cls.for_model(model), steps=12)
+
     def for_noise(self, roughness: float) -> AgreeConfig:
         """The same for a cloud of a ``roughness`` (0..1, see `Shape.roughness`): all samples, shared, a stiffer template."""
         return replace(

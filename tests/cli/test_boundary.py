@@ -117,6 +117,7 @@ def load(path):
         Path("cleaned").touch()
 
 files.mesh_names = load
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, and stays so
 sys.exit(main(["info", "a.ply"]))
 """
 

@@ -128,7 +128,7 @@ def test_an_agreement_goes_on_where_it_was_stopped(
     with pytest.raises(KeyboardInterrupt):
         meshmatch.Collection(stopped, workers=1).fit(shapes, model="human")
     meshmatch.Collection(stopped, workers=1).fit(shapes)
-    assert len(taken) == 3 * 8 + 1  # the one that was interrupted is taken twice
+    assert len(taken) == 3 * 12 + 1  # the one that was interrupted is taken twice
     meshmatch.Collection(straight, workers=1).fit(shapes, model="human")
     assert contents(stopped) == contents(straight) and not (stopped / "agreeing").exists()
 
