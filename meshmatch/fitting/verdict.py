@@ -10,7 +10,7 @@ from meshmatch.fitting.fit import Reason, ReasonCode, Verdict
 from meshmatch.fitting.signs import Signs, cloud_allowance, signs_of, unexplained
 from meshmatch.fitting.task import Registration
 
-# Trust from which on a fit is good (of those that tuned, 1 in 100 is then over 5 cm), and fair; a part is fair at best.
+# Trust from which on a fit is good, and fair; a part is fair at best.
 GOOD_TRUST, FAIR_TRUST = 0.97, 0.65
 EVEN_TRUST = 0.5  # at most, where nearness says nothing: as likely wrong as right
 # Shares without counterpart up to which a fit is good; and of the template, up to which it is fair. Set by hand.
@@ -56,8 +56,8 @@ def judge(signs: Signs) -> Judgement:
     else:
         return Judgement("good", (), signs)
     if trust < GOOD_TRUST and not reasons:
-        short = f"{int(100 * trust)} % likely, short of {100 * GOOD_TRUST:.0f}"
-        reasons.append(Reason("doubt", f"all signs together make it {short}"))
+        likely = f"{int(100 * trust)} % likely to be right, where a good fit needs {100 * GOOD_TRUST:.0f} %"
+        reasons.append(Reason("doubt", likely))
     return Judgement(verdict, tuple(reasons), signs)
 
 

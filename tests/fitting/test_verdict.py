@@ -80,7 +80,7 @@ def test_reasons_are_sentences_with_codes() -> None:
     assert str(reason) == "template and shape stay 10.0 % of sqrt(area) apart on average"
     judged = (judge(replace(SOUND, residual=0.028, stretch=value)) for value in np.linspace(0.5, 1, 400))
     doubtful = next(each for each in judged if each.verdict == "fair")
-    assert doubtful.reasons == ("all signs together make it 96 % likely, short of 97",)
+    assert doubtful.reasons == ("96 % likely to be right, where a good fit needs 97 %",)
     again = pickle.loads(pickle.dumps(reason))
     assert (again, again.code) == (reason, reason.code)
 
