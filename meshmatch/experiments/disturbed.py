@@ -17,34 +17,16 @@ import time
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from typer import Option
 
 from meshmatch.collections.stores import LOCK
 from meshmatch.errors import OptionError
 from meshmatch.experiments import runner
 from meshmatch.experiments.groupwise import contents
-from meshmatch.experiments.human_bodies import unseen_bodies
-from meshmatch.outputs import make_folder
-from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.shape import Shape
-from meshmatch.templates.template import read_template
+from meshmatch.experiments.human_bodies import write_bodies
 
-_AT_ONCE = 50  # bodies that are generated together
 COLUMNS = {"bodies": "bodies:d", "kills": "kills:d", "undisturbed, s": "undisturbed_s:.0f", "killed, s": "killed_s:.0f"}
 COLUMNS |= {"same bits": "same", "left over": "left_over:d", "good": "good:d"}
-
-
-def write_bodies(folder: Path, count: int, seed: int) -> None:
-    """Generated bodies as ply files, each with its vertices in an order of its own."""
-    make_folder(folder)
-    template, rng = read_template("human-T"), np.random.default_rng(seed)
-    for first in range(0, count, _AT_ONCE):
-        some = unseen_bodies(template, min(_AT_ONCE, count - first), seed=seed + first)
-        for number, verts in enumerate(some, first):
-            order = rng.permutation(len(verts))
-            rank = np.argsort(order)
-            save_shape(folder / f"body-{number:04d}.ply", Shape(verts[order], rank[template.shape.faces]))
 
 
 def run_fit(shapes: Path, output: Path, jobs: int) -> subprocess.Popen[bytes]:

@@ -3,6 +3,8 @@
 The fits are made by one process and by two, each from nothing, and must be the same bit for bit; the ratio of their times
 is what two processes gain. Errors count all pairs, as in `meshmatch.experiments.bench`, where the same maps made pair by
 pair are. Hearts are fitted without a model (`--model none`); their error is that of `meshmatch.experiments.hearts`.
+Bodies are generated ones, enough of them that the start of the processes does not tell; of their maps those from the first
+body are measured, in straight distances.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,16 +24,22 @@ from typing import Annotated, Any
 import numpy as np
 from typer import Option
 
+from meshmatch.arrays import Int, Ints
 from meshmatch.collections.collection import Collection
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.hearts import TRUTH, heart_errors
+from meshmatch.experiments.human_bodies import write_bodies
 from meshmatch.experiments.scores import evaluate_set
 from meshmatch.experiments.sets import load_folder, load_set
 from meshmatch.fitting.viscous import NO_MODEL
+from meshmatch.maps.evaluate import CM_PER_UNIT
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.files import load_shape
 
-HEART = "heart"
-SETS = ("scape", "faust", HEART)
+HEART, BODIES = "heart", "bodies"
+SETS = ("scape", "faust", HEART, BODIES)
+_BODIES = 100
 COLUMNS = {"set": "set", "shapes": "shapes:d", "maps": "maps:d", "fits, 1 process": "one_s:.1f"}
 COLUMNS |= {
     "2 processes": "two_s:.1f",
@@ -59,12 +68,26 @@ def timed_fits(shapes: list[Path], folder: Path, model: str, jobs: int) -> float
     return seconds
 
 
+def straight_cm(
+    folder: Path, orders: Mapping[str, Int[Ints, " V"]], source: str, target: str, vertex_map: VertexMap
+) -> float:
+    """Mean straight distance of the partners of generated bodies' vertices from the true ones (cm, the person scaled as
+    usual)."""
+    shape = load_shape(folder / f"{target}.ply")
+    true = np.argsort(orders[target])[orders[source]]
+    off = shape.verts[vertex_map.index] - shape.verts[true]
+    return CM_PER_UNIT / float(np.sqrt(shape.area)) * float(np.linalg.norm(off, axis=1).mean())
+
+
 def measure(name: str, data: Path, work: Path, limit: int | None) -> dict[str, Any]:
     """One row."""
     model = NO_MODEL if name == HEART else "human"
     if name == HEART:
         shapes, truth = load_folder(data / HEART, TRUTH)
         paths = [data / HEART / f"{each}.ply" for each in runner.spread(list(shapes), limit)]
+    elif name == BODIES:
+        orders = write_bodies(work / name, limit or _BODIES, seed=0)
+        paths = sorted((work / name).iterdir())
     else:
         bench = load_set(name, data)
         paths = [bench.path(each) for each in runner.spread(list(bench.shapes), limit)]
@@ -72,9 +95,9 @@ def measure(name: str, data: Path, work: Path, limit: int | None) -> dict[str, A
     seconds = {folder: timed_fits(paths, folder, model, number) for folder, number in ((one, 1), (two, 2))}
     largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6  # of all processes so far
     collection = Collection(two, 2)
-    pairs = list(permutations(collection.names, 2))
+    pairs = [pair for pair in permutations(collection.names, 2) if name != BODIES or pair[0] == collection.names[0]]
     began = time.perf_counter()
-    collection.save_maps(work / f"{name}-maps")
+    collection.save_maps(work / f"{name}-maps", pairs)
     written = time.perf_counter() - began
     found: dict[tuple[str, str], Any] = {}
     began = time.perf_counter()
@@ -83,6 +106,8 @@ def measure(name: str, data: Path, work: Path, limit: int | None) -> dict[str, A
     each = (time.perf_counter() - began) / len(pairs)
     if name == HEART:
         error, unit = heart_errors(shapes, truth, found)["mean_x100"], "x100 of sqrt(area)"
+    elif name == BODIES:
+        error, unit = float(np.mean([straight_cm(paths[0].parent, orders, *pair, found[pair]) for pair in pairs])), "cm"
     else:
         scores = evaluate_set(bench, {pair: one.index for pair, one in found.items()}, pairs=pairs, cache=work / "kept")
         error, unit = float(np.mean(list(scores.means_cm.values()))), "cm"

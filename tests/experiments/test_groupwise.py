@@ -21,6 +21,15 @@ def test_hearts_without_a_model(bench: Path, tmp_path: Path, capsys: pytest.Capt
     assert isinstance(row["largest_gb"], float) and row["largest_gb"] > 0.05
 
 
+def test_generated_bodies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("anny")
+    words = ["--sets", "bodies", "--limit-shapes", "2", "--work", str(tmp_path / "work")]
+    assert groupwise.main(words) == 0
+    row = last_row(capsys)
+    assert (row["shapes"], row["maps"], row["same"]) == (2, 1, True)
+    assert isinstance(row["error"], float) and 0.1 < row["error"] < 5.0
+
+
 def test_a_run_that_is_killed_ends_as_one_that_is_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("anny")
     words = ["--bodies", "3", "--every", "8", "--jobs", "1", "--work", str(tmp_path / "work")]
