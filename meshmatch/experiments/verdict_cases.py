@@ -18,11 +18,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.experiments import verdict_shapes as craft
 from meshmatch.experiments.character_designs import Designer
 from meshmatch.experiments.furniture import KINDS, furniture
 from meshmatch.experiments.human_bodies import unseen_bodies
 from meshmatch.experiments.simulated_scans import scanned
-from meshmatch.experiments.verdict_shapes import between, direction, faces_kept, grid, joined, refined, solids
 from meshmatch.generators.generator import Generator
 from meshmatch.generators.kinds import GENERATORS, Kind
 from meshmatch.generators.proportions import CHILD, PLAIN, TOON
@@ -31,15 +31,7 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, read_template
 
-_METRES = 1.7  # how large what is no person is made
 _DRAWN = 200
-_LIMBS = (
-    ("left thigh", "left shin", "left foot"), ("right thigh", "right shin", "right foot"),
-    ("left upper arm", "left forearm", "left hand"), ("right upper arm", "right forearm", "right hand"),
-    ("head", "neck"), ("left forearm", "left hand"), ("right hand",), ("left foot", "left shin"),
-    ("chest", "belly", "hips"),
-    ("hips", "left thigh", "left shin", "left foot", "right thigh", "right shin", "right foot"),
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +70,7 @@ class Cases:
         if kind not in self._kept:
             generator = torch.Generator().manual_seed(7100 + self.seed)
             verts = self._others[kind].draw(_DRAWN, generator).double().numpy()
-            self._kept[kind] = verts * (_METRES / np.ptp(verts, axis=1).max(1)[:, None, None])
+            self._kept[kind] = verts * (craft.METRES / np.ptp(verts, axis=1).max(1)[:, None, None])
         return self._kept[kind]
 
     @cached_property
@@ -130,7 +122,7 @@ class Cases:
         for _ in range(int(rng.integers(1, 9))):
             at = centers[rng.integers(shape.F)]
             kept &= np.linalg.norm(centers - at, axis=1) > rng.uniform(0.04, 0.2)
-        return faces_kept(shape, truth, kept)
+        return craft.faces_kept(shape, truth, kept)
 
     def _scan(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
@@ -176,7 +168,7 @@ class Cases:
 
     def _scaled(self, number: int, rng: np.random.Generator, factor: float) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
-        axis = np.eye(3)[rng.integers(3)] if number % 3 else direction(rng)
+        axis = np.eye(3)[rng.integers(3)] if number % 3 else craft.direction(rng)
         along = shape.verts @ axis
         return Shape(shape.verts + np.outer(along * (factor - 1), axis), shape.faces), truth
 
@@ -187,13 +179,13 @@ class Cases:
     def _limb(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
         kept = self._in_limb(truth, rng)[shape.faces].all(1)
-        return faces_kept(shape, truth, np.asarray(kept))
+        return craft.faces_kept(shape, truth, np.asarray(kept))
 
-    def _in_limb(self, truth: Ints, rng: np.random.Generator, most: int = len(_LIMBS)) -> Bool[Bools, " V"]:
+    def _in_limb(self, truth: Ints, rng: np.random.Generator, most: int = len(craft.LIMBS)) -> Bool[Bools, " V"]:
         """Whether vertices are of some limb, one of the first so many: of people a named one, else a few parts."""
         names, labels = self.template.label_names or (), np.asarray(self.template.labels)
         if self.kind == "human":
-            asked = [names.index(name) for name in _LIMBS[int(rng.integers(most))]]
+            asked = [names.index(name) for name in craft.LIMBS[int(rng.integers(most))]]
         else:
             first = int(rng.integers(len(names)))
             asked = list(range(first, min(first + int(rng.integers(1, 4)), len(names))))
@@ -201,19 +193,17 @@ class Cases:
 
     def _cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
-        return between(shape, truth, direction(rng), rng.uniform(0.1, 0.75), 1.0)
+        return craft.between(shape, truth, craft.direction(rng), rng.uniform(0.1, 0.75), 1.0)
 
     def _merged(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         (one, first), (other, second) = self.body(number, rng), self.body(number + 1, rng)
-        apart = rng.uniform(0.0, 0.8) * direction(rng)
-        return joined(one, other, other.verts + apart), np.concatenate([first, second])
+        apart = rng.uniform(0.0, 0.8) * craft.direction(rng)
+        return craft.joined(one, other, other.verts + apart), np.concatenate([first, second])
 
     def _floor(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
-        plane = grid(rng.uniform(0.8, 6.0), 40)
-        low = shape.verts.min(0)
-        at = np.array([shape.verts[:, 0].mean(), low[1], shape.verts[:, 2].mean()])
-        return joined(shape, plane, plane.verts + at), np.append(truth, np.full(plane.V, -1))
+        whole = craft.on_floor(shape, rng.uniform(0.8, 6.0))
+        return whole, np.append(truth, np.full(whole.V - shape.V, -1))
 
     def _melted(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
@@ -227,15 +217,21 @@ class Cases:
         """An animal, a hand or a head."""
         kind = [name for name in GENERATORS if name != self.kind][number % 2 if self.kind != "human" else number % 3]
         verts = self._drawn(kind)
-        return _no_body(verts[int(rng.integers(len(verts)))], np.asarray(self._others[kind].template.shape.faces))
+        return craft.no_body(verts[int(rng.integers(len(verts)))], np.asarray(self._others[kind].template.shape.faces))
 
     def _furniture(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         mesh = furniture(sorted(KINDS)[number % 3], 50 + self.seed, number).mesh(48)
-        return _no_body(np.asarray(mesh.verts), np.asarray(mesh.faces))
+        return craft.no_body(np.asarray(mesh.verts), np.asarray(mesh.faces))
 
     def _solid(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        whole = solids(rng)
-        return _no_body(whole.verts, whole.faces)
+        whole = craft.solids(rng)
+        return craft.no_body(whole.verts, whole.faces)
+
+    def _kit(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Furniture of boxes that run into each other."""
+        made = furniture(sorted(KINDS)[number % 3], 70 + self.seed, number)
+        kit = craft.boxes([solid.box for _, solid in made.solids], 0.2)
+        return craft.no_body(kit.verts, kit.faces)
 
     # Kept: nothing is tuned on these.
 
@@ -249,17 +245,16 @@ class Cases:
     def _amputated(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
         lost = self._in_limb(truth, rng, 8)[shape.faces].all(1)
-        return faces_kept(shape, truth, np.asarray(~lost))
+        return craft.faces_kept(shape, truth, np.asarray(~lost))
 
     def _beside(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         """Boxes and balls on or in the body."""
         shape, truth = self.body(number, rng)
         for _ in range(int(rng.integers(1, 4))):
             size = rng.uniform(0.05, 0.8, 3)
-            made = trimesh.creation.box(size).subdivide_to_size(0.08)
-            thing = Shape(np.asarray(made.vertices), np.asarray(made.faces))
+            thing = craft.boxes([np.stack([-0.5 * size, 0.5 * size])], 0.08)
             at = shape.verts[rng.integers(shape.V)] + rng.normal(size=3) * 0.1
-            shape = joined(shape, thing, thing.verts + at)
+            shape = craft.joined(shape, thing, thing.verts + at)
             truth = np.append(truth, np.full(thing.V, -1))
         return shape, truth
 
@@ -275,21 +270,21 @@ class Cases:
         shape, truth = self.body(number, rng)
         verts = np.array(shape.verts)
         for _ in range(12):
-            wave = direction(rng) * rng.uniform(2, 9)
+            wave = craft.direction(rng) * rng.uniform(2, 9)
             phase = rng.uniform(0, 2 * np.pi)
-            verts += np.outer(np.sin(shape.verts @ wave + phase), direction(rng)) * rng.uniform(0.0, 0.05)
+            verts += np.outer(np.sin(shape.verts @ wave + phase), craft.direction(rng)) * rng.uniform(0.0, 0.05)
         return Shape(verts, shape.faces), truth
 
     def _two_cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         """Two cuts: what lies between two parallel planes."""
         shape, truth = self.body(number, rng)
-        axis, low = direction(rng), rng.uniform(0, 0.5)
-        return between(shape, truth, axis, low, low + rng.uniform(0.3, 0.5))
+        axis, low = craft.direction(rng), rng.uniform(0, 0.5)
+        return craft.between(shape, truth, axis, low, low + rng.uniform(0.3, 0.5))
 
     def _dense(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         """The same surface in two million triangles."""
         shape, truth = self.body(number, rng)
-        fine = refined(shape, 2_000_000)
+        fine = craft.refined(shape, 2_000_000)
         return fine, truth[cKDTree(shape.verts).query(fine.verts)[1]]
 
     def _not_manifold(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
@@ -312,9 +307,6 @@ TUNED: dict[str, Family] = {
 KEPT: dict[str, Family] = {
     "twisted": Cases._twisted, "amputated": Cases._amputated, "things beside": Cases._beside, "sheared": Cases._sheared,
     "lumpy": Cases._lumpy, "cut twice": Cases._two_cut, "two million": Cases._dense, "not manifold": Cases._not_manifold,
+    "kit": Cases._kit,
 }  # fmt: skip
 FAMILIES = TUNED | KEPT
-
-
-def _no_body(verts: Floats, faces: Ints) -> tuple[Shape, Ints]:
-    return Shape(verts * (_METRES / np.ptp(verts, axis=0).max()), faces), np.full(len(verts), -1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import reduce
 
 import numpy as np
@@ -9,6 +10,17 @@ import trimesh
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.shapes.shape import Shape
+
+METRES = 1.7
+"""How large what is no person is made."""
+LIMBS = (
+    ("left thigh", "left shin", "left foot"), ("right thigh", "right shin", "right foot"),
+    ("left upper arm", "left forearm", "left hand"), ("right upper arm", "right forearm", "right hand"),
+    ("head", "neck"), ("left forearm", "left hand"), ("right hand",), ("left foot", "left shin"),
+    ("chest", "belly", "hips"),
+    ("hips", "left thigh", "left shin", "left foot", "right thigh", "right shin", "right foot"),
+)  # fmt: skip
+"""Labels of parts of people that are cut out together."""
 
 
 def direction(rng: np.random.Generator) -> Float[Floats, " 3"]:
@@ -67,3 +79,24 @@ def solids(rng: np.random.Generator) -> Shape:
         made.apply_translation(rng.normal(size=3) * 0.4)
         parts.append(Shape(np.asarray(made.vertices), np.asarray(made.faces)))
     return reduce(lambda whole, part: joined(whole, part, part.verts), parts)
+
+
+def boxes(corners: Sequence[Float[Floats, "2 3"]], edge: float) -> Shape:
+    """Boxes by their lower and upper corners, which may run into each other; no edge is longer than that."""
+    parts = []
+    for low, high in corners:
+        made = trimesh.creation.box(high - low).subdivide_to_size(edge)
+        parts.append(Shape(np.asarray(made.vertices) + 0.5 * (low + high), np.asarray(made.faces)))
+    return reduce(lambda whole, part: joined(whole, part, part.verts), parts)
+
+
+def on_floor(shape: Shape, side: float) -> Shape:
+    """A shape above the middle of a square that it stands on."""
+    plane = grid(side, 40)
+    at = np.array([shape.verts[:, 0].mean(), shape.verts[:, 1].min(), shape.verts[:, 2].mean()])
+    return joined(shape, plane, plane.verts + at)
+
+
+def no_body(verts: Floats, faces: Ints) -> tuple[Shape, Ints]:
+    """A shape as large as a person, none of whose vertices has a counterpart."""
+    return Shape(verts * (METRES / np.ptp(verts, axis=0).max()), faces), np.full(len(verts), -1)

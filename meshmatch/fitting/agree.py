@@ -23,7 +23,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig, NodeRefineConfig, geometric_between
 from meshmatch.fitting.nodes import add_landmarks, nearest_rotations, pair_terms
 from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.fitting.task import Landmarks, take_samples
+from meshmatch.fitting.task import Landmarks, take_samples, without_inside
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.symmetric import entries_of, exponential, logarithm, matrices_of
 from meshmatch.models.trained import TrainedModel
@@ -115,7 +115,7 @@ def member_of(
     """What agreement needs of a repaired shape and its fit; landmarks are in the shape's file frame."""
     local = None if landmarks is None else (landmarks[0], fit.frame.apply(landmarks[1]))
     own = config.for_noise(shape.roughness)
-    frame, samples = take_samples(shape, own.samples, np.random.default_rng(own.seed))
+    frame, samples = take_samples(without_inside(shape), own.samples, np.random.default_rng(own.seed))
     points = fit.frame.apply(frame.undo(samples.points))
     normals = samples.normals @ frame.rotation @ fit.frame.rotation.T
     samples = replace(samples, points=points, normals=normals).facing(system.surface(fit.vectors))

@@ -88,7 +88,7 @@ def fit_whole(task: FitTask, refine: Refine) -> Registration:
         task, candidates = _rescaled(task, candidates)
     best = task.predictor.fit_all([(task.samples, each.pose) for each in candidates[:careful]])
     orientation(1.0)
-    return Registration(task, refine(task, best_first(best)))
+    return Registration(task.bare, refine(task, best_first(best)))
 
 
 def _rescaled(task: FitTask, candidates: list[Candidate]) -> tuple[FitTask, list[Candidate]]:

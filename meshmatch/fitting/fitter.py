@@ -86,7 +86,7 @@ class Fitter:
         refinement = REFINEMENTS[task.config.refine]
         found, partial = fit_whole(task, refinement.whole), False
         if landmarks is None and _may_be_part(found, refinement):
-            part = fit_part(task, refinement.part)
+            part = fit_part(task.bare, refinement.part)
             # A part explains the shape better than the whole, and lacks some of it.
             closer = part.candidate.cost < _CLOSER * found.candidate.residual
             partial = closer and part.candidate.share < 1 - _MISSING

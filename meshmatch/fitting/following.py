@@ -37,7 +37,7 @@ def follow(fitter: Fitter, shape: Shape, last: Fit) -> Fit:
     ratio = last.frame.scale / task.frame.scale  # the size is known, and no longer estimated
     if not 1 / _RESIZED < ratio < _RESIZED:
         return fitter.fit(shape)
-    task = task.rescaled(ratio, replace(task.samples, points=task.samples.points / ratio))
+    task = task.rescaled(ratio)
     task = replace(task, config=replace(task.config, variants=_VARIANTS))
     pose = _pose_in(task.frame, last.frame)
 
@@ -51,7 +51,7 @@ def follow(fitter: Fitter, shape: Shape, last: Fit) -> Fit:
     tried: list[Fit] = []
     for candidates in (asked, held):
         best = REFINEMENTS[task.config.refine].whole(task, candidates())
-        tried.append(as_fit(Registration(task, best), False, began))
+        tried.append(as_fit(Registration(task.bare, best), False, began))
         if tried[-1].verdict != "poor" and tried[-1].residual <= _LOST * last.residual:
             return tried[-1]
     tried.append(fitter.fit(shape))

@@ -4,7 +4,8 @@ A new refinement is a line of `REFINEMENTS`, and its name in `meshmatch.fitting.
 
 The surface alone hardly tells which of several interpretations of a pose is right: a crossed arm taken for the other one
 lies on it as well as the right one does. But points that are neighbours on the shape then belong far apart on the
-template: the map is discontinuous. Interpretations that differ are each refined in full, and judged by both.
+template: the map is discontinuous. Interpretations that differ are each refined in full, and judged by both; where they tie,
+as front and back of a robot do, by how files usually stand.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from meshmatch.fitting.nodes import refine_nodes
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import FitTask, Refine
 from meshmatch.fitting.tears import Pairs, neighbours, torn_share
+from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
 from meshmatch.threads import beside
@@ -41,6 +43,8 @@ _POOL = 24  # among how many of the best those that are unlike each other are lo
 # One whose score is so many times the best one's after a few steps is left: on 78 bodies of SCAPE, FAUST and SHREC'19 the
 # best after a few steps was the best at the end.
 _BEHIND = 1.05
+# Residual by which another way to stand must be better than that of most files, and the cosine from which on it is that one.
+_UNUSUAL, _UPRIGHT = 0.002, 0.85
 _PART_FINALISTS = 4  # interpretations of a part that get a few steps each
 _SCREENED_SAMPLES = 4096  # enough to tell interpretations apart
 
@@ -84,7 +88,7 @@ def _fit_nodes(task: FitTask, candidates: list[Candidate]) -> Candidate:
         residual = two_way_residual(task.system, coarse.to_local(each.pose), each.vectors)
         pool.append(replace(each, residual=residual))
     found = best_first(pool)
-    return choose(found, config.finalists, _WholeComparison(task, found), task.progress.stage("refinement"))
+    return choose(found, config.finalists, _WholeComparison(task.bare, found), task.progress.stage("refinement"))
 
 
 def _fit_nodes_to_part(task: FitTask, candidates: list[Candidate]) -> Candidate:
@@ -180,7 +184,8 @@ class _WholeComparison:
 
     def score(self, candidate: Candidate, in_full: bool) -> float:
         scorer = self.scorers[in_full]
-        return replace(candidate, residual=scorer.score(candidate.local(scorer.samples), candidate)).cost
+        residual = scorer.score(candidate.local(scorer.samples), candidate)
+        return replace(candidate, residual=residual).cost + (0.0 if stands_as_usual(candidate.pose) else _UNUSUAL)
 
     def vertices(self, candidate: Candidate) -> Float[Floats, "V 3"]:
         moved = self.task.system.moved(candidate.vectors)
@@ -229,6 +234,14 @@ class CandidateScorer:
         back = cKDTree(moved).query(local.points, distance_upper_bound=_CAP)[0]
         squares = [np.square(np.minimum(distance, _CAP)) for distance in (forward, back)]
         return float(np.sqrt(0.5 * (squares[0].mean() + weighted_mean(squares[1], local.weights))))
+
+
+def stands_as_usual(pose: RigidPose) -> bool:
+    """Whether a core frame stands as shapes do in most files: up along y and front along z, or up along z and front
+    along -y.
+    """
+    up, front = pose.rotation[:, 1], pose.rotation[:, 2]
+    return bool(min(up[1], front[2]) > _UPRIGHT or min(up[2], -front[1]) > _UPRIGHT)
 
 
 def differ(here: Float[Floats, "V 3"], there: Float[Floats, "V 3"], far: float = _FAR) -> bool:

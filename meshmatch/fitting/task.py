@@ -20,12 +20,14 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress
 from meshmatch.shapes.cloud import outlier_points
 from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.outside import without_hidden
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
 # How much further than its neighbours from theirs an outlier is from its own, see `outlier_points`. Set by hand.
 _OUTLIER_RATIO = 1.3
 _CLEAN: WeakKeyDictionary[Shape, Shape | None] = WeakKeyDictionary()
+_SHOWN: WeakKeyDictionary[Shape, Shape | None] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +40,8 @@ class FitTask:
     shape: Shape  # repaired, in its file's frame
     roughness: float  # of the shape without outliers (0..1, see `Shape.roughness`)
     frame: Frame  # from the file to the frame of the samples: area about 1, centroid 0
-    samples: OrientedPoints  # of the shape without outliers
+    samples: OrientedPoints  # of the shape without outliers, for the network, which knows what may be hidden in shapes
+    shown: OrientedPoints  # the same, or of what can be seen from outside, for all else
     landmarks: Landmarks | None  # template vertices (N,), positions (N, 3) in the file
     progress: Progress
 
@@ -57,9 +60,12 @@ class FitTask:
         rng = np.random.default_rng(config.seed)
         clean = without_outliers(shape)
         frame, samples = take_samples(clean, config.samples, rng, scan_frame(model, clean, mirrored))
+        shown = samples
+        if (bare := without_inside(shape)) is not shape:
+            shown = sample_surface(bare, config.samples, np.random.default_rng(config.seed)).in_frame(frame)
         predictor = Predictor.of(model, rng, config.device)
         progress = progress or Progress()
-        return cls(model, config, predictor, shape, clean.roughness, frame, samples, landmarks, progress)
+        return cls(model, config, predictor, shape, clean.roughness, frame, samples, shown, landmarks, progress)
 
     @property
     def system(self) -> NodeSystem:
@@ -71,10 +77,18 @@ class FitTask:
         """The first samples, for screening."""
         return self.samples.first(self.config.coarse_samples)
 
-    def rescaled(self, scale: float, samples: OrientedPoints) -> FitTask:
-        """The same task with lengths divided by ``scale``, and with the samples that are left in that frame."""
+    @property
+    def bare(self) -> FitTask:
+        """The same task with samples of what can be seen alone."""
+        return replace(self, samples=self.shown)
+
+    def rescaled(self, scale: float, samples: OrientedPoints | None = None) -> FitTask:
+        """The same task with lengths divided by ``scale``; where samples were left out, with those that are left."""
         frame = self.frame.compose(Frame(scale, np.eye(3), np.zeros(3)))
-        return replace(self, frame=frame, samples=samples)
+        if samples is not None:
+            return replace(self, frame=frame, samples=samples, shown=samples)
+        all_samples, shown = (replace(each, points=each.points / scale) for each in (self.samples, self.shown))
+        return replace(self, frame=frame, samples=all_samples, shown=shown)
 
 
 # Of a task's candidates, best first, to the fit.
@@ -117,6 +131,14 @@ def without_outliers(shape: Shape) -> Shape:
         clean = None if kept.all() else Shape(shape.verts[kept], shape.faces, shape.name, weights=weights)
         _CLEAN[shape] = clean  # None, for the shape itself would never be forgotten
     return _CLEAN[shape] or shape
+
+
+def without_inside(shape: Shape) -> Shape:
+    """A mesh without what cannot be seen from outside (found once); any other shape as it is."""
+    if shape not in _SHOWN:
+        shown = without_hidden(shape)
+        _SHOWN[shape] = None if shown is shape else shown
+    return _SHOWN[shape] or shape
 
 
 def take_samples(

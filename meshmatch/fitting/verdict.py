@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshmatch.fitting.fit import Reason, ReasonCode, Verdict
-from meshmatch.fitting.signs import Signs, cloud_allowance, signs_of, unexplained
+from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, signs_of, unexplained
 from meshmatch.fitting.task import Registration
 
 # Trust from which on a fit is good, and fair; a part is fair at best.
@@ -36,10 +36,11 @@ class Judgement:
 def judge_registration(found: Registration, partial: bool) -> Judgement:
     """What is thought of a registration."""
     task, vectors = found.task, found.candidate.vectors
-    residual = found.candidate.residual
     if task.shape.is_cloud:
         allowance = cloud_allowance(task.system, found.local, task.shape.V, vectors, task.config.seed)
-        residual = unexplained(residual, allowance)
+    else:
+        allowance = built_allowance(task.shape)
+    residual = unexplained(found.candidate.residual, allowance)
     return judge(signs_of(task.system, vectors, found.local, residual, partial))
 
 

@@ -1,0 +1,61 @@
+"""What of a shape can be seen from outside."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from meshmatch.shapes.outside import without_hidden
+from meshmatch.shapes.shape import Shape
+
+
+def ball(radius: float, center: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
+    made = trimesh.creation.icosphere(3, radius)
+    return made.apply_translation(center)
+
+
+def joined(*solids: trimesh.Trimesh) -> Shape:
+    whole = trimesh.util.concatenate(list(solids))
+    return Shape(np.asarray(whole.vertices), np.asarray(whole.faces), "solids")
+
+
+def kept(shape: Shape, solid: trimesh.Trimesh, first: int = 0) -> float:
+    """Share of a solid's faces that are left, whose vertices begin with some number."""
+    left = without_hidden(shape).faces
+    return float(((left >= first) & (left < first + len(solid.vertices))).all(1).sum() / len(solid.faces))
+
+
+def test_what_lies_inside_is_left_out() -> None:
+    outer, inner = ball(1.0), ball(0.6)
+    shape = joined(outer, inner)
+    assert kept(shape, outer) == 1.0
+    assert kept(shape, inner, len(outer.vertices)) == 0.0
+    assert without_hidden(shape).V == shape.V
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_layers_close_to_each_other_are_told_apart_whichever_way_they_face(inverted: bool) -> None:
+    outer, inner = ball(1.0), ball(0.99)
+    if inverted:
+        outer.invert()
+    shape = joined(outer, inner)
+    assert kept(shape, outer) > 0.99
+    assert kept(shape, inner, len(outer.vertices)) < 0.1
+
+
+def test_parts_that_run_into_each_other_lose_what_is_inside() -> None:
+    shape = joined(ball(1.0), ball(1.0, (1.0, 0, 0)))
+    bare = without_hidden(shape)
+    centers = bare.verts[bare.faces].mean(1)
+    inside = np.minimum(np.linalg.norm(centers, axis=1), np.linalg.norm(centers - [1.0, 0, 0], axis=1)) < 0.95
+    assert inside.mean() < 0.02
+    assert 0.7 < bare.area / shape.area < 0.8  # half of each ball's radius lies inside the other one: a quarter
+
+
+@pytest.mark.parametrize("shape", [joined(ball(1.0)), joined(ball(1.0), ball(1.0, (3.0, 0, 0)))], ids=["one", "apart"])
+def test_what_hides_nothing_stays_as_it_is(shape: Shape) -> None:
+    assert without_hidden(shape) is shape
+
+
+def test_a_cloud_stays_as_it_is() -> None:
+    cloud = Shape(ball(1.0).vertices, np.empty((0, 3), np.int64))
+    assert without_hidden(cloud) is cloud
