@@ -115,7 +115,7 @@ def member_of(
     """What agreement needs of a repaired shape and its fit; landmarks are in the shape's file frame."""
     local = None if landmarks is None else (landmarks[0], fit.frame.apply(landmarks[1]))
     own = config.for_noise(shape.roughness)
-    frame, samples = take_samples(without_inside(shape), own.samples, np.random.default_rng(own.seed))
+    frame, samples = take_samples(without_inside(shape, system), own.samples, np.random.default_rng(own.seed))
     points = fit.frame.apply(frame.undo(samples.points))
     normals = samples.normals @ frame.rotation @ fit.frame.rotation.T
     samples = replace(samples, points=points, normals=normals).facing(system.surface(fit.vectors))

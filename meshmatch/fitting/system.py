@@ -26,6 +26,7 @@ from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import triangle_vectors
 from meshmatch.models.trained import TrainedModel, once_per_model
+from meshmatch.shapes.outside import without_hidden
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 
@@ -81,6 +82,16 @@ class NodeSystem:
         field = self.field
         assert isinstance(field, ShapeFunctions)
         return self._once("equations", lambda: Equations.of(self.phi, field.gradient_at(self.strain_points)))
+
+    @property
+    def shows_all(self) -> bool:
+        """Whether all of the resting template can be seen from outside; the chambers of a heart cannot."""
+
+        def compare() -> bool:
+            resting = Shape(self.verts, self.faces)
+            return without_hidden(resting) is resting
+
+        return self._once("shows all", compare)
 
     def moved(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
         """Template vertices under node vectors, or under whatever rows the field reads."""

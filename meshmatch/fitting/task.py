@@ -60,10 +60,10 @@ class FitTask:
         rng = np.random.default_rng(config.seed)
         clean = without_outliers(shape)
         frame, samples = take_samples(clean, config.samples, rng, scan_frame(model, clean, mirrored))
-        shown = samples
-        if (bare := without_inside(shape)) is not shape:
-            shown = sample_surface(bare, config.samples, np.random.default_rng(config.seed)).in_frame(frame)
         predictor = Predictor.of(model, rng, config.device)
+        shown = samples
+        if (bare := without_inside(shape, predictor.system)) is not shape:
+            shown = sample_surface(bare, config.samples, np.random.default_rng(config.seed)).in_frame(frame)
         progress = progress or Progress()
         return cls(model, config, predictor, shape, clean.roughness, frame, samples, shown, landmarks, progress)
 
@@ -133,8 +133,10 @@ def without_outliers(shape: Shape) -> Shape:
     return _CLEAN[shape] or shape
 
 
-def without_inside(shape: Shape) -> Shape:
-    """A mesh without what cannot be seen from outside (found once); any other shape as it is."""
+def without_inside(shape: Shape, system: NodeSystem) -> Shape:
+    """A mesh without what cannot be seen from outside (found once), where the template has nothing of the kind."""
+    if not system.shows_all:
+        return shape
     if shape not in _SHOWN:
         shown = without_hidden(shape)
         _SHOWN[shape] = None if shown is shape else shown

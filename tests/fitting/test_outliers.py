@@ -1,4 +1,4 @@
-"""Strays among the points of a cloud, normals whose side nobody knows, and clouds that are none."""
+"""Strays among the points of a cloud, normals whose side nobody knows, clouds that are none, and what shapes hide."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import one_way_residual, two_way_residual
 from meshmatch.fitting.system import NodeSystem, node_system
-from meshmatch.fitting.task import take_samples, without_outliers
+from meshmatch.fitting.task import take_samples, without_inside, without_outliers
 from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
@@ -167,3 +167,22 @@ def test_a_point_at_the_end_of_the_world_is_a_stray() -> None:
     here, there = (register(Shape(cloud, NO_FACES), config=replace(FEW, refine="none")) for cloud in (points, far))
     assert there.verdict == here.verdict != "poor"
     assert np.linalg.norm(here.points_in_file - there.points_in_file, axis=1).mean() < 4  # centimetres
+
+
+def nested(outer: Shape, size: float) -> Shape:
+    """A shape with a smaller copy inside."""
+    return Shape(np.concatenate([outer.verts, size * outer.verts]), np.concatenate([outer.faces, outer.faces + outer.V]))
+
+
+def test_what_lies_inside_neither_pulls_nor_counts(system: NodeSystem) -> None:
+    egg = Shape(system.verts, system.faces, "egg")
+    assert without_inside(nested(egg, 0.7), system).F == egg.F
+    alone, with_it = (Fitter(egg_model(), FEW).fit(shape) for shape in (egg, nested(egg, 0.7)))
+    assert with_it.residual < 1.2 * alone.residual
+
+
+def test_a_template_with_chambers_keeps_those_of_shapes(system: NodeSystem) -> None:
+    hollow = nested(Shape(system.verts, system.faces), 0.7)
+    assert system.shows_all and not NodeSystem(hollow, system.field).shows_all
+    shape = nested(Shape(system.verts, system.faces), 0.6)
+    assert without_inside(shape, NodeSystem(hollow, system.field)) is shape
