@@ -171,7 +171,9 @@ def test_a_point_at_the_end_of_the_world_is_a_stray() -> None:
 
 def nested(outer: Shape, size: float) -> Shape:
     """A shape with a smaller copy inside."""
-    return Shape(np.concatenate([outer.verts, size * outer.verts]), np.concatenate([outer.faces, outer.faces + outer.V]))
+    return Shape(
+        np.concatenate([outer.verts, size * outer.verts]), np.concatenate([outer.faces, outer.faces + outer.V])
+    )
 
 
 def test_what_lies_inside_neither_pulls_nor_counts(system: NodeSystem) -> None:
