@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,6 +24,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.stats import beta
 from typer import Option
 
 from meshmatch.api.matching import Matcher
@@ -152,12 +153,22 @@ def rows_of(found: Sequence[Mapping[str, Any]], group: str, names: Sequence[str]
 
 
 def bars_of(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The two numbers by which verdicts are judged; a refused shape is no map."""
+    """The numbers by which verdicts are judged; a refused shape is no map.
+
+    ``at_most``: the upper end of the 95 % interval of the share of wrong maps among good ones.
+    """
     good = [each for each in found if each["verdict"] == "good"]
     right = [each for each in found if each["verdict"] != REFUSED and each["error"] < RIGHT_CM]
     wrong = sum(each["error"] > WRONG_CM for each in good)
     believed = sum(each["verdict"] != "poor" for each in right)
-    return {"good": len(good), "good_and_wrong": wrong, "right": len(right), "right_and_believed": believed}
+    most = float(beta.ppf(0.975, wrong + 1, max(len(good) - wrong, 1e-9)))  # Clopper and Pearson 1934
+    return {
+        "good": len(good),
+        "good_and_wrong": wrong,
+        "at_most": most,
+        "right": len(right),
+        "right_and_believed": believed,
+    }
 
 
 def fitted_weights(found: Sequence[Mapping[str, Any]]) -> tuple[Float[Floats, " N"], float]:
@@ -180,6 +191,38 @@ def fitted_weights(found: Sequence[Mapping[str, Any]]) -> tuple[Float[Floats, " 
     return p[1:] / deviation, float(p[0])
 
 
+@dataclass(frozen=True)
+class Request:
+    """How many cases of each family, of which seed; and where they are kept."""
+
+    count: int
+    seed: int
+    threads: int
+    folder: Path
+
+
+def of_seed(kind: str, names: Sequence[str], asked: Request) -> Iterator[dict[str, Any]]:
+    """All cases of one seed, measured where they are not kept already."""
+    cases, matcher = Cases(kind, asked.seed), Matcher(kind, FitConfig(seed=asked.seed), asked.threads)
+    targets: list[Target] = []
+
+    def family(name: str) -> dict[str, Any]:
+        if not targets:
+            targets.extend(targets_of(cases, matcher))
+        numbers = runner.track(range(asked.count), f"{name}, seed {asked.seed}", asked.count)
+        return {"found": [measured(cases.draw(name, k), targets[k % _TARGETS], matcher) for k in numbers]}
+
+    for name in names:
+        which = {"kind": kind, "family": name, "count": asked.count, "seed": asked.seed}
+        path = asked.folder / f"{kind}-{name.replace(' ', '-')}-{asked.seed}.json"
+        kept = runner.once(path, which, partial(family, name))["found"]
+        # null is what JSON makes of infinity
+        found = [each | {"error": np.inf if each["error"] is None else each["error"]} for each in kept]
+        (row,) = rows_of(found, "family", [name])
+        runner.tell(f"{name}, seed {asked.seed}: " + ", ".join(f"{row[word]} {word}" for word in (*VERDICTS, REFUSED)))
+        yield from found
+
+
 @runner.command
 def main(
     kind: Annotated[str, Option(help=f"human, {', '.join(GENERATORS)}")] = "human",
@@ -189,25 +232,12 @@ def main(
     fit: Annotated[bool, Option("--fit", help="also find the weights of the signs")] = False,
     threads: runner.Threads = 1,
     seed: runner.Seed = 1,
+    seeds: Annotated[int, Option(min=1, help="so many seeds from that one on, all of which count together")] = 1,
 ) -> runner.Report:
     names = GROUPS.get(families) or runner.names_of(families, FAMILIES, "family")
-    cases, matcher = Cases(kind, seed), Matcher(kind, FitConfig(seed=seed), threads)
-    targets: list[Target] = []
-
-    def family(name: str) -> dict[str, Any]:
-        if not targets:
-            targets.extend(targets_of(cases, matcher))
-        numbers = runner.track(range(count), name, count)
-        return {"found": [measured(cases.draw(name, k), targets[k % _TARGETS], matcher) for k in numbers]}
-
     found: list[dict[str, Any]] = []
-    for name in names:
-        asked = {"kind": kind, "family": name, "count": count, "seed": seed}
-        kept = runner.once(output / f"{kind}-{name.replace(' ', '-')}.json", asked, partial(family, name))
-        for each in kept["found"]:  # null is what JSON makes of infinity
-            found.append(each | {"error": np.inf if each["error"] is None else each["error"]})
-        rows = rows_of(found, "family", [name])
-        runner.tell(f"{name}: " + ", ".join(f"{rows[0][verdict]} {verdict}" for verdict in (*VERDICTS, REFUSED)))
+    for number in range(seed, seed + seeds):
+        found += of_seed(kind, names, Request(count, number, threads, output))
     mapped = [each for each in found if each["verdict"] != REFUSED]
     steps, auc = calibration(mapped)
     bars, by_family, by_verdict = bars_of(found), rows_of(found, "family", names), rows_of(found, "verdict", VERDICTS)
@@ -219,12 +249,14 @@ def main(
         [Chart("confidence", {"measured": chart, "ideal": ideal})], output / f"{kind}.png", f"within {RIGHT_CM:g} cm"
     )
     tables = [
-        runner.table(f"{kind}: verdicts by family, seed {seed}", by_family, {"family": "of", **_COLUMNS}),
+        runner.table(
+            f"{kind}: verdicts by family, {seeds} seeds from {seed} on", by_family, {"family": "of", **_COLUMNS}
+        ),
         runner.table("By verdict", by_verdict, {"verdict": "of", **_COLUMNS}),
         runner.table("Confidence of vertices", steps, _STEPS),
     ]
     notes = [
-        f"good: {bars['good']}, of which over {WRONG_CM:g} cm: {bars['good_and_wrong']}",
+        f"good: {bars['good']}, of which over {WRONG_CM:g} cm: {bars['good_and_wrong']}, at most {bars['at_most']:.1%}",
         f"under {RIGHT_CM:g} cm: {bars['right']}, of which good or fair: {bars['right_and_believed']}",
         f"confidence: AUC {auc:.3f}, furthest from the truth {furthest:.3f}",
     ]
