@@ -19,6 +19,8 @@ from meshmatch.threads import set_threads
 if TYPE_CHECKING:
     from meshmatch.generators.bodies import Bodies
     from meshmatch.generators.kinds import Kind
+    from meshmatch.models.trained import TrainedModel
+    from meshmatch.templates.prepared_folder import RegisteredShapes
     from meshmatch.training.loop import StepReport
 
 
@@ -130,7 +132,8 @@ class TrainOptions:
     )
     shapes: Path | None = optional(
         "FOLDER",
-        "Learn from a folder that `meshmatch prepare` made, with its template. Default: generated shapes of a --kind.",
+        "Learn from a folder that `meshmatch prepare` made, with its template; or go on with the model of a folder that "
+        "`meshmatch fit` made, from its fits that are not poor. Default: generated shapes of a --kind.",
     )
     kind: Literal["human", "quadruped", "hand", "head"] | None = Option(
         None,
@@ -220,7 +223,7 @@ def train(
     """
     with needs("torch", "train"):
         from meshmatch.training import train as training
-        from meshmatch.training.recipes import recipe_for
+        from meshmatch.training.recipes import going_on, recipe_for
 
     set_threads(how.threads)
     if how.implicit:
@@ -235,22 +238,12 @@ def train(
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
     console = Console(quiet or not first)
     settings = (
-        "field",
-        "volume",
-        "arap",
-        "blend",
-        "rate",
-        "points",
-        "steps",
-        "minutes",
-        "bf16",
-        "workers",
-        "threads",
-        "seed",
-    )
-    recipe = recipe_for(how.shapes, how.preset, how.unsupervised, how.kind)
+        "field", "volume", "arap", "blend", "rate", "points", "steps", "minutes", "bf16", "workers", "threads", "seed",
+    )  # fmt: skip
+    fitted, start = _fits(how, console)
+    recipe = going_on(start) if start and fitted else recipe_for(how.shapes, how.preset, how.unsupervised, how.kind)
     recipe = recipe.changed(**{name: getattr(how, name) for name in settings})
-    facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, how.start)
+    facts = training.CardFacts(how.name or "", how.category or "", "", how.licence, how.stiffness, start or how.start)
     if not how.fresh and (output / training.CHECKPOINT).is_file():
         console.say(f"going on from the checkpoint in {output}; --fresh starts anew")
     reports: list[StepReport] = []
@@ -262,12 +255,33 @@ def train(
 
     with console.progress() as progress:
         training.train(
-            output, shapes=how.shapes, kind=_generated(how), recipe=recipe, facts=facts, resume=not how.fresh,
+            output, shapes=fitted or how.shapes, kind=_generated(how), recipe=recipe, facts=facts, resume=not how.fresh,
             progress=progress, report=report,
         )  # fmt: skip
     if first:
         draw_reports(console, how.picture, reports)
         _summary(console, output, recipe.train.steps, how.picture, json)
+
+
+def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None, TrainedModel | None]":
+    """The shapes of a folder of fits and the model to go on with, which is that of the fits; none of any other folder."""
+    from meshmatch.collections.settle import is_collection
+
+    if how.shapes is None or not is_collection(how.shapes):
+        return None, None
+    from meshmatch.api.inputs import as_model
+    from meshmatch.collections.collection import Collection
+
+    if how.preset != "default" or how.unsupervised:
+        name = "--unsupervised" if how.unsupervised else f"--preset {how.preset}"
+        raise OptionError(f"{name} does not go with fits", "fits are learned from by the model that made them")
+    collection = Collection(how.shapes)
+    found = collection.to_learn()
+    start = as_model(how.start or collection.model)
+    console.say(
+        f"going on with {start.card.name}, from {len(found.verts)} of {len(collection.names)} fits in {how.shapes}"
+    )
+    return found, start
 
 
 def _generated(how: TrainOptions) -> "Kind | Bodies | None":

@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from functools import cached_property, lru_cache
 from itertools import permutations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from meshmatch.collections.workers import hired
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.viscous import NO_MODEL
 from meshmatch.maps.build import build_map
 from meshmatch.maps.files import check_suffix
 from meshmatch.maps.places import Places
@@ -34,6 +36,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import AUTO
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.templates.prepared_folder import RegisteredShapes
 from meshmatch.templates.template import Template, load_template
 
 _KEPT = 64  # fits in memory
@@ -99,9 +102,7 @@ class Collection:
     @property
     def names(self) -> list[str]:
         """Names of the fitted shapes, sorted."""
-        if read_about(self.store) is None:
-            hint = "make one with `meshmatch fit SHAPES -o FOLDER`"
-            raise InputError(f"{self.store.location} is not a folder of fits", hint)
+        self._about()
         found = [name.removesuffix(SUFFIX) for name in self.store.names(FITS) if name.endswith(SUFFIX)]
         if not found:
             raise InputError(f"{self.store.location} holds no finished fit", "run `meshmatch fit` to its end")
@@ -112,6 +113,23 @@ class Collection:
         """The template of all fits."""
         with self.store.reading(TEMPLATE) as path:
             return load_template(path)
+
+    @property
+    def model(self) -> str:
+        """Name or folder of the model of all fits; "none" where there was none."""
+        return str(self._about()["model"])
+
+    def to_learn(self) -> RegisteredShapes:
+        """The fitted shapes, without poor fits, for `train` to learn from; `InputError` where fewer than three are left, or
+        they were fitted without a model, which says nothing sure of correspondence.
+        """
+        if self.model == NO_MODEL:
+            raise InputError(
+                f"the fits in {self.store.location} are of no model", "fit the shapes with a trained model"
+            )
+        with self.registered() as found:
+            name = Path(self.store.location).name
+            return RegisteredShapes(self.template, np.array(found.points), name, self.model)
 
     def fit_of(self, name: str) -> Fit:
         """The fit of a shape, after all have agreed. It does not know the shape itself: its ``verts`` are none."""
@@ -184,7 +202,7 @@ class Collection:
         names = tuple(name for name in verdicts if name not in left_out)
         if len(names) < 3:
             out = f" and {len(left_out)} poor ones" if left_out else ""
-            raise InputError(f"{self.store.location} holds {len(names)} fits{out}", "an atlas needs three or more")
+            raise InputError(f"{self.store.location} holds {len(names)} fits{out}", "three or more are needed")
 
         def read(number: int) -> Float[Floats, "V 3"]:
             fit = self.fit_of(names[number])
@@ -193,6 +211,13 @@ class Collection:
         faces = np.asarray(self.template.shape.faces)
         with held(len(names), self.template.shape.V, read) as points:
             yield Registered(points, faces, names, np.eye(3), left_out, self.template.hash)
+
+    def _about(self) -> dict[str, Any]:
+        about = read_about(self.store)
+        if about is None:
+            hint = "make one with `meshmatch fit SHAPES -o FOLDER`"
+            raise InputError(f"{self.store.location} is not a folder of fits", hint)
+        return about
 
     def _load(self, name: str) -> tuple[Fit, Places]:
         file = f"{FITS}/{name}{SUFFIX}"

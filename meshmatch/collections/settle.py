@@ -112,6 +112,11 @@ def _chosen(sources: Sequence[Source], config: FitConfig) -> str:
     raise trouble
 
 
+def is_collection(folder: str | Path) -> bool:
+    """Whether a folder holds fits."""
+    return (Path(folder) / ABOUT).is_file()
+
+
 def read_about(store: Store) -> dict[str, Any] | None:
     """What a folder says of its fits; None if it is no folder of fits."""
     if not store.exists(ABOUT):

@@ -53,6 +53,16 @@ class ShapeSamples:
     scale: Scale
 
 
+@dataclass(frozen=True, eq=False)
+class RegisteredShapes:
+    """N shapes on the vertices of a template, which stand as it does: what fits of a trained model found."""
+
+    template: Template
+    verts: Float[Floats, "N V 3"]
+    name: str  # of them all
+    model: str  # its name or folder
+
+
 def same_faces(like: Repaired, found: list[Repaired]) -> bool:
     """Whether all files have one file's vertex count and triangles."""
     first = like.original

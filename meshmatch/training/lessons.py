@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from meshmatch.errors import OptionError
@@ -15,7 +16,14 @@ from meshmatch.generators.kinds import Kind
 from meshmatch.models.registry import TEMPLATE
 from meshmatch.progress import Progress
 from meshmatch.shapes.normalise import Mirroring
-from meshmatch.templates.prepared_folder import ShapeSamples, frame_of, has_sides, read_registered, read_samples
+from meshmatch.templates.prepared_folder import (
+    RegisteredShapes,
+    ShapeSamples,
+    frame_of,
+    has_sides,
+    read_registered,
+    read_samples,
+)
 from meshmatch.templates.template import Template, read_template
 from meshmatch.training.datasets import deformed_source, registered_source
 from meshmatch.training.recipes import Recipe
@@ -66,10 +74,15 @@ def kind_named(name: str) -> Kind | Bodies:
     return Bodies() if name == "human" else Kind(name)
 
 
-def lessons(shapes: str | Path | None, kind: Kind | Bodies | None, recipe: Recipe, progress: Progress) -> Lessons:
+def lessons(
+    shapes: str | Path | RegisteredShapes | None, kind: Kind | Bodies | None, recipe: Recipe, progress: Progress
+) -> Lessons:
     """The shapes of a folder, or generated ones; `OptionError` if both are asked for."""
     if shapes is None:
         return generated(kind or Bodies(), recipe, progress)
     if kind is not None:
         raise OptionError("generated shapes do not go with a folder of shapes", "leave out one of the two")
+    if isinstance(shapes, RegisteredShapes):
+        source = deformed_source(torch.from_numpy(np.asarray(shapes.verts, np.float32)))
+        return Lessons(shapes.template, source, shapes.name, f"{len(shapes.verts)} fits of {shapes.name}")
     return prepared(Path(shapes), recipe)

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from meshmatch.errors import OptionError
-from meshmatch.geometry.kernels import Kernel
+from meshmatch.geometry.kernels import KERNELS, Kernel
 from meshmatch.models.checkpoint import Storage
 from meshmatch.models.network import PAPER, NetworkConfig
+from meshmatch.models.trained import TrainedModel
 from meshmatch.templates.prepared_folder import frame_of, is_registered
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss
@@ -111,6 +112,14 @@ def compact() -> Recipe:
     network = NetworkConfig(code=384, width=512, basis=640, align_basis=384, align_width=384, correct_width=448)
     train = replace(usual.train, steps=4000, shapes=16, rate=8e-4, align_steps=3000)
     return replace(usual, network=network, train=train, characters=0.0)
+
+
+def going_on(start: TrainedModel) -> Recipe:
+    """For shapes that a trained model has fitted: its own network and kernel, at a small rate."""
+    usual = people()
+    train = replace(usual.train, steps=1500, rate=1e-4, shapes=16, decay=0.5)
+    kernel = next(name for name in KERNELS if name == start.card.field["kernel"])
+    return replace(usual, network=start.inference.config, kernel=kernel, train=train, deform=True, characters=0.0)
 
 
 def recipe_for(

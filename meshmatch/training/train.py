@@ -33,7 +33,7 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import make_folder
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.sampling import farthest_points
-from meshmatch.templates.prepared_folder import ShapeSamples
+from meshmatch.templates.prepared_folder import RegisteredShapes, ShapeSamples
 from meshmatch.templates.template import Template, save_template, template_radius
 from meshmatch.training.aligner import train_aligner
 from meshmatch.training.alone import CHECKPOINT as CHECKPOINT
@@ -42,7 +42,7 @@ from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattic
 from meshmatch.training.lessons import kind_named, lessons
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
-from meshmatch.training.recipes import Recipe, recipe_for
+from meshmatch.training.recipes import Recipe, going_on, recipe_for
 from meshmatch.training.scans import ScanConfig
 
 VALIDATION_SEED = 999_983
@@ -71,7 +71,7 @@ class CardFacts:
 def train(
     output: str | Path,
     *,
-    shapes: str | Path | None = None,
+    shapes: str | Path | RegisteredShapes | None = None,
     kind: str | Kind | Bodies | None = None,
     recipe: Recipe | None = None,
     facts: CardFacts | None = None,
@@ -83,9 +83,10 @@ def train(
 
     The folder ``output`` receives ``checkpoint/last.safetensors`` on the way and, at every stop, ``template.safetensors``,
     ``weights.safetensors`` and last ``card.json``. It learns from ``shapes``, a folder that `prepare` made, which also has
-    the template, or else from generated shapes of a ``kind``: human (the default), quadruped, hand or head, or `Bodies` or
-    a `Kind` with choices. The recipe is `recipe_for` of these unless another is given, such as
-    ``recipe_for(shapes, ...).changed(steps=..., minutes=...)``. ``progress`` is called with (stage, name, share),
+    the template; from fits of a model, which goes on learning (``Collection(FITS).to_learn()``); or else from generated
+    shapes of a ``kind``: human (the default), quadruped, hand or head, or `Bodies` or a `Kind` with choices. The recipe is
+    `recipe_for` or, of fits, `going_on` of these unless another is given, such as ``recipe_for(shapes,
+    ...).changed(steps=..., minutes=...)``. ``progress`` is called with (stage, name, share),
     ``report`` with losses and validation every 50 steps.
 
     `InputError` if the folder is not prepared or has too few shapes; `OptionError` for choices that do not go together, or
@@ -95,10 +96,16 @@ def train(
     output = Path(output)
     facts = facts or CardFacts()
     facts = replace(facts, name=check_name(facts.name or output.resolve().name))
-    if isinstance(facts.start, str | Path):
-        facts = replace(facts, start=load_model(facts.start))
     kind = kind_named(kind) if isinstance(kind, str) else kind
-    recipe = recipe or recipe_for(shapes, kind=None if kind is None else kind.name)
+    start = facts.start or (shapes.model if isinstance(shapes, RegisteredShapes) else None)
+    start = load_model(start) if isinstance(start, str | Path) else start
+    facts = replace(facts, start=start)
+    if not isinstance(shapes, RegisteredShapes):
+        recipe = recipe or recipe_for(shapes, kind=None if kind is None else kind.name)
+    else:
+        assert start is not None
+        facts = replace(facts, frame=facts.frame or start.card.frame, mirror=facts.mirror or start.card.mirror)
+        recipe = recipe or going_on(start)
     learned = lessons(shapes, kind, recipe, Progress(progress, "shapes").stage("making shapes (once)"))
     facts = replace(facts, category=facts.category or learned.category, data=facts.data or learned.data)
     facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)

@@ -23,6 +23,7 @@ from meshmatch.fitting.fitter import Fitter
 from meshmatch.locks import locked
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.location import bundled_folder
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
 NAMES = ["climber", "dancer", "turned"]
@@ -295,6 +296,24 @@ def test_a_collection_has_an_atlas(made: tuple[Path, tuple[Record, ...]], tmp_pa
     assert main(["atlas", str(made[0]), "-o", str(output), "--scale", "remove", "-q"]) == 0
     assert np.allclose(meshmatch.Atlas.load(output).scores, atlas.scores)
     assert not (output / "measures.csv").exists()  # three shapes are too few
+
+
+def test_a_model_can_learn_from_fits(
+    made: tuple[Path, tuple[Record, ...]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, Any] = {}
+
+    def train(output: Path, **given: Any) -> None:
+        asked.update(given)
+        shutil.copy(bundled_folder() / "models" / "human" / "card.json", output / "card.json")
+
+    monkeypatch.setattr("meshmatch.training.train.train", train)
+    assert main(["train", "--shapes", str(made[0]), "--steps", "1", "-o", str(tmp_path / "mine"), "-q"]) == 0
+    found, start = asked["shapes"], asked["facts"].start
+    assert found.verts.shape == (3, found.template.shape.V, 3) and found.template.hash == start.template.hash
+    assert (found.name, start.card.name, asked["recipe"].network) == ("fits", "human", start.inference.config)
+    for odd in ("--unsupervised", "--preset=paper"):
+        assert main(["train", "--shapes", str(made[0]), odd, "-o", str(tmp_path / "mine"), "-q"]) == 1
 
 
 def test_poor_fits_are_left_out_of_an_atlas(

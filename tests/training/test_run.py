@@ -23,12 +23,12 @@ from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
-from meshmatch.templates.prepared_folder import read_registered
+from meshmatch.templates.prepared_folder import RegisteredShapes, read_registered
 from meshmatch.templates.template import Template, read_template, save_template
 from meshmatch.training.datasets import registered_source
 from meshmatch.training.loop import StepReport, TrainConfig
 from meshmatch.training.losses import CorrespondenceLoss
-from meshmatch.training.recipes import Recipe, default, paper, people, recipe_for
+from meshmatch.training.recipes import Recipe, default, going_on, paper, people, recipe_for
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import CardFacts, train, train_model
 from tests.generators.stick import stick_figure
@@ -174,6 +174,24 @@ def test_a_training_may_begin_with_a_models_weights(prepared: Path, tmp_path: Pa
     assert "start" not in scratch.card.recipe
     with pytest.raises(OptionError, match="another template, network or kernel"):
         trained(prepared, tmp_path / "other", replace(SMALL, kernel="cubic"), start=first)
+
+
+def test_a_model_goes_on_with_shapes_that_it_has_fitted(prepared: Path, tmp_path: Path) -> None:
+    start = load_model(trained(prepared, tmp_path / "start"))
+    verts = np.asarray(start.template.shape.verts) * np.array([[[1.0, 1.1, 1.0]], [[1.0, 0.9, 1.0]], [[1.1, 1.0, 1.0]]])
+    known = RegisteredShapes(start.template, verts, "fits", str(tmp_path / "start"))
+    usual = going_on(start)
+    assert (usual.network, usual.kernel, usual.deform) == (SMALL.network, SMALL.kernel, True)
+    card = verify_model(
+        train(
+            tmp_path / "more",
+            shapes=known,
+            recipe=usual.changed(steps=2, points=96, workers=0),
+            facts=CardFacts(name="more"),
+        )
+    )
+    assert (card.data, card.category, card.template_hash) == ("3 fits of fits", "fits", start.template.hash)
+    assert card.recipe["start"]["model"] == "eggs" and card.mirror == start.card.mirror
 
 
 def test_an_output_that_cannot_be_made_is_told(prepared: Path, tmp_path: Path) -> None:
