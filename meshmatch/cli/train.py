@@ -154,10 +154,10 @@ class TrainOptions:
     preset: Literal["default", "paper"] = Option(
         "default", help="The recipe: what measured best, or the paper's network, losses and rates."
     )
-    field: Literal["mls", "rbf", "pointwise"] = Option(
-        "mls",
-        help="How a deformation is represented: by moving least squares or radial basis functions of nodes, or by a "
-        "network at every point, which is slow (--refine nodes then refines its code).",
+    field: Literal["mls", "rbf", "pointwise"] | None = Option(
+        None,
+        help="How a deformation is represented: by moving least squares (mls, the default) or radial basis functions of "
+        "nodes, or by a network at every point, which is slow (--refine nodes then refines its code).",
     )
     start: str | None = optional("MODEL", "Begin with the weights of a trained model of the same template and preset.")
     rate: float | None = Option(None, min=0.0, help="Learning rate; default: the preset's.")
@@ -275,6 +275,9 @@ def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None
     if how.preset != "default" or how.unsupervised:
         name = "--unsupervised" if how.unsupervised else f"--preset {how.preset}"
         raise OptionError(f"{name} does not go with fits", "fits are learned from by the model that made them")
+    for name in ("template", "poses", "characters", "identities"):
+        if getattr(how, name) is not None:
+            raise OptionError(f"--{name} goes with generated shapes, not with fits", f"leave out --{name}")
     collection = Collection(how.shapes)
     found = collection.to_learn()
     start = as_model(how.start or collection.model)

@@ -46,7 +46,7 @@ def train_shapes(output: Path, how: Any, json: bool, console: Console) -> None:
             reports.append(now)
             progress(now.words, "training", now.step / now.steps)
 
-        config = ImplicitConfig(how.field)
+        config = ImplicitConfig(how.field or "mls")
         train_implicit(
             output, how.shapes, config=config, training=training, facts=facts, resume=not how.fresh, report=report
         )

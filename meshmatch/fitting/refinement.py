@@ -44,7 +44,7 @@ _POOL = 24  # among how many of the best those that are unlike each other are lo
 # best after a few steps was the best at the end.
 _BEHIND = 1.05
 # Residual by which another way to stand must be better than that of most files, and the cosine from which on it is that one.
-_UNUSUAL, _UPRIGHT = 0.002, 0.85
+_UNUSUAL, _UPRIGHT = 0.001, 0.85
 _PART_FINALISTS = 4  # interpretations of a part that get a few steps each
 _SCREENED_SAMPLES = 4096  # enough to tell interpretations apart
 
@@ -185,7 +185,8 @@ class _WholeComparison:
     def score(self, candidate: Candidate, in_full: bool) -> float:
         scorer = self.scorers[in_full]
         residual = scorer.score(candidate.local(scorer.samples), candidate)
-        return replace(candidate, residual=residual).cost + (0.0 if stands_as_usual(candidate.pose) else _UNUSUAL)
+        usual = not in_full or stands_as_usual(candidate.pose)
+        return replace(candidate, residual=residual).cost + (0.0 if usual else _UNUSUAL)
 
     def vertices(self, candidate: Candidate) -> Float[Floats, "V 3"]:
         moved = self.task.system.moved(candidate.vectors)

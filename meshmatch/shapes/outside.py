@@ -23,25 +23,32 @@ _FACING = 0.25  # cosine of a normal towards the viewer
 _GAPS, _REACH = (0.008, 0.016), 0.007  # how far above a sample another part is looked for, and how near to there
 _OFTEN = 2  # views in which a sample must be seen
 _SIDED = 0.05  # of a part whose normals tell inside from outside, see `_outward`
-_CELLS = 512  # along a view at most
+_WIDE = 4.0  # a body with its arms spread is 1.4 wide; depths of more would take memory
 _APART = 0.05  # share of the area outside the largest part from which on something may be hidden
 _HIDDEN = 0.1  # share of the area that must be hidden to be left out
+_SHOWN = 0.2  # share of the area that must be seen
 
 
 def without_hidden(shape: Shape) -> Shape:
     """A mesh of several connected parts without the faces that no view from outside shows; any other shape as it is.
 
-    All vertices stay. A shape of which little is hidden stays as it is.
+    All vertices stay. A shape stays as it is if little of it is hidden, or nearly all, as of foliage; if it reaches so far
+    that views show too little; or if it is not trusted alike everywhere, for what is not must hide nothing.
     """
-    if shape.is_cloud:
+    if shape.is_cloud or (shape.weights is not None and np.ptp(shape.weights[shape.faces]) > 0):
         return shape
     part = face_parts(shape.faces, shape.V)
     area = np.bincount(part, shape.face_areas)
-    if not area.sum() > 0 or area.max() > (1 - _APART) * area.sum():
+    unit = float(np.sqrt(area.sum()))
+    if (
+        not unit > 0
+        or area.max() > (1 - _APART) * unit**2
+        or np.ptp(shape.verts[shape.faces.ravel()], 0).max() > _WIDE * unit
+    ):
         return shape
     samples = sample_surface(shape, _SAMPLES, np.random.default_rng(0))
-    seen = _seen(samples, part[samples.face], float(np.sqrt(area.sum())))
-    if seen.mean() > 1 - _HIDDEN:
+    seen = _seen(samples, part[samples.face], unit)
+    if not _SHOWN < seen.mean() < 1 - _HIDDEN:
         return shape
     drawn, shown = (np.bincount(samples.face[rows], minlength=shape.F) for rows in (slice(None), seen))
     kept = 2 * shown >= drawn
@@ -54,10 +61,9 @@ def _seen(samples: Samples, part: Int[Ints, " P"], unit: float) -> Bool[Bools, "
     """Whether some views from outside show each sample of parts."""
     points = (samples.points - samples.points.mean(0)) / unit
     side = _outward(points, samples.normals, part)[part]
-    cell = max(_CELL, float(np.ptp(points, axis=0).max()) * 2 / _CELLS)
     times = np.zeros(len(points), np.int64)
     for toward, across, up in _views():
-        at = np.floor(points @ np.stack([across, up], 1) / cell).astype(np.int64)
+        at = np.floor(points @ np.stack([across, up], 1) / _CELL).astype(np.int64)
         at -= at.min(0)
         key, depth = at[:, 0] * (at[:, 1].max() + 1) + at[:, 1], points @ toward
         nearest = np.full(key.max() + 1, -np.inf)

@@ -119,7 +119,10 @@ def going_on(start: TrainedModel) -> Recipe:
     usual = people()
     train = replace(usual.train, steps=1500, rate=1e-4, shapes=16, decay=0.5)
     kernel = next(name for name in KERNELS if name == start.card.field["kernel"])
-    return replace(usual, network=start.inference.config, kernel=kernel, train=train, deform=True, characters=0.0)
+    known = start.card.recipe.get("scan", {})
+    scan = replace(usual.scan, **{name: bool(known.get(name)) for name in ("upright", "sphere")})
+    usual = replace(usual, scan=scan, characters=0.0)
+    return replace(usual, network=start.inference.config, kernel=kernel, train=train, deform=True)
 
 
 def recipe_for(

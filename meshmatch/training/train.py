@@ -104,8 +104,9 @@ def train(
         recipe = recipe or recipe_for(shapes, kind=None if kind is None else kind.name)
     else:
         assert start is not None
-        facts = replace(facts, frame=facts.frame or start.card.frame, mirror=facts.mirror or start.card.mirror)
-        recipe = recipe or going_on(start)
+        if Path(shapes.model).resolve() == output.resolve():
+            raise OptionError(f"{output} is the model that made the fits", "choose another folder")
+        facts, recipe = _inherited(facts, start.card), recipe or going_on(start)
     learned = lessons(shapes, kind, recipe, Progress(progress, "shapes").stage("making shapes (once)"))
     facts = replace(facts, category=facts.category or learned.category, data=facts.data or learned.data)
     facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
@@ -117,6 +118,16 @@ def train(
             report(now)
 
     return train_model(learned.template, learned.source, output, recipe, facts, resume, both)
+
+
+def _inherited(facts: CardFacts, card: ModelCard) -> CardFacts:
+    """What is not said of a model is said of the one that it goes on from; `OptionError` if that may not teach."""
+    if not card.correspondence:
+        raise OptionError(f"{card.name} was learned without correspondence", "fit with a model that knows it")
+    plain = CardFacts()
+    names = ("frame", "mirror", "category", "licence", "stiffness")
+    unsaid = {name: getattr(card, name) for name in names if getattr(facts, name) == getattr(plain, name)}
+    return replace(facts, **unsaid)
 
 
 def train_model(

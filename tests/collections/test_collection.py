@@ -312,7 +312,7 @@ def test_a_model_can_learn_from_fits(
     found, start = asked["shapes"], asked["facts"].start
     assert found.verts.shape == (3, found.template.shape.V, 3) and found.template.hash == start.template.hash
     assert (found.name, start.card.name, asked["recipe"].network) == ("fits", "human", start.inference.config)
-    for odd in ("--unsupervised", "--preset=paper"):
+    for odd in ("--unsupervised", "--preset=paper", "--template=human-A", "--identities=8"):
         assert main(["train", "--shapes", str(made[0]), odd, "-o", str(tmp_path / "mine"), "-q"]) == 1
 
 

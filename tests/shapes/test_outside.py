@@ -56,6 +56,23 @@ def test_what_hides_nothing_stays_as_it_is(shape: Shape) -> None:
     assert without_hidden(shape) is shape
 
 
+def test_what_is_not_trusted_hides_nothing() -> None:
+    shape = joined(ball(1.0), ball(0.6))
+    weights = np.repeat([0.2, 1.0], shape.V // 2)
+    doubted = Shape(shape.verts, shape.faces, weights=weights)
+    assert without_hidden(doubted) is doubted
+
+
+def test_foliage_and_what_reaches_far_stay_as_they_are() -> None:
+    rng = np.random.default_rng(0)
+    leaves = rng.uniform(-1, 1, (4000, 1, 3)) + 0.3 * rng.standard_normal((4000, 3, 3))
+    soup = Shape(leaves.reshape(-1, 3), np.arange(12_000).reshape(-1, 3))
+    assert without_hidden(soup) is soup
+    needle = trimesh.creation.box((100.0, 0.05, 0.05)).subdivide_to_size(0.5)
+    far = joined(ball(1.0), ball(0.6), needle)
+    assert without_hidden(far) is far
+
+
 def test_a_cloud_stays_as_it_is() -> None:
     cloud = Shape(ball(1.0).vertices, np.empty((0, 3), np.int64))
     assert without_hidden(cloud) is cloud

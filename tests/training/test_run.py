@@ -190,8 +190,14 @@ def test_a_model_goes_on_with_shapes_that_it_has_fitted(prepared: Path, tmp_path
             facts=CardFacts(name="more"),
         )
     )
-    assert (card.data, card.category, card.template_hash) == ("3 fits of fits", "fits", start.template.hash)
-    assert card.recipe["start"]["model"] == "eggs" and card.mirror == start.card.mirror
+    assert (card.data, card.category, card.template_hash) == ("3 fits of fits", "eggs", start.template.hash)
+    assert card.recipe["start"]["model"] == "eggs"
+    assert (card.mirror, card.licence) == (start.card.mirror, "CC0-1.0")
+    with pytest.raises(OptionError, match="the model that made the fits"):
+        train(tmp_path / "start", shapes=known)
+    doubted = TrainedModel.of(replace(start.card, correspondence=False), start.template, start.network)
+    with pytest.raises(OptionError, match="without correspondence"):
+        train(tmp_path / "doubted", shapes=known, facts=CardFacts(start=doubted))
 
 
 def test_an_output_that_cannot_be_made_is_told(prepared: Path, tmp_path: Path) -> None:
