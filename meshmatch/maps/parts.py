@@ -28,10 +28,14 @@ def kept_together(source: Places, target: Places, found: Footpoints, workers: in
 
     They are ``found`` where they lie there already, and everywhere if not both shapes are put together from parts.
     """
-    own, own_areas = _parts(source)
-    theirs, their_areas = _parts(target)
-    if not (_put_together(own, own_areas) and _put_together(theirs, their_areas)):
-        return found
+    parts = {}
+    for places in sorted(
+        (source, target), key=lambda places: len(places.faces)
+    ):  # of millions of faces not without need
+        parts[id(places)] = _parts(places)
+        if not _put_together(*parts[id(places)]):
+            return found
+    (own, own_areas), (theirs, their_areas) = parts[id(source)], parts[id(target)]
     back = own[source.nearest(target.resting, workers).vertex]
     there = theirs[found.vertex]
     shape = int(own.max()) + 1, int(theirs.max()) + 1
