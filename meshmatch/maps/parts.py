@@ -29,9 +29,8 @@ def kept_together(source: Places, target: Places, found: Footpoints, workers: in
     They are ``found`` where they lie there already, and everywhere if not both shapes are put together from parts.
     """
     parts = {}
-    for places in sorted(
-        (source, target), key=lambda places: len(places.faces)
-    ):  # of millions of faces not without need
+    # the smaller shape first: of millions of faces not without need
+    for places in sorted((source, target), key=lambda places: len(places.faces)):
         parts[id(places)] = _parts(places)
         if not _put_together(*parts[id(places)]):
             return found

@@ -9,7 +9,7 @@ from meshmatch.fitting import candidates
 from meshmatch.fitting.candidates import fit_whole
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.network_fit import Candidate, Predictor
-from meshmatch.fitting.refinement import CandidateScorer, averaged, choose, differ
+from meshmatch.fitting.refinement import CandidateScorer, averaged, choose, differ, stands_as_usual
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.task import FitTask
 from meshmatch.fitting.tears import neighbours, torn_share
@@ -158,3 +158,15 @@ def test_of_a_rough_cloud_positions_alone_are_scorerd_and_squares(system: NodeSy
     # a template out of reach: every distance counts as the cap
     away = replace(still(system), vectors=np.full((system.K, 3), 3.0))
     assert rough.scatter(scan, away.vectors) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("up", "front", "usual"),
+    [("y", "z", True), ("z", "-y", True), ("y", "-z", False), ("-y", "z", False), ("z", "y", False), ("x", "z", False)],
+)
+def test_how_most_files_stand(up: str, front: str, usual: bool) -> None:
+    def axis(name: str) -> np.ndarray:
+        return np.eye(3)["xyz".index(name[-1])] * (-1 if name.startswith("-") else 1)
+
+    rotation = np.stack([np.cross(axis(up), axis(front)), axis(up), axis(front)], 1)
+    assert stands_as_usual(RigidPose(rotation, np.zeros(3))) is usual

@@ -10,7 +10,7 @@ import pytest
 from meshmatch.api.matching import Matcher
 from meshmatch.fitting.fit import Reason
 from meshmatch.fitting.fitter import doubted
-from meshmatch.fitting.signs import Signs, signs_of
+from meshmatch.fitting.signs import Signs, built_allowance, signs_of
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.verdict import FAIR_TRUST, GOOD_TRUST, judge
 from meshmatch.shapes.files import load_shape
@@ -132,3 +132,14 @@ def test_what_nobody_could_match_is_poor(damage: str) -> None:
         used, faces = np.unique(body.faces[kept], return_inverse=True)
         shape = Shape(body.verts[used], faces.reshape(-1, 3), damage)
     assert Matcher("human", threads=1).fit(shape).verdict == "poor"
+
+
+def test_the_residual_of_many_solids_is_allowed_for() -> None:
+    egg = node_system(egg_model())
+
+    def solids(count: int) -> Shape:
+        verts = np.concatenate([egg.verts + 3.0 * k for k in range(count)])
+        return Shape(verts, np.concatenate([egg.faces + len(egg.verts) * k for k in range(count)]))
+
+    allowed = [built_allowance(solids(count)) for count in (1, 2, 5, 8, 12)]
+    assert allowed == pytest.approx([0.0, 0.0, 0.02 * np.sqrt(0.5), 0.02, 0.02], abs=1e-6)
