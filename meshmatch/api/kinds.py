@@ -13,7 +13,7 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, MeshmatchError, ModelError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import may_show_part
-from meshmatch.fitting.kind import KNOWN, SURE, kind_samples, read_kind
+from meshmatch.fitting.kind import KNOWN, SURE, is_of_kind, kind_samples, read_kind
 from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import list_models
 from meshmatch.models.trained import TrainedModel
@@ -134,14 +134,17 @@ def kinds_of(
 ) -> list[str | None]:
     """The category of each shape's best reading, None where it is too high for a shape that may hide some of itself.
 
-    `InputError` where it is too high for a complete shape.
+    `InputError` for a complete shape that is not of that kind (`is_of_kind`).
     """
     found: list[str | None] = []
     for shape, config, column in zip(shapes, configs, readings.T, strict=True):
         best = int(column.argmin())
-        found.append(models[best].card.category if column[best] <= KNOWN else None)
-        if found[-1] is None and not shape.is_cloud and not may_show_part(shape, config):
-            known = ", ".join(sorted({model.card.category for model in models}))
-            problem = f"{shape.name} is of no kind that the installed models know: {known}"
+        whole = not shape.is_cloud and not may_show_part(shape, config)
+        strange = whole and KNOWN < column[best] < np.inf
+        known = is_of_kind(models[best].load(), shape, column[best], config) if strange else column[best] <= KNOWN
+        found.append(models[best].card.category if known else None)
+        if whole and not known:
+            names = ", ".join(sorted({model.card.category for model in models}))
+            problem = f"{shape.name} is of no kind that the installed models know: {names}"
             raise InputError(problem, "if it is of one of them, name its model with --model (model=...)")
     return found

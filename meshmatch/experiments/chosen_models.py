@@ -1,7 +1,8 @@
 """Of what kind `--model auto` takes every shape of the benchmark, and things that are of none.
 
 Bodies, animals, hands and heads have a model; hearts, furniture and plain solids have none and must be refused. Hands and
-heads are generated (meshmatch/experiments/cut_scans.py). Clouds with noise, and
+heads are generated (meshmatch/experiments/cut_scans.py), and so are characters (character_designs.py), but for the
+evaluation data's two. Clouds with noise, and
 sparse ones with outliers, are bodies too; where a cloud cannot be told alone it takes the kind of the shape that it is
 matched with ("unsure" here). *Reading* is the mean distance of the shape and a model's unrefined template (units of
 sqrt(area)).
@@ -22,19 +23,23 @@ from meshmatch.api.inputs import validated
 from meshmatch.api.kinds import installed_models, kinds_of, read_kinds
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
+from meshmatch.experiments.character_designs import Designer
+from meshmatch.experiments.characters import characters_of
 from meshmatch.experiments.cut_scans import make_scans
 from meshmatch.experiments.sets import CLOUD_SET, SET_NAMES, load_set
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.kind import KNOWN
 from meshmatch.shapes.files import as_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.template import read_template
 from meshmatch.threads import thread_limit
 
 FOLDERS = {"faust_scans": "human", "animal": "quadruped", "heart": "", "chair": "", "table": "", "plane": ""}
 """Folders of meshes, and their kind; empty: none."""
 MADE = ("hand", "head")
-SETS = (*SET_NAMES, CLOUD_SET, "outliers", *FOLDERS, *MADE, "solids")
-_SCANS = 20
+CHARACTERS = ("stylised", "robots", "soldiers", "rogues")
+SETS = (*SET_NAMES, CLOUD_SET, "outliers", *FOLDERS, *MADE, *CHARACTERS, "solids")
+_SCANS, _CAST = 20, 12
 COLUMNS = {
     **{
         "set": "set",
@@ -57,6 +62,9 @@ def shapes_of(name: str, data: Path) -> Iterator[Shape]:
         yield from (as_shape(np.asarray(points, float)) for points in np.load(data / "faust_outliers.npy"))
     elif name in MADE:
         yield from (scan.shape for scan in make_scans(name, _SCANS))
+    elif name in CHARACTERS:
+        designer = Designer.unseen(read_template("human-T"))
+        yield from (each.shape for each in characters_of(name, _CAST, designer, data))
     elif name == "solids":
         solids = {
             "box": trimesh.creation.box().subdivide().subdivide().subdivide(),

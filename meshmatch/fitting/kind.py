@@ -1,5 +1,6 @@
 """Of what kind a shape is, read coarsely: how near a model's network alone brings its template to the shape.
 
+A complete shape that reads strangely, such as a robot, is fitted: where the fit is not poor, it is of the kind.
 A reading takes the shape for complete: of a part, and of a sparse or noisy cloud, a high one says little.
 """
 
@@ -10,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.initial_frames import frames_to_try, scan_frame
 from meshmatch.fitting.network_fit import Predictor, best_first
 from meshmatch.fitting.task import without_outliers
@@ -21,6 +23,8 @@ from meshmatch.shapes.shape import Shape
 KNOWN = 0.0485
 """Readings up to this (units of sqrt(area)) are of a shape that the model knows. The benchmark's bodies, scans and animals
 have 0.046 at most, its hearts and furniture 0.051 at least (docs/results.md)."""
+STRANGE = 0.062
+"""Up to this a complete shape may be a strange one of the kind, such as a robot: a fit tells, see `is_of_kind`."""
 SURE = 0.042
 """Up to this a reading needs no other model's beside it: another kind's were 0.0439 at least (docs/results.md)."""
 _SAMPLES, _THIN = 2048, 768  # how many the reading is of, and how many rank the orientations
@@ -44,3 +48,10 @@ def read_kind(model: TrainedModel, shape: Shape, samples: OrientedPoints, config
     starts = [(thin, pose) for pose in frames_to_try(model, thin, config)]
     best = best_first(predictor.fit_all(starts, rounds=1, draws=1))[0]
     return predictor.fit(placed, best.pose, draws=1).residual
+
+
+def is_of_kind(model: TrainedModel, shape: Shape, reading: float, config: FitConfig) -> bool:
+    """Whether a repaired shape is of a model's kind: its reading says so, or the whole fit of one that reads strangely."""
+    if reading <= KNOWN or reading > STRANGE:
+        return reading <= KNOWN
+    return Fitter(model, replace(config, refine="nodes", partial="no")).fit(shape).verdict != "poor"

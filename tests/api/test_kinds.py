@@ -17,6 +17,7 @@ from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.fitting.fit_config import FitConfig, Partial
 from meshmatch.models import registry
 from meshmatch.models.trained import TrainedModel
+from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
@@ -81,6 +82,16 @@ def test_later_shapes_are_of_the_kind_before(models: list[TrainedModel]) -> None
 def test_a_complete_shape_of_no_kind_is_refused() -> None:
     with pytest.raises(InputError, match=r"chair 7 7 6 is of no kind .*: human, quadruped"):
         choose(ball("man 3 4 6"), ball("chair 7 7 6"))
+
+
+@pytest.mark.usefixtures("models")
+def test_what_reads_strangely_is_of_the_kind_that_fits_it() -> None:
+    dancer = load_shape(SAMPLES / "dancer.ply")
+    strange = Shape(dancer.verts, dancer.faces, "robot 5.5 5.6 7")
+    assert choose(strange) == ("human", ["robot 5.5 5.6 7: human"])
+    for words in ("robot 7 7.1 7.2", "robot 7 7.1 5.5"):  # too strange; and no animal
+        with pytest.raises(InputError, match="is of no kind"):
+            choose(Shape(dancer.verts, dancer.faces, words))
 
 
 @pytest.mark.usefixtures("models")
