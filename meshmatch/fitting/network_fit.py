@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.errors import TemplateError
 from meshmatch.fields.shape_functions import ShapeFunctions
 from meshmatch.fitting.system import NodeSystem, node_system
@@ -28,6 +28,7 @@ from meshmatch.threads import beside
 # How many points the network sees of tilted copies, in turn: thin samples tip it either way where it is in doubt.
 _VARIANT_POINTS = (700, 1400)
 _PREDICT_POINTS = 2048  # it sees of other samples
+_SPREAD_READINGS, _SPREAD_SEED = 6, 5  # tilts by which it is found out how sure the network is
 _BATCH = 24  # clouds that it is asked about together: more save nothing, and take memory
 # Residual that a share of 0 has to be better by than one of 1: rather the whole than a part. Set by hand.
 _SHARE_COST = 0.004
@@ -176,12 +177,32 @@ class Predictor:
         It is predicted from the samples ``local``, and ``coarse`` ones give the residual; both are in the core frame,
         which is ``pose``. There are ``count`` tilts with a standard deviation of ``degrees`` about each axis.
         """
+        found = self._readings(local, count, degrees)
+        return beside(lambda vectors: Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors)), found)
+
+    def spread(
+        self, local: OrientedPoints, vectors: Float[Floats, "K 3"], at: Bool[Bools, " V"], degrees: float
+    ) -> float:
+        """How far a fit lies from what the network reads in tilted copies of the samples: the mean over some vertices of
+        the template, and of the readings the median (units of sqrt(area)).
+
+        Of a shape that the network knows, all readings are much the same.
+        """
+        asked = replace(self, rng=np.random.default_rng(_SPREAD_SEED))
+        here = self.system.moved(vectors)[at]
+        readings = asked._readings(local, _SPREAD_READINGS, degrees)
+        return float(
+            np.median([np.linalg.norm(self.system.moved(each)[at] - here, axis=1).mean() for each in readings])
+        )
+
+    def _readings(self, local: OrientedPoints, count: int, degrees: float) -> list[Floats]:
+        """Node vectors (K, 3) read in tilted copies of samples, and as many in those of their mirror image."""
         tilts = Rotation.from_rotvec(np.radians(degrees) * self.rng.standard_normal((count, 3))).as_matrix()
         found = self._tilted(local, tilts)
         if self.mirror is not None:
             mirrored = replace(local, points=self.mirror.points(local.points))
             found += [self.mirror.vectors(vectors) for vectors in self._tilted(mirrored, tilts)]
-        return beside(lambda vectors: Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors)), found)
+        return found
 
     def _tilted(self, samples: OrientedPoints, tilts: Float[Floats, "N 3 3"]) -> list[Floats]:
         """Node vectors (K, 3) predicted from tilted samples, turned back."""

@@ -8,6 +8,7 @@ right and wrong fits whose truth is known, other ones than it is measured with (
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,9 +32,11 @@ _NEAR, _HOME = 0.06, 0.06
 # More noise than this (units of sqrt(area), 3.4 cm on a person) is a wrong fit rather than noise.
 _MAX_NOISE = 0.025
 _TEAR_SAMPLES = 4096  # enough to see tears
+USUAL_SPREAD = 0.03  # of fits that no network read
+_LEAST_SPREAD = 0.01  # less of it says no more
 _MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
 # Of the logit of a wrong fit, in the order of `Signs.trust`.
-_WEIGHTS, _OFFSET = (1.494, 3.922, 1.154, 2.048, 0.26, 5.404), 0.115
+_WEIGHTS, _OFFSET = (1.476, 5.358, 0.966, 1.589, 0.009, 7.478, 2.163), 4.285
 # Residual (units of sqrt(area)) of even a right fit of a figure built of many solids, which no skin follows; between so many
 # parts of equal area and so many it grows to that. Set by hand, on robots that are not those of docs/results.md.
 _BUILT, _FEW, _MANY = 0.02, 2.0, 8.0
@@ -55,6 +58,7 @@ class Signs:
     against : share (0..1) of the shape that faces the other way than the template
     partial : whether the shape was taken for a part
     hidden : share (0..1) of the template that a part does not show
+    spread : how far the network's readings of tilted copies lie from the fit (units of sqrt(area)), see `Predictor.spread`
     """
 
     residual: float
@@ -65,16 +69,18 @@ class Signs:
     against: float = 0.0
     partial: bool = False
     hidden: float = 0.0
+    spread: float = USUAL_SPREAD
 
     def values(self) -> tuple[float, ...]:
         """Numbers that grow about as the doubt does; beside the others ``empty`` and ``partial`` told nothing more."""
         return (
             100 * self.residual,
-            10 * min(self.missed, 0.2),
+            float(np.sqrt(10 * min(self.missed, 0.2))),
             float(np.log(self.torn + 0.003)),
             float(np.log(max(self.stretch, 0.3))),
             float(np.log(self.against + 0.01)),
             self.hidden,
+            float(np.log(max(self.spread, _LEAST_SPREAD))),
         )
 
     @property
@@ -84,10 +90,17 @@ class Signs:
 
 
 def signs_of(
-    system: NodeSystem, vectors: Float[Floats, "K 3"], local: OrientedPoints, residual: float, partial: bool = False
+    system: NodeSystem,
+    vectors: Float[Floats, "K 3"],
+    local: OrientedPoints,
+    residual: float,
+    partial: bool = False,
+    spread_at: Callable[[Bool[Bools, " V"]], float] | None = None,
 ) -> Signs:
-    """The signs of a fit; ``local`` are samples of the shape in the core frame."""
-    hidden = 1 - area_share(system, visible_vertices(system, local, vectors)) if partial else 0.0
+    """The signs of a fit; ``local`` are samples of the shape in the core frame, ``spread_at`` gives the spread over the
+    vertices that the shape shows (a usual one if there is no network).
+    """
+    shown = visible_vertices(system, local, vectors) if partial else np.ones(len(system.verts), bool)
     surface = system.surface(vectors)
     gap, nearest = cKDTree(surface.points).query(local.points)
     some = local.first(_TEAR_SAMPLES)
@@ -102,7 +115,8 @@ def signs_of(
         float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
         float(weighted_mean(against, local.weights)) if local.signed else _AGAINST_IF_UNSIGNED,
         partial,
-        hidden,
+        1 - area_share(system, shown),
+        USUAL_SPREAD if spread_at is None or not shown.any() else spread_at(shown),
     )
 
 

@@ -6,15 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from meshmatch.arrays import Bool, Bools
 from meshmatch.fitting.fit import Reason, ReasonCode, Verdict
 from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, signs_of, unexplained
 from meshmatch.fitting.task import Registration
 
 # Trust from which on a fit is good, and fair; a part is fair at best.
-GOOD_TRUST, FAIR_TRUST = 0.97, 0.65
+GOOD_TRUST, FAIR_TRUST = 0.97, 0.75
 EVEN_TRUST = 0.5  # at most, where nearness says nothing: as likely wrong as right
 # Shares without counterpart up to which a fit is good; and of the template, up to which it is fair. Set by hand.
 _GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
+_CRUSHED = 1.0  # a stretch of the template from which on no fit is good
 # A residual (units of sqrt(area)) from which on a fit may be one of a part, and the search for parts goes on. Set by hand.
 FAIR_RESIDUAL = 0.031
 
@@ -41,18 +43,24 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
     else:
         allowance = built_allowance(task.shape)
     residual = unexplained(found.candidate.residual, allowance)
-    return judge(signs_of(task.system, vectors, found.local, residual, partial))
+    predictor, tilt = task.predictor, task.config.tilt
+
+    def spread_at(vertices: Bool[Bools, " V"]) -> float:
+        return predictor.spread(found.local, vectors, vertices, tilt)
+
+    return judge(signs_of(task.system, vectors, found.local, residual, partial, spread_at))
 
 
 def judge(signs: Signs) -> Judgement:
     """Verdict, reasons and trust."""
     trust, reasons = signs.trust, _reasons(signs)
+    lacking = max(signs.missed, signs.empty)
     if signs.partial:
         lost = f"{100 * signs.hidden:.0f} % of the template has no counterpart"
         reasons.append(Reason("part", f"taken for a part: {lost}"))
     if trust < FAIR_TRUST or signs.empty > _FAIR_SHARE:
         verdict: Verdict = "poor"
-    elif trust < GOOD_TRUST or signs.partial or max(signs.missed, signs.empty) > _GOOD_SHARE:
+    elif trust < GOOD_TRUST or signs.partial or lacking > _GOOD_SHARE or signs.stretch > _CRUSHED:
         verdict = "fair"
     else:
         return Judgement("good", (), signs)
@@ -69,12 +77,14 @@ def _reasons(signs: Signs) -> list[Reason]:
     empty = f"{100 * signs.empty:.0f} % of the template lies where the shape has no surface"
     crushed = f"the template is stretched or crushed {np.exp(signs.stretch):.1f} times on average"
     facing = f"{100 * signs.against:.0f} % of the shape faces the other way than the template"
+    unsure = f"what the network reads in copies of the shape is {100 * signs.spread:.0f} % of sqrt(area) from the fit"
     told: list[tuple[bool, ReasonCode, str]] = [
         (signs.residual > 0.0285, "residual", gap),
         (signs.missed > _GOOD_SHARE, "unreached", unreached),
         (signs.empty > _GOOD_SHARE, "empty", empty),
         (signs.torn > 0.02, "torn", f"{100 * signs.torn:.0f} % of neighbours on the shape belong far apart"),
-        (signs.stretch > 1.0, "crushed", crushed),
+        (signs.stretch > _CRUSHED, "crushed", crushed),
         (signs.against > 0.1, "facing", facing),
+        (signs.spread > 0.06, "unsure", unsure),
     ]
     return [Reason(code, words) for speaks, code, words in told if speaks]

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import trimesh
 
 from meshmatch.api.matching import Matcher
 from meshmatch.fitting.fit import Reason
@@ -20,7 +21,7 @@ from tests.conftest import some_fit
 from tests.fitting.eggs import egg_model, scan_of
 
 RANK = {"good": 0, "fair": 1, "poor": 2}
-SOUND = Signs(0.023, torn=0.001, stretch=0.5, against=0.015)
+SOUND = Signs(0.023, torn=0.001, stretch=0.5, against=0.015, spread=0.02)
 RISING = {
     "residual": np.linspace(0.02, 0.1, 30),
     "missed": np.linspace(0, 1, 30),
@@ -30,6 +31,7 @@ RISING = {
     "against": np.linspace(0, 1, 30),
     "partial": [False, True],
     "hidden": np.linspace(0, 1, 30),
+    "spread": np.geomspace(0.005, 0.3, 30),
 }
 
 
@@ -78,7 +80,9 @@ def test_reasons_are_sentences_with_codes() -> None:
     (reason,) = judge(replace(SOUND, residual=0.1)).reasons
     assert reason.code == "residual"
     assert str(reason) == "template and shape stay 10.0 % of sqrt(area) apart on average"
-    judged = (judge(replace(SOUND, residual=0.028, stretch=value)) for value in np.linspace(0.5, 1, 400))
+    judged = (
+        judge(replace(SOUND, residual=0.028, stretch=0.98, spread=value)) for value in np.linspace(0.02, 0.06, 400)
+    )
     doubtful = next(each for each in judged if each.verdict == "fair")
     assert doubtful.reasons == ("96 % likely to be right, where a good fit needs 97 %",)
     again = pickle.loads(pickle.dumps(reason))
@@ -117,6 +121,15 @@ def test_signs_of_a_template_pressed_flat() -> None:
     assert "crushed" in {reason.code for reason in judge(signs).reasons}
     turned = replace(scan, normals=-scan.normals)
     assert signs_of(system(), np.zeros_like(flat), turned, 0.025).against > 0.9
+
+
+def test_the_network_reads_what_it_knows_alike_and_a_box_in_many_ways() -> None:
+    matcher = Matcher("human", threads=1)
+    known = matcher.fit(load_shape(bundled_folder() / "samples" / "dancer.ply")).signs
+    box = trimesh.creation.box((1, 2, 0.5)).subdivide().subdivide().subdivide()
+    unknown = matcher.fit(Shape(box.vertices, box.faces, "box")).signs
+    assert known is not None and unknown is not None
+    assert known.spread < 0.02 < 0.05 < unknown.spread
 
 
 @pytest.mark.slow
