@@ -55,12 +55,23 @@ class ShapeSamples:
 
 @dataclass(frozen=True, eq=False)
 class RegisteredShapes:
-    """N shapes on the vertices of a template, which stand as it does: what fits of a trained model found."""
+    """N shapes on the vertices of a template, which stand as it does: what fits of a trained model found.
+
+    `InputError` for another number of vertices than the template's, or coordinates that are no finite numbers.
+    """
 
     template: Template
     verts: Float[Floats, "N V 3"]
     name: str  # of them all
     model: str  # its name or folder
+
+    def __post_init__(self) -> None:
+        V, shape = self.template.shape.V, np.shape(self.verts)
+        if len(shape) != 3 or shape[1:] != (V, 3) or not np.isfinite(self.verts).all():
+            raise InputError(
+                f"{self.name}: shapes of {V} vertices with finite coordinates are wanted, (N, {V}, 3), not {shape}",
+                "take those of `Collection.to_learn`",
+            )
 
 
 def same_faces(like: Repaired, found: list[Repaired]) -> bool:
