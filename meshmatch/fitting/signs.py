@@ -36,7 +36,7 @@ USUAL_SPREAD = 0.03  # of fits that no network read
 _LEAST_SPREAD = 0.01  # less of it says no more
 _MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
 # Of the logit of a wrong fit, in the order of `Signs.trust`.
-_WEIGHTS, _OFFSET = (1.476, 5.358, 0.966, 1.589, 0.009, 7.478, 2.163), 4.285
+_WEIGHTS, _OFFSET = (1.459, 5.303, 0.928, 1.259, 6.89, 2.481), 5.474
 # Residual (units of sqrt(area)) of even a right fit of a figure built of many solids, which no skin follows; between so many
 # parts of equal area and so many it grows to that. Set by hand, on robots that are not those of docs/results.md.
 _BUILT, _FEW, _MANY = 0.02, 2.0, 8.0
@@ -72,13 +72,12 @@ class Signs:
     spread: float = USUAL_SPREAD
 
     def values(self) -> tuple[float, ...]:
-        """Numbers that grow about as the doubt does; beside the others ``empty`` and ``partial`` told nothing more."""
+        """Numbers that grow about as the doubt does; ``empty``, ``against`` and ``partial`` told nothing beside them."""
         return (
             100 * self.residual,
             float(np.sqrt(10 * min(self.missed, 0.2))),
             float(np.log(self.torn + 0.003)),
             float(np.log(max(self.stretch, 0.3))),
-            float(np.log(self.against + 0.01)),
             self.hidden,
             float(np.log(max(self.spread, _LEAST_SPREAD))),
         )
@@ -100,7 +99,7 @@ def signs_of(
     """The signs of a fit; ``local`` are samples of the shape in the core frame, ``spread_at`` gives the spread over the
     vertices that the shape shows (a usual one if there is no network).
     """
-    shown = visible_vertices(system, local, vectors) if partial else np.ones(len(system.verts), bool)
+    shown = visible_vertices(system, local, vectors)
     surface = system.surface(vectors)
     gap, nearest = cKDTree(surface.points).query(local.points)
     some = local.first(_TEAR_SAMPLES)
@@ -115,7 +114,7 @@ def signs_of(
         float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
         float(weighted_mean(against, local.weights)) if local.signed else _AGAINST_IF_UNSIGNED,
         partial,
-        1 - area_share(system, shown),
+        1 - area_share(system, shown) if partial else 0.0,
         USUAL_SPREAD if spread_at is None or not shown.any() else spread_at(shown),
     )
 

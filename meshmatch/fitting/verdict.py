@@ -12,10 +12,11 @@ from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, sig
 from meshmatch.fitting.task import Registration
 
 # Trust from which on a fit is good, and fair; a part is fair at best.
-GOOD_TRUST, FAIR_TRUST = 0.97, 0.75
+GOOD_TRUST, FAIR_TRUST = 0.97, 0.7
 EVEN_TRUST = 0.5  # at most, where nearness says nothing: as likely wrong as right
 # Shares without counterpart up to which a fit is good; and of the template, up to which it is fair. Set by hand.
 _GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
+_HIDDEN = 0.6  # share of the template: of a part that shows less than the rest, such as a leg, too little can be told
 _CRUSHED = 1.0  # a stretch of the template from which on no fit is good
 # A residual (units of sqrt(area)) from which on a fit may be one of a part, and the search for parts goes on. Set by hand.
 FAIR_RESIDUAL = 0.031
@@ -43,12 +44,13 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
     else:
         allowance = built_allowance(task.shape)
     residual = unexplained(found.candidate.residual, allowance)
-    predictor, tilt = task.predictor, task.config.tilt
 
     def spread_at(vertices: Bool[Bools, " V"]) -> float:
-        return predictor.spread(found.local, vectors, vertices, tilt)
+        return task.predictor.spread(found.local, vectors, vertices, task.config.tilt)
 
-    return judge(signs_of(task.system, vectors, found.local, residual, partial, spread_at))
+    # a network for shapes that stand alike has not learned to read tilted ones
+    turned = task.model.card.frame["orientation"] == "searched"
+    return judge(signs_of(task.system, vectors, found.local, residual, partial, spread_at if turned else None))
 
 
 def judge(signs: Signs) -> Judgement:
@@ -58,7 +60,7 @@ def judge(signs: Signs) -> Judgement:
     if signs.partial:
         lost = f"{100 * signs.hidden:.0f} % of the template has no counterpart"
         reasons.append(Reason("part", f"taken for a part: {lost}"))
-    if trust < FAIR_TRUST or signs.empty > _FAIR_SHARE:
+    if trust < FAIR_TRUST or signs.empty > _FAIR_SHARE or signs.hidden > _HIDDEN:
         verdict: Verdict = "poor"
     elif trust < GOOD_TRUST or signs.partial or lacking > _GOOD_SHARE or signs.stretch > _CRUSHED:
         verdict = "fair"
