@@ -23,12 +23,17 @@ from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.geometry.oriented import OrientedPoints, nearest_unsigned, with_normals
 from meshmatch.models.network import Network
 from meshmatch.models.trained import TrainedModel, once_per_model
+from meshmatch.shapes.sampling import sample_surface
 from meshmatch.threads import beside
 
 # How many points the network sees of tilted copies, in turn: thin samples tip it either way where it is in doubt.
 _VARIANT_POINTS = (700, 1400)
 _PREDICT_POINTS = 2048  # it sees of other samples
 _SPREAD_READINGS, _SPREAD_SEED = 6, 5  # tilts by which it is found out how sure the network is
+_SPREAD_TILT = 15.0  # degrees, see `Predictor.variants`
+# Further (units of sqrt(area)) its readings of the resting template lie from it only if it has not learned to read tilted
+# shapes; models that ship have 0.008 at most.
+_READS_ALIKE = 0.02
 _BATCH = 24  # clouds that it is asked about together: more save nothing, and take memory
 # Residual that a share of 0 has to be better by than one of 1: rather the whole than a part. Set by hand.
 _SHARE_COST = 0.004
@@ -180,9 +185,7 @@ class Predictor:
         found = self._readings(local, count, degrees)
         return beside(lambda vectors: Candidate(pose, vectors, two_way_residual(self.system, coarse, vectors)), found)
 
-    def spread(
-        self, local: OrientedPoints, vectors: Float[Floats, "K 3"], at: Bool[Bools, " V"], degrees: float
-    ) -> float:
+    def spread(self, local: OrientedPoints, vectors: Float[Floats, "K 3"], at: Bool[Bools, " V"]) -> float:
         """How far a fit lies from what the network reads in tilted copies of the samples: the mean over some vertices of
         the template, and of the readings the median (units of sqrt(area)).
 
@@ -190,7 +193,7 @@ class Predictor:
         """
         asked = replace(self, rng=np.random.default_rng(_SPREAD_SEED))
         here = self.system.moved(vectors)[at]
-        readings = asked._readings(local, _SPREAD_READINGS, degrees)
+        readings = asked._readings(local, _SPREAD_READINGS, _SPREAD_TILT)
         return float(
             np.median([np.linalg.norm(self.system.moved(each)[at] - here, axis=1).mean() for each in readings])
         )
@@ -212,6 +215,16 @@ class Predictor:
             clouds.append(samples.drawn(size, self.rng) @ tilt.T)
         found = list(self.network.predict(clouds)) if clouds else []
         return [self.network.rotate_rows(vectors, tilt) for vectors, tilt in zip(found, tilts, strict=True)]
+
+
+@once_per_model
+def reads_alike(model: TrainedModel) -> bool:
+    """Whether a model reads copies of its resting template much the same; if not, a spread says nothing of a fit."""
+    predictor = Predictor.of(model, np.random.default_rng(_SPREAD_SEED))
+    system = predictor.system
+    samples = sample_surface(model.template.shape, _PREDICT_POINTS, predictor.rng)
+    still = np.zeros((system.K, 3))
+    return predictor.spread(samples, still, np.ones(len(system.verts), bool)) <= _READS_ALIKE
 
 
 def two_way_residual(

@@ -8,11 +8,12 @@ import numpy as np
 
 from meshmatch.arrays import Bool, Bools
 from meshmatch.fitting.fit import Reason, ReasonCode, Verdict
+from meshmatch.fitting.network_fit import reads_alike
 from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, signs_of, unexplained
 from meshmatch.fitting.task import Registration
 
 # Trust from which on a fit is good, and fair; a part is fair at best.
-GOOD_TRUST, FAIR_TRUST = 0.97, 0.7
+GOOD_TRUST, FAIR_TRUST = 0.99, 0.7
 EVEN_TRUST = 0.5  # at most, where nearness says nothing: as likely wrong as right
 # Shares without counterpart up to which a fit is good; and of the template, up to which it is fair. Set by hand.
 _GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
@@ -46,11 +47,10 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
     residual = unexplained(found.candidate.residual, allowance)
 
     def spread_at(vertices: Bool[Bools, " V"]) -> float:
-        return task.predictor.spread(found.local, vectors, vertices, task.config.tilt)
+        return task.predictor.spread(found.local, vectors, vertices)
 
-    # a network for shapes that stand alike has not learned to read tilted ones
-    turned = task.model.card.frame["orientation"] == "searched"
-    return judge(signs_of(task.system, vectors, found.local, residual, partial, spread_at if turned else None))
+    told = task.model.has_nodes and reads_alike(task.model)
+    return judge(signs_of(task.system, vectors, found.local, residual, partial, spread_at if told else None))
 
 
 def judge(signs: Signs) -> Judgement:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.kinds import Installed
 from meshmatch.experiments import chosen_models
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
@@ -20,7 +21,9 @@ def readings(monkeypatch: pytest.MonkeyPatch) -> None:
         return np.array([[float(word) / 100] for word in shapes[0].name.split()[1:]])
 
     monkeypatch.setattr(chosen_models, "read_kinds", read)
-    monkeypatch.setattr(chosen_models, "installed_models", lambda: [as_model("human"), as_model("quadruped")])
+    monkeypatch.setattr(
+        chosen_models, "installed_models", lambda: [Installed.loaded(as_model(name)) for name in ("human", "quadruped")]
+    )
 
 
 def named(*names: str) -> list[Shape]:

@@ -84,7 +84,7 @@ def test_reasons_are_sentences_with_codes() -> None:
         judge(replace(SOUND, residual=0.028, stretch=0.98, spread=value)) for value in np.linspace(0.02, 0.06, 400)
     )
     doubtful = next(each for each in judged if each.verdict == "fair")
-    assert doubtful.reasons == ("96 % likely to be right, where a good fit needs 97 %",)
+    assert doubtful.reasons == ("98 % likely to be right, where a good fit needs 99 %",)
     again = pickle.loads(pickle.dumps(reason))
     assert (again, again.code) == (reason, reason.code)
 
