@@ -15,7 +15,7 @@ from meshmatch.maps.vertex_map import VERDICTS, VertexMap
 # fits (where it moved them much, one shape alone says something else), at which it is 1/e = 0.37 (units of sqrt(area)):
 _DISTANCE_SCALE, _AGREEMENT_SCALE = 0.042, 0.081
 # the share that is near without distance, of wrong fits and of right ones; and what turns odds of being right to odds of it
-_BY_CHANCE, _MOST, _ODDS, _MAX_TRUST = 0.07, 0.98, 0.135, 0.999
+_BY_CHANCE, _MOST, _ODDS, _MAX_TRUST = 0.07, 0.98, 0.08, 0.999
 
 
 def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
