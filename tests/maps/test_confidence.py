@@ -26,7 +26,7 @@ def mapped(
 def confidence(doubt: NDArray[np.float64] | float, trust: float = 1.0) -> NDArray[np.float64]:
     """Of squared distances in their units: what the regression found."""
     doubt, trust = np.maximum(doubt, 1e-6), min(trust, 0.999)
-    right = 1 / (1 + (1 - trust) / trust / 0.135 * np.sqrt(np.expm1(doubt)))
+    right = 1 / (1 + (1 - trust) / trust / 0.08 * np.sqrt(np.expm1(doubt)))
     return np.asarray(np.exp(-doubt) * (0.07 + 0.91 * right))
 
 

@@ -181,7 +181,7 @@ def test_a_model_goes_on_with_shapes_that_it_has_fitted(prepared: Path, tmp_path
     verts = np.asarray(start.template.shape.verts) * np.array([[[1.0, 1.1, 1.0]], [[1.0, 0.9, 1.0]], [[1.1, 1.0, 1.0]]])
     known = RegisteredShapes(start.template, verts, "fits", str(tmp_path / "start"))
     for wrong in (verts[:, 1:], verts[0], np.where(verts > 0, np.nan, verts)):
-        with pytest.raises(InputError, match="shapes of 10 vertices"):
+        with pytest.raises(InputError, match="shapes of 162 vertices"):
             replace(known, verts=wrong)
     usual = going_on(start)
     assert (usual.network, usual.kernel, usual.deform) == (SMALL.network, SMALL.kernel, True)
