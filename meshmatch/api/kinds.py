@@ -140,8 +140,9 @@ def kinds_of(
     for shape, config, column in zip(shapes, configs, readings.T, strict=True):
         best = int(column.argmin())
         whole = not shape.is_cloud and not may_show_part(shape, config)
-        strange = whole and KNOWN < column[best] < np.inf
-        known = is_of_kind(models[best].load(), shape, column[best], config) if strange else column[best] <= KNOWN
+        known = column[best] <= KNOWN
+        if whole and np.isfinite(column[best]):
+            known = is_of_kind(models[best].load(), shape, column[best], config)
         found.append(models[best].card.category if known else None)
         if whole and not known:
             names = ", ".join(sorted({model.card.category for model in models}))

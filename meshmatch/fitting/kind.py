@@ -51,7 +51,7 @@ def read_kind(model: TrainedModel, shape: Shape, samples: OrientedPoints, config
 
 
 def is_of_kind(model: TrainedModel, shape: Shape, reading: float, config: FitConfig) -> bool:
-    """Whether a repaired shape is of a model's kind: its reading says so, or the whole fit of one that reads strangely."""
-    if reading <= KNOWN or reading > STRANGE:
-        return reading <= KNOWN
-    return Fitter(model, replace(config, refine="nodes", partial="no")).fit(shape).verdict != "poor"
+    """Whether a complete shape is of a model's kind: its reading says so, or the fit of one that reads strangely."""
+    if KNOWN < reading <= STRANGE:
+        return Fitter(model, replace(config, refine="nodes", partial="no")).fit(shape).verdict != "poor"
+    return reading <= KNOWN

@@ -87,6 +87,8 @@ def test_reasons_are_sentences_with_codes() -> None:
     assert doubtful.reasons == ("98 % likely to be right, where a good fit needs 99 %",)
     again = pickle.loads(pickle.dumps(reason))
     assert (again, again.code) == (reason, reason.code)
+    assert "unsure" in {reason.code for reason in judge(replace(SOUND, residual=0.05, spread=0.1)).reasons}
+    assert "unsure" not in {reason.code for reason in judge(replace(SOUND, residual=0.05)).reasons}
 
 
 @cache
