@@ -275,9 +275,7 @@ def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None
     if how.preset != "default" or how.unsupervised:
         name = "--unsupervised" if how.unsupervised else f"--preset {how.preset}"
         raise OptionError(f"{name} does not go with fits", "fits are learned from by the model that made them")
-    for name in ("template", "poses", "characters", "identities"):
-        if getattr(how, name) is not None:
-            raise OptionError(f"--{name} goes with generated shapes, not with fits", f"leave out --{name}")
+    _refuse(how, ("template", "poses", "characters", "identities"), "generated shapes, not with fits")
     collection = Collection(how.shapes)
     found = collection.to_learn()
     start = as_model(how.start or collection.model)
@@ -298,10 +296,15 @@ def _generated(how: TrainOptions) -> "Kind | Bodies | None":
         if how.shapes is not None and how.kind is None and known is None and how.characters is None:
             return None
         return Bodies(how.template, how.identities or Bodies.identities, known, how.characters)
-    for name in ("template", "poses", "characters"):
-        if getattr(how, name) is not None:
-            raise OptionError(f"--{name} goes with human bodies, not with --kind {how.kind}", f"leave out --{name}")
+    _refuse(how, ("template", "poses", "characters"), f"human bodies, not with --kind {how.kind}")
     return Kind(str(how.kind), how.identities or Kind.identities)
+
+
+def _refuse(how: TrainOptions, names: tuple[str, ...], use: str) -> None:
+    """`OptionError` if an option of some names is given, which goes with another use of the command."""
+    for name in names:
+        if getattr(how, name) is not None:
+            raise OptionError(f"--{name} goes with {use}", f"leave out --{name}")
 
 
 def _summary(console: Console, output: Path, steps: int, picture: Path | None, json: bool) -> None:
