@@ -1,4 +1,4 @@
-"""What fields and losses do to a template's triangles: the paper's figures 4 and 5.
+"""What fields and losses do to a template's triangles, the paper's figures 4 and 5; what refinement changes, figure 6.
 
 The *change* of a triangle is log2 of its area over its area before, or over its area on the true body: 0 for none, 1 for
 twice, -1 for half.
@@ -40,6 +40,9 @@ SCALE = Scale(-1.0, 1.0, "area of a triangle: log2 of how many times what it sho
 COLUMNS = {"what": "what", "mean |change|": "change:.3f", "beyond a quarter": "over_quarter:.1%"}
 COLUMNS |= {"beyond twice": "over_twice:.1%", "turned over": "turned:.2%"}
 PULL_COLUMNS = COLUMNS | {"handles missed, cm": "missed_cm:.2f", "rest moved, cm": "elsewhere_cm:.2f"}
+REFINED = {"none": "the network", "code": "its code searched", "nodes": "nodes refined"}
+OFF = Scale(0.0, 10.0, "distance of the template's points from where they belong, cm", beyond=(False, True))
+REFINED_COLUMNS = {"body": "body:d", "refinement": "what", "error, cm": "error_cm:.2f", "over 10 cm": "far:.1%"}
 FIT_COLUMNS = COLUMNS | {"volume": "volume:.1%", "error, cm": "error_cm:.2f"}
 _WIDTH, _MOST_STEPS, _CLOSE = 256, 3000, 1e-3
 
@@ -173,3 +176,25 @@ def fits(
         stands, colors = Shape(upright.apply(verts), faces, name), SCALE.colors(found)
         panels.append(Panel(stands, label=name, face_colors=colors, rotation=np.eye(3)))
     return Drawn(panels, rows)
+
+
+def refinements(model: TrainedModel, bodies: Sequence[Float[Floats, "V 3"]], measure: Measure) -> list[Drawn]:
+    """Bodies, and the template as a model fits each: by its network, after the search over codes, after that for nodes.
+
+    The error is the distance of the template's vertices from where they belong, at 1.9 m2 of skin.
+    """
+    faces, drawn = model.template.shape.faces, []
+    for number, body in enumerate(bodies):
+        upright, start = template_frame(model.template, body), begin_body(model, body, measure)
+        panels = [Panel(Shape(upright.apply(body), faces, "body"), None, "the body", rotation=np.eye(3))]
+        rows = []
+        for method, words in REFINED.items():
+            found = refined(model, start, refinement_of(BASE, method, measure), measure.seed)
+            verts = upright.apply(start.frame.undo(node_system(model).moved(found)))
+            off = CM_PER_UNIT * np.linalg.norm(verts - upright.apply(body), axis=1)
+            rows.append(
+                {"body": number, "what": words, "error_cm": float(off.mean()), "far": float((off > OFF.high).mean())}
+            )
+            panels.append(Panel(Shape(verts, faces, words), OFF.colors(off), words, rotation=np.eye(3)))
+        drawn.append(Drawn(panels, rows))
+    return drawn

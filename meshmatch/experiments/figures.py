@@ -1,8 +1,9 @@
-"""The paper's figures 4, 5 and 7, drawn, with the numbers behind them.
+"""The paper's figures 4 to 7, drawn, with the numbers behind them.
 
 - 4: area distortion of the three representations of a field. Above, an arm pulled by the same handles; below, one body
   that nobody learned from, fitted with each.
 - 5: the same body fitted after different regularisers.
+- 6: bodies as a trained model's network fits them, and after both refinements.
 - 7: what the rules for nodes look at, a node that they refuse, and the three stages of choosing.
 
 By default fields are fitted to the body themselves (`meshmatch.experiments.figure_direct`), without a network. With
@@ -36,11 +37,14 @@ from meshmatch.experiments.figure_fields import (
     FIGURE5,
     FIT_COLUMNS,
     LOSSES,
+    OFF,
     PULL_COLUMNS,
+    REFINED_COLUMNS,
     SCALE,
     Drawn,
     fits,
     pull,
+    refinements,
 )
 from meshmatch.experiments.human_bodies import unseen_bodies
 from meshmatch.fields.shape_functions import FIELDS, FieldName
@@ -50,9 +54,10 @@ from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
 from meshmatch.templates.template import read_template
 
-FIGURES = ("4", "5", "7")
+FIGURES = ("4", "5", "6", "7")
 _FRONT = Look(turn=0.0, tilt=4.0)
 _WIDEST = 1400  # pixels
+_REFINED = 2  # bodies of figure 6
 
 
 def stacked(rows: Sequence[tuple[Sequence[Panel], Look]], path: Path) -> None:
@@ -120,6 +125,7 @@ def main(
     output: Annotated[Path | None, Option(help="folder of trained runs; by default none are used")] = None,
     train_steps: Annotated[int, Option(min=1, help="of training a run")] = 300,
     batch: Annotated[int | None, Option(min=1, help="shapes of a step of training a run")] = None,
+    model: Annotated[str, Option(help="whose fits figure 6 shows")] = "human",
     method: Annotated[str, Option(help=f"refinement of a run's fits, of {', '.join(METHODS)}")] = "code",
     code_steps: Annotated[int, Option(min=1, help="of the search over codes")] = 60,
     supervised: Annotated[int, Option(min=4, help="template points with a known place, without a network")] = 300,
@@ -141,10 +147,17 @@ def main(
     notes = []
     body = unseen_bodies(template, 1, seed=seed)[0] if {"4", "5"} & set(wanted) else np.empty((0, 3))
     for name in wanted:
-        learned = kept is not None and name != "7"
+        learned = kept is not None and name in ("4", "5")
         path = pictures / f"paper-figure-{name}{'-trained' if learned else ''}.png"
         if name == "7":
             found |= figure_7(nodes, radius, path)
+        elif name == "6":
+            bodies = list(unseen_bodies(template, _REFINED, seed=seed))
+            refined = refinements(as_model(model), bodies, Measure(code_steps=code_steps, seed=seed))
+            found["refined"] = [row for each in refined for row in each.rows]
+            stacked(
+                [(each.panels, replace(_FRONT, legend=OFF if each is refined[-1] else None)) for each in refined], path
+            )
         else:
             below = drawn_fits(name, body, kept, method, how)
             found[f"fits {name}"] = below.rows
@@ -159,6 +172,7 @@ def main(
         "pull": ("Figure 4, an arm pulled by the same handles: change of triangles (log2 of area)", PULL_COLUMNS),
         "fits 4": ("Figure 4, one body fitted with each field", FIT_COLUMNS),
         "fits 5": ("Figure 5, one body fitted after each loss", FIT_COLUMNS),
+        "refined": ("Figure 6, bodies fitted by the network, and refined", REFINED_COLUMNS),
         "refused": ("Figure 7, candidates that the rules refuse", figure_nodes.COLUMNS),
     }
     drawn = [runner.table(words, found[key], columns) for key, (words, columns) in titles.items() if key in found]

@@ -14,7 +14,18 @@ from meshmatch.experiments import figure_fields
 from meshmatch.experiments.ablation_errors import Measure
 from meshmatch.experiments.ablation_views import BASE
 from meshmatch.experiments.figure_direct import Direct, direct_fits, fitted, in_template_frame
-from meshmatch.experiments.figure_fields import PULL, change, fits, pull, pulled_by, pulled_nodes, volume
+from meshmatch.experiments.figure_fields import (
+    OFF,
+    PULL,
+    REFINED,
+    change,
+    fits,
+    pull,
+    pulled_by,
+    pulled_nodes,
+    refinements,
+    volume,
+)
 from meshmatch.experiments.figure_nodes import config_of, refusals, refused, worst_candidate
 from meshmatch.experiments.figures import main, stacked
 from meshmatch.maps.evaluate import CM_PER_UNIT
@@ -117,8 +128,8 @@ def test_the_command_draws_figure_7(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert {row["template"] for row in record["refused"]} == {"human-T", "human-A"}
     assert record["stages"][0]["nodes"] >= 60 and len(record["bad"][0]["node moves"]) > 1
     assert (tmp_path / "paper-figure-7.png").stat().st_size > 10_000
-    assert main(["--figures", "6"]) == 1
-    assert "unknown figure '6'" in capsys.readouterr().err
+    assert main(["--figures", "8"]) == 1
+    assert "unknown figure '8'" in capsys.readouterr().err
 
 
 def test_a_field_is_fitted_without_a_network(template: Template) -> None:
@@ -146,3 +157,17 @@ def test_fits_of_runs_stand_as_the_body_does() -> None:
     assert np.array_equal(first.rotation, np.eye(3)) and np.array_equal(second.rotation, np.eye(3))
     assert np.linalg.norm(second.shape.verts - first.shape.verts, axis=1).mean() < 0.5
     assert drawn.rows[0]["error_cm"] > 0
+
+
+def test_refinement_is_measured_and_colored_by_the_distance_from_the_truth() -> None:
+    """Of a longer template, elsewhere: refined nodes come nearer, and every panel shows its own errors."""
+    model = egg_model()
+    body = model.template.shape.verts * [3.0, 3.6, 3.0] + 7
+    (drawn,) = refinements(model, [body], Measure(samples=3000, code_steps=2))
+    assert [row["what"] for row in drawn.rows] == [panel.label for panel in drawn.panels[1:]] == list(REFINED.values())
+    errors = [row["error_cm"] for row in drawn.rows]
+    assert errors[-1] < 0.7 * errors[0]
+    for row, panel in zip(drawn.rows, drawn.panels[1:], strict=True):
+        off = CM_PER_UNIT * np.linalg.norm(panel.shape.verts - drawn.panels[0].shape.verts, axis=1)
+        assert off.mean() == pytest.approx(row["error_cm"], abs=1e-6) and row["far"] == (off > OFF.high).mean()
+        assert panel.colors == pytest.approx(OFF.colors(off))
