@@ -19,6 +19,7 @@ from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, check_landmarks, fits_with_landmarks, landmark_places
+from meshmatch.maps.build import judged_by_pairs
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import AUTO
 from meshmatch.models.trained import TrainedModel
@@ -149,11 +150,13 @@ class Matcher:
             known = None
             if landmarks is not None:
                 pairs = np.asarray(landmarks[0]), np.asarray(landmarks[1])
-                honoured, known = fits_with_landmarks(self.model, clean, fits, pairs, configs)
-                fits = [self._finished(*each) for each in zip(honoured, clean, configs, strict=True)]
+                pulled, known = fits_with_landmarks(self.model, clean, fits, pairs, configs)
+                fits = [self._finished(*each) for each in zip(pulled, clean, configs, strict=True)]
             before = fits[0], fits[1]
             agreed = self._agreed(before, configs[0], known)
             found = map_of_fits(agreed, before, self.threads)
+            if landmarks is not None:
+                found = judged_by_pairs(found, clean[1].original, pairs, agreed[1].frame.scale)
         notes = tuple(dict.fromkeys((*(words for kind in kinds for words in kind), *fits[0].notes, *fits[1].notes)))
         return MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads)
 
@@ -248,8 +251,8 @@ def match(
     ``source`` and ``target`` are meshes or point clouds of the model's category, in any unit, orientation and resolution:
     a path, a Shape, an (N, 3) array, (vertices, faces), or an object with .vertices and .faces. ``config`` says how
     shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes.
-    ``landmarks`` are known pairs, (source vertices (N,), target vertices (N,)), which the map then honours; only with
-    ``refine="nodes"``. See `Matcher` for the rest.
+    ``landmarks`` are known pairs, (source vertices (N,), target vertices (N,)), which pull both fits; the map says
+    which of them it misses, and is then not good. Only with ``refine="nodes"``. See `Matcher` for the rest.
 
     `MeshmatchError`: a shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
     """

@@ -51,7 +51,7 @@ Points = Annotated[
         help="The truth as two lists: vertices of SOURCE, and the same points as vertices of TARGET.",
     ),
 ]
-PAIRS_HELP = "Known pairs that the map must honour: a source vertex and a target vertex a line, counted from 0."
+PAIRS_HELP = "Known pairs that pull both fits: a source vertex and a target vertex a line, counted from 0. The map says which it misses."
 
 
 def output_option(metavar: str, help: str) -> Any:

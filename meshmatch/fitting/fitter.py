@@ -217,6 +217,11 @@ def landmark_places(clean: Sequence[Repaired], landmarks: Sequence[ArrayLike]) -
         places.append(part.shape.verts[part.original_to_repaired[chosen]])
     if len(places[0]) != len(places[1]):
         raise OptionError("landmarks must come in pairs", _HINT)
+    sources, targets = np.unique(np.stack([np.asarray(each) for each in landmarks]), axis=1)
+    if len(twice := np.flatnonzero(np.diff(sources) == 0)):
+        vertex, (one, other) = sources[twice[0]], targets[twice[0] : twice[0] + 2]
+        two = f"landmarks pair vertex {vertex} of {clean[0].shape.name} with two of {clean[1].shape.name}: {one} and {other}"
+        raise OptionError(two, "keep one of the two lines")
     return places
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
 from meshmatch.maps.parts import kept_together
 from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VERDICTS, VertexMap
+from meshmatch.shapes.shape import Shape
 
 # Where confidence is the probability that a vertex is within 5 cm of its true partner on a person. Distances, and how far
 # agreement moved the two fits (where it moved them much, one shape alone says something else), at which it is 1/e = 0.37
@@ -17,6 +20,9 @@ _DISTANCE_SCALE, _AGREEMENT_SCALE = 0.042, 0.081
 # the share that is near without distance, of wrong fits and of right ones; and what turns odds of being right to odds of it:
 # the most likely values on 247 right and wrong fits, seeds 0 to 2 of docs/results.md, which measures it on others
 _BY_CHANCE, _MOST, _ODDS, _MAX_TRUST = 0.098, 0.964, 0.044, 0.999
+# Known pairs further apart than this on the target (units of sqrt(area); 5 and 14 cm on a person) are missed, or show that the
+# map is wrong there; so many are told.
+_MISSED, _LOST, _TOLD = 0.036, 0.1, 3
 
 
 def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
@@ -54,6 +60,24 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
         target.hash,
         target.faces.astype(np.int64),
     )
+
+
+def judged_by_pairs(
+    found: VertexMap, target: Shape, pairs: tuple[Int[Ints, " N"], Int[Ints, " N"]], unit: float
+) -> VertexMap:
+    """A map with what it makes of known pairs, vertices of source and target: a reason for each that it misses, the
+    furthest first, and a verdict no better than these allow. ``unit`` is sqrt(area) of the target, in the unit of its file.
+    """
+    off = np.linalg.norm(found.points(target)[pairs[0]] - target.verts[pairs[1]], axis=1) / unit
+    missed = [k for k in np.argsort(-off, kind="stable") if off[k] > _MISSED]
+    if not missed:
+        return found
+    reasons = tuple(
+        f"the known pair {pairs[0][k]}, {pairs[1][k]} is missed by {100 * off[k]:.0f} % of sqrt(area)"
+        for k in missed[:_TOLD]
+    )
+    verdict = max(found.verdict, "poor" if off.max() > _LOST else "fair", key=VERDICTS.index)
+    return replace(found, verdict=verdict, reasons=(*reasons, *found.reasons))
 
 
 def _confidence(doubt: Float[Floats, " V"], trust: float) -> Float[Floats, " V"]:

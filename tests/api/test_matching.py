@@ -166,6 +166,7 @@ def test_matchers_refuse_other_types_with_a_hint(matcher: Matcher, sphere: Shape
         (([0, 1], [0]), "in pairs"),
         (([0.5], [1]), "lists of vertex numbers"),
         (([9999], [1]), "vertex 9999 is not on"),
+        (([3, 5, 3], [1, 2, 4]), "vertex 3 of .* with two of .*: 1 and 4"),
     ],
 )
 def test_landmarks_are_checked_before_the_shapes_are_fitted(
