@@ -46,6 +46,8 @@ def read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
     if own and values.flags.c_contiguous and not values.flags.writeable:
         return values
     try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex ones have two parts")
         array: NDArray[Any] = np.array(values, dtype=dtype, order="C")
     except (TypeError, ValueError) as error:
         raise InputError(f"{label}: not an array of numbers ({error})") from error
@@ -61,7 +63,10 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
 def as_numbers(values: ArrayLike, name: str, finite: bool = False) -> Floats:
     """An array of numbers; `InputError` where they are something else, such as words or rows of different lengths."""
     try:
-        found = np.asarray(values, np.float64)
+        found = np.asarray(values)
+        if found.dtype.kind == "c":
+            raise TypeError("complex ones have two parts")
+        found = found.astype(np.float64, copy=False)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must be numbers ({error})", "pass an array, one row for each vertex") from error
     if finite and not np.isfinite(found).all():

@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -55,6 +55,9 @@ class InterpolationOptions:
     place: Place = "auto"
 
     def __post_init__(self) -> None:
+        for name in ("start", "stop"):
+            if not isinstance(value := getattr(self, name), Real):
+                raise OptionError(f"{name} must be a number, not {value!r}", "the source is at 0 and the target at 1")
         if not EARLIEST <= self.start < self.stop <= LATEST:
             times = f"times go from {EARLIEST:g} to {LATEST:g}, the earlier first"
             hint = f"the source is at 0 and the target at 1; {times}"
@@ -119,8 +122,10 @@ def interpolate(
     options = options or InterpolationOptions()
     shapes = as_shapes(shapes)
     for count, what in ((len(shapes), "two shapes to go between"), (frames, "two shapes to make")):
-        if not isinstance(count, Integral) or count < 2:
-            raise OptionError(f"a sequence needs at least {what}, not {count}")
+        if not isinstance(count, Integral):
+            raise OptionError(f"the number of shapes to make must be an integer, not {count!r}", "give 2 or more")
+        if count < 2:
+            raise OptionError(f"a sequence needs at least {what}, not {count}", "give two or more")
     matcher = Matcher(model, None, threads, progress)
     fits = matcher.fit_all(shapes, config)
     notes = tuple(dict.fromkeys(note for fit in fits for note in fit.notes))

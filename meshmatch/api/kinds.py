@@ -10,7 +10,7 @@ import numpy as np
 
 from meshmatch.api.inputs import as_model
 from meshmatch.arrays import Float, Floats
-from meshmatch.errors import InputError, MeshmatchError, ModelError
+from meshmatch.errors import InputError, MeshmatchError, ModelError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import may_show_part
 from meshmatch.fitting.kind import KNOWN, SURE, is_of_kind, kind_samples, read_kind
@@ -68,6 +68,8 @@ def read_kinds(
     def reading(model: Installed, number: int) -> float:
         try:
             return read_kind(model.load(), shapes[number], samples[number], configs[number])
+        except OptionError:  # a device that is not there: true of all models
+            raise
         except MeshmatchError:  # also of a damaged model: `meshmatch models list` tells what is wrong with it
             return np.inf
 

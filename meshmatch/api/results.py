@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -120,8 +121,8 @@ class ConfidenceRule:
     def __post_init__(self) -> None:
         if self.fill and self.blank is not None:
             raise OptionError("fill and blank contradict each other", "choose one of them")
-        if not 0 <= self.minimum <= 1:
-            raise OptionError(f"a confidence lies in 0..1, not {self.minimum:g}")
+        if not (isinstance(self.minimum, Real) and 0 <= self.minimum <= 1):
+            raise OptionError(f"a confidence lies in 0..1, not {self.minimum!r}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ Shapes and ``match`` are as in `find_maps`. `ConfidenceRule` says what is done w
 from __future__ import annotations
 
 from collections.abc import Callable
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, get_args
 
@@ -94,6 +95,9 @@ def transfer_values(
     blank = None if rule.blank is None else as_numbers(rule.blank, "blank")
     if blank is not None and blank.shape not in ((), (1,), numbers.shape[1:]):
         raise OptionError(f"blank has {blank.shape} numbers and the values {numbers.shape[1:]}", "give one number")
+    if directions and numbers.shape != (source.V, 3):
+        hint = "give x, y and z of each vector, or transfer plain numbers"
+        raise InputError(f"directions must be an array of ({source.V}, 3), not {numbers.shape}", hint)
     maps = find_maps(source, target, match)
     with thread_limit(1):
         if directions:
@@ -202,8 +206,10 @@ def transfer_weights(
     source = as_shape(source, "source")
     if rule.blank is not None:
         raise OptionError("skin weights cannot be left blank", "fill them in, or keep them")
-    if influences < 1:
-        raise OptionError(f"a vertex needs at least 1 joint, not {influences}")
+    if not isinstance(influences, Integral) or influences < 1:
+        raise OptionError(
+            f"influences must be an integer of 1 or more, not {influences!r}", "4 is what most programs read"
+        )
     if isinstance(weights, str | Path):
         given = load_weights(weights, source)
     else:

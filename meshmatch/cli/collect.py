@@ -125,6 +125,7 @@ def map(
         collection = meshmatch.Collection(fits, scheduler or jobs, progress)
         wanted = collection.pairs(to) if pairs is None else load_pairs(pairs)
         count = collection.save_maps(output, wanted, suffix=suffix)
-    console.say(f"wrote {count} maps to {output}: {output}/SOURCE/TARGET{suffix}")
+    files = f"{output}/SOURCE/TARGET.{suffix.removeprefix('.')}"
+    console.say(f"{count} maps in {output}: {files}; those that were as new as the fits were kept")
     if json:
         print_json({"output": output, "fits": fits, "maps": count})

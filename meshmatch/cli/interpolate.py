@@ -80,7 +80,7 @@ def interpolate(
     # What cannot be written, a mistyped model and broken files are told before the long work.
     with (replace_on_success if suffix else folder_on_success)(output) as temporary:
         check_model(how.model)
-        shapes = [how.load(file) for file in files]
+        shapes = how.load(*files)
         with console.progress() as report:
             result = interpolation.interpolate(
                 shapes, sequence.frames, options=options, model=how.model, config=how.configs()[0],

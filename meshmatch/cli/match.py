@@ -55,15 +55,15 @@ def match(
     # What cannot be written, a mistyped model and broken files are told before the long work.
     with replace_on_success(output) as temporary:
         check_model(how.model)
-        shapes = how.load(source), how.load(target)
-        result = how.match(*shapes, run, console)
+        a, b = how.load(source, target)
+        result = how.match(a, b, run, console)
         found = result.map
         words.refuse_poor(run.strict, found.verdict, found.reasons)
         meshmatch.save_map(temporary, found)
     if picture is not None:
         from meshmatch.render.compose import compose_match
 
-        compose_match(*shapes, found, result.rotations).named(names).render(picture)
+        compose_match(a, b, found, result.rotations).named(names).render(picture)
     words.tell_match(console, result, names)
     words.tell_verdict(console, found.verdict, found.reasons)
     console.say(
@@ -145,7 +145,7 @@ def register(
     console = Console(run.quiet)
     with replace_on_success(output) as temporary:
         check_model(how.model)
-        loaded = how.load(shape)
+        (loaded,) = how.load(shape)
         matcher = meshmatch.Matcher(how.model, how.configs()[0], run.threads)
         with console.progress() as matcher.progress:
             fit = matcher.fit(loaded)

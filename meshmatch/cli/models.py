@@ -102,4 +102,4 @@ def verify(
         print_json({"models": checked})
     wrong = sum(model["sha256"] is None for model in checked)
     if wrong:
-        raise ModelError(f"{wrong} {'model is' if wrong == 1 else 'models are'} damaged", "see the lines above")
+        raise ModelError(f"{wrong} of {len(checked)} models could not be verified", "see the lines above")

@@ -51,7 +51,7 @@ Points = Annotated[
         help="The truth as two lists: vertices of SOURCE, and the same points as vertices of TARGET.",
     ),
 ]
-PAIRS_HELP = "Known pairs that pull both fits: a source vertex and a target vertex a line, counted from 0. The map says which it misses."
+PAIRS_HELP = "Known pairs that pull both fits, source and target vertex a line, from 0; the map says which it misses."
 
 
 def output_option(metavar: str, help: str) -> Any:
@@ -199,9 +199,11 @@ class FitOptions:
         """Up and front of all shapes, or of each."""
         return ((self.up, self.front),)
 
-    def load(self, path: Path) -> meshmatch.Shape:
-        """A shape; of a scene that has meshes of the chosen names, with weight on these alone."""
-        return meshmatch.load_shape(path, only=self.only or (), without=self.without or ())
+    def load(self, *paths: Path) -> list[meshmatch.Shape]:
+        """Shapes; of scenes that have meshes of the chosen names, with weight on these alone."""
+        from meshmatch.shapes.files import load_shapes
+
+        return load_shapes(paths, only=self.only or (), without=self.without or ())
 
     def check(self) -> None:
         """Refuse up and front along one axis (`OptionError`), before anything is loaded."""

@@ -79,10 +79,12 @@ class PictureOptions:
             raise OptionError("--confidence and the truth both color the shapes", "make a picture for each")
         for name, files in each.items():
             if files and len(files) != count:
-                raise OptionError(f"{count} shapes need {name} {count} times, not {len(files)}")
+                shapes = "1 shape needs" if count == 1 else f"{count} shapes need"
+                problem = f"{shapes} {name} {'once' if count == 1 else f'{count} times'}, not {len(files)}"
+                raise OptionError(problem, "give one for each shape, in the same order")
         for name, given in single.items():
             if given is not None and count != 1:
-                raise OptionError(f"{name} is for one shape, not for {count}")
+                raise OptionError(f"{name} is for one shape, not for {count}", "draw the shapes one by one")
         if self.on is not None and not self.labels:
             raise OptionError("--on needs --labels", "give the labels, or leave out --on")
         if self.title is not None and not self.values:

@@ -95,7 +95,7 @@ class Transfer:
 
         def matched(a: meshmatch.Shape, b: meshmatch.Shape) -> meshmatch.MatchResult:
             if self.options.only or self.options.without:  # a fit's weights, no attribute to carry
-                a, b = self.options.load(self.source), self.options.load(self.target)
+                a, b = self.options.load(self.source, self.target)
             return self.options.match(a, b, self.run, self.console)
 
         if self.options.map is not None and self.options.map.is_dir():

@@ -53,7 +53,8 @@ def transfer_texture(
 
     Every texel takes the color of its place on SRC: from its materials and their images, or from its vertex colors.
     The VALUE of --blank is a color such as #808080, or 0 for a hole. The first vertices of a written glb are those of
-    TGT in their order, and copies at texture seams follow; an obj has exactly the vertices and faces of TGT.
+    TGT in their order, and copies at texture seams follow; an obj has exactly the vertices and triangles of TGT, whose
+    polygons are split.
     """
     from meshmatch.shapes import textured_files
     from meshmatch.transfer.vertex_files import parse_color, save_colors

@@ -152,7 +152,7 @@ def stdout_refused(error: OSError) -> OutputError:
     """
     with suppress(AttributeError, OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return OutputError(f"cannot write to stdout: {error.strerror}", "is the disk full?")
+    return OutputError(f"cannot write to stdout: {error.strerror}", "is the disk full, or stdout closed?")
 
 
 def _coding() -> str:

@@ -175,6 +175,7 @@ class Collection:
         The one from A to B is ``output/A/B`` with the suffix, which chooses the format. Maps that are as new as the fits
         are kept. `MeshmatchError`: an unknown name or format, or the folder cannot be written, or is by somebody else.
         """
+        suffix = f".{suffix.removeprefix('.')}"
         check_suffix(Path(f"map{suffix}"))
         wanted = self.pairs() if pairs is None else list(pairs)
         known = set(self.names)
@@ -223,6 +224,7 @@ class Collection:
         file = f"{FITS}/{name}{SUFFIX}"
         if not self.store.exists(file):
             close = get_close_matches(name, self.names, n=1)
-            raise InputError(f"the collection has no fit of {name}", f"did you mean {close[0]}?" if close else "")
+            hint = f"did you mean {close[0]}?" if close else "names are those of the fitted files, without the suffix"
+            raise InputError(f"the collection has no fit of {name}", hint)
         with self.store.reading(file) as path:
             return load_finished(path, self.template)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -55,9 +55,19 @@ def settled(wish: Setting, sources: Sequence[Source]) -> Setting:
             save_template(template, path)
         save_text(store, ABOUT, json.dumps(wanted, indent=2) + "\n")  # last: a folder without it is no collection
     elif differs := [name for name in wanted if about[name] != wanted[name]]:
-        other = f"the fits in {store.location} were made with another {differs[0]}"
+        other = f"the fits in {store.location} were made with another {_differing(differs[0], about, wanted)}"
         raise OptionError(other, "choose another folder, or the options of before")
     return setting
+
+
+def _differing(name: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """The first choice that differs, by its own name where choices lie within choices, and what it was before."""
+    then, wanted = before[name], now[name]
+    if isinstance(then, dict) and isinstance(wanted, dict):
+        inner = next((key for key in wanted if then.get(key) != wanted[key]), None)
+        if inner is not None and inner in then:
+            return _differing(inner, then, wanted)
+    return f"{name}: {then}, not {wanted}" if isinstance(then, str | int | float) else name
 
 
 def _first_template(store: Store, sources: Sequence[Source], new: bool) -> Template:

@@ -27,6 +27,8 @@ def find_sources(shapes: str | Path | Sequence[str | Path], output: Store) -> li
     `InputError` if there is nothing, or two shapes have one name.
     """
     given = [shapes] if isinstance(shapes, str | Path) else list(shapes)
+    if any(Store.of(each).location == output.location for each in given if is_url(each) or as_path(each).is_dir()):
+        raise InputError(f"cannot fit {output.location} into itself", "choose another folder with --output")
     found = sorted((source for each in given for source in _sources(each, output)), key=lambda source: source.name)
     if not found:
         raise InputError(

@@ -63,8 +63,8 @@ def in_torch(network: Network, K: int, device: str = "cpu") -> Deformer:
     try:
         return found.to(torch.device(device))
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        problem = f"device {device!r} cannot be used: {str(error).splitlines()[0]}"
-        raise OptionError(problem, "write cpu, or cuda") from error
+        problem = f"device {device!r} cannot be used: {str(error).splitlines()[0][:80]}"
+        raise OptionError(problem, "use cpu; cuda needs a GPU and a torch that was built for it") from error
 
 
 class NodeNetwork:

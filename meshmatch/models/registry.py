@@ -213,7 +213,7 @@ def remove_model(name: str) -> None:
 
     folder = _registered(name)
     if folder.parent == built_in_folder():
-        raise ModelError(f"{name} is a built-in model and cannot be removed")
+        raise ModelError(f"{name} is a built-in model and cannot be removed", "only models that you added can be")
     with suppress(OSError):  # of no use to anybody, and replaced if it stays
         shared_file(name).unlink(missing_ok=True)
     with changing(user_folder(), _ELSEWHERE):

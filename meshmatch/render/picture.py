@@ -13,7 +13,7 @@ from PIL import Image
 
 from meshmatch.arrays import Float, Floats, UInts8
 from meshmatch.errors import OptionError
-from meshmatch.outputs import replace_on_success
+from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.render import raster
 from meshmatch.render.figures import Figure, Panel, build_figure, rotation_about_x
 from meshmatch.render.scales import Ink, Legend, draw_legend, fitting, legend_height, write
@@ -86,8 +86,9 @@ def background_color(background: str) -> Ink | None:
 
 def check_picture(path: str | Path) -> None:
     """Refuse a file name that is not .png (`OptionError`)."""
-    if Path(path).suffix.lower() != ".png":
-        raise OptionError(f"{Path(path).name}: a picture is a PNG", "end the name in .png")
+    path = as_path(path)
+    if path.suffix.lower() != ".png":
+        raise OptionError(f"{path.name}: a picture is a PNG", "end the name in .png")
 
 
 def render_shapes(

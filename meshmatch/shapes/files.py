@@ -40,7 +40,7 @@ SUFFIXES = tuple(_FORMATS)
 _HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
 
 
-def load_shape(path: str | Path, *, only: Sequence[str] = (), without: Sequence[str] = ()) -> Shape:
+def load_shape(path: str | Path, *, only: str | Sequence[str] = (), without: str | Sequence[str] = ()) -> Shape:
     """Read a mesh or a point cloud as it is: all vertices, in file order, in the file's frame and unit.
 
     A vertex whose position is not a number is kept in its place and marked in `Shape.invalid`; its `verts` row is then
@@ -54,6 +54,33 @@ def load_shape(path: str | Path, *, only: Sequence[str] = (), without: Sequence[
     `InputError`: the file is missing, empty, cut short, of an unknown kind, or holds no usable vertex; or no mesh of it has
     a name that is given.
     """
+    return load_shapes([path], only=only, without=without)[0]
+
+
+def load_shapes(
+    paths: Sequence[str | Path], *, only: str | Sequence[str] = (), without: str | Sequence[str] = ()
+) -> list[Shape]:
+    """Read shapes as `load_shape` does. A shape whose scene lacks a name is not asked for it, but one must have it.
+
+    Errors are those of `load_shape`.
+    """
+    chosen, left_out = ([names] if isinstance(names, str) else list(names) for names in (only, without))
+    found = [_read(path) for path in paths]
+    for pattern in (*chosen, *left_out):
+        if not any(_has(raw, pattern) for _, raw in found):
+            files = " or ".join(shape.name for shape, _ in found)
+            known = ", ".join(dict.fromkeys(names[0] for _, raw in found for names, _ in raw.meshes if names))
+            if not any(raw.meshes for _, raw in found):
+                raise InputError(f"{files} names no meshes to choose from", "meshes of .glb and .gltf files have names")
+            raise InputError(f"no mesh of {files} is called {pattern[:80]!r}", f"there are: {known[:200] or 'none'}")
+    shapes = []
+    for shape, raw in found:
+        own = [[pattern for pattern in names if _has(raw, pattern)] for names in (chosen, left_out)]
+        shapes.append(replace(shape, weights=_chosen(shape.name, raw, *own)) if any(own) else shape)
+    return shapes
+
+
+def _read(path: str | Path) -> tuple[Shape, Raw]:
     path = existing(as_path(path), suffixes=SUFFIXES)
     suffix = path.suffix.lower()
     if suffix not in _FORMATS:
@@ -62,10 +89,7 @@ def load_shape(path: str | Path, *, only: Sequence[str] = (), without: Sequence[
     data = read_bytes(path)
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
         raw = _FORMATS[suffix][0](path, data)
-    shape = Shape.with_invalid(raw.verts, raw.faces, plain_text(path.name), raw.colors)
-    if not only and not without:
-        return shape
-    return replace(shape, weights=_chosen(shape.name, raw, only, without))
+    return Shape.with_invalid(raw.verts, raw.faces, plain_text(path.name), raw.colors), raw
 
 
 def mesh_names(path: str | Path) -> dict[str, int]:
@@ -82,20 +106,18 @@ def mesh_names(path: str | Path) -> dict[str, int]:
     return found
 
 
+def _has(raw: Raw, pattern: str) -> bool:
+    return any(_called(names, pattern) for names, _ in raw.meshes)
+
+
+def _called(names: tuple[str, ...], pattern: str) -> bool:
+    return any(fnmatchcase(each.lower(), pattern.lower()) for each in names)
+
+
 def _chosen(name: str, raw: Raw, only: Sequence[str], without: Sequence[str]) -> Float[Floats, " V"]:
     """1 for the vertices of the meshes that are to be trusted, 0 for all others."""
-    if not raw.meshes:
-        raise InputError(f"{name} names no meshes to choose from", "meshes of .glb and .gltf files have names")
-
-    def has(names: tuple[str, ...], pattern: str) -> bool:
-        return any(fnmatchcase(each.lower(), pattern.lower()) for each in names)
-
-    for pattern in (*only, *without):
-        if not any(has(names, pattern) for names, _ in raw.meshes):
-            known = ", ".join(dict.fromkeys(names[0] for names, _ in raw.meshes if names))
-            raise InputError(f"no mesh of {name} is called {pattern[:80]!r}", f"there are: {known[:200] or 'none'}")
     kept = [
-        (not only or any(has(names, each) for each in only)) and not any(has(names, each) for each in without)
+        (not only or any(_called(names, each) for each in only)) and not any(_called(names, each) for each in without)
         for names, _ in raw.meshes
     ]
     if not any(kept):

@@ -71,8 +71,9 @@ def repair(shape: Shape) -> Repaired:
     notes: list[str] = []
     valid = shape.valid
     if not valid.any():
-        raise InputError(f"{shape.name or 'the shape'}: no vertex has a position (all NaN)", "export it again")
-    _note(notes, shape.V - int(valid.sum()), "vertex", "without a position (NaN) dropped")
+        hint = "all are NaN, infinite or huge: export it again"
+        raise InputError(f"{shape.name or 'the shape'}: no vertex has a usable position", hint)
+    _note(notes, shape.V - int(valid.sum()), "vertex", "without a usable position dropped")
     return (_repair_cloud if shape.is_cloud else _repair_mesh)(shape, valid, notes)
 
 

@@ -94,7 +94,10 @@ class Shape:
         if usable.all():
             return cls(verts, faces, name, colors)
         if not usable.any():
-            raise InputError(f"{name or 'the shape'}: no vertex has a finite position (all NaN)", "export it again")
+            raise InputError(
+                f"{name or 'the shape'}: no vertex has a usable position",
+                f"all are NaN, or beyond {LARGEST:.0e}: export it again",
+            )
         verts = verts.copy()
         verts[~usable] = verts[usable].mean(axis=0)
         return cls(verts, faces, name, colors, ~usable)

@@ -27,7 +27,7 @@ On = Literal["vertices", "faces"]
 Label = int | str
 LABEL_SUFFIXES = (".npy", ".csv", ".txt", ".json", ".ply")
 check_labels_suffix = partial(table_files.check_suffix, suffixes=LABEL_SUFFIXES, what="labels")
-_HINT = "one label for each vertex or each face of the source, in the order of its file"
+_HINT = "one label for each vertex or triangle of the source, in the order of its file; polygons are fans of triangles"
 
 
 @dataclass(frozen=True, eq=False)

@@ -81,9 +81,10 @@ def at_faces(
     held = f"{shape.name or 'the source'} has {shape.F} faces"
     hint = "faces are counted from 0; are they landmarks of the source?"
     _refuse((face < 0) | (face >= shape.F), names, lambda k: f" is in face {face[k]}, but {held}", hint)
-    shares = (weights >= -1e-9).all(axis=1) & (np.abs(weights.sum(axis=1) - 1.0) < 1e-4)
-    hint = "the weights of a face's corners are 0 or more"
-    _refuse(~shares, names, lambda k: f": its weights {weights[k].tolist()} do not sum to 1", hint)
+    hint = "the weights of a face's corners are 0 or more, and sum to 1"
+    negative, sums = (weights < -1e-9).any(axis=1), weights.sum(axis=1)
+    _refuse(negative, names, lambda k: f": one of its weights {weights[k].tolist()} is negative", hint)
+    _refuse(~(np.abs(sums - 1.0) < 1e-4), names, lambda k: f": its weights {weights[k].tolist()} do not sum to 1", hint)
     weights = np.clip(weights, 0.0, None)
     weights /= weights.sum(axis=1, keepdims=True)
     return _on_surface(shape, names, shape.faces[face, weights.argmax(axis=1)], face, weights)

@@ -112,15 +112,23 @@ def diffuse(graph: csr_array, known: Bools, values: Floats) -> tuple[Floats, Boo
 def replace_low_values(
     values: Floats, low: Bool[Bools, " V"], target: Shape, blank: Floats | float | None = None, fill: bool = False
 ) -> tuple[Floats, LowConfidence]:
-    """Values (V,) or (V, D) of the target; those of low confidence, or nan, are left blank, filled in, or kept."""
+    """Values (V,) or (V, D) of the target; those of low confidence, or nan, are left blank, filled in, or kept.
+
+    Columns are told apart: what one lacks says nothing of the others. Vertices count if any of their values do.
+    """
     table = values.reshape(len(values), -1)
-    low = low | ~np.isfinite(table).all(axis=1)
-    count, blanked, filled = int(low.sum()), 0, 0
+    wanting = low[:, None] | ~np.isfinite(table)
+    count, blanked, filled = int(wanting.any(axis=1).sum()), 0, 0
     if fill:
-        table, done = diffuse(vertex_graph(target), ~low, table)
+        graph, done, table = vertex_graph(target), np.zeros(len(low), bool), table.copy()
+        masks, groups = np.unique(wanting, axis=1, return_inverse=True)
+        for group, mask in enumerate(masks.T):
+            columns = np.flatnonzero(groups.ravel() == group)
+            table[:, columns], reached = diffuse(graph, ~mask, table[:, columns])
+            done |= reached
         filled = int(done.sum())
     elif blank is not None:
-        table, blanked = np.where(low[:, None], blank, table), count
+        table, blanked = np.where(wanting, blank, table), count
     return table.reshape(values.shape), LowConfidence(len(low), count, blanked, filled)
 
 

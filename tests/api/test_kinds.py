@@ -186,6 +186,13 @@ class _Fit:
     notes: tuple[str, ...] = ("of the fit",)
 
 
+def test_a_device_that_is_not_there_is_said() -> None:
+    """It is true of all models: none of them is damaged."""
+    with pytest.raises(OptionError, match="device 'gpu' cannot be used") as caught:
+        meshmatch.match(ball("man 3 4 6"), ball("boy 3 4 6"), config=FitConfig(device="gpu"))
+    assert "use cpu" in caught.value.hint
+
+
 def test_damaged_models_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(registry.HOME_VARIABLE, str(tmp_path))
     (tmp_path / "models" / "broken").mkdir(parents=True)

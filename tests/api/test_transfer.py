@@ -121,8 +121,9 @@ def test_what_is_not_trusted_is_kept_filled_or_blank(pair: tuple[Shape, Shape, V
     assert abs(at_ten(fill=True) - source.verts[10, 0]) < 0.05
     with pytest.raises(OptionError, match="contradict"):
         ConfidenceRule(fill=True, blank=0.0)
-    with pytest.raises(OptionError, match=r"lies in 0\.\.1"):
-        ConfidenceRule(minimum=2.0)
+    for minimum in (2.0, "a"):
+        with pytest.raises(OptionError, match=r"lies in 0\.\.1"):
+            ConfidenceRule(minimum=minimum)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -135,6 +136,7 @@ def test_what_is_not_trusted_is_kept_filled_or_blank(pair: tuple[Shape, Shape, V
         ("transfer_values", (["a"] * 642,), "values must be numbers"),
         ("transfer_landmarks", ([642],), "landmark 0 is vertex 642"),
         ("transfer_landmarks", ([[1.0, 2.0]],), "landmarks cannot be an array"),
+        ("transfer_values", (1j * np.ones(642),), "values must be numbers"),
     ],
 )
 def test_what_does_not_belong_to_the_source(
@@ -143,6 +145,21 @@ def test_what_does_not_belong_to_the_source(
     source, target, found = pair
     with pytest.raises(MeshmatchError, match=told):
         getattr(meshmatch, call)(source, target, *words, found)
+
+
+def test_directions_are_checked_before_the_shapes_are_matched(pair: tuple[Shape, Shape, VertexMap]) -> None:
+    source, target, _ = pair
+    with pytest.raises(InputError, match=r"directions must be an array of \(642, 3\), not \(642, 2\)"):
+        meshmatch.transfer_values(
+            source, target, np.zeros((642, 2)), lambda *_: pytest.fail("matched"), directions=True
+        )
+
+
+@pytest.mark.parametrize("influences", [0, 1.5, "4"])
+def test_influences_are_counted(pair: tuple[Shape, Shape, VertexMap], influences: Any) -> None:
+    source, target, found = pair
+    with pytest.raises(OptionError, match="influences must be an integer of 1 or more"):
+        meshmatch.transfer_weights(source, target, np.ones((642, 2)), found, influences=influences)
 
 
 def test_colors_that_are_not_there(pair: tuple[Shape, Shape, VertexMap]) -> None:

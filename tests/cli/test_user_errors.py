@@ -80,7 +80,7 @@ BAD_FILES = {
         lambda path: write_text(path, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
         "refers to vertex 9",
     ),
-    "all NaN": ("bad.obj", all_nan, "NaN"),
+    "all NaN": ("bad.obj", all_nan, "no vertex has a usable position"),
     "a cloud of NaN": ("bad.npy", nan_cloud, "NaN"),
     "one triangle": ("bad.ply", one_triangle, "only 1 usable triangle"),
     "no face with area": ("bad.ply", flat_faces, "no face with any area"),

@@ -171,6 +171,8 @@ def test_maps_are_written_once(made: tuple[Path, tuple[Record, ...]], tmp_path: 
     assert np.array_equal(read.index, collection.map("dancer", "turned").index)
     times = [path.stat().st_mtime_ns for path in sorted(folder.rglob("*.npz"))]
     assert collection.save_maps(folder, [("dancer", "turned")]) == 1
+    assert collection.save_maps(folder, [("dancer", "turned")], suffix="npy") == 1
+    assert (folder / "dancer" / "turned.npy").is_file()
     assert [path.stat().st_mtime_ns for path in sorted(folder.rglob("*.npz"))] == times
 
 
@@ -196,8 +198,12 @@ def test_what_is_wrong_is_said(made: tuple[Path, tuple[Record, ...]], shapes: Pa
     assert error.value.hint == "did you mean dancer?"
     with pytest.raises(OptionError, match="not a format"):
         collection.save_maps(tmp_path / "maps", suffix=".png")
-    with pytest.raises(OptionError, match="another fit"):
+    with pytest.raises(OptionError, match="another seed: 0, not 1"):
         collection.fit(shapes, config=meshmatch.FitConfig(seed=1))
+    with pytest.raises(OptionError, match="another refine: nodes, not none"):
+        collection.fit(shapes, config=meshmatch.FitConfig(refine="none"))
+    with pytest.raises(InputError, match=r"cannot fit .* into itself"):
+        meshmatch.Collection(shapes).fit(shapes)
     with pytest.raises(OptionError, match="another model"):
         collection.fit(shapes, model="quadruped")
     with pytest.raises(InputError, match="not a folder of fits"):

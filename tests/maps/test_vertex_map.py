@@ -93,6 +93,13 @@ def test_refusals(change: dict, message: str, hint: str) -> None:
     assert hint in caught.value.hint
 
 
+def test_names_of_files_are_no_shapes(cube: Shape) -> None:
+    for call in (lambda: VertexMap.identity(cube).points("b.ply"), lambda: VertexMap.between("a.ply", cube, [0])):
+        with pytest.raises(InputError, match="must be a Shape, not str") as caught:
+            call()  # type: ignore[no-untyped-call]
+        assert "load_shape" in caught.value.hint
+
+
 def test_a_face_that_the_target_lacks_is_refused() -> None:
     with pytest.raises(InputError, match=r"face 18, but its target has only 18"):
         VertexMap.between(A, B, np.zeros(A.V, int), face=np.full(A.V, B.F))

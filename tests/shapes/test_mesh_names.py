@@ -10,7 +10,7 @@ import trimesh
 
 from meshmatch.cli import main
 from meshmatch.errors import InputError
-from meshmatch.shapes.files import load_shape, mesh_names, save_shape
+from meshmatch.shapes.files import load_shape, load_shapes, mesh_names, save_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 
@@ -86,6 +86,21 @@ def test_formats_without_names_say_so(tmp_path: Path, make_sphere: Callable[[int
     save_shape(tmp_path / "a.ply", make_sphere(1))
     with pytest.raises(InputError, match=r"a\.ply names no meshes to choose from"):
         load_shape(tmp_path / "a.ply", only=["body"])
+
+
+def test_shapes_together_are_asked_for_the_names_they_know(
+    knight: Path, tmp_path: Path, make_sphere: Callable[[int], Shape]
+) -> None:
+    """A character with a sword beside a scan, which has no meshes to choose from."""
+    scan = tmp_path / "a.ply"
+    save_shape(scan, make_sphere(1))
+    first, second = load_shapes([knight, scan], only="body")
+    assert second.weights is None
+    assert np.array_equal(first.weights, load_shape(knight, only=["body"]).weights)
+    with pytest.raises(InputError, match=r"no mesh of knight\.glb or a\.ply is called 'lance'"):
+        load_shapes([knight, scan], only=["body"], without=["lance"])
+    with pytest.raises(InputError, match=r"a\.ply or a\.ply names no meshes"):
+        load_shapes([scan, scan], without="body")
 
 
 def test_the_command_line_hands_the_names_on(knight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -275,7 +275,7 @@ def test_invalid_vertices_are_dropped_and_answered_by_a_neighbour(sphere: Shape)
     done = repair(shape)
     assert done.shape.V == sphere.V - 2
     assert done.shape.invalid is None
-    assert done.notes[0] == "3 vertices without a position (NaN) dropped"
+    assert done.notes[0] == "3 vertices without a usable position dropped"
     check_answers(shape, done)
     for vertex in (7, 100):
         ring = np.unique(sphere.faces[(sphere.faces == vertex).any(axis=1)])
@@ -320,7 +320,7 @@ def test_cloud_loses_doubles_strays_and_nan(sphere: Shape) -> None:
     assert done.shape.is_cloud
     assert done.shape.V == sphere.V
     assert done.notes == (
-        "1 vertex without a position (NaN) dropped",
+        "1 vertex without a usable position dropped",
         "5 points merged with another at the same position",
         "1 outlier point far from all others dropped",
     )

@@ -532,7 +532,7 @@ BINARY = PLY_HEADER.format(format="binary_little_endian").encode() + bytes(60)
         ("a.ply", HUGE.format("ascii", 0).encode(), "no vertices"),
         ("a.ply", HUGE.format("ascii", 2).encode() + b"1 2 3\n4 5", "fewer vertex rows"),
         ("a.ply", HUGE.format("ascii", 1).encode() + b"1 two 3\n", "'two' where a number should be"),
-        ("a.ply", HUGE.format("ascii", 1).encode() + b"nan nan nan\n", "all NaN"),
+        ("a.ply", HUGE.format("ascii", 1).encode() + b"nan nan nan\n", "no vertex has a usable position"),
         ("a.ply", HUGE.format("morse", 1).encode() + b"1 2 3\n", "header line 'format morse 1.0'"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty int x\nend_header\n1", "no x, y and z"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement face 0\nend_header\n", "declares no vertices"),
@@ -546,7 +546,7 @@ BINARY = PLY_HEADER.format(format="binary_little_endian").encode() + bytes(60)
         ("a.obj", b"v 0 0 0\nf 1 1 1.5\n", "not a whole number"),
         ("a.obj", b"v 0 0 0\nv x 0 0\n", "'x' where a number should be"),
         ("a.obj", b"f 1 2 3\n", "no 'v' lines"),
-        ("a.obj", b"v nan nan nan\n", "all NaN"),
+        ("a.obj", b"v nan nan nan\n", "no vertex has a usable position"),
         ("a.off", b"OFF\n1000000000 1 0\n0 0 0\n", "promises 1000000000 vertices"),
         ("a.off", b"OFF\n2 1 0\n0 0 0\n1 1 1\n", "only 2 lines"),
         ("a.off", b"OFF\n1 1 0\n0 0 0\n4 0 0 0\n", "fewer corners than it says"),
@@ -602,7 +602,7 @@ def test_npy_is_never_unpickled(tmp_path: Path) -> None:
         (np.zeros(9), "holds an array of (9,)"),
         (np.zeros((0, 3)), ""),
         (np.zeros((3, 3), complex), "not hold an array of numbers"),
-        (np.full((3, 3), np.nan), "all NaN"),
+        (np.full((3, 3), np.nan), "no vertex has a usable position"),
     ],
 )
 def test_npy_of_something_else(tmp_path: Path, array: np.ndarray, words: str) -> None:

@@ -218,6 +218,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
         write('[{"name": "nose", "face": 80, "barycentric": [1, 0, 0]}]'),
         "in face 80, but sphere1 has 80 faces",
     ),
+    "negative weight": ("a.json", write('[{"name": "nose", "face": 8, "barycentric": [2, -1, 0]}]'), "is negative"),
     "weights": ("a.json", write('[{"name": "nose", "face": 8, "barycentric": [1, 1, 0]}]'), "do not sum to 1"),
     "far away": ("a.csv", write("name,x,y,z\nnose,100,0,0\n"), "lies 9.* away from sphere1"),
     "no position": ("a.csv", write("name,x,y,z\nnose,nan,0,0\n"), "nose has no position"),

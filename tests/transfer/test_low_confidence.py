@@ -117,6 +117,23 @@ def test_values_that_the_source_does_not_have_are_in_doubt() -> None:
     assert np.isfinite(out).all()
 
 
+@pytest.mark.parametrize("fill", [False, True])
+def test_what_one_column_lacks_says_nothing_of_the_others(fill: bool) -> None:
+    values = SHEET.verts.copy()
+    values[::3, 1], values[:, 2] = np.nan, np.nan
+    low = np.arange(SHEET.V) == 7
+    out, doubt = replace_low_values(values, low, SHEET, None if fill else -1.0, fill)
+    assert np.array_equal(out[~low, 0], SHEET.verts[~low, 0])
+    known = ~low & (np.arange(SHEET.V) % 3 > 0)
+    assert np.array_equal(out[known, 1], SHEET.verts[known, 1]) and np.isfinite(out[:, 1]).all()
+    if fill:
+        assert abs(out[7, 0] - SHEET.verts[7, 0]) < 0.5 and np.isnan(out[:, 2]).all()
+        assert doubt.filled == (~known).sum()
+    else:
+        assert (out[~known, 1] == -1).all() and (out[:, 2] == -1).all() and out[7, 0] == -1
+    assert doubt.low == SHEET.V
+
+
 def test_labels_are_filled_by_the_nearest_never_by_a_mean() -> None:
     labels = np.where(SHEET.verts[:, 0] < 5, 0, 6)
     confidence = np.where(np.abs(SHEET.verts[:, 0] - 5) < 2, 0.0, 1.0)
