@@ -81,7 +81,7 @@ BAD_FILES = {
         "refers to vertex 9",
     ),
     "all NaN": ("bad.obj", all_nan, "no vertex has a usable position"),
-    "a cloud of NaN": ("bad.npy", nan_cloud, "NaN"),
+    "a cloud of NaN": ("bad.npy", nan_cloud, "no vertex has a usable position"),
     "one triangle": ("bad.ply", one_triangle, "only 1 usable triangle"),
     "no face with area": ("bad.ply", flat_faces, "no face with any area"),
     "few points": ("bad.npy", few_points, "only 20 distinct point positions"),

@@ -57,7 +57,7 @@ def test_nan_vertices_keep_their_place(cube: Shape) -> None:
         ((np.zeros((4, 3)), [[0, 1]]), r"faces must be an array of \(F, 3\)"),
         ((np.zeros((4, 3)), [[0, 1, 9]]), "a face refers to vertex 9"),
         ((np.zeros((4, 3)), [[0, 1, 2.5]]), "faces must be integers"),
-        (np.full((4, 3), np.nan), "no vertex has a finite position"),
+        (np.full((4, 3), np.nan), "no vertex has a usable position"),
         (np.zeros((0, 3)), "holds no vertices"),
         (([[0, 0, 0], [1, 1]], [[0, 1, 2]]), "not an array of numbers"),
     ],

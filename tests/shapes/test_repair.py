@@ -296,7 +296,7 @@ def test_nothing_left_is_an_input_error() -> None:
         repair(Shape(line, [[0, 1, 2]]))
     with pytest.raises(InputError, match="no face with any area"):
         repair(Shape(line, [[0, 1, 2]], invalid=[True, False, False]))
-    with pytest.raises(InputError, match="no vertex has a position"):
+    with pytest.raises(InputError, match="no vertex has a usable position"):
         repair(Shape(line, [], invalid=[True] * 3))
 
 
