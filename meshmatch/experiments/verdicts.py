@@ -17,6 +17,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,7 @@ from typer import Option
 
 from meshmatch.api.matching import Matcher
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
-from meshmatch.errors import MeshmatchError
+from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.experiments.charts import Chart, Line, draw_lines
 from meshmatch.experiments.verdict_cases import FAMILIES, KEPT, Case, Cases
@@ -65,18 +66,21 @@ class Target:
 
 
 def targets_of(cases: Cases, matcher: Matcher) -> list[Target]:
-    """Sound shapes of other people than the cases; every fourth is cut."""
+    """Sound shapes of other people than the cases; every fourth is cut, again where a cut leaves parts far apart."""
     others = Cases(cases.kind, 900 + cases.seed)
     found = []
     for number in range(_TARGETS):
-        rng = np.random.default_rng([cases.seed, number])
+        rng, cut = np.random.default_rng([cases.seed, number]), number % 4 == 3
         places, faces = others.bodies[number], cases.template.shape.faces
-        shape, kept = Shape(places, faces, f"target {number}"), np.arange(len(places))
-        if number % 4 == 3:
-            shape, kept = between(shape, kept, direction(rng), rng.uniform(0.15, 0.5), 1.0)
+        whole, every = Shape(places, faces, f"target {number}"), np.arange(len(places))
+        fit = None
+        while fit is None:
+            shape, kept = between(whole, every, direction(rng), rng.uniform(0.15, 0.5), 1.0) if cut else (whole, every)
+            with suppress(InputError) if cut else nullcontext():
+                fit = matcher.fit(shape)
         has = np.zeros(len(places), bool)
         has[kept] = True
-        found.append(Target(shape, matcher.fit(shape), places, has))
+        found.append(Target(shape, fit, places, has))
     return found
 
 

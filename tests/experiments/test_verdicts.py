@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from meshmatch.errors import InputError
 from meshmatch.experiments import verdicts
 from meshmatch.experiments.verdict_cases import FAMILIES, KEPT, TUNED, Cases
+from meshmatch.shapes.shape import Shape
 
 pytest.importorskip("anny")
 
@@ -43,6 +45,24 @@ def test_a_truth_is_where_the_body_has_it(cases: Cases) -> None:
     edges = case.shape.faces[:, :2]
     lengths = np.linalg.norm(resting[edges[:, 0]] - resting[edges[:, 1]], axis=1)
     assert lengths.mean() < 0.05
+
+
+def test_a_target_in_pieces_is_cut_again(cases: Cases) -> None:
+    """Every fourth target is cut; a cut whose parts lie far apart cannot be fitted."""
+    seen: list[int] = []
+
+    class Refusing:
+        def fit(self, shape: Shape) -> str:
+            seen.append(shape.F)
+            if len(seen) == 4:
+                raise InputError("2 large parts far apart")
+            return "fit"
+
+    targets = verdicts.targets_of(cases, Refusing())  # type: ignore[arg-type]
+    whole = len(cases.template.shape.faces)
+    assert len(targets) == 8 and len(seen) == 9
+    assert [target.shape.F < whole for target in targets] == 2 * [False, False, False, True]
+    assert seen[3] != seen[4] == targets[3].shape.F and targets[3].has.sum() < cases.template.shape.V
 
 
 def case_of(family: str, verdict: str, error: float) -> dict[str, object]:
