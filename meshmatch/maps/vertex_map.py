@@ -12,7 +12,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, as
 from meshmatch.errors import InputError
 from meshmatch.geometry.quick_scipy import csr_array
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.shape import Shape, checked_shape
 
 UNKNOWN = -1
 """A number of vertices that is not known."""
@@ -173,7 +173,7 @@ class VertexMap:
 
         `InputError` if `target` has other vertices or faces than the shape that this map leads to.
         """
-        if self.target_vertices not in (UNKNOWN, _shape(target, "the target").V):
+        if self.target_vertices not in (UNKNOWN, checked_shape(target, "the target").V):
             led = f"the map leads to {self.target} with {self.target_vertices} vertices"
             raise InputError(f"{led}, but {target.name or 'the target'} has {target.V}")
         check_range(self.index, target.V, f"the map {_way(self)}")
@@ -307,15 +307,8 @@ def _whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
     return np.array(array, dtype=np.int64)
 
 
-def _shape(shape: object, whose: str) -> Shape:
-    if not isinstance(shape, Shape):
-        raise InputError(f"{whose} must be a Shape, not {type(shape).__name__}", "read a file with load_shape")
-    return shape
-
-
 def _side(side: str, shape: Shape) -> dict[str, Any]:
-    shape = _shape(shape, f"the {side}")
-    return {side: shape.name, f"{side}_vertices": shape.V, f"{side}_hash": shape.hash}
+    return {side: checked_shape(shape, f"the {side}").name, f"{side}_vertices": shape.V, f"{side}_hash": shape.hash}
 
 
 def _way(m: VertexMap) -> str:

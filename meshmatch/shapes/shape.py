@@ -221,3 +221,10 @@ class Shape:
     def __repr__(self) -> str:
         kind = "cloud" if self.is_cloud else f"{self.F} faces"
         return f"Shape({self.name!r}, {self.V} vertices, {kind})"
+
+
+def checked_shape(shape: object, whose: str) -> Shape:
+    """A shape that somebody handed in; `InputError` for anything else, such as a file's name."""
+    if not isinstance(shape, Shape):
+        raise InputError(f"{whose} must be a Shape, not {type(shape).__name__}", "read a file with load_shape")
+    return shape
