@@ -45,7 +45,7 @@ def test_fits_made_once_give_the_map_of_match(matcher: Matcher, result: MatchRes
 def test_the_backward_map_doubts_what_the_forward_map_doubts(result: MatchResult) -> None:
     forward, backward = result.map.confidence, result.backward().confidence
     assert abs(float(forward.mean()) - float(backward.mean())) < 0.02
-    assert 0.05 < (backward < 0.7).mean() < 0.12  # 0.016 where agreement is forgotten
+    assert 0.06 < (backward < 0.8).mean() < 0.16  # 0.026 where agreement is forgotten
 
 
 def test_fits_of_other_templates_or_without_shapes_are_refused(matcher: Matcher, result: MatchResult) -> None:
