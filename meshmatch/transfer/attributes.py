@@ -44,12 +44,10 @@ def pull_directions(
     """Unit vectors at the target's vertices from vectors, such as normals, at the source's; each in its file's frame.
 
     They are turned as the edges and the normal around each vertex are (Kabsch); vectors that cancel become zeros.
-    `InputError` if one of the shapes is a point cloud, or there is not one vector for each vertex.
+    `InputError` if one of the shapes is a point cloud.
     """
     if source.is_cloud or target.is_cloud:
         raise InputError("directions need meshes, not point clouds", "transfer them as plain numbers")
-    if directions.shape != (source.V, 3):
-        raise InputError(f"directions must be an array of ({source.V}, 3), not {directions.shape}")
     points = back.points(source)
     edges = target.edges.vertices
     here, there = (place[edges[:, 1]] - place[edges[:, 0]] for place in (target.verts, points))

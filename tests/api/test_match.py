@@ -75,6 +75,16 @@ def test_landmarks_are_honoured(dancer: Shape, both) -> None:
     assert np.linalg.norm(climber.verts[found] - climber.verts[wanted], axis=1).max() < 0.02 * height
 
 
+@pytest.mark.slow
+def test_a_map_tells_which_landmarks_it_misses(dancer: Shape, both) -> None:
+    """The far end of the climber for one vertex of the dancer: the surfaces say something else."""
+    climber = meshmatch.load_shape(SAMPLES / "climber.ply")
+    right = both.map.index[100]
+    far = int(np.linalg.norm(climber.verts - climber.verts[right], axis=1).argmax())
+    found = match(dancer, climber, landmarks=([100], [far])).map
+    assert found.verdict == "poor" and found.reasons[0].startswith(f"the known pair 100, {far} is missed by ")
+
+
 @pytest.mark.parametrize(
     ("choice", "config", "error"),
     [

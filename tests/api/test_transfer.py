@@ -268,6 +268,8 @@ def test_pictures_and_pages_that_cannot_be(pair: tuple[Shape, Shape, VertexMap],
             meshmatch.picture(shapes, file, **choice)  # type: ignore[arg-type]
     with pytest.raises(OptionError, match=r"^a\.jpg: a picture is a PNG"):
         meshmatch.picture([source], tmp_path / "a.jpg")
+    with pytest.raises(InputError, match="expected a path, not NoneType"):
+        meshmatch.picture([source], None)  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="two names"):
         meshmatch.view(source, target, tmp_path / "a.html", found, names=["one"])
     with pytest.raises(OptionError, match="threads"):

@@ -162,10 +162,14 @@ def test_one_shape_is_no_sequence(run: Run, eggs: Path) -> None:
     assert run("interpolate", eggs / "a.ply", eggs / "b.ply", "-o", "x", "-n", 1).status == 2
     with pytest.raises(interpolation.OptionError, match="at least two shapes to make, not 1"):
         interpolation.interpolate([eggs / "a.ply", eggs / "b.ply"], 1)
+    with pytest.raises(interpolation.OptionError, match=r"must be an integer, not '3'"):
+        interpolation.interpolate([eggs / "a.ply", eggs / "b.ply"], "3")  # type: ignore[arg-type]
     with pytest.raises(interpolation.OptionError, match="invalid mesh 'hat'"):
         interpolation.InterpolationOptions(mesh="hat")  # type: ignore[arg-type]
     with pytest.raises(interpolation.OptionError, match="invalid place 'moon'"):
         interpolation.InterpolationOptions(place="moon")  # type: ignore[arg-type]
+    with pytest.raises(interpolation.OptionError, match="start must be a number, not 'a'"):
+        interpolation.InterpolationOptions(start="a")  # type: ignore[arg-type]
 
 
 def test_strict_wants_fits_that_are_not_poor(run: Run, eggs: Path, tmp_path: Path, torus: Shape) -> None:
