@@ -1,11 +1,11 @@
 """How honest verdicts and confidences are: shapes of which some can be matched and some cannot, and what is said of them.
 
-Each case (`meshmatch.experiments.verdict_cases`) is matched onto a shape that another person, or animal, made in another
-pose, every fourth of which is cut. The error of a vertex is the straight distance on the target between its partner and the
-true one, in centimetres of a person of 1.9 m2; a map's error is the mean over the vertices that have a partner, and that of
-a shape of another kind is infinite. A map is right below 5 cm and wrong above 8. Confidence is compared, at every vertex,
-with how often the error is within 5 cm; a vertex without a partner never is. All maps weigh the same, however many
-vertices they have. The longest fit is in CPU seconds.
+Each case (`meshmatch.experiments.verdict_cases`) is matched onto a shape that another person, or animal, made in
+another pose, one of two dozen, every fourth of which is cut. The error of a vertex is the straight distance on the
+target between its partner and the true one, in centimetres of a person of 1.9 m2; a map's error is the mean over the
+vertices that have a partner, and that of a shape of another kind is infinite. A map is right below 5 cm and wrong
+above 8. Confidence is compared, at every vertex, with how often the error is within 5 cm; a vertex without a partner
+never is. All maps weigh the same, however many vertices they have. The longest fit is in CPU seconds.
 
 ``--fit`` prints the weights that tell right from wrong best, of the cases of this run: those in
 `meshmatch.fitting.signs` are of nine cases of seeds 0 and 1 and the families that may tune, of as many limbs, cuts and holes
@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -45,7 +45,7 @@ from meshmatch.shapes.shape import Shape
 RIGHT_CM, WRONG_CM = 5.0, 8.0
 VERDICTS = ("good", "fair", "poor")
 REFUSED = "refused"
-_TARGETS, _FINE, _COARSE = 8, 100, 10
+_TARGETS, _FINE, _COARSE = 24, 100, 10
 _OFTEN = 200  # vertices of a step of confidence, at least, of which a share is told
 _COLUMNS = {"maps": "maps:d", "good": "good:d", "fair": "fair:d", "poor": "poor:d", "refused": "refused:d"}
 _COLUMNS |= {"under 5 cm": "right:d", "over 8 cm": "wrong:d", "mean cm": "mean_cm:.1f", "worst": "worst_cm:.1f"}
@@ -65,23 +65,17 @@ class Target:
     has: Bool[Bools, " T"]
 
 
-def targets_of(cases: Cases, matcher: Matcher) -> list[Target]:
-    """Sound shapes of other people than the cases; every fourth is cut, again where a cut leaves parts far apart."""
-    others = Cases(cases.kind, 900 + cases.seed)
-    found = []
-    for number in range(_TARGETS):
-        rng, cut = np.random.default_rng([cases.seed, number]), number % 4 == 3
-        places, faces = others.bodies[number], cases.template.shape.faces
-        whole, every = Shape(places, faces, f"target {number}"), np.arange(len(places))
-        fit = None
-        while fit is None:
-            shape, kept = between(whole, every, direction(rng), rng.uniform(0.15, 0.5), 1.0) if cut else (whole, every)
-            with suppress(InputError) if cut else nullcontext():
-                fit = matcher.fit(shape)
-        has = np.zeros(len(places), bool)
-        has[kept] = True
-        found.append(Target(shape, fit, places, has))
-    return found
+def target_of(others: Cases, matcher: Matcher, number: int) -> Target:
+    """A sound shape of another person than the cases; every fourth is cut, again where a cut leaves parts far apart."""
+    rng, cut = np.random.default_rng([others.seed, number]), number % 4 == 3
+    places, faces = others.bodies[number], others.template.shape.faces
+    whole, every = Shape(places, faces, f"target {number}"), np.arange(len(places))
+    while True:
+        shape, kept = between(whole, every, direction(rng), rng.uniform(0.15, 0.5), 1.0) if cut else (whole, every)
+        with suppress(InputError) if cut else nullcontext():
+            has = np.zeros(len(places), bool)
+            has[kept] = True
+            return Target(shape, matcher.fit(shape), places, has)
 
 
 def measured(case: Case, target: Target, matcher: Matcher) -> dict[str, Any]:
@@ -208,16 +202,15 @@ class Request:
 def of_seed(kind: str, names: Sequence[str], asked: Request) -> Iterator[dict[str, Any]]:
     """All cases of one seed, measured where they are not kept already."""
     cases, matcher = Cases(kind, asked.seed), Matcher(kind, FitConfig(seed=asked.seed), asked.threads)
-    targets: list[Target] = []
+    onto = cache(partial(target_of, Cases(kind, 900 + asked.seed), matcher))
 
     def family(name: str) -> dict[str, Any]:
-        if not targets:
-            targets.extend(targets_of(cases, matcher))
+        first = list(FAMILIES).index(name) * asked.count
         numbers = runner.track(range(asked.count), f"{name}, seed {asked.seed}", asked.count)
-        return {"found": [measured(cases.draw(name, k), targets[k % _TARGETS], matcher) for k in numbers]}
+        return {"found": [measured(cases.draw(name, k), onto((first + k) % _TARGETS), matcher) for k in numbers]}
 
     for name in names:
-        which = {"kind": kind, "family": name, "count": asked.count, "seed": asked.seed}
+        which = {"kind": kind, "family": name, "count": asked.count, "seed": asked.seed, "targets": _TARGETS}
         path = asked.folder / f"{kind}-{name.replace(' ', '-')}-{asked.seed}.json"
         kept = runner.once(path, which, partial(family, name))["found"]
         # null is what JSON makes of infinity
