@@ -17,7 +17,7 @@ from meshmatch.generators.figure import PARTS, SIDED, Figure, part
 from meshmatch.generators.rig import skin
 
 PLAIN, CHILD, FREE, TOON, BUILT = range(5)
-SHARES = (0.24, 0.14, 0.1, 0.3, 0.22)
+SHARES = (0.56, 0.1, 0.05, 0.15, 0.14)
 """Of the characters: as they are, children, freely stretched, stylised, built of parts."""
 # Typical sizes of parts: along and across, and how much they vary (deviation of the logarithm).
 _CHILD = {"head": (1.5, 1.45, 0.14), "neck": (0.75, 1.0, 0.12), "thigh": (0.72, 1.0, 0.12), "shin": (0.72, 1.0, 0.12),
