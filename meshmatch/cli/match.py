@@ -58,14 +58,14 @@ def match(
         a, b = how.load(source, target)
         result = how.match(a, b, run, console)
         found = result.map
-        words.refuse_poor(run.strict, found.verdict, found.reasons)
+        words.refuse_poor(run.strict, found.verdict, found.reasons, "the map")
         meshmatch.save_map(temporary, found)
     if picture is not None:
         from meshmatch.render.compose import compose_match
 
         compose_match(a, b, found, result.rotations).named(names).render(picture)
     words.tell_match(console, result, names)
-    words.tell_verdict(console, found.verdict, found.reasons)
+    words.tell_verdict(console, found.verdict, found.reasons, "the map")
     console.say(
         f"wrote {output}: for each of the {found.source_vertices} vertices of {names[0]} "
         f"its vertex of {names[1]} ({result.seconds:.1f} s)"
@@ -99,13 +99,13 @@ def _match_implicit(
         with console.progress() as progress:
             a, b = (fit_implicit(model, shape, seed=how.seed, progress=progress) for shape in shapes)
         found = model.match(a, b, *shapes)
-        words.refuse_poor(run.strict, found.verdict, found.reasons)
+        words.refuse_poor(run.strict, found.verdict, found.reasons, "the map")
         meshmatch.save_map(temporary, found)
     if picture is not None:
         from meshmatch.render.compose import compose_match
 
         compose_match(*shapes, found).named(names).render(picture)
-    words.tell_verdict(console, found.verdict, found.reasons)
+    words.tell_verdict(console, found.verdict, found.reasons, "the map")
     console.say(
         f"wrote {output}: for each of the {found.source_vertices} vertices of {names[0]} its vertex of {names[1]}"
     )

@@ -269,7 +269,7 @@ class PairOptions(FitOptions):
 class RunOptions:
     """How a verb that takes long behaves."""
 
-    strict: bool = Option(False, "--strict", help="Write nothing and exit with 1 if a fit is poor.")
+    strict: bool = Option(False, "--strict", help="Write nothing and exit with 1 if a fit or map is poor.")
     json: Json = False
     threads: Threads = 2
     quiet: Quiet = False

@@ -103,14 +103,14 @@ class Transfer:
         else:
             maps = meshmatch.find_maps(source, target, self.options.map or matched)
         found = maps.forward
-        words.refuse_poor(self.run.strict, found.verdict, found.reasons)
+        words.refuse_poor(self.run.strict, found.verdict, found.reasons, "the map")
         a, b = self.names
         if maps.match is None:
             self.console.say(f"used the map {self.options.map} from {a} to {b}")
         else:
             words.tell_match(self.console, maps.match, (a, b))
             self.console.say(f"matched {a} to {b} ({maps.match.seconds:.1f} s)")
-        words.tell_verdict(self.console, found.verdict, found.reasons)
+        words.tell_verdict(self.console, found.verdict, found.reasons, "the map")
         return maps
 
     def tell_low(self, low: LowConfidence, minimum: float, what: str = "vertices") -> Json:

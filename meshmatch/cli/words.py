@@ -168,10 +168,10 @@ def names_of(paths: Sequence[Path], names: Sequence[str] = ()) -> list[str]:
     return [name if len(real[name]) == 1 else str(path) for path, name in zip(paths, names, strict=True)]
 
 
-def refuse_poor(strict: bool, verdict: str, reasons: Sequence[str]) -> None:
-    """With --strict, a poor fit is an error (`PoorFit`)."""
+def refuse_poor(strict: bool, verdict: str, reasons: Sequence[str], what: str = "the fit") -> None:
+    """With --strict, a poor fit or map is an error (`PoorFit`)."""
     if strict and verdict == "poor":
-        raise PoorFit(f"poor fit, nothing was written: {why(reasons)}", _HINT)
+        raise PoorFit(f"{what} is poor, nothing was written: {why(reasons)}", _HINT)
 
 
 def tell_verdict(console: Console, verdict: str, reasons: Sequence[str], what: str = "the fit") -> None:

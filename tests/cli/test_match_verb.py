@@ -105,7 +105,7 @@ def test_a_poor_fit_warns_even_when_quiet(run: Run, two: tuple[Path, Path], stub
     output = two[0].with_name("map.npy")
     answer = run("match", *two, "-o", output, "-q")
     assert answer.status == 0
-    assert answer.err == "warning: the fit is poor: an arm is missing\n"
+    assert answer.err == "warning: the map is poor: an arm is missing\n"
     assert output.exists()
 
 

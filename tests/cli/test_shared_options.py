@@ -138,6 +138,6 @@ def test_transfer_texture_that_is_strict(run: Run, painted: Path) -> None:
     words = ("transfer-texture", "a.ply", "b.ply", "-o", "out.glb", "--map", "ab.npz", "--size", "32")
     answer = run(*words, "--strict")
     assert answer.status == 1
-    assert answer.err.startswith("error: poor fit, nothing was written: it lies elsewhere")
+    assert answer.err.startswith("error: the map is poor, nothing was written: it lies elsewhere")
     assert not Path("out.glb").exists()
     assert run(*words).status == 0

@@ -411,7 +411,7 @@ def test_poor_maps_are_written_with_a_warning_or_not_at_all(run: Run, pair: Path
     before = {path.name for path in pair.iterdir()}
     refused(run(*call(verb, "--strict")), "it lies elsewhere", pair, before)
     answer = well(run(*call(verb)))
-    assert "warning: the fit is poor: it lies elsewhere" in answer.err
+    assert "warning: the map is poor: it lies elsewhere" in answer.err
     save_map("ab.npz", replace(found, verdict="fair"))
     answer = well(run(*call(verb, "--strict")))
     assert "note: it lies elsewhere" in answer.err

@@ -103,7 +103,7 @@ def test_a_poor_fit_is_shown_unless_strict(run: Run, two: tuple[Path, Path], stu
     assert "an arm is missing" in answer.err
     assert not page.exists()
     answer = run("view", *reversed(two), "-o", page, "--quiet")
-    assert (answer.status, answer.err) == (0, "warning: the fit is poor: an arm is missing\n")
+    assert (answer.status, answer.err) == (0, "warning: the map is poor: an arm is missing\n")
     assert words_of(page)["verdict"] == "poor"
     # nor is its orientation believed: a torus around z is flat to the front
     extent = words_of(page)["source"]["extent"]
