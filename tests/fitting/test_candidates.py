@@ -5,11 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshmatch.fitting import candidates
+from meshmatch.fitting import candidates, refinement
 from meshmatch.fitting.candidates import fit_whole
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.network_fit import Candidate, Predictor
-from meshmatch.fitting.refinement import CandidateScorer, averaged, choose, differ, stands_as_usual
+from meshmatch.fitting.refinement import (
+    CandidateScorer,
+    PartComparison,
+    WholeComparison,
+    averaged,
+    choose,
+    differ,
+    stands_as_usual,
+)
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.task import FitTask
 from meshmatch.fitting.tears import neighbours, torn_share
@@ -170,3 +178,25 @@ def test_how_most_files_stand(up: str, front: str, usual: bool) -> None:
 
     rotation = np.stack([np.cross(axis(up), axis(front)), axis(up), axis(front)], 1)
     assert stands_as_usual(RigidPose(rotation, np.zeros(3))) is usual
+
+
+@pytest.mark.parametrize(("reads", "spread", "told"), [(True, 0.02, True), (True, 0.09, True), (False, 0.02, False)])
+def test_of_interpretations_that_tie_the_network_chooses(
+    monkeypatch: pytest.MonkeyPatch, reads: bool, spread: float, told: bool
+) -> None:
+    """Front and back, say: the one that is read in tilted copies, by a model that reads these."""
+    model = egg_model()
+    task = FitTask.of(model, FitConfig(), model.template.shape)
+    comparison = WholeComparison(task, [])
+    here, there = still(comparison.task.system), folded(comparison.task.system)
+    monkeypatch.setattr(refinement, "reads_alike", lambda _: reads)
+    monkeypatch.setattr(Predictor, "spread", lambda self, local, vectors, at: spread if vectors.any() else 0.01)
+    doubt = comparison.doubt(there) - comparison.doubt(here)
+    assert (doubt > 0) is told and doubt <= 0.3 * 0.02 + 1e-9  # beyond a usual spread it is no more
+    both = [comparison.score(there, in_full) for in_full in (True, False)]
+    monkeypatch.setattr(Predictor, "spread", lambda *_: 0.01)
+    assert [both[0] - comparison.score(there, True), both[1] - comparison.score(there, False)] == [
+        pytest.approx(doubt),
+        0.0,
+    ]
+    assert PartComparison(task).doubt(there) == 0.0
