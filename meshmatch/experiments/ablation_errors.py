@@ -37,6 +37,7 @@ from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
+from meshmatch.templates.template import Template
 
 METHODS = ("none", "code", "chamfer", "nodes")
 """Refinements: none; of the code with the run's regularisers, or without; Gauss-Newton on the nodes."""
@@ -133,17 +134,20 @@ class Start:
     candidate: Candidate
 
 
+def in_core_frame(template: Template, one: Subject, reference: str) -> tuple[Frame, OrientedPoints]:
+    """A subject, whose frame is that of the ``reference`` model, in the core frame of a template."""
+    theirs, turn = as_model(reference).template, Frame.identity()
+    if theirs.shape.V == template.shape.V and np.array_equal(theirs.core, template.core):
+        turn = kabsch(template.shape.verts[template.core], theirs.shape.verts[theirs.core]).frame
+    return one.frame.compose(turn), one.scan.in_frame(turn)
+
+
 def begin(model: TrainedModel, one: Subject, reference: str, measure: Measure) -> Start:
     """The network's answer on a subject, whose frame is that of the ``reference`` model."""
-    theirs, ours = as_model(reference).template, model.template
-    turn = Frame.identity()
-    if theirs.shape.V == ours.shape.V and np.array_equal(theirs.core, ours.core):
-        turn = kabsch(ours.shape.verts[ours.core], theirs.shape.verts[theirs.core]).frame
-    scan = one.scan.in_frame(turn)
+    frame, scan = in_core_frame(model.template, one, reference)
     rng = np.random.default_rng(measure.seed)
     found = Predictor.of(model, rng).fit(scan, RigidPose.identity())
-    frame = one.frame.compose(turn).compose(found.pose.frame)
-    return Start(frame, scan.to_local(found.pose), found)
+    return Start(frame.compose(found.pose.frame), scan.to_local(found.pose), found)
 
 
 def begin_body(model: TrainedModel, verts: Float[Floats, "V 3"], measure: Measure) -> Start:
@@ -184,16 +188,20 @@ def errors_of(
         rows = [refined(model, start, how, measure.seed) for start in starts]
         seconds = (time.process_time() - began) / len(subjects)
         fitted = [start.frame.undo(node_system(model).moved(each)) for start, each in zip(starts, rows, strict=True)]
-        errors = pair_errors(subjects, fitted)
-        found[method] = {
-            "mean_cm": round(float(np.mean(errors)), 4),
-            "median_cm": round(float(np.median(errors)), 4),
-            "share_over_15cm": round(float((errors > LOST_CM).mean()), 4),
-            "pair_cm": errors.mean(1).round(3).tolist(),
-            "seconds": round(seconds, 4),
-            "how": None if how is None else asdict(how),
-        }
+        words = {"seconds": round(seconds, 4), "how": None if how is None else asdict(how)}
+        found[method] = scored(subjects, fitted) | words
     return found
+
+
+def scored(subjects: Sequence[Subject], fitted: Sequence[Float[Floats, "V 3"]]) -> dict[str, Any]:
+    """Errors in cm of the maps between subjects through fitted templates."""
+    errors = pair_errors(subjects, fitted)
+    return {
+        "mean_cm": round(float(np.mean(errors)), 4),
+        "median_cm": round(float(np.median(errors)), 4),
+        "share_over_15cm": round(float((errors > LOST_CM).mean()), 4),
+        "pair_cm": errors.mean(1).round(3).tolist(),
+    }
 
 
 def pair_errors(subjects: Sequence[Subject], fitted: Sequence[Float[Floats, "V 3"]]) -> Float[Floats, "pairs N"]:

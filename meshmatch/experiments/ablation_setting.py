@@ -14,7 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from meshmatch.arrays import Float
+from meshmatch.arrays import Float, Int
 from meshmatch.errors import TemplateError
 from meshmatch.experiments.ablation_views import BASE, Run
 from meshmatch.experiments.human_bodies import diameter
@@ -98,7 +98,9 @@ class Setting:
             arap=given.arap if "arap" in run.constraint else 0.0,
             blend=given.blend if "Z" in run.constraint else 0.0,
         )
-        network = replace(chosen.network, field=run.field, align_basis=0, corrections=0)
+        network = replace(chosen.network, align_basis=0, corrections=0)
+        if run.field != "transmatch":  # which has a network of its own
+            network = replace(network, field=run.field)
         train = replace(
             chosen.train,
             loss=loss,
@@ -179,7 +181,7 @@ class Pool:
 
     Parameters
     ----------
-    points : without points (P = 0) where all that is read of them is in the features
+    points : without points (P = 0) unless they are read
     features : of a network that reads the points themselves (N, 0, 3)
     targets : where the template's loss points belong
     basis : basis points of every run's encoder, whose features these are
@@ -196,16 +198,20 @@ class Pool:
 
     def batch(self, step: int, count: int, shapes: int, seed: int, encoder: BasisEncoder | PointEncoder) -> Batch:
         """The batch of a step, of the scans of the first ``shapes``: a function of its arguments."""
-        generator = torch.Generator().manual_seed((seed * 2_654_435_761 + step) % (2**63))
-        chosen = torch.randint(min(shapes * SCANS, len(self.targets)), (count,), generator=generator)
+        chosen = self.rows(step, count, shapes, seed)
         points = self.points[chosen]
         features = self.features[chosen] if self.features.shape[1] else encoder.features(points)
         return Batch(points, self.targets[chosen], features)
 
+    def rows(self, step: int, count: int, shapes: int, seed: int) -> Int[Tensor, " count"]:
+        """Which scans a step sees."""
+        generator = torch.Generator().manual_seed((seed * 2_654_435_761 + step) % (2**63))
+        return torch.randint(min(shapes * SCANS, len(self.targets)), (count,), generator=generator)
+
 
 @lru_cache(maxsize=3)
-def pool_of(setting: Setting, pose: str, shapes: int = BASE.shapes) -> Pool:
-    """The pool of a template pose, drawn once in a process."""
+def pool_of(setting: Setting, pose: str, shapes: int = BASE.shapes, read_points: bool = False) -> Pool:
+    """The pool of a template pose, drawn once in a process; the same scans whether or not their points are kept."""
     template, recipe = setting.resting(pose), setting.recipe(Run(pose=pose))
     source, unseen = setting.sources(pose)
     generator = torch.Generator().manual_seed(_SEED)
@@ -216,13 +222,13 @@ def pool_of(setting: Setting, pose: str, shapes: int = BASE.shapes) -> Pool:
 
     model = build_deformer(template, some, recipe.network, recipe.scan, recipe.kernel, _SEED)
     data = build_dataset(template, some, model, recipe.scan, _BLOCK, SCANS, _SEED)
-    reads = recipe.network.encoder == "point"
+    encodes = recipe.network.encoder != "point"
     blocks = []
     for number, block in enumerate(drawn.split(_BLOCK)):
         batch = replace(data, source=lambda *_, block=block: block, shapes=len(block))[number]
         none = torch.zeros(len(batch.points), 0, 3)
-        features = none if reads else batch.encode_features
-        blocks.append((batch.points if reads else none, features, batch.targets))
+        points = none if encodes and not read_points else batch.points
+        blocks.append((points, batch.encode_features if encodes else none, batch.targets))
     points, features, targets = (torch.cat(part) for part in zip(*blocks, strict=True))
     held_out = replace(data, source=unseen, shapes=HELD_OUT_SHAPES, scans_per_shape=1, seed=_UNSEEN)[0]
     encoder = model.encoder

@@ -18,6 +18,7 @@ import torch
 from meshmatch.arrays import Float
 from meshmatch.experiments.ablation_setting import Pool, Setting, pool_of
 from meshmatch.experiments.ablation_views import Run
+from meshmatch.experiments.learned_baselines import WORDS, load_transmatch
 from meshmatch.fields.field import Field, PointField, PointwiseField
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.deformer import Deformer
@@ -127,9 +128,11 @@ def fewer(points: LossPoints, supervised: int) -> LossPoints:
 
 def is_trained(folder: Path, found: dict[str, Any]) -> bool:
     """Whether the model folder is the one that a record tells of."""
-    if not (folder / CARD).is_file() or not (folder / WEIGHTS).is_file():
+    if not (folder / WEIGHTS).is_file() or not any((folder / each).is_file() for each in (CARD, WORDS)):
         return False
-    return read_card(folder / CARD).weights_sha256 == found.get("model")
+    if (folder / CARD).is_file():
+        return read_card(folder / CARD).weights_sha256 == found.get("model")
+    return load_transmatch(folder).words.get("weights_sha256") == found.get("model")
 
 
 def built(setting: Setting, run: Run) -> tuple[Trainer, list[Any]]:

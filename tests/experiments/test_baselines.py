@@ -28,6 +28,7 @@ from meshmatch.experiments.learned_baselines import (
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.training.datasets import step_generator
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.scans import ScanConfig
 from tests.conftest import icosphere
@@ -263,11 +264,12 @@ def test_the_recipe_of_3d_coded_is_pointwise_and_free() -> None:
     assert chosen.scan.upright and chosen.scan.points == 96 and chosen.scan.partial == 0
 
 
-def test_a_batch_of_transmatch_has_its_truth_on_the_scan() -> None:
+def test_a_batch_of_transmatch_has_its_truth_on_the_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learned_baselines, "TARGETS", 50)
     template = egg_template()
     clean = ScanConfig(points=2000, noise=0, outliers=0, holes=0, partial=0, density=0, upright=True)
     generator = torch.Generator().manual_seed(0)
-    points, chosen, goal = draw_batch(template, bent_eggs(template), clean, 3, 50, generator)
+    points, chosen, goal = draw_batch(template, bent_eggs(template), clean, 3, generator)
     assert points.shape == (3, 2000, 3) and goal.shape == (3, 50, 3) and len(set(chosen.tolist())) == 50
     assert torch.cdist(goal, points).amin(2).max() < 0.1  # about the spacing of so many points
     assert points.mean(1).abs().max() < 1e-5
@@ -290,7 +292,10 @@ def trained(folder: Path, steps: int) -> dict[str, Any]:
     """TransMatch on bent eggs."""
     template, train = egg_template(), brief(steps, rate=3e-3, shapes=8)
     config = TransConfig(width=32, heads=2, latents=8, depth=1, frequencies=2)
-    return train_transmatch(template, bent_eggs(template), folder, train, 96, config, 40)
+    scan, eggs = ScanConfig(points=96, partial=0.0, upright=True), bent_eggs(template)
+    return train_transmatch(
+        template, lambda k: draw_batch(template, eggs, scan, 8, step_generator(0, k)), folder, train, config
+    )
 
 
 def test_transmatch_learns(tmp_path: Path) -> None:
