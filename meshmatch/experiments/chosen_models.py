@@ -2,10 +2,9 @@
 
 Bodies, animals, hands and heads have a model; hearts, furniture and plain solids have none and must be refused. Hands and
 heads are generated (meshmatch/experiments/cut_scans.py), and so are characters (character_designs.py), but for the
-evaluation data's two. Clouds with noise, and
-sparse ones with outliers, are bodies too; where a cloud cannot be told alone it takes the kind of the shape that it is
-matched with ("unsure" here). *Reading* is the mean distance of the shape and a model's unrefined template (units of
-sqrt(area)).
+evaluation data's two, and the chairs, tables and planes of "furniture". Clouds with noise, and sparse ones with outliers,
+are bodies too; where a cloud cannot be told alone it takes the kind of the shape that it is matched with ("unsure" here).
+*Reading* is the mean distance of the shape and a model's unrefined template (units of sqrt(area)).
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ from meshmatch.experiments import runner
 from meshmatch.experiments.character_designs import Designer
 from meshmatch.experiments.characters import characters_of
 from meshmatch.experiments.cut_scans import make_scans
+from meshmatch.experiments.furniture import KINDS, furniture
 from meshmatch.experiments.sets import CLOUD_SET, SET_NAMES, load_set
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.kind import KNOWN
@@ -38,8 +38,8 @@ FOLDERS = {"faust_scans": "human", "animal": "quadruped", "heart": "", "chair": 
 """Folders of meshes, and their kind; empty: none."""
 MADE = ("hand", "head")
 CHARACTERS = ("stylised", "robots", "soldiers", "rogues")
-SETS = (*SET_NAMES, CLOUD_SET, "outliers", *FOLDERS, *MADE, *CHARACTERS, "solids")
-_SCANS, _CAST = 20, 12
+SETS = (*SET_NAMES, CLOUD_SET, "outliers", *FOLDERS, *MADE, *CHARACTERS, "solids", "furniture")
+_SCANS, _CAST, _PIECES = 20, 12, 20
 COLUMNS = {
     **{
         "set": "set",
@@ -65,6 +65,8 @@ def shapes_of(name: str, data: Path) -> Iterator[Shape]:
     elif name in CHARACTERS:
         designer = Designer.unseen(read_template("human-T"))
         yield from (each.shape for each in characters_of(name, _CAST, designer, data))
+    elif name == "furniture":
+        yield from (furniture(kind, 0, number).mesh() for kind in KINDS for number in range(_PIECES))
     elif name == "solids":
         solids = {
             "box": trimesh.creation.box().subdivide().subdivide().subdivide(),
@@ -80,7 +82,7 @@ def shapes_of(name: str, data: Path) -> Iterator[Shape]:
 
 def row_of(name: str, shapes: list[Shape]) -> dict[str, Any]:
     """How many of a set's shapes are taken for what they are; the highest reading of their kind, the lowest of others."""
-    wanted = FOLDERS.get(name, name if name in MADE else "" if name == "solids" else "human")
+    wanted = FOLDERS.get(name, name if name in MADE else "" if name in ("solids", "furniture") else "human")
     models, config = installed_models(), [FitConfig()]
     right, unsure, wrong, own, others = 0, 0, list[str](), 0.0, np.inf
     for shape in runner.track(shapes, name):

@@ -23,8 +23,9 @@ from meshmatch.shapes.shape import Shape
 KNOWN = 0.0485
 """Readings up to this (units of sqrt(area)) are of a shape that the model knows. The benchmark's bodies, scans and animals
 have 0.046 at most, its hearts and furniture 0.051 at least (docs/results.md)."""
-STRANGE = 0.062
-"""Up to this a complete shape may be a strange one of the kind, such as a robot: a fit tells, see `is_of_kind`."""
+FAMILIAR, STRANGE = 0.0465, 0.062
+"""Between these a complete shape may be a strange one of the kind, such as a robot, or none, such as an aeroplane with wings
+for arms: a fit tells, see `is_of_kind`."""
 SURE = 0.042
 """Up to this a reading needs no other model's beside it: another kind's were 0.0439 at least (docs/results.md)."""
 _SAMPLES, _THIN = 2048, 768  # how many the reading is of, and how many rank the orientations
@@ -52,6 +53,6 @@ def read_kind(model: TrainedModel, shape: Shape, samples: OrientedPoints, config
 
 def is_of_kind(model: TrainedModel, shape: Shape, reading: float, config: FitConfig) -> bool:
     """Whether a complete shape is of a model's kind: its reading says so, or the fit of one that reads strangely."""
-    if KNOWN < reading <= STRANGE:
+    if FAMILIAR < reading <= STRANGE:
         return Fitter(model, replace(config, refine="nodes", partial="no")).fit(shape).verdict != "poor"
-    return reading <= KNOWN
+    return reading <= FAMILIAR

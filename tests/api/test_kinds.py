@@ -92,6 +92,8 @@ def test_what_reads_strangely_is_of_the_kind_that_fits_it() -> None:
     for words in ("robot 7 7.1 7.2", "robot 7 7.1 5.5"):  # too strange; and no animal
         with pytest.raises(InputError, match="is of no kind"):
             choose(Shape(dancer.verts, dancer.faces, words))
+    with pytest.raises(InputError, match="is of no kind"):  # read like a body, or nearly, but nothing fits it
+        choose(ball("aeroplane 4.7 4.8 7"))
 
 
 @pytest.mark.usefixtures("models")
