@@ -99,8 +99,8 @@ def test_what_a_model_invents_is_told(model: ImplicitModel) -> None:
     half = Shape(whole.verts, whole.faces[whole.verts[whole.faces].mean(1)[:, 0] < 0.1], "half")
     assert 0 < half.F < whole.F
     found = {shape.name: fit_implicit(model, shape, steps=120) for shape in (whole, half)}
-    assert found["whole"].invented < 0.05
-    assert found["half"].invented > 0.1
+    assert found["whole"].invented < 0.15  # 0.04 to 0.06, by processor: the training is short
+    assert found["half"].invented > 0.3
     assert found["half"].verdict == "poor"
     assert "of the model's surface is over" in " ".join(found["half"].reasons)
 
