@@ -18,8 +18,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import Template, template_radius, unit_frame
-from meshmatch.training.losses import ChamferLoss
-from meshmatch.training.recipes import Recipe, paper_clouds
+from meshmatch.training.recipes import Recipe
 from meshmatch.training.train import CardFacts, train_model
 
 _POINTS = 2048  # of each training shape
@@ -98,11 +97,6 @@ def mesh_template(kind: str, seed: int, number: int) -> Template:
     mesh = made.surface
     nodes = NodeConfig("uniform", 320, 0.2, 0.03, seed=seed)
     return make_template(mesh, f"{kind}{number}", nodes, labels=made.parts_at(mesh.verts), label_names=KINDS[kind])
-
-
-def paper_recipe() -> Recipe:
-    """The paper's network and weights, neighbours by position alone and squared distances; no warm-up."""
-    return paper_clouds().changed(loss=ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4, plain=True), warm_up=1)
 
 
 def learn(folder: Path, template: Template, shapes: Learned, recipe: Recipe) -> TrainedModel:

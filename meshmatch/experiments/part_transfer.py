@@ -40,7 +40,6 @@ from meshmatch.experiments.furniture_models import (
     learn,
     learned_shapes,
     mesh_template,
-    paper_recipe,
 )
 from meshmatch.experiments.keypoint_parts import category_overlap, mean_overlap, renumbered_errors
 from meshmatch.experiments.part_votes import Electorate
@@ -59,7 +58,7 @@ from meshmatch.render.picture import Panel, render_shapes
 from meshmatch.shapes.colors import label_colors
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.training.recipes import clouds
+from meshmatch.training.recipes import clouds, paper_clouds
 
 UPRIGHT = {
     "table": np.array([[-1, 0, 0], [0, 0, -1], [0, -1, 0]]),
@@ -214,7 +213,7 @@ def measure(kind: str, plan: Plan, methods: Sequence[str], pictures: Path | None
         size: dict[str, Any] = {"steps": plan.steps[method], "threads": plan.threads, "seed": plan.seed}
         if method == "paper":
             template = cloud_template(kind, plan.seed, chosen[0])
-            models = [learn(folder / "paper", template, shapes, paper_recipe().changed(bf16=True, **size))]
+            models = [learn(folder / "paper", template, shapes, paper_clouds().changed(bf16=True, **size))]
             fits = {
                 "paper, network alone": FitConfig(seed=plan.seed, refine="none", **_UPRIGHT_ONCE),
                 "paper, 200 steps": FitConfig(seed=plan.seed, refine="latent", latent=_PAPER, **_UPRIGHT_ONCE),

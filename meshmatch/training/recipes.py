@@ -20,7 +20,7 @@ Preset = Literal["default", "paper"]
 _PLAIN_ADAM: dict[str, Any] = {
     "warm_up": 0, "decay": 0.0, "weight_decay": 0.0, "average": 0.0, "momentum": 0.999, "clip": None,
 }  # fmt: skip
-_CHAMFER = ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4)  # the paper's weights for segmentation transfer
+_CHAMFER = ChamferLoss(volume=1e-4, arap=1e-3, blend=1e-4)  # the paper's weights for segmentation transfer (table 2)
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,13 @@ def clouds() -> Recipe:
 
 
 def paper_clouds() -> Recipe:
-    """The paper's network and weights for shapes without correspondence."""
-    train = TrainConfig(steps=4000, shapes=8, scans_per_shape=1, loss=_CHAMFER, workers=0, **_PLAIN_ADAM)
-    scan = ScanConfig(points=1024, noise=0.0, scale=0.0)
+    """The paper's for shapes without correspondence: its network, its weights, and neighbours by squared distance alone.
+
+    Lengths of the loss are those of the unit sphere for shapes that `meshmatch prepare --scale sphere` made ready.
+    """
+    loss = replace(_CHAMFER, plain=True)
+    train = TrainConfig(steps=4000, shapes=8, scans_per_shape=1, loss=loss, workers=0, **_PLAIN_ADAM)
+    scan = ScanConfig(points=1024, noise=0.0, scale=0.0, sphere=True)
     return Recipe(PAPER, train, scan, "cubic", storage="float16")
 
 

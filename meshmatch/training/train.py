@@ -141,17 +141,15 @@ def train_model(
 ) -> Path:
     """`train` on shapes with the template's vertices, or on samples without correspondence; returns the folder.
 
-    `InputError` if there is only one shape; `OptionError` if the model to start from has another template, network or
-    kernel.
+    `InputError` of a single shape; `OptionError` if the model to start from has another template, network or kernel.
     """
     output = Path(output)
     checkpoint = output / CHECKPOINT
     make_folder(checkpoint.parent)
     config, kernel = recipe.train, recipe.kernel
-    if recipe.scan.sphere:  # lengths of the paper are in the unit sphere
+    if recipe.scan.sphere and getattr(source, "scale", "sphere") == "sphere":  # the paper's lengths are in it
         reconstruction = config.loss.reconstruction / template_radius(template) ** 2
         config = replace(config, loss=replace(config.loss, reconstruction=reconstruction))
-        facts = replace(facts, frame=facts.frame or {"orientation": "searched", "scale": "sphere"})
     points: Any
     data: Any = source
     if isinstance(source, ShapeSamples):
@@ -172,6 +170,8 @@ def train_model(
         facts = replace(facts, frame=facts.frame or {"orientation": source.align, "scale": source.scale})
         few = {"shapes": min(32, 2 * len(source.points))}
     else:
+        turned = {"orientation": "searched", "scale": "sphere"} if recipe.scan.sphere else None
+        facts = replace(facts, frame=facts.frame or turned)
         points = build_loss_points(template, kernel, model)
         size = config.shapes, config.scans_per_shape
         data = build_dataset(template, source, model, recipe.scan, *size, config.seed, config.steps)

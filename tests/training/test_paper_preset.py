@@ -20,9 +20,11 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepare import PrepareConfig, prepare
+from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import read_template, template_radius
 from meshmatch.training import recipes
 from meshmatch.training.loop import TrainConfig
+from meshmatch.training.losses import ChamferLoss
 from meshmatch.training.train import CardFacts, build_dataset, train_model
 from tests.training.small import POINTS, egg_template
 
@@ -99,8 +101,10 @@ def test_the_papers_numbers() -> None:
     assert (train.rate, train.shapes, train.scans_per_shape, train.steps) == (1e-3, 16, 1, 75_000)
     assert (train.warm_up, train.decay, train.weight_decay, train.average, train.clip) == (0, 0.0, 0.0, 0.0, None)
     assert (chosen.scan.points, chosen.scan.sphere, chosen.kernel) == (3000, True, "cubic")
-    config = recipes.paper_clouds().train.loss  # table 2
+    clouds = recipes.paper_clouds()
+    config = clouds.train.loss  # table 2
     assert (config.reconstruction, config.volume, config.arap, config.blend) == (1.0, 1e-4, 1e-3, 1e-4)
+    assert isinstance(config, ChamferLoss) and config.plain and clouds.scan.sphere
     template = read_template(chosen.template)
     assert template.K == 300
     middle = 0.5 * (template.shape.verts.min(0) + template.shape.verts.max(0))
@@ -140,6 +144,13 @@ def test_lengths_of_the_loss_are_those_of_the_unit_sphere(tmp_path: Path, monkey
             train_model(
                 template, lambda n, _: verts.expand(n, -1, -1), tmp_path / str(sphere), recipe, CardFacts("egg")
             )
+        assert found.value.args[0] == pytest.approx(unit**-2)
+    points = np.random.default_rng(0).normal(size=(2, 50, 3)).astype(np.float32)
+    for scale, unit in (("sphere", template_radius(template)), ("area", 1.0)):
+        samples = ShapeSamples(points, points, points[:, :0], np.zeros(0, np.int64), "none", scale)
+        recipe = replace(recipes.paper_clouds(), network=POINTS)
+        with pytest.raises(Seen) as found:
+            train_model(template, samples, tmp_path / scale, recipe, CardFacts("egg"))
         assert found.value.args[0] == pytest.approx(unit**-2)
 
 
