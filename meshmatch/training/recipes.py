@@ -29,8 +29,8 @@ class Recipe:
 
     ``deform``: registered shapes are smoothly deformed whenever they are drawn, and the card says how a fit finds the
     orientation, as the network does not. ``storage``: how compactly the weights are written. ``template``: the bundled one
-    that generated bodies have, unless they name another. ``characters``: the share of such bodies
-    in clothes or of other proportions, unless they say another.
+    that generated bodies have, unless they name another. ``characters``: the share of such bodies in clothes or of other
+    proportions, and ``bodies``: how many are drawn, once (0: ever new ones), unless they say otherwise.
     """
 
     network: NetworkConfig
@@ -41,6 +41,7 @@ class Recipe:
     storage: Storage = "int8"
     template: str = "human-T"
     characters: float = 0.0
+    bodies: int = 0
 
     def changed(self, **settings: Any) -> Recipe:
         """Another recipe: fields of `TrainConfig`, ``field`` of the network, ``points`` of a scan, ``volume``, ``arap`` and
@@ -76,11 +77,12 @@ def paper() -> Recipe:
     Adam as it is.
 
     Scans are 3,000 clean points in the unit sphere, turned about the vertical axis; 75,000 steps are its 1,200 epochs of
-    1,000 shapes. The template has its 300 nodes, each with a radius of a fifth of the diameter.
+    1,000 shapes, which are drawn once. The template has its 300 nodes, each with a radius of a fifth of the diameter.
     """
     train = TrainConfig(steps=75_000, shapes=16, scans_per_shape=1, **_PLAIN_ADAM)
     clean = dict.fromkeys(("noise", "holes", "outliers", "partial", "density", "bumps", "scale"), 0.0)
-    return Recipe(PAPER, train, ScanConfig(3000, upright=True, sphere=True, **clean), "cubic", template="human-T-300")
+    scan = ScanConfig(3000, upright=True, sphere=True, **clean)
+    return Recipe(PAPER, train, scan, "cubic", template="human-T-300", bodies=1000)
 
 
 def small_data() -> Recipe:

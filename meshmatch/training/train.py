@@ -168,14 +168,14 @@ def train_model(
         data = replace(data, encoder=deepcopy(model.encoder).cpu())
         points = build_surface_points(template, kernel, model, source.template_landmarks)
         facts = replace(facts, frame=facts.frame or {"orientation": source.align, "scale": source.scale})
-        few = {"shapes": min(32, 2 * len(source.points))}
+        few: dict[str, Any] = {"shapes": min(32, 2 * len(source.points))}
     else:
         turned = {"orientation": "searched", "scale": "sphere"} if recipe.scan.sphere else None
         facts = replace(facts, frame=facts.frame or turned)
         points = build_loss_points(template, kernel, model)
         size = config.shapes, config.scans_per_shape
         data = build_dataset(template, source, model, recipe.scan, *size, config.seed, config.steps)
-        few = {"shapes": 32, "scans_per_shape": 1}
+        few = {"shapes": 32, "scans_per_shape": 1, "source": getattr(source, "others", source)}
     resumed = resume and checkpoint.is_file()
     if config.align_steps and not resumed and isinstance(data, BatchDataset) and model.aligner is not None:
         torch.set_num_threads(config.threads)

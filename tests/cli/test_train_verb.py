@@ -28,12 +28,17 @@ class Recorder:
         self.called: dict[str, Any] = {}
         self.poses: Any = None
         self.characters: Any = None
+        self.drawn = 0
 
-    def people_source(self, template: Any, bodies: Any, seed: int, progress: Any) -> str:
+    def people_source(self, template: Any, bodies: Any, seed: int, progress: Any) -> Any:
         self.bodies = (template.name, bodies.identities, seed)
         self.poses, self.characters = bodies.poses, bodies.characters
         progress(0.5)
-        return "bodies"
+        return self.draw if bodies.bodies else "bodies"
+
+    def draw(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        self.drawn += count
+        return torch.rand(count, 4, 3, generator=generator)
 
     def train_model(self, *given: Any) -> Path:
         template, source, output, recipe, facts, resume, report = given
@@ -82,6 +87,19 @@ def test_half_of_the_people_are_characters_unless_another_share_is_asked_for(
     assert "characters" not in stub.called["data"]
     assert run("train", "-o", tmp_path / "paper", "--preset", "paper").status == 0
     assert stub.characters == 0
+
+
+def test_bodies_are_drawn_once_where_so_many_are_asked_for(run: Run, stub: Recorder, tmp_path: Path) -> None:
+    assert run("train", "-o", tmp_path / "mine", "--bodies", 70).status == 0
+    source = stub.called["source"]
+    assert stub.drawn == 70 and "70 bodies, drawn once" in stub.called["data"]
+    many = source(1000, torch.Generator().manual_seed(1))
+    assert len(many.unique(dim=0)) == 70 and stub.drawn == 70
+    assert len(source.others(5, torch.Generator())) == 5 and stub.drawn == 75  # what is measured on is new
+    assert run("train", "-o", tmp_path / "paper", "--preset", "paper").status == 0
+    assert stub.drawn == 1075 and "1000 bodies, drawn once" in stub.called["data"]
+    assert run("train", "-o", tmp_path / "paper", "--preset", "paper", "--bodies", 0).status == 0
+    assert stub.called["source"] == "bodies" and "once" not in stub.called["data"]
 
 
 @pytest.mark.parametrize("weight", ["volume", "arap", "blend"])
@@ -251,6 +269,8 @@ def test_of_several_processes_one_speaks(
         (["--kind", "cat"], 2, "cat"),
         (["--kind", "hand", "--template", "human-A"], 1, "--template goes with human bodies"),
         (["--kind", "hand", "--characters", "0.5"], 1, "--characters goes with human bodies"),
+        (["--kind", "hand", "--bodies", "5"], 1, "--bodies goes with human bodies"),
+        (["--bodies", "20001"], 1, "must be from 0 to 20,000"),
         (["--kind", "human", "--shapes", "nowhere"], 1, "do not go with a folder"),
     ],
 )

@@ -239,6 +239,7 @@ def test_the_presets_are_what_they_say() -> None:
     assert usual.network.encoder == "basis"
     assert usual.scan.noise > 0
     assert (usual.characters, papers.characters) == (0.5, 0)
+    assert (usual.bodies, papers.bodies) == (0, 1000)
     assert usual.scan.strays > 0 < usual.scan.outside
     assert replace(usual, scan=default().scan, characters=0.0) == default()
     with pytest.raises(OptionError, match="unknown preset 'best'") as caught:
