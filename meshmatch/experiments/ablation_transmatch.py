@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,8 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.experiments.ablation_errors import Measure, Subject, in_core_frame, scored
 from meshmatch.experiments.ablation_setting import Setting, pool_of
 from meshmatch.experiments.ablation_views import Run
-from meshmatch.experiments.learned_baselines import (
-    TARGETS,
-    TransBatch,
-    TransConfig,
-    TransModel,
-    load_transmatch,
-    train_transmatch,
-)
+from meshmatch.experiments.learned_baselines import TARGETS, TransBatch, TransModel, load_transmatch, train_transmatch
+from meshmatch.experiments.transformer import TransConfig
 from meshmatch.geometry.frames import kabsch
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.threads import set_threads
@@ -39,7 +33,10 @@ _POINTS, _ROUNDS = 1024, 2
 def train_transformer(
     run: Run, setting: Setting, folder: Path, *, steps: int, config: TransConfig | None = None
 ) -> dict[str, Any]:
-    """Train from the beginning, write a folder of TransMatch, and say how it went, as `train_run` does."""
+    """Train, or go on exactly where it was stopped, write a folder of TransMatch, and say how it went, as `train_run` does.
+
+    ``seconds`` are those of this call alone.
+    """
     set_threads(setting.threads)
     template, train = setting.resting(run.pose), replace(setting.recipe(run).train, steps=steps)
     pool, supervised = pool_of(setting, run.pose, read_points=True), torch.from_numpy(loss_vertices(template))
@@ -47,11 +44,11 @@ def train_transformer(
     def draw(step: int) -> TransBatch:
         scans = pool.rows(step, train.shapes, run.shapes, run.seed)
         told = torch.randperm(min(run.supervised, len(supervised)), generator=step_generator(run.seed, step))[:TARGETS]
-        return pool.points[scans], supervised[told], pool.targets[scans][:, told]
+        return TransBatch(pool.points[scans], supervised[told], pool.targets[scans][:, told])
 
     clock = time.monotonic if torch.cuda.is_available() else time.process_time
     began = clock()
-    words = train_transmatch(template, draw, folder, train, config)
+    words = train_transmatch(folder, template, draw, train, config, {"run": asdict(run), "setting": asdict(setting)})
     seconds = clock() - began
     model = load_transmatch(folder)
     rest = torch.from_numpy(template.shape.verts.astype(np.float32))[supervised]

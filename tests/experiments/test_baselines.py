@@ -10,24 +10,25 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from meshmatch.errors import InputError, ModelError
+from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.experiments import baseline_methods, classical_baselines, learned_baselines
 from meshmatch.experiments.baseline_methods import METHODS, Baseline, Choices, Coded
 from meshmatch.experiments.baselines import main
 from meshmatch.experiments.bench import Method
 from meshmatch.experiments.classical_baselines import Registration, ZoomOut, carried, library, placed
 from meshmatch.experiments.learned_baselines import (
-    TransConfig,
-    Transformer,
+    TransBatch,
     TransMatch,
     coded_recipe,
     draw_batch,
     load_transmatch,
     train_transmatch,
 )
+from meshmatch.experiments.transformer import TransConfig, Transformer
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
+from meshmatch.training.alone import CHECKPOINT
 from meshmatch.training.datasets import step_generator
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.scans import ScanConfig
@@ -269,10 +270,11 @@ def test_a_batch_of_transmatch_has_its_truth_on_the_scan(monkeypatch: pytest.Mon
     template = egg_template()
     clean = ScanConfig(points=2000, noise=0, outliers=0, holes=0, partial=0, density=0, upright=True)
     generator = torch.Generator().manual_seed(0)
-    points, chosen, goal = draw_batch(template, bent_eggs(template), clean, 3, generator)
-    assert points.shape == (3, 2000, 3) and goal.shape == (3, 50, 3) and len(set(chosen.tolist())) == 50
-    assert torch.cdist(goal, points).amin(2).max() < 0.1  # about the spacing of so many points
-    assert points.mean(1).abs().max() < 1e-5
+    batch = draw_batch(template, bent_eggs(template), clean, 3, generator)
+    assert batch.points.shape == (3, 2000, 3) and batch.goal.shape == (3, 50, 3)
+    assert len(set(batch.chosen.tolist())) == 50
+    assert torch.cdist(batch.goal, batch.points).amin(2).max() < 0.1  # about the spacing of so many points
+    assert batch.points.mean(1).abs().max() < 1e-5
 
 
 def test_the_transformer_ignores_the_order_of_points_and_starts_at_rest() -> None:
@@ -288,20 +290,72 @@ def test_the_transformer_ignores_the_order_of_points_and_starts_at_rest() -> Non
     assert not torch.allclose(network(points.flip(0), rest), there, atol=1e-3)
 
 
-def trained(folder: Path, steps: int) -> dict[str, Any]:
-    """TransMatch on bent eggs."""
-    template, train = egg_template(), brief(steps, rate=3e-3, shapes=8)
-    config = TransConfig(width=32, heads=2, latents=8, depth=1, frequencies=2)
-    scan, eggs = ScanConfig(points=96, partial=0.0, upright=True), bent_eggs(template)
-    return train_transmatch(
-        template, lambda k: draw_batch(template, eggs, scan, 8, step_generator(0, k)), folder, train, config
-    )
+EGG = TransConfig(width=32, heads=2, latents=8, depth=1, frequencies=2)
+
+
+def trained(
+    folder: Path, steps: int, drawn: list[int] | None = None, killed: int | None = None, **choices: Any
+) -> dict[str, Any]:
+    """TransMatch on bent eggs; ``drawn`` hears which batches it asks for, and at ``killed`` it is."""
+    template = egg_template()
+    config = choices.pop("config", EGG)
+    told = {"points": choices.pop("points", 96)}
+    scan, eggs = ScanConfig(points=told["points"], partial=0.0, upright=True), bent_eggs(template)
+
+    def draw(step: int) -> TransBatch:
+        if step == killed:
+            raise KeyboardInterrupt
+        if drawn is not None:
+            drawn.append(step)
+        return draw_batch(template, eggs, scan, 8, step_generator(0, step))
+
+    train = brief(steps, **({"rate": 3e-3, "shapes": 8} | choices))
+    return train_transmatch(folder, template, draw, train, config, told)
 
 
 def test_transmatch_learns(tmp_path: Path) -> None:
     first, last = trained(tmp_path / "a", 1), trained(tmp_path / "b", 120)
     assert last["steps"] == 120 and last["distance"] < 0.9 * first["distance"]
     assert load_transmatch(tmp_path / "b").words["steps"] == 120
+
+
+def test_transmatch_goes_on_exactly_where_it_was_stopped(tmp_path: Path) -> None:
+    whole = trained(tmp_path / "whole", 9)
+    broken, drawn = tmp_path / "broken", []
+    assert trained(broken, 9, minutes=1e-9)["steps"] == 1
+    with pytest.raises(KeyboardInterrupt):  # a kill, four steps after the last checkpoint
+        trained(broken, 9, killed=5)
+    last = trained(broken, 9, drawn)
+    assert drawn == [*range(1, 9), 9]  # the batch after the last is what it is measured on
+    assert all(last[name] == whole[name] for name in ("steps", "weights_sha256", "distance"))
+    drawn.clear()
+    again = trained(broken, 9, drawn)
+    assert drawn == [9] and again["weights_sha256"] == whole["weights_sha256"]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"steps": 8}, {"seed": 1}, {"shapes": 4}, {"points": 90}, {"config": TransConfig(32, 4, 8, 1, 2)}],
+    ids=["steps", "seed", "shapes", "points", "heads"],
+)
+def test_a_checkpoint_of_other_choices_is_refused(
+    other: dict[str, Any], tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    trained(tmp_path, 7, minutes=1e-9)
+    name = request.node.callspec.id
+    with pytest.raises(OptionError, match=rf"other choices \({name}\)"):
+        trained(tmp_path, **({"steps": 7} | other))
+    drawn: list[int] = []
+    (tmp_path / CHECKPOINT).with_name("asked.json").unlink()  # as the hint says
+    trained(tmp_path, drawn=drawn, **({"steps": 7} | other))
+    assert drawn[0] == 0
+
+
+def test_a_damaged_checkpoint_of_transmatch_is_refused(tmp_path: Path) -> None:
+    trained(tmp_path, 3, minutes=1e-9)
+    (tmp_path / CHECKPOINT).write_bytes(b"not a checkpoint")
+    with pytest.raises(ModelError, match="is not a checkpoint"):
+        trained(tmp_path, 3)
 
 
 def test_transmatch_finds_a_turned_copy(tmp_path: Path) -> None:
