@@ -11,15 +11,19 @@ The set's true points come from a template (SMPL) registered to every shape. Whe
 - on which parts of the body the error of the set's truth lies;
 - the pairs of the protocol, with the set's truth and with the best that is known.
 
-Every shape is fitted once. Every landmark counts; --landmarks looks at some of them, evenly spread, in less time.
+Every shape is fitted once. Every landmark counts; --landmarks looks at some of them, evenly spread, in less time. What is
+measured on each target is kept in --work: a stopped command goes on with the next one.
 """
 
 from __future__ import annotations
 
 import sys
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
 from itertools import permutations
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -71,43 +75,54 @@ Question = tuple[Literal["charged", "true", "perfect"], Pair]
 Found = Mapping[Question, Errors]
 
 
-def matched(bench: BenchSet, method: Method, pairs: Sequence[Pair]) -> tuple[dict[str, Any], dict[Pair, Ints]]:
-    """Fits of every shape of some pairs, and maps of the pairs; one that fails counts as a map to vertex 0."""
-    shapes = {name: bench.seen(name) for name in dict.fromkeys(name for pair in pairs for name in pair)}
-    fits = {name: method.fit(shape) for name, shape in runner.track(list(shapes.items()), "fitting")}
+@dataclass(frozen=True)
+class Kept:
+    """The folder of finished work, and the choices that it depends on."""
+
+    folder: Path
+    asked: Mapping[str, Any]
+    threads: int = 1
+
+    def once(self, name: str, measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
+        """What was measured, now or before."""
+
+        def measured() -> dict[str, Any]:
+            return {"here": runner.circumstances(self.threads), "found": measure()}
+
+        return dict(runner.once(self.folder / f"{name}.json", self.asked, measured)["found"])
+
+
+def mapped(bench: BenchSet, method: Method, fit: Callable[[str], Any], pairs: Sequence[Pair]) -> dict[Pair, Ints]:
+    """Maps of some pairs; one that fails counts as a map to vertex 0."""
     maps = {}
-    for a, b in runner.track(pairs, "mapping"):
+    for a, b in pairs:
+        fits = fit(a), fit(b)
+        source, target = bench.seen(a), bench.seen(b)
         try:
-            maps[a, b] = method.map(shapes[a], fits[a], shapes[b], fits[b]).index
+            maps[a, b] = method.map(source, fits[0], target, fits[1]).index
         except MeshmatchError:
-            maps[a, b] = np.zeros(shapes[a].V, dtype=np.int64)
-    return fits, maps
+            maps[a, b] = np.zeros(source.V, dtype=np.int64)
+    return maps
 
 
-def all_errors(truths: Truths, maps: Maps, inside: Sequence[Pair]) -> dict[Question, Errors]:
-    """Errors of our maps by the set's truth ("charged") and by the best that is known ("true"); on the pairs of shapes
-    with the same triangles also what the set charges the map with that sends vertex i to vertex i ("perfect").
+def errors_at(truths: Truths, target: str, maps: Maps, inside: Sequence[Pair]) -> dict[Question, Errors]:
+    """Errors of our maps to a target by the set's truth ("charged") and by the best that is known ("true"); on the pairs of
+    shapes with the same triangles also what the set charges the map with that sends vertex i to vertex i ("perfect").
     """
     asked: dict[Question, tuple[Ints, Ints]] = {}
     for pair, index in maps.items():
         here, there, _ = truths.of_pair(pair)
-        asked["charged", pair] = truths.landmarks(pair[1]), index[truths.landmarks(pair[0])]
+        asked["charged", pair] = truths.landmarks(target), index[truths.landmarks(pair[0])]
         asked["true", pair] = there, index[here]
-    for a, b in inside:
-        asked["perfect", (a, b)] = truths.landmarks(b), truths.landmarks(a)
-    found: dict[Question, Errors] = {}
-    targets = dict.fromkeys(pair[1] for _, pair in asked)
-    for target in runner.track(list(targets), "measuring"):  # all questions of a target at once share their rows
-        mine = [question for question in asked if question[1][1] == target]
-        right, said = (np.concatenate([asked[question][side] for question in mine]) for side in (0, 1))
-        parts = np.split(
-            truths.distances(target).between(right, said), np.cumsum([len(asked[q][0]) for q in mine])[:-1]
-        )
-        found |= {question: Errors(part.astype(np.float32)) for question, part in zip(mine, parts, strict=True)}
-    return found
+    for pair in inside:
+        asked["perfect", pair] = truths.landmarks(target), truths.landmarks(pair[0])
+    right, said = (np.concatenate([both[side] for both in asked.values()]) for side in (0, 1))
+    far = truths.distances(target).between(right, said)  # all questions at once share their rows
+    parts = np.split(far, np.cumsum([len(both[0]) for both in asked.values()])[:-1])
+    return {question: Errors(part.astype(np.float32)) for question, part in zip(asked, parts, strict=True)}
 
 
-def stretch(truths: Truths, pairs: Sequence[Pair]) -> tuple[float, float]:
+def stretch(truths: Truths, pairs: Sequence[Pair]) -> dict[str, float]:
     """Mean |log| of the factor by which identity, and the set's truth, change distances of `STRETCHED_CM`."""
     low, high = (cm / CM_PER_UNIT for cm in STRETCHED_CM)
     names = list(dict.fromkeys(name for pair in pairs for name in pair))
@@ -125,14 +140,13 @@ def stretch(truths: Truths, pairs: Sequence[Pair]) -> tuple[float, float]:
         for truth, of in enumerate((a, b)):
             after = np.clip(rows[b][part[of], part[of]], low / _FAR, _FAR * high)  # landmarks may share a vertex
             found[truth].append(float(np.abs(np.log(after[near] / before[near])).mean()))
-    return float(np.mean(found[0])), float(np.mean(found[1]))
+    return {"stretch_identity": float(np.mean(found[0])), "stretch_set": float(np.mean(found[1]))}
 
 
-def group_row(truths: Truths, names: Sequence[str], found: Found) -> dict[str, Any]:
+def group_row(truths: Truths, names: Sequence[str], found: Found, kept: Kept) -> dict[str, Any]:
     """What the two truths say on all ordered pairs of shapes with the same triangles."""
     pairs = list(permutations(names, 2))
     perfect = summary([found["perfect", pair] for pair in pairs])
-    identity, own = stretch(truths, pairs)
     return {
         **{"names": ", ".join(names), "shapes": list(names), "pairs": len(pairs)},
         "alike": float(np.mean([truths.wound_alike(pair) for pair in pairs])),
@@ -140,7 +154,7 @@ def group_row(truths: Truths, names: Sequence[str], found: Found) -> dict[str, A
         "perfect_worst_cm": max(found["perfect", pair].mean_cm for pair in pairs),
         "perfect_over_15cm": perfect["share_over_15cm"],
         **_both(found, pairs),
-        **{"stretch_identity": identity, "stretch_set": own},
+        **kept.once(f"stretch-{'-'.join(names)}", partial(stretch, truths, pairs)),
     }
 
 
@@ -173,22 +187,23 @@ def consensus_row(truths: Truths, name: str) -> dict[str, Any]:
     return {"name": name, "rms_cm": float(np.sqrt((cm**2).mean())), "median_cm": float(np.median(cm))}
 
 
-def part_rows(
-    truths: Truths, errors: Mapping[Pair, Errors], fits: Mapping[str, Any], template: Template
-) -> list[dict[str, Any]]:
-    """Where errors lie: by the part of the fitted template that a landmark of the source is on, both sides together."""
-    labels, by_part = np.asarray(template.labels), defaultdict(list)
-    names = np.array([name.removeprefix("left ").removeprefix("right ") for name in template.label_names])
-    parts = {}
-    for name in dict.fromkeys(source for source, _ in errors):
-        fit = fits[name]
-        if isinstance(fit, Fit):
-            belongs = template_footpoints(shape_of(fit).shape, fit)[1]
-            part = names[labels[cKDTree(fit.resting).query(belongs)[1]]]
-            kept = shape_of(fit).kept_vertex
-            whole = np.full(truths.bench.shape(name).V, "", dtype=part.dtype)
-            whole[kept] = part
-            parts[name] = whole[truths.landmarks(name)]
+def parts_at(truths: Truths, name: str, fit: Any, template: Template | None) -> list[str]:
+    """The part of the fitted template that each landmark of a shape is on, both sides together; none where that is not
+    known.
+    """
+    if template is None or not isinstance(fit, Fit):
+        return []
+    names = np.array([each.removeprefix("left ").removeprefix("right ") for each in template.label_names])
+    belongs = template_footpoints(shape_of(fit).shape, fit)[1]
+    part = names[np.asarray(template.labels)[cKDTree(fit.resting).query(belongs)[1]]]
+    whole = np.full(truths.bench.shape(name).V, "", dtype=part.dtype)
+    whole[shape_of(fit).kept_vertex] = part
+    return list(whole[truths.landmarks(name)].tolist())
+
+
+def part_rows(errors: Mapping[Pair, Errors], known: Mapping[str, Sequence[str]]) -> list[dict[str, Any]]:
+    """Where errors lie: by the part that a landmark of the source is on."""
+    by_part, parts = defaultdict(list), {name: np.array(each) for name, each in known.items() if each}
     for (source, _), each in errors.items():
         for part in np.unique(parts[source]) if source in parts else ():
             by_part[str(part)].append(each.cm[parts[source] == part])
@@ -210,13 +225,40 @@ def protocol_rows(truths: Truths, found: Found) -> list[dict[str, Any]]:
     return [{"kind": kind, "pairs": len(some), **_both(found, some)} for kind, some in kinds.items()]
 
 
-def measure(truths: Truths, method: Method, template: Template | None) -> dict[str, list[dict[str, Any]]]:
+def measured(
+    truths: Truths, method: Method, template: Template | None, inside: Sequence[Pair], kept: Kept
+) -> tuple[dict[Question, Errors], dict[str, list[str]]]:
+    """All errors, and the parts at the landmarks of the shapes of ``inside``; one target's after the other's."""
+    bench, pairs = truths.bench, list(dict.fromkeys([*truths.bench.pairs, *inside]))
+    fit = cache(lambda name: method.fit(bench.seen(name)))
+
+    def at(target: str) -> dict[str, Any]:
+        maps = mapped(bench, method, fit, [pair for pair in pairs if pair[1] == target])
+        mine = [pair for pair in inside if pair[1] == target]
+        errors: dict[str, dict[str, list[float]]] = defaultdict(dict)
+        for (kind, (source, _)), each in errors_at(truths, target, maps, mine).items():
+            errors[kind][source] = each.values.tolist()
+        return {"errors": errors, "parts": parts_at(truths, target, fit(target), template) if mine else []}
+
+    found: dict[Question, Errors] = {}
+    parts = {}
+    for target in runner.track(list(dict.fromkeys(target for _, target in pairs)), "measuring"):
+        record = kept.once(target, partial(at, target))
+        parts[target] = record["parts"]
+        for kind, by_source in record["errors"].items():
+            found |= {(kind, (name, target)): Errors(np.array(each)) for name, each in by_source.items()}
+    return found, parts
+
+
+def measure(truths: Truths, method: Method, template: Template | None, kept: Kept) -> dict[str, list[dict[str, Any]]]:
     """All tables of a set, as rows.
 
     Raises
     ------
     InputError
         Nothing is known beyond the set's own truth.
+    OptionError
+        What is kept was measured with other choices.
     """
     bench = truths.bench
     if not truths.groups and not truths.templates:
@@ -224,21 +266,19 @@ def measure(truths: Truths, method: Method, template: Template | None) -> dict[s
             f"no two shapes of {bench.name} have the same triangles", "nothing better than its truth is known"
         )
     inside = [pair for group in truths.groups for pair in permutations(group, 2)]
-    fits, maps = matched(bench, method, list(dict.fromkeys([*bench.pairs, *inside])))
-    found = all_errors(truths, maps, inside)
+    found, parts = measured(truths, method, template, inside, kept)
     rows = []
     for group in truths.groups:
-        rows.append(group_row(truths, group, found))
+        rows.append(group_row(truths, group, found, kept))
         for names in SAME_PERSON.get(bench.name, ()):
             if set(names) < set(group):
-                rows.append(group_row(truths, names, found))
-    rows += [template_row(truths, name) for name in truths.templates]
+                rows.append(group_row(truths, names, found, kept))
+    rows += [kept.once(f"template-{name}", partial(template_row, truths, name)) for name in truths.templates]
     large = [name for group in truths.groups if len(group) > 2 for name in group]
-    perfect = {pair: found["perfect", pair] for pair in inside}
     return {
         "groups": rows,
         "consensus": [consensus_row(truths, name) for name in large],
-        "parts": [] if template is None else part_rows(truths, perfect, fits, template),
+        "parts": part_rows({pair: found["perfect", pair] for pair in inside}, parts),
         "protocol": protocol_rows(truths, found),
     }
 
@@ -251,10 +291,13 @@ def main(
     refine: Refine = "nodes",
     seed: runner.Seed = 0,
     landmarks: Annotated[int | None, Option(min=2, help="of each shape, evenly spread; by default all")] = None,
+    work: Annotated[Path, Option(help="where finished work is kept")] = Path("runs/truth"),
     threads: runner.Threads = 1,
 ) -> runner.Report:
-    method = OurMethod(model, refine, seed, threads=threads)
-    found = measure(Truths(load_set(set, data), landmarks), method, as_model(model).template)
+    method, trained = OurMethod(model, refine, seed, threads=threads), as_model(model)
+    asked = {"set": set, "model": trained.card.weights_sha256, "refine": refine, "seed": seed, "landmarks": landmarks}
+    kept = Kept(work / (set if landmarks is None else f"{set}-{landmarks}"), asked, threads)
+    found = measure(Truths(load_set(set, data), landmarks), method, trained.template, kept)
     titles = {
         "groups": ("its truth, and ours, against vertices in the same order, cm", COLUMNS),
         "consensus": ("landmarks of one shape against the mean of the others'", OTHERS),

@@ -4,19 +4,22 @@ import json
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, OptionError
 from meshmatch.experiments.sets import BenchSet, load_set
-from meshmatch.experiments.truth import main, measure, template_row
-from meshmatch.experiments.truths import Truths, consensus_points, same_triangles
-from meshmatch.maps.evaluate import CM_PER_UNIT
+from meshmatch.experiments.truth import Kept, main, measure, part_rows, parts_at, template_row
+from meshmatch.experiments.truths import NearDistances, Truths, consensus_points, same_triangles
+from meshmatch.maps.evaluate import CM_PER_UNIT, Errors
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
+from tests.conftest import some_fit
 from tests.experiments.small_bench import BODY, build
 
 STRETCHED = [1.0, 2.0, 1.0]
@@ -70,8 +73,8 @@ def test_a_set_without_such_shapes(tmp_path: Path, capsys: pytest.CaptureFixture
         ids = np.load(data / "shrec19" / f"{name}.landmarks.npy")
         np.save(data / "shrec19" / f"{name}.landmarks.npy", ids[:-1])  # no shape is the template
     with pytest.raises(InputError, match="no two shapes"):
-        measure(Truths(load_set("shrec19", data)), Keeps(), None)
-    assert main(["--set", "shrec19", "--data", str(data)]) == 1
+        measure(Truths(load_set("shrec19", data)), Keeps(), None, Kept(tmp_path / "kept", {}))
+    assert main(["--set", "shrec19", "--data", str(data), "--work", str(tmp_path / "kept")]) == 1
     assert "no two shapes" in capsys.readouterr().err
     assert Truths(load_set("scape", data)).groups == [["mesh000", "mesh001"]]
 
@@ -82,7 +85,7 @@ def test_a_truth_that_is_wrong_by_hand(tmp_path: Path) -> None:
     wrong = ids.copy()
     wrong[0] = 1
     bench = write(tmp_path, {"1": ids, "2": wrong})
-    found = measure(Truths(bench), Keeps(), None)
+    found = measure(Truths(bench), Keeps(), None, Kept(tmp_path / "kept", {}))
     (row,), (identity, whole) = found["groups"], found["protocol"]
     assert (row["names"], row["pairs"], row["alike"]) == ("1, 2", 2, 1.0)
     edges = [edge_cm(bench.shape(name)) / len(ids) for name in ("1", "2")]
@@ -92,8 +95,62 @@ def test_a_truth_that_is_wrong_by_hand(tmp_path: Path) -> None:
     assert row["stretch_set"] > row["stretch_identity"] > 0
     assert identity["kind"] == "identity" and (whole["kind"], whole["pairs"]) == ("all", 1)
     assert identity["charged_cm"] == pytest.approx(edges[1], rel=0.02) and identity["true_cm"] == 0.0
-    ours = measure(Truths(bench), Keeps(moved=1), None)["groups"][0]  # vertex 0 to vertex 1 everywhere
+    other = Kept(tmp_path / "other", {})
+    ours = measure(Truths(bench), Keeps(moved=1), None, other)["groups"][0]  # vertex 0 to vertex 1 everywhere
     assert ours["true_cm"] == pytest.approx(edges[1] / 2, rel=0.02)  # the second shape has no landmark there
+
+
+def test_what_is_kept_is_not_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two shapes in one order, both the template, and a third; the command is stopped at its second target."""
+    ids = np.arange(BODY.V)
+    wrong = ids.copy()
+    wrong[3] = 4
+    other = np.random.default_rng(0).permutation(BODY.V)
+    bench = write(tmp_path, {"1": ids, "2": wrong, "3": np.argsort(other)}, {"3": other[BODY.faces]})
+    whole = measure(Truths(bench), Keeps(), None, Kept(tmp_path / "whole", {"seed": 0}))
+    kept, plain = Kept(tmp_path / "kept", {"seed": 0}), Keeps.map
+    done: list[tuple[str, str]] = []
+    stop = ["3"]
+
+    def watched(self: Keeps, source: Shape, source_fit: Any, target: Shape, target_fit: Any) -> VertexMap:
+        if target_fit in stop:
+            raise KeyboardInterrupt
+        done.append((source_fit, target_fit))
+        return plain(self, source, source_fit, target, target_fit)
+
+    monkeypatch.setattr(Keeps, "map", watched)
+    with pytest.raises(KeyboardInterrupt):
+        measure(Truths(bench), Keeps(), None, kept)
+    assert done == [("1", "2")]
+    stop.clear()
+    assert measure(Truths(bench), Keeps(), None, kept) == whole
+    assert done == [("1", "2"), ("2", "3"), ("2", "1")]
+
+    def never(*_: Any) -> Any:
+        raise AssertionError("measured again")
+
+    for owner, name in ((Keeps, "fit"), (Keeps, "map"), (NearDistances, "between"), (NearDistances, "among")):
+        monkeypatch.setattr(owner, name, never)
+    assert measure(Truths(bench), Keeps(), None, kept) == whole
+    with pytest.raises(OptionError, match=r"other choices \(seed\)"):
+        measure(Truths(bench), Keeps(), None, Kept(kept.folder, {"seed": 1}))
+
+
+def test_errors_by_part(tmp_path: Path) -> None:
+    """The template lies on the shape, its left and right hands below and its head above."""
+    bench = write(tmp_path, {"1": np.arange(BODY.V), "2": np.arange(BODY.V)})
+    labels = np.where(BODY.verts[:, 2] > 0, 2, (BODY.verts[:, 0] > 0).astype(int))
+    template: Any = SimpleNamespace(labels=labels, label_names=("left hand", "right hand", "head"))
+    fit = some_fit(BODY.verts, BODY.faces, repaired=repair(BODY))
+    parts = parts_at(Truths(bench), "1", fit, template)
+    assert parts == ["head" if label == 2 else "hand" for label in labels]
+    assert parts_at(Truths(bench), "1", fit, None) == parts_at(Truths(bench), "1", "no fit", template) == []
+    off = Errors(np.where(labels == 2, 0.03, 0.01))
+    head, hand = part_rows({("1", "2"): off, ("2", "1"): off}, {"1": parts, "2": []})
+    assert (head["part"], hand["part"]) == ("head", "hand")
+    assert head["cm"] == pytest.approx(3 * hand["cm"], rel=1e-5)
+    assert head["landmarks"] == pytest.approx((labels == 2).mean())
+    assert head["sum"] + hand["sum"] == pytest.approx(1)
 
 
 def test_the_mean_of_the_others_and_the_template(tmp_path: Path) -> None:
