@@ -2,6 +2,9 @@
 
 A pair that cannot be matched is not left out: it counts as the map that sends every vertex to vertex 0. --limit-pairs
 measures a stated part and says so.
+
+--oriented-by MODEL asks what --model is worth where the orientation is no question: every shape is first turned into the
+frame of that model's unrefined fit, and up and front are told. Maps are between the same vertices, and measured as ever.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Protocol
@@ -22,8 +25,9 @@ from typer import Option
 
 from meshmatch.api.matching import Matcher
 from meshmatch.arrays import Int, Ints
-from meshmatch.errors import MeshmatchError
+from meshmatch.errors import MeshmatchError, OptionError
 from meshmatch.experiments import runner
+from meshmatch.experiments.orientation import frame_by, in_frame
 from meshmatch.experiments.scores import SetScores, evaluate_set
 from meshmatch.experiments.sets import ALL_SETS, SET_NAMES, BenchSet, Pair, load_set
 from meshmatch.fitting.fit import Fit
@@ -32,6 +36,7 @@ from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.registry import find_model
 from meshmatch.outputs import make_folder
 from meshmatch.render.charts import draw_curves
 from meshmatch.shapes.shape import Shape
@@ -52,13 +57,17 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class OurMethod:
-    """This project with its options."""
+    """This project with its options.
+
+    ``oriented_by``: a model whose unrefined fit finds the orientation; then a fit searches only what is left of it.
+    """
 
     model: str = "human"
     refine: Refine = "nodes"
     seed: int = 0
     partial: Partial = "auto"
     threads: int = 1
+    oriented_by: str = ""  # a model; empty: the fitted model searches by itself
 
     def _matcher(self) -> Matcher:
         config = FitConfig(refine=self.refine, seed=self.seed, partial=self.partial)
@@ -66,7 +75,12 @@ class OurMethod:
 
     def fit(self, shape: Shape) -> Fit:
         """Fit the model's template to the shape."""
-        return self._matcher().fit(shape)
+        matcher = self._matcher()
+        if not self.oriented_by:
+            return matcher.fit(shape)
+        frame = frame_by(self.oriented_by, shape, self.seed)
+        upright = in_frame(shape, replace(frame, rotation=frame.turn))  # which is no mirror image
+        return matcher.fit(upright, replace(matcher.config, up="y", front="z"))
 
     def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:
         """Build the map from two fits."""
@@ -213,8 +227,8 @@ def load_maps(folder: Path, bench: BenchSet, pairs: Iterable[Pair]) -> dict[Pair
     return {pair: load_map(_map_path(folder, bench, pair), shapes[pair[0]], shapes[pair[1]]).index for pair in pairs}
 
 
-def scores_table(sets: Sequence[SetScores]) -> Table:
-    """A row for each set, and one for each kind of pair in it."""
+def scores_table(sets: Sequence[SetScores], oriented_by: str = "") -> Table:
+    """A row for each set, and one for each kind of pair in it; the title names the model that found the orientation."""
     rows = []
     for whole in sets:
         for scores in (whole, *whole.groups()):
@@ -225,7 +239,8 @@ def scores_table(sets: Sequence[SetScores]) -> Table:
     columns = {"set": "set", "pairs": "pairs:>", "mean": "mean_cm:.2f", "median": "median_cm:.2f"}
     columns |= {"median pair": "median_pair_cm:.2f", f"over {LOST_CM:g} cm": "share_over_15cm:.2%"}
     columns |= {"flips": "flips:.1%", "worst pair": "worst:.2f"}
-    return runner.table(f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})", rows, columns)
+    title = f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})"
+    return runner.table(f"{title}, oriented by {oriented_by}" if oriented_by else title, rows, columns)
 
 
 INCOMPLETE = "Not all pairs were measured: these means are not the benchmark's."
@@ -236,6 +251,7 @@ def main(
     data: runner.Data = runner.DATA,
     sets: Annotated[str, Option(help=f"of {', '.join(ALL_SETS)}")] = ",".join(SET_NAMES),
     model: runner.Model = "human",
+    oriented_by: Annotated[str, Option(help="model whose fits turn every shape upright first; none by default")] = "",
     refine: Refine = "nodes",
     seed: runner.Seed = 0,
     limit_pairs: runner.LimitPairs = None,
@@ -247,7 +263,11 @@ def main(
     curve: Annotated[Path | None, Option(help="draw the cumulative curves into this file")] = None,
 ) -> runner.Report:
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
-    method = OurMethod(model, refine, seed, threads=threads)
+    if oriented_by and maps is not None:
+        raise OptionError("maps that are given cannot be oriented anew", "leave out --oriented-by or --maps")
+    if oriented_by:
+        find_model(oriented_by)  # else a wrong name would cost every pair
+    method = OurMethod(model, refine, seed, threads=threads, oriented_by=oriented_by)
     runs: list[SetRun] = []
     for bench in benches:
         pairs = runner.spread(bench.pairs, limit_pairs)
@@ -266,7 +286,7 @@ def main(
     if any(len(each.errors) < each.expected for each in scores):
         notes.append(INCOMPLETE)
     record = {"geodesic": GEODESIC, "sets": {each.scores.bench.name: each.as_dict() for each in runs}}
-    return runner.Report(record, [scores_table(scores)], notes)
+    return runner.Report(record, [scores_table(scores, oriented_by)], notes)
 
 
 if __name__ == "__main__":

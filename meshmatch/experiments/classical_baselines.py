@@ -18,10 +18,9 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.api.matching import Matcher
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.experiments.orientation import frame_by, in_frame
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import interpolate
@@ -46,16 +45,11 @@ class Placed:
     samples: OrientedPoints
 
 
-def frame_by(model: str, shape: Shape, seed: int = 0) -> Frame:
-    """The frame in which a model's unrefined fit sees a shape: area 1, upright, facing forward."""
-    return Matcher(model, FitConfig(refine="none", partial="no", seed=seed)).fit(shape).frame
-
-
 def placed(shape: Shape, seed: int = 0, faces: int | None = None, frame: Frame | None = None) -> Placed:
     """Bring a shape into a frame (default: area 1, centered), sample it, and thin it to about so many faces."""
     frame = frame or sqrt_area_frame(shape)
     drawn = sample_surface(shape, _SAMPLES, np.random.default_rng(seed))
-    whole = Shape(frame.apply(shape.verts), shape.faces, shape.name, invalid=shape.invalid)
+    whole = in_frame(shape, frame)
     thin = whole if faces is None or whole.is_cloud else decimate(whole, faces)
     return Placed(whole, thin, drawn.in_frame(frame))
 
@@ -199,7 +193,7 @@ class ZoomOut:
         """Thin, and find the eigenfunctions."""
         need_meshes("ZoomOut", shape)
         frame = frame_by(self.oriented_by, shape, self.seed) if self.oriented_by else sqrt_area_frame(shape)
-        whole = Shape(frame.apply(shape.verts), shape.faces, shape.name, invalid=shape.invalid)
+        whole = in_frame(shape, frame)
         thin = decimate(whole, self.faces)
         used, faces = np.unique(thin.faces, return_inverse=True)  # a lone vertex makes the mass matrix singular
         thin = Shape(thin.verts[used], faces.reshape(-1, 3), thin.name)
