@@ -20,7 +20,7 @@ from meshmatch.templates.make import STRATEGIES, NodeConfig, choose_nodes, edge_
 from meshmatch.templates.template import Template
 
 KEPT, REFUSED, NODE = (0.20, 0.55, 0.80), (0.85, 0.15, 0.12), (0.86, 0.30, 0.12)
-COLUMNS = {"template": "template", "radius": "radius:.2f", "candidates": "candidates:d"}
+COLUMNS = {"template": "template", "radius": "radius:.3f", "candidates": "candidates:d"}
 COLUMNS |= {"refused by parts": "parts:.1%", "spectral": "spectral:.1%", "geodesic": "geodesic:.1%"}
 SHARE = 0.2  # of the diameter along the surface, by which the third panel is coloured
 
@@ -110,7 +110,8 @@ def segmentations(template: Template, config: NodeConfig) -> tuple[list[Panel], 
             point_radius=0.02,
         ),
     ]
-    return panels, {"template": template.name, "node moves": moved_parts, "vertices": int(moved.sum())}
+    numbers = {"template": template.name, "radius": config.radius}
+    return panels, numbers | {"node moves": moved_parts, "vertices": int(moved.sum())}
 
 
 def stages(template: Template, config: NodeConfig) -> tuple[list[Panel], dict[str, Any]]:
@@ -151,7 +152,8 @@ def stages(template: Template, config: NodeConfig) -> tuple[list[Panel], dict[st
             point_radius=0.012,
         ),
     ]
-    numbers = {"template": template.name, "candidates": len(bad), "refused": int(bad.sum()), "by distance": len(chosen)}
+    numbers = {"template": template.name, "radius": config.radius, "candidates": len(bad), "refused": int(bad.sum())}
+    numbers["by distance"] = len(chosen)
     return panels, numbers | {"added where vertices lacked nodes": len(nodes) - len(chosen), "nodes": len(nodes)}
 
 

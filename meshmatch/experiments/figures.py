@@ -4,7 +4,8 @@
   that nobody learned from, fitted with each.
 - 5: the same body fitted after different regularisers.
 - 6: bodies as a trained model's network fits them, and after both refinements.
-- 7: what the rules for nodes look at, a node that they refuse, and the three stages of choosing.
+- 7: what the rules for nodes look at, a node that they refuse, and the three stages of choosing; drawn with the templates'
+  own radius (0.13), and counted with the paper's too: 0.2 of each template's diameter, as in table 7 of the ablations.
 
 By default fields are fitted to the body themselves (`meshmatch.experiments.figure_direct`), without a network. With
 --output, the fits are by runs of the ablations (`meshmatch.experiments.ablations`) with the same choices: they are trained
@@ -29,7 +30,7 @@ from meshmatch.arrays import Floats
 from meshmatch.experiments import figure_nodes, runner
 from meshmatch.experiments.ablation_errors import METHODS, Measure
 from meshmatch.experiments.ablation_setting import Setting
-from meshmatch.experiments.ablation_views import Run
+from meshmatch.experiments.ablation_views import BASE, Run
 from meshmatch.experiments.ablations import Kept
 from meshmatch.experiments.figure_direct import CONSTRAINTS, Direct, direct_fits
 from meshmatch.experiments.figure_fields import (
@@ -46,7 +47,7 @@ from meshmatch.experiments.figure_fields import (
     pull,
     refinements,
 )
-from meshmatch.experiments.human_bodies import unseen_bodies
+from meshmatch.experiments.human_bodies import diameter, unseen_bodies
 from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import make_folder, replace_on_success
@@ -100,7 +101,8 @@ def drawn_fits(figure: str, body: Floats, kept: Kept | None, method: str, how: D
 
 
 def figure_7(nodes: int, radius: float | None, path: Path) -> dict[str, list[dict[str, Any]]]:
-    """Both templates' segmentations, and the stages on one of them."""
+    """Both templates' segmentations, and the stages on one of them; what the rules refuse by the radius that is drawn, and
+    by the paper's of each template."""
     templates = [read_template(name) for name in ("human-T", "human-A")]
     configs = [figure_nodes.config_of(template, nodes, radius) for template in templates]
     rows, bad = [], []
@@ -112,8 +114,8 @@ def figure_7(nodes: int, radius: float | None, path: Path) -> dict[str, list[dic
     stacked([*rows, (panels, _FRONT)], path)
     shares = [
         figure_nodes.refusals(template, figure_nodes.config_of(template, nodes, each))
-        for template in templates
-        for each in dict.fromkeys((configs[0].radius, 0.29))
+        for template, config in zip(templates, configs, strict=True)
+        for each in dict.fromkeys((config.radius, BASE.radius * diameter(template.shape)))
     ]
     return {"refused": shares, "bad": bad, "stages": [steps]}
 
@@ -173,7 +175,10 @@ def main(
         "fits 4": ("Figure 4, one body fitted with each field", FIT_COLUMNS),
         "fits 5": ("Figure 5, one body fitted after each loss", FIT_COLUMNS),
         "refined": ("Figure 6, bodies fitted by the network, and refined", REFINED_COLUMNS),
-        "refused": ("Figure 7, candidates that the rules refuse", figure_nodes.COLUMNS),
+        "refused": (
+            "Figure 7, candidates that the rules refuse by the radius that is drawn, and by the paper's",
+            figure_nodes.COLUMNS,
+        ),
     }
     drawn = [runner.table(words, found[key], columns) for key, (words, columns) in titles.items() if key in found]
     notes += [str(row) for key in ("bad", "stages") for row in found.get(key, ())]

@@ -48,9 +48,10 @@ _MAX_PAIRED = 8000  # vertices, evenly spread, whose pairs the geodesic rule loo
 class NodeConfig:
     """How nodes are chosen. Lengths in units of sqrt(surface area).
 
-    radius 0.13 is the paper's 0.2 in the unit sphere for a standing body. Candidates lie up to ``depth`` below the
-    surface; ``spectral`` begins with so many ``clusters``. ``grow``: vertices that lack nodes widen those around them
-    (the supplement's other way, section 3.3) instead of getting more, or a milder strategy. `OptionError` for an unknown
+    radius 0.13 is 0.2 of half a standing body's height (0.65), about the radius of a sphere around it. The paper's 0.2 is of
+    the diameter, as its captions read: 0.27 to 0.29, by pose. Candidates lie up to ``depth`` below the surface;
+    ``spectral`` begins with so many ``clusters``. ``grow``: vertices that lack nodes widen those around them (the
+    supplement's other way, section 3.3) instead of getting more, or a milder strategy. `OptionError` for an unknown
     strategy, fewer than 4 nodes, or a length or count that is not positive.
     """
 
