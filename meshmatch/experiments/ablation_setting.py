@@ -17,7 +17,7 @@ from torch import Tensor
 from meshmatch.arrays import Float, Int
 from meshmatch.errors import TemplateError
 from meshmatch.experiments.ablation_views import BASE, Run
-from meshmatch.experiments.human_bodies import diameter
+from meshmatch.experiments.human_bodies import diameter, styled
 from meshmatch.generators.bodies import human_source
 from meshmatch.generators.generator import Source
 from meshmatch.models.layers import BasisEncoder, PointEncoder
@@ -145,7 +145,8 @@ class Setting:
         return _with_nodes(self.resting(run.pose), run.nodes, self._radius(run), run.strategy)
 
     def resting(self, pose: str) -> Template:
-        """The template in a pose, with the nodes that it came with; a folder has one pose."""
+        """The template in a pose, with the nodes that it came with; of other people where a style follows ("T-heavy"); a
+        folder has one pose."""
         return _resting(self.folder, pose)
 
     def sources(self, pose: str) -> tuple[Source, Source]:
@@ -160,7 +161,11 @@ class Setting:
 
 @lru_cache(maxsize=4)
 def _resting(folder: str | None, pose: str) -> Template:
-    return read_template(f"human-{pose}" if folder is None else Path(folder) / "template.safetensors")
+    if folder is not None:
+        return read_template(Path(folder) / "template.safetensors")
+    pose, _, style = pose.partition("-")
+    template = read_template(f"human-{pose}")
+    return styled(template, style) if style else template
 
 
 @lru_cache(maxsize=32)

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
+from meshmatch.experiments.human_bodies import STYLES
 from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.templates.make import STRATEGIES, Strategy
@@ -17,6 +18,8 @@ from meshmatch.templates.make import STRATEGIES, Strategy
 CONSTRAINTS = ("none", "arap", "vol", "vol+arap", "vol+arap+Z")
 PAPER_SETS = ("shrec19", "scape-pcn")
 HELD_OUT = "held out"
+POSES = ("T", "A", "I", *(f"T-{style}" for style in STYLES))
+"""Of the template; of another style than the mean body's where one follows."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Run:
     constraint : one of `CONSTRAINTS`
     nodes, radius : K, and r in the paper's unit
     strategy : how nodes are chosen
-    pose : of the template
+    pose : of the template, one of `POSES`
     shapes : how many there are to learn from
     supervised : on how many template points the right place is told
     """
@@ -160,7 +163,9 @@ VIEWS = {
     "figure10": View(
         "Figure 10", ("supervised points", "method"), _numbers("supervised", (50, 100, 1000)), across=True
     ),
-    "figure8": View("Figure 8", ("template",), tuple(Row((pose,), replace(BASE, pose=pose)) for pose in "TAI")),
+    "figure8": View(
+        "Figure 8", ("template", "nodes by"), tuple(Row((pose, "{rule}"), replace(BASE, pose=pose)) for pose in POSES)
+    ),
     "table7": View(
         "Table 7",
         ("nodes by", "template"),

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.generators.bodies import human_source, pose_limbs
 from meshmatch.generators.limbs import Draw, Limbs
-from meshmatch.generators.rig import Rig, forward_kinematics, skin
+from meshmatch.generators.rig import Rig, cached_rig, forward_kinematics, skin
 from meshmatch.generators.rotations import rotation_from_vector
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, choose_nodes, make_template
 from meshmatch.templates.template import Template, read_template
@@ -38,6 +40,9 @@ _PARTS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("foot", ("foot", "toe")),
 )
 _CORE = ("chest", "belly", "hips")
+STYLES = ("heavy", "child")
+"""Of a template besides its pose, see `styled`."""
+_PEOPLE = 1024
 _AT_ONCE = 50  # bodies that are generated together
 
 
@@ -94,11 +99,11 @@ def still_pose(
     return rotations
 
 
-def standing_body(rig: Rig, pose: str) -> Shape:
-    """The mean identity in a template pose, metres."""
+def standing_body(rig: Rig, pose: str, people: Int[Ints, " N"] | slice = slice(None)) -> Shape:
+    """The mean of all identities, or of some, in a template pose, metres."""
     arms, legs = POSES[pose]
-    rest = rig.rest.float().mean(0, keepdim=True)
-    heads = rig.heads.mean(0, keepdim=True)
+    rest = rig.rest[people].float().mean(0, keepdim=True)
+    heads = rig.heads[people].mean(0, keepdim=True)
     rotations = still_pose(rig, heads, arms, legs)
     verts = skin(rig, rest, *forward_kinematics(rig, heads, rotations))[0]
     return Shape(verts.double().numpy(), rig.faces.numpy(), f"human-{pose}")
@@ -112,6 +117,23 @@ def human_template(rig: Rig, pose: str, config: NodeConfig, low: tuple[Int[Ints,
         standing_body(rig, pose), f"human-{pose}", config, labels=labels, label_names=names, core=core, low=low
     )
     return replace(made, pose=pose, source=SOURCE, licence=LICENCE)
+
+
+def styled(template: Template, style: str) -> Template:
+    """A human template in its own pose, of the mean of other people: the heaviest twentieth, or the smallest, who are
+    children (`STYLES`). `OptionError` as `meshmatch.generators.bodies.human_source`.
+    """
+    rig = cached_rig(_PEOPLE, 0)
+    rest = rig.rest.float().numpy()
+    height = np.ptp(rest[:, :, 1], axis=1)
+    a, b, c = (rest[:, rig.faces.numpy()[:, corner]] for corner in range(3))
+    weight = np.einsum("nfi,nfi->n", a, np.cross(b, c)) / height**3
+    order = np.argsort(-weight if style == "heavy" else height)
+    body = standing_body(rig, template.pose, order[: _PEOPLE // 20])
+    keep = cKDTree(template.dense.verts).query(template.shape.verts)[1]
+    verts = sqrt_area_frame(body).apply(body.verts)
+    shape, dense = Shape(verts[keep], template.shape.faces), Shape(verts, template.dense.faces)
+    return replace(template, name=f"{template.name}-{style}", shape=shape, dense=dense)
 
 
 def diameter(shape: Shape) -> float:

@@ -27,6 +27,7 @@ from meshmatch.experiments.ablation_views import (
     BASE,
     CODED,
     CONSTRAINTS,
+    POSES,
     TABLE4,
     TRANSMATCH,
     VIEWS,
@@ -34,8 +35,10 @@ from meshmatch.experiments.ablation_views import (
     all_runs,
     methods_of,
 )
+from meshmatch.experiments.human_bodies import STYLES
 from meshmatch.experiments.learned_baselines import TransConfig
 from meshmatch.fields.shape_functions import FIELDS, FieldName
+from meshmatch.geometry.frames import kabsch
 from meshmatch.models.registry import load_model
 from meshmatch.templates.template import read_template
 from meshmatch.training.train import build_loss_points
@@ -306,3 +309,18 @@ def test_memory_is_that_of_the_iterations(prepared: Path) -> None:
     assert "resident set" in found["how"] or "GPU" in found["how"]
     # 32 x 642 points, layers of 384 numbers, in float32, are 4 MB and more with what gradients keep
     assert found["megabytes"] > 4
+
+
+def test_templates_of_other_styles_stand_as_the_first_and_are_other_people() -> None:
+    pytest.importorskip("anny", reason="the body model is of the extra `train`")
+    usual = Setting().resting("T")
+    heavy, child = (Setting().resting(f"T-{style}") for style in STYLES)
+    for each in (heavy, child):
+        assert (each.pose, each.shape.V) == ("T", usual.shape.V) and np.array_equal(each.shape.faces, usual.shape.faces)
+        assert each.shape.area == pytest.approx(1, abs=0.01)
+        assert np.array_equal(each.core, usual.core) and np.array_equal(each.labels, usual.labels)
+        turned = kabsch(usual.shape.verts[usual.core], each.shape.verts[each.core]).frame
+        assert np.trace(turned.rotation) > 2.99  # up and to the front as well
+    tall = [np.ptp(each.shape.verts[:, 1]) for each in (usual, heavy)]
+    assert tall[1] < 0.95 * tall[0]  # of the same area
+    assert POSES == ("T", "A", "I", "T-heavy", "T-child")
