@@ -1,28 +1,79 @@
 """What the table of implicit surfaces counts, and how real shapes are compared."""
 
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 pytest.importorskip("skimage", reason="scikit-image is of the extra `implicit`")
 
-from meshmatch.experiments.implicit import label_transfer, labelled_points, means, pairs_of, part_iou
+from meshmatch.experiments import implicit
+from meshmatch.experiments.implicit import (
+    FRAMES,
+    chamfer,
+    draw,
+    interpolation,
+    label_transfer,
+    labelled_points,
+    means,
+    moved_colors,
+    pairs_of,
+    part_iou,
+    pieces,
+    reconstruction,
+    volume,
+)
 from meshmatch.experiments.implicit_real import undeformed
 from meshmatch.geometry.frames import Frame
 from meshmatch.implicit.model import ImplicitFit, ImplicitModel
 from meshmatch.implicit.network import ImplicitConfig, ImplicitNetwork
 from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
 from meshmatch.models.implicit_card import ImplicitCard
-from tests.implicit.boxes import box
+from meshmatch.render.figures import Panel
+from meshmatch.render.picture import Look
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Shape
+from tests.implicit.boxes import box, box_sdf
+
+ONE, TWO = ((0.0, 0.0, 0.0),), ((-0.5, 0.0, 0.0), (0.5, 0.0, 0.0))
+
+
+def card_of(count: int, scale: float) -> ImplicitCard:
+    names, frames = [f"plane{k}" for k in range(count)], [[scale, 0, 0, 0]] * count
+    return ImplicitCard(
+        name="planes", category="plane", network={}, shapes=names, frames=frames, data="", licence="", recipe={}, seed=0,
+        steps=0, training_minutes=0.0, weights_sha256="", created="",
+    )  # fmt: skip
+
+
+class Balls:
+    """In place of a network: balls whose radius is the square of the code, all of them moved along x to the template."""
+
+    def __init__(self, codes: list[float], centers: tuple[tuple[float, ...], ...], moved: float = 0.0) -> None:
+        self.codes, self.centers, self.moved = torch.tensor(codes)[:, None], torch.tensor(centers), moved
+
+    def distance(self, points: torch.Tensor, code: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        off = (points[:, :, None] - self.centers).norm(dim=-1).amin(2) - code.square()
+        return off, points + torch.tensor([self.moved, 0.0, 0.0])
+
+    def __call__(self, points: torch.Tensor, code: torch.Tensor) -> Any:
+        return SimpleNamespace(F=torch.diag(torch.tensor([2.0, 1.0, 1.0])).expand(*points.shape, 3))
+
+
+def balls(*codes: float, centers: tuple[tuple[float, ...], ...] = ONE, moved: float = 0.0) -> ImplicitModel:
+    """A model of balls, in files that are twice as large as the cube."""
+    network: Any = Balls(list(codes), centers, moved)
+    return ImplicitModel(card_of(len(codes), 2.0), network)
 
 
 @pytest.fixture(scope="module")
 def model() -> ImplicitModel:
     """Two planes whose deformation is a random one."""
-    card = ImplicitCard(
-        name="planes", category="plane", network={}, shapes=["plane0", "plane1"], frames=[[0.6, 0, 0, 0]] * 2, data="",
-        licence="", recipe={}, seed=0, steps=0, training_minutes=0.0, weights_sha256="", created="",
-    )  # fmt: skip
+    card = card_of(2, 0.6)
     torch.manual_seed(0)
     nodes = torch.from_numpy(cube_nodes()).float()
     config = ImplicitConfig("mls", code=8, width=16, depth=2, inner=8, nodes=4)
@@ -40,6 +91,101 @@ def test_labels_arrive_where_they_came_from(model: ImplicitModel) -> None:
 def test_overlap_of_parts() -> None:
     truth, found = np.array([0, 0, 1, 1]), np.array([0, 1, 1, 1])
     assert part_iou(truth, found, [0, 1]) == pytest.approx((1 / 2 + 2 / 3) / 2)
+
+
+def test_distances_of_both_ways_count_alike() -> None:
+    one, two = np.array([[0.0, 0, 0]]), np.array([[0.0, 0, 0], [3, 0, 0]])
+    assert chamfer(one, two) == chamfer(two, one) == pytest.approx(0.75)  # (0 + (0 + 3) / 2) / 2
+    assert chamfer(two, two) == 0
+
+
+def test_volume_and_pieces_of_boxes() -> None:
+    half = np.array([0.5, 0.2, 0.3])
+    one = box(half)
+    other = Shape(one.verts + np.array([5.0, 0, 0]), one.faces)
+    both = Shape(np.concatenate([one.verts, other.verts]), np.concatenate([one.faces, one.faces + one.V]))
+    assert [volume(one), volume(other), volume(both) / 2] == pytest.approx([8 * half.prod()] * 3)
+    assert (pieces(one), pieces(both)) == (1, 2)
+
+
+@pytest.mark.parametrize("centers", [ONE, TWO])
+def test_the_way_from_a_shape_to_itself_is_a_standstill(centers: tuple[tuple[float, ...], ...]) -> None:
+    with np.errstate(invalid="ignore"):  # nothing moves, so no part of the motion is bent
+        found = interpolation(balls(0.6, centers=centers), [(0, 0)])
+    assert [found["bend"], found["volume_change"]] == pytest.approx([0, 0], abs=1e-4)
+    assert found["pieces"] == len(centers)
+    assert found["volume_energy"] == pytest.approx(1)  # (det F - 1)^2
+    assert found["arap_energy"] == pytest.approx(3)  # |F'F - I|
+
+
+def test_the_way_between_two_balls_by_hand() -> None:
+    """Radii are squares of codes that go evenly, so their second difference is 2 h^2, and the first 2 c h."""
+    codes = np.linspace(0.6, 0.8, FRAMES)
+    h, times = codes[1] - codes[0], np.linspace(0, 1, FRAMES)
+    found = interpolation(balls(0.6, 0.8), [(0, 1)])
+    assert found["bend"] == pytest.approx(100 / 1.7 * 2 * h**2, rel=1e-3)
+    assert found["bend_share"] == pytest.approx(np.mean(h / codes[1:-1]), rel=1e-3)
+    volumes = codes**6
+    even = volumes[0] + times * (volumes[-1] - volumes[0])
+    assert found["volume_change"] == pytest.approx(100 * np.abs(volumes / even - 1).mean(), rel=0.02)
+    assert found["pieces"] == 1
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_errors_of_a_box_that_is_learned_in_part(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is learned is the whole box, or what of it lies at x below 0."""
+    half = np.array([0.8, 0.4, 0.5])
+    part, center = half * [share, 1, 1], np.array([(share - 1) * half[0], 0, 0])
+
+    def drawn(count: int, rng: np.random.Generator) -> tuple[np.ndarray]:
+        return (sample_surface(box(2 * half), count, rng).points,)
+
+    truth = SimpleNamespace(sample=drawn, field=lambda at: box_sdf(at, 2 * half), surface=box(2 * half))
+    monkeypatch.setattr(implicit, "furniture", lambda kind, seed, number: truth)
+    learned = balls(0.0)
+    monkeypatch.setattr(
+        learned.network,
+        "distance",
+        lambda at, code: (torch.from_numpy(box_sdf(at[0].numpy() - center, part))[None], at),
+    )
+    found = reconstruction(learned, "plane", [0], 0)
+    assert found["iou"] == pytest.approx(share, abs=0.03)
+    if share == 1:
+        assert found["chamfer"] < 1  # % of the side: about the spacing of points
+    else:
+        assert 5 < found["chamfer"] < 25  # half of the points are up to half a side away
+
+
+def test_colors_say_how_far_the_deformation_goes() -> None:
+    for moved, color in ((0.0, (0.93, 0.93, 0.90)), (0.25, (0.70, 0.10, 0.15)), (0.125, (0.98, 0.72, 0.35))):
+        still = balls(0.6, moved=moved)
+        fit = still.known("plane0")
+        found = moved_colors(still, fit, still.surface(fit, 16))
+        assert np.allclose(found, color, atol=1e-5)
+
+
+def test_figure_12_has_a_row_for_each_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[list[Panel]] = []
+
+    def rendered(panels: list[Panel], path: Path, look: Look) -> None:
+        shown.append(panels)
+        Image.new("RGB", look.size, ("red", "blue")[len(shown) - 1]).save(path)
+
+    monkeypatch.setattr(implicit, "render_shapes", rendered)
+    models = {
+        ("plane", method): balls(0.4, 0.8, moved=moved) for method, moved in (("DIF-Net", 0.0), ("reduced", 0.25))
+    }
+    draw(tmp_path / "figure.png", models, (0, 1))
+    assert [path.name for path in tmp_path.iterdir()] == ["figure.png"]
+    picture = Image.open(tmp_path / "figure.png")
+    assert picture.size == (1500, 2 * 260)
+    assert [picture.getpixel((700, at)) for at in (259, 260)] == [(255, 0, 0), (0, 0, 255)]
+    for panels, name, color in zip(
+        shown, ("DIF-Net", "reduced"), ((0.93, 0.93, 0.90), (0.70, 0.10, 0.15)), strict=True
+    ):
+        assert [panel.label for panel in panels] == [f"plane, {name}", "0.2", "0.4", "0.6", "0.8", "1.0"]
+        assert np.all(np.diff([volume(panel.shape) for panel in panels]) > 0)  # from the small ball to the large one
+        assert all(np.allclose(panel.colors, color, atol=1e-5) for panel in panels)
 
 
 def test_means_over_trainings_keep_what_they_are_of() -> None:
