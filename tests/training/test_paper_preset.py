@@ -23,7 +23,7 @@ from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.templates.template import read_template, template_radius
 from meshmatch.training import recipes
-from meshmatch.training.loop import TrainConfig
+from meshmatch.training.loop import TrainConfig, Trainer
 from meshmatch.training.losses import ChamferLoss
 from meshmatch.training.train import CardFacts, build_dataset, train_model
 from tests.training.small import POINTS, egg_template
@@ -94,13 +94,18 @@ def test_the_model_has_the_papers_choices(loaded: TrainedModel) -> None:
 
 
 def test_the_papers_numbers() -> None:
-    """Table 1, and what the text says of training."""
+    """Table 1, what the text says of training, and the search over codes (eq. 11)."""
     chosen = recipes.paper()
     loss, train = chosen.train.loss, chosen.train
     assert (loss.reconstruction, loss.volume, loss.arap, loss.blend) == (1.0, 5e-3, 1e-2, 5e-3)
     assert (train.rate, train.shapes, train.scans_per_shape, train.steps) == (1e-3, 16, 1, 75_000)
     assert (train.warm_up, train.decay, train.weight_decay, train.average, train.clip) == (0, 0.0, 0.0, 0.0, None)
+    adam = Trainer(torch.nn.Linear(2, 2), None, train).optimiser.defaults
+    assert (adam["lr"], adam["betas"], adam["weight_decay"]) == (1e-3, (0.9, 0.999), 0.0)
     assert (chosen.scan.points, chosen.scan.sphere, chosen.kernel) == (3000, True, "cubic")
+    search = FitConfig().latent
+    assert (search.steps, search.rate, search.points) == (2000, 1e-3, 3000)
+    assert (search.chamfer, search.volume, search.arap) == (1.0, 1e-4, 1e-3)
     clouds = recipes.paper_clouds()
     config = clouds.train.loss  # table 2
     assert (config.reconstruction, config.volume, config.arap, config.blend) == (1.0, 1e-4, 1e-3, 1e-4)
