@@ -11,8 +11,9 @@ from meshmatch.errors import OptionError, needs
 if TYPE_CHECKING:
     from meshmatch.training.loop import StepReport
 
+_ENERGIES = ("volume", "arap", "blend")
 _IMPLICIT = (
-    *("implicit", "shapes", "field", "rate", "volume", "arap", "blend", "name", "category", "licence", "steps"),
+    *("implicit", "shapes", "field", "rate", *_ENERGIES, "name", "category", "licence", "steps"),
     *("minutes", "workers", "threads", "seed", "picture", "fresh"),
 )
 
@@ -22,6 +23,8 @@ def train_shapes(output: Path, how: Any, json: bool, console: Console) -> None:
     refuse_given(how, _IMPLICIT, "--implicit")
     if how.shapes is None or how.field == "rbf":
         raise OptionError("--implicit needs --shapes, and the field mls or pointwise", "give a folder of shapes")
+    if how.field == "pointwise":  # DIF-Net's deformation: these are energies of the other
+        refuse_given(how, set(_IMPLICIT).difference(_ENERGIES), "--implicit --field pointwise")
     with needs("torch", "implicit"):
         from meshmatch.implicit.network import ImplicitConfig
         from meshmatch.implicit.training import TRAINING, train_implicit
@@ -32,7 +35,7 @@ def train_shapes(output: Path, how: Any, json: bool, console: Console) -> None:
 
         check_chart(how.picture)
     check_writable(how.picture)
-    weights = {name: value for name in ("volume", "arap", "blend") if (value := getattr(how, name)) is not None}
+    weights = {name: value for name in _ENERGIES if (value := getattr(how, name)) is not None}
     chosen = {name: value for name in ("rate", "steps", "workers") if (value := getattr(how, name)) is not None}
     loss = replace(TRAINING.loss, **weights)
     training = replace(TRAINING, minutes=how.minutes, threads=how.threads, seed=how.seed, loss=loss, **chosen)

@@ -39,14 +39,15 @@ def model(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("field", ["mls", "pointwise"])
 def test_a_folder_becomes_a_model_and_goes_on(folder: Path, tmp_path: Path, capsys: Capture, field: str) -> None:
     words = ["train", "--implicit", "--shapes", str(folder), "-o", str(tmp_path / "model"), "--json"]
-    words += ["--field", field, "--arap", "0.004", "--category", "box", "--licence", "CC0", "--steps"]
+    words += ["--field", field, *(["--arap", "0.004"] if field == "mls" else [])]
+    words += ["--category", "box", "--licence", "CC0", "--steps"]
     assert main([*words, "1"]) == 0
     heard = capsys.readouterr()
     assert json.loads(heard.out)["steps"] == 1
     card = read_implicit_card(tmp_path / "model")
     assert (card.category, card.licence, card.shapes) == ("box", "CC0", ["box0", "box1", "box2"])
     assert card.network["field"] == field
-    assert card.recipe["loss"]["arap"] == 0.004
+    assert card.recipe["loss"]["arap"] == (0.004 if field == "mls" else TRAIN.loss.arap)
     assert (tmp_path / "model" / CHECKPOINT).is_file()
     assert not [path for path in (tmp_path / "model").rglob("*") if path.suffix in (".pt", ".pkl", ".pth")]
     assert main([*words, "2"]) == 0
@@ -62,6 +63,10 @@ def test_a_folder_becomes_a_model_and_goes_on(folder: Path, tmp_path: Path, caps
         (["--unsupervised"], "--unsupervised does not go"),
         (["--preset", "paper"], "--preset does not go"),
         (["--bf16"], "--bf16 does not go"),
+        *(
+            (["--field", "pointwise", energy, "0.001"], f"{energy} does not go with --implicit --field pointwise")
+            for energy in ("--volume", "--arap", "--blend")
+        ),
     ],
 )
 def test_what_does_not_go_with_it_is_told(
