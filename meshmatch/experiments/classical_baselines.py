@@ -167,6 +167,7 @@ class Spectrum:
     mesh: Any
     at: Float[Floats, "V k"]  # the eigenfunctions at the original's vertices
     original: Int[Ints, " V_thin"]  # the original vertex nearest to each of the thinned mesh
+    thinned: Int[Ints, " V"]  # the thinned mesh's vertex nearest to each original
     verts: Float[Floats, "V_thin 3"]  # the thinned mesh's in the frame in which nearest vertices are a start
 
 
@@ -205,24 +206,31 @@ class ZoomOut:
         surface = Surface(thin.verts, thin.faces, thin.vertex_normals)
         foot = surface.query(whole.verts, whole.vertex_normals)
         at = interpolate(mesh.eigenvectors, thin.faces[foot.face], foot.barycentric)
-        return Spectrum(mesh, at, cKDTree(whole.verts).query(thin.verts)[1], thin.verts)
+        original, thinned = (cKDTree(a.verts).query(b.verts)[1] for a, b in ((whole, thin), (thin, whole)))
+        return Spectrum(mesh, at, original, thinned, thin.verts)
 
-    def map(self, source: Shape, source_fit: Spectrum, target: Shape, target_fit: Spectrum) -> VertexMap:
-        """Fit the functional map from target to source, which pulls vertices from source to target; refine it."""
+    def map(
+        self, source: Shape, source_fit: Spectrum, target: Shape, target_fit: Spectrum, start: VertexMap | None = None
+    ) -> VertexMap:
+        """Fit the functional map from target to source, which pulls vertices from source to target, or begin with a map of
+        vertices; refine it."""
         first, second = target_fit.mesh, source_fit.mesh
         with library("ZoomOut"):
             from pyFM.refine.zoomout import zoomout_refine
             from pyFM.spectral import FM_to_p2p, p2p_to_FM
 
-            if self.oriented_by:
-                nearest = cKDTree(target_fit.verts).query(source_fit.verts)[1]
+            if start is not None or self.oriented_by:
+                if start is not None:
+                    nearest = target_fit.thinned[start.index[source_fit.original]]
+                else:
+                    nearest = cKDTree(target_fit.verts).query(source_fit.verts)[1]
                 bases = (mesh.eigenvectors[:, : self.first] for mesh in (first, second))
-                start = p2p_to_FM(nearest, *bases, A2=second.A)
+                coarse = p2p_to_FM(nearest, *bases, A2=second.A)
             else:
-                start = self._described(first, second)
+                coarse = self._described(first, second)
             rounds = (self.last - self.first) // self.step
             vectors = first.eigenvectors, second.eigenvectors
-            refined = zoomout_refine(start, *vectors, rounds, self.step, A2=second.A, n_jobs=1)
+            refined = zoomout_refine(coarse, *vectors, rounds, self.step, A2=second.A, n_jobs=1)
             index = FM_to_p2p(refined, first.eigenvectors, source_fit.at, n_jobs=1)
         return VertexMap.between(source, target, target_fit.original[index])
 

@@ -16,7 +16,8 @@ the right chamber.
 - collection: the same ten without any training: each is the template once, fitted to the others by node vectors, and
   of the maps through all of them the median counts (`experiments.collection`). It has seen no truth.
 - meshmonk (Apache-2.0, pip install meshmonk): its viscoelastic registration of the same template, from the same
-  alignment, with its defaults; zoomout: pyfmaps' ZoomOut (pip install 'meshmatch[bench]'); coded: 3D-CODED, a network at
+  alignment, with its defaults; zoomout: pyfmaps' ZoomOut (pip install 'meshmatch[bench]'), from
+  descriptors alone, and from the nearest vertices of the rigid alignment; coded: 3D-CODED, a network at
   every point that learns the same ten by the Chamfer distance, and a search over its codes. Beside them all: rigid
   alignment and the nearest vertex.
 """
@@ -148,8 +149,11 @@ def meshmonk_places(
     return places
 
 
-def by_zoomout(shapes: Shapes, pairs: Sequence[Pair], kept: Path) -> dict[Pair, VertexMap]:
-    """Maps of pyfmaps' ZoomOut, kept as files; a pair on which the library gives up is the map of everything to vertex 0."""
+def by_zoomout(
+    shapes: Shapes, pairs: Sequence[Pair], kept: Path, starts: Mapping[Pair, VertexMap] | None = None
+) -> dict[Pair, VertexMap]:
+    """Maps of pyfmaps' ZoomOut, from descriptors or from maps that are there, kept as files; a pair on which the library
+    gives up is the map of everything to vertex 0."""
     method, fits = ZoomOut(), dict[str, Any]()
     make_folder(kept)
     maps = {}
@@ -158,7 +162,8 @@ def by_zoomout(shapes: Shapes, pairs: Sequence[Pair], kept: Path) -> dict[Pair, 
         if not file.is_file():
             fits |= {name: method.fit(shapes[name]) for name in (a, b) if name not in fits}
             try:
-                index = method.map(shapes[a], fits[a], shapes[b], fits[b]).index
+                start = None if starts is None else starts[a, b]
+                index = method.map(shapes[a], fits[a], shapes[b], fits[b], start).index
             except InputError as error:
                 runner.tell(f"{a} to {b}: {error.message}")
                 index = np.zeros(shapes[a].V, np.int64)
@@ -209,7 +214,8 @@ def main(
     errors = partial(heart_errors, shapes, truth, unseen=strange)
     # walls that touch move together; less than the radius that suits a body
     config = NodeConfig("uniform", nodes, radius, 0.01, seed=seed)
-    rows = [{"method": category.RIGID, **errors(category.nearest_maps(measured, "near", "area", pairs))}]
+    rigid = category.nearest_maps(measured, "near", "area", pairs)
+    rows = [{"method": category.RIGID, **errors(rigid)}]
     went, notes = {}, []
     maps: Maps = {}
     how = {"minutes": minutes, "steps": steps, "threads": threads, "seed": seed}
@@ -228,6 +234,8 @@ def main(
                     notes.append("pyfmaps is not installed: the row of ZoomOut is left out")
                     continue
                 rows.append({"method": "ZoomOut", **errors(by_zoomout(measured, few, here.work))})
+                aligned = by_zoomout(measured, few, here.work / "aligned", rigid)
+                rows.append({"method": "ZoomOut from the alignment", **errors(aligned)})
                 continue
             if way == "coded":
                 pointwise = replace(here, pointwise=True)

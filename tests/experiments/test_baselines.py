@@ -26,6 +26,7 @@ from meshmatch.experiments.learned_baselines import (
 )
 from meshmatch.experiments.transformer import TransConfig, Transformer
 from meshmatch.geometry.frames import Frame
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.training.alone import CHECKPOINT
@@ -101,6 +102,20 @@ def test_a_ball_is_found_again_from_the_orientation_that_it_is_given(
     monkeypatch.setattr(classical_baselines, "frame_by", frame_by)
     found = method.map(source, method.fit(source), target, method.fit(target))
     assert np.linalg.norm(target.verts[found.index] - target.verts, axis=1).mean() < 0.06
+
+
+def test_zoomout_goes_on_from_a_map() -> None:
+    """One that is rough: every vertex goes to one of its neighbours."""
+    pytest.importorskip("pyFM")
+    ball = icosphere(3)
+    source, target = (Shape(ball.verts, ball.faces, name) for name in ("ball", "again"))
+    method = ZoomOut(1000, 10, 30)
+    neighbour = np.zeros(ball.V, np.int64)
+    neighbour[ball.faces] = np.roll(ball.faces, 1, axis=1)
+    rough = VertexMap.between(source, target, neighbour)
+    found = method.map(source, method.fit(source), target, method.fit(target), rough)
+    away, before = (np.linalg.norm(ball.verts[each.index] - ball.verts, axis=1).mean() for each in (found, rough))
+    assert away < 0.06 < before
 
 
 def test_the_frame_of_a_model_is_upright_whatever_the_files_is() -> None:

@@ -313,8 +313,10 @@ def test_maps_of_zoomout_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         def fit(self, shape):
             return shape.name
 
-        def map(self, source, first, target, second):
+        def map(self, source, first, target, second, start=None):
             asked.append((first, second))
+            if start is not None:
+                return start
             if first.startswith("1"):
                 raise InputError("gave up")
             return VertexMap.between(source, target, np.arange(162))
@@ -325,6 +327,9 @@ def test_maps_of_zoomout_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert np.array_equal(maps["0", "1"].index, np.arange(162))
         assert not maps["1", "0"].index.any()
     assert len(asked) == 2
+    turned = VertexMap.between(shapes["0"], shapes["1"], np.arange(162)[::-1])
+    again = hearts.by_zoomout(shapes, [("0", "1")], tmp_path / "aligned", {("0", "1"): turned})
+    assert np.array_equal(again["0", "1"].index, turned.index)
 
 
 def test_a_collection_is_registered_without_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
