@@ -214,7 +214,7 @@ class Pool:
         return torch.randint(min(shapes * SCANS, len(self.targets)), (count,), generator=generator)
 
 
-@lru_cache(maxsize=3)
+@lru_cache(maxsize=8)
 def pool_of(setting: Setting, pose: str, shapes: int = BASE.shapes, read_points: bool = False) -> Pool:
     """The pool of a template pose, drawn once in a process; the same scans whether or not their points are kept."""
     template, recipe = setting.resting(pose), setting.recipe(Run(pose=pose))
