@@ -16,8 +16,8 @@ from torch import Tensor
 
 from meshmatch.arrays import Float, Int
 from meshmatch.errors import TemplateError
-from meshmatch.experiments.ablation_views import BASE, Run
-from meshmatch.experiments.human_bodies import diameter, styled
+from meshmatch.experiments.ablation_views import BASE, HEAVY, Run
+from meshmatch.experiments.human_bodies import diameter, heavy
 from meshmatch.generators.bodies import human_source
 from meshmatch.generators.generator import Source
 from meshmatch.models.layers import BasisEncoder, PointEncoder
@@ -145,8 +145,8 @@ class Setting:
         return _with_nodes(self.resting(run.pose), run.nodes, self._radius(run), run.strategy)
 
     def resting(self, pose: str) -> Template:
-        """The template in a pose, with the nodes that it came with; of other people where a style follows ("T-heavy"); a
-        folder has one pose."""
+        """The template in a pose, with the nodes that it came with; of other people in "T-heavy"; a folder has one
+        pose."""
         return _resting(self.folder, pose)
 
     def sources(self, pose: str) -> tuple[Source, Source]:
@@ -163,9 +163,8 @@ class Setting:
 def _resting(folder: str | None, pose: str) -> Template:
     if folder is not None:
         return read_template(Path(folder) / "template.safetensors")
-    pose, _, style = pose.partition("-")
-    template = read_template(f"human-{pose}")
-    return styled(template, style) if style else template
+    template = read_template(f"human-{pose.removesuffix(HEAVY)}")
+    return heavy(template) if pose.endswith(HEAVY) else template
 
 
 @lru_cache(maxsize=32)

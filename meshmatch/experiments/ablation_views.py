@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
-from meshmatch.experiments.human_bodies import STYLES
 from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.geometry.kernels import Kernel
 from meshmatch.templates.make import STRATEGIES, Strategy
@@ -18,8 +17,9 @@ from meshmatch.templates.make import STRATEGIES, Strategy
 CONSTRAINTS = ("none", "arap", "vol", "vol+arap", "vol+arap+Z")
 PAPER_SETS = ("shrec19", "scape-pcn")
 HELD_OUT = "held out"
-POSES = ("T", "A", "I", *(f"T-{style}" for style in STYLES))
-"""Of the template; of another style than the mean body's where one follows."""
+HEAVY = "-heavy"
+POSES = ("T", "A", "I", f"T{HEAVY}")
+"""Of the template; the last is of other people."""
 
 
 @dataclass(frozen=True)

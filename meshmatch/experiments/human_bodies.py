@@ -40,8 +40,6 @@ _PARTS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("foot", ("foot", "toe")),
 )
 _CORE = ("chest", "belly", "hips")
-STYLES = ("heavy", "child")
-"""Of a template besides its pose, see `styled`."""
 _PEOPLE = 1024
 _AT_ONCE = 50  # bodies that are generated together
 
@@ -119,21 +117,20 @@ def human_template(rig: Rig, pose: str, config: NodeConfig, low: tuple[Int[Ints,
     return replace(made, pose=pose, source=SOURCE, licence=LICENCE)
 
 
-def styled(template: Template, style: str) -> Template:
-    """A human template in its own pose, of the mean of other people: the heaviest twentieth, or the smallest, who are
-    children (`STYLES`). `OptionError` as `meshmatch.generators.bodies.human_source`.
+def heavy(template: Template) -> Template:
+    """A human template in its own pose, of the mean of other people: the heaviest twentieth for their height. `OptionError`
+    as `meshmatch.generators.bodies.human_source`.
     """
     rig = cached_rig(_PEOPLE, 0)
     rest = rig.rest.float().numpy()
     height = np.ptp(rest[:, :, 1], axis=1)
     a, b, c = (rest[:, rig.faces.numpy()[:, corner]] for corner in range(3))
     weight = np.einsum("nfi,nfi->n", a, np.cross(b, c)) / height**3
-    order = np.argsort(-weight if style == "heavy" else height)
-    body = standing_body(rig, template.pose, order[: _PEOPLE // 20])
+    body = standing_body(rig, template.pose, np.argsort(-weight)[: _PEOPLE // 20])
     keep = cKDTree(template.dense.verts).query(template.shape.verts)[1]
     verts = sqrt_area_frame(body).apply(body.verts)
     shape, dense = Shape(verts[keep], template.shape.faces), Shape(verts, template.dense.faces)
-    return replace(template, name=f"{template.name}-{style}", shape=shape, dense=dense)
+    return replace(template, name=f"{template.name}-heavy", shape=shape, dense=dense)
 
 
 def diameter(shape: Shape) -> float:
