@@ -11,6 +11,7 @@ from pathlib import Path
 from meshmatch.api.matching import Matcher
 from meshmatch.experiments.bench import Method, OurMethod
 from meshmatch.experiments.classical_baselines import Registration, ZoomOut
+from meshmatch.experiments.orientation import upright
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.latent import LatentRefineConfig
@@ -23,17 +24,22 @@ from meshmatch.shapes.shape import Shape
 class Coded:
     """3D-CODED behind the benchmark's `Method`: its code is refined by the Chamfer distance alone.
 
-    ``model`` is a folder of `meshmatch.experiments.learned_baselines`: its losses had no constraint.
+    ``model`` is a folder of `meshmatch.experiments.learned_baselines`: its losses had no constraint. ``oriented_by``: a
+    model whose unrefined fit finds the orientation, which is then told.
     """
 
     model: str
     steps: int = 2000
     seed: int = 0
+    oriented_by: str = ""
 
     def fit(self, shape: Shape) -> Fit:
         """Orient, predict, search the code."""
         latent = replace(LatentRefineConfig(steps=self.steps), volume=0.0, arap=0.0)
         config = FitConfig(refine="latent", seed=self.seed, partial="no", latent=latent)
+        if self.oriented_by:
+            shape = upright(self.oriented_by, shape, self.seed)
+            config = replace(config, up="y", front="z")
         return Matcher(self.model, config).fit(shape)
 
     def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:

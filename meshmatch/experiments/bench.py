@@ -27,7 +27,7 @@ from meshmatch.api.matching import Matcher
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import MeshmatchError, OptionError
 from meshmatch.experiments import runner
-from meshmatch.experiments.orientation import frame_by, in_frame
+from meshmatch.experiments.orientation import upright
 from meshmatch.experiments.scores import SetScores, evaluate_set
 from meshmatch.experiments.sets import ALL_SETS, SET_NAMES, BenchSet, Pair, load_set
 from meshmatch.fitting.fit import Fit
@@ -78,9 +78,8 @@ class OurMethod:
         matcher = self._matcher()
         if not self.oriented_by:
             return matcher.fit(shape)
-        frame = frame_by(self.oriented_by, shape, self.seed)
-        upright = in_frame(shape, replace(frame, rotation=frame.turn))  # which is no mirror image
-        return matcher.fit(upright, replace(matcher.config, up="y", front="z"))
+        told = replace(matcher.config, up="y", front="z")
+        return matcher.fit(upright(self.oriented_by, shape, self.seed), told)
 
     def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:
         """Build the map from two fits."""

@@ -21,3 +21,9 @@ def frame_by(model: str, shape: Shape, seed: int = 0) -> Frame:
 def in_frame(shape: Shape, frame: Frame) -> Shape:
     """The same shape, vertex by vertex, in another frame than its file's."""
     return replace(shape, verts=frame.apply(shape.verts))
+
+
+def upright(model: str, shape: Shape, seed: int = 0) -> Shape:
+    """The same shape turned (and never mirrored) into the frame of a model's unrefined fit; errors as `frame_by`."""
+    frame = frame_by(model, shape, seed)
+    return in_frame(shape, replace(frame, rotation=frame.turn))

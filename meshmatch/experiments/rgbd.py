@@ -15,7 +15,8 @@ that fly, and points of no body, are in the clouds but have no answer.
 
 - truth: the source point nearest to the right place: the least that is possible.
 - ours: `meshmatch.transfer_colors`. coded: 3D-CODED (--coded, a folder of `experiments.learned_baselines`), its code
-  searched by the Chamfer distance, then the nearest point. rigid: scaled by area, all orientations tried, nearest point.
+  searched by the Chamfer distance, then the nearest point; --coded-by names a model that tells it the orientation. rigid:
+  scaled by area, all orientations tried, nearest point.
 
 Clouds, and the results of each pair and method, are kept in the output folder; the same command goes on from there.
 """
@@ -183,6 +184,7 @@ def main(
     methods: Annotated[str, Option(help=f"of {', '.join(NAMES)}")] = ",".join(NAMES),
     coded: Annotated[str | None, Option(help="a model folder of experiments.learned_baselines")] = None,
     coded_steps: Annotated[int, Option(min=1, help="of its search over codes")] = 200,
+    coded_by: Annotated[str, Option(help="a model that finds the orientation for it; none by default")] = "",
     picture: Annotated[Path | None, Option(help="draw the clouds of one person")] = None,
     person: Annotated[int, Option(min=0, help="whom the picture shows")] = 0,
     shown: Annotated[str, Option(help="numbers of views in the picture")] = "4",
@@ -199,8 +201,8 @@ def main(
     }
     settings: dict[str, Any] = {"ours": find_model(model)[1].weights_sha256}
     if coded is not None:
-        ways["coded"] = partial(by_coded, method=Coded(coded, coded_steps, seed), fits={})
-        settings["coded"] = [find_model(coded)[1].weights_sha256, coded_steps]
+        ways["coded"] = partial(by_coded, method=Coded(coded, coded_steps, seed, coded_by), fits={})
+        settings["coded"] = [find_model(coded)[1].weights_sha256, coded_steps, coded_by]
     elif "coded" in asked:
         asked.remove("coded")
         notes.append("3D-CODED is left out: give --coded MODEL, made by experiments.learned_baselines coded")

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import InputError, ModelError, OptionError
-from meshmatch.experiments import baseline_methods, classical_baselines, learned_baselines
+from meshmatch.experiments import baseline_methods, classical_baselines, learned_baselines, orientation
 from meshmatch.experiments.baseline_methods import METHODS, Baseline, Choices, Coded
 from meshmatch.experiments.baselines import main
 from meshmatch.experiments.bench import Method
@@ -25,6 +26,7 @@ from meshmatch.experiments.learned_baselines import (
     train_transmatch,
 )
 from meshmatch.experiments.transformer import TransConfig, Transformer
+from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
@@ -102,6 +104,28 @@ def test_a_ball_is_found_again_from_the_orientation_that_it_is_given(
     monkeypatch.setattr(classical_baselines, "frame_by", frame_by)
     found = method.map(source, method.fit(source), target, method.fit(target))
     assert np.linalg.norm(target.verts[found.index] - target.verts, axis=1).mean() < 0.06
+
+
+def test_3d_coded_can_be_told_how_a_shape_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    turn, asked = Rotation.from_rotvec([1.4, 0.4, -0.9]).as_matrix(), []
+
+    class Told:
+        def __init__(self, model: str, config: FitConfig) -> None:
+            self.config = config
+
+        def fit(self, shape: Shape) -> None:
+            asked.append((shape.verts, self.config))
+
+    monkeypatch.setattr(orientation, "frame_by", lambda *given: Frame(2.0, turn.T, np.zeros(3)))
+    monkeypatch.setattr(baseline_methods, "Matcher", Told)
+    ball = icosphere(1)
+    turned = Shape(ball.verts @ turn.T, ball.faces, "turned")
+    for model in ("", "human"):
+        Coded("coded", 7, 5, model).fit(turned)
+    (free, searched), (upright, told) = asked
+    assert np.array_equal(free, turned.verts) and np.allclose(2 * upright, ball.verts)
+    assert (searched.up, searched.front, told.up, told.front) == (None, None, "y", "z")
+    assert searched == replace(told, up=None, front=None)
 
 
 def test_zoomout_goes_on_from_a_map() -> None:

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.experiments import bench as command
+from meshmatch.experiments import orientation
 from meshmatch.experiments.bench import OurMethod, main, run_set, save_maps
 from meshmatch.experiments.sets import load_set
 from meshmatch.fitting.fit_config import FitConfig
@@ -152,7 +153,7 @@ def test_shapes_are_turned_upright_and_the_orientation_is_told(
         return frames[Path(shape.name).stem]
 
     monkeypatch.setattr(command, "Matcher", Told)
-    monkeypatch.setattr(command, "frame_by", frame_by)
+    monkeypatch.setattr(orientation, "frame_by", frame_by)
     words = ["--data", str(small), "--cache", str(kept), "--sets", "scape", "--model", "another", "--seed", "3"]
     assert main(words) == 0
     plain = capsys.readouterr().out.strip().splitlines()
