@@ -136,20 +136,22 @@ def _draw_bars(view: View, known: Known, sets: Sequence[str], path: Path) -> boo
 
 
 def _draw_lines(view: View, known: Known, sets: Sequence[str], path: Path) -> bool:
-    """A line of each method for the held-out bodies and each set."""
-    lines = {}
+    """A chart for the held-out bodies and each set, with a line for each method."""
+    charts, ticks = [], sorted({float(row.words[0]) for row in view.rows})
     for where in (HELD_OUT, *sets):
+        lines = {}
         for method in dict.fromkeys(row.words[-1] for row in view.rows):
             there = [(float(row.words[0]), known.error(row.run, where)) for row in view.rows if row.words[-1] == method]
             there = [(at, errors) for at, errors in there if errors]
             if there:
                 off = [stdev(errors) if len(errors) > 1 else 0.0 for _, errors in there]
                 points = [at for at, _ in there], [fmean(errors) for _, errors in there]
-                lines[f"{method}, {where}"] = Line(*points, off)
-    if lines:
-        ticks = sorted({float(row.words[0]) for row in view.rows})
-        draw_lines([Chart(view.heads[0], lines, ticks, True)], path, _AXIS)
-    return bool(lines)
+                lines[method] = Line(*points, off)
+        if lines:
+            charts.append(Chart(f"{view.heads[0]}, {where}", lines, ticks, True))
+    if charts:
+        draw_lines(charts, path, _AXIS)
+    return bool(charts)
 
 
 def _draw_descent(known: Known, path: Path) -> bool:

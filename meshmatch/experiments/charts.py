@@ -68,7 +68,7 @@ def draw_lines(charts: Sequence[Chart], path: str | Path, ylabel: str) -> None:
         lowest = min([*line.y, *line.spread, *(line.x if log else ())])
         if not np.isfinite(numbers).all() or lowest < 0:
             raise OptionError("a line needs values of 0 or more, and on a logarithmic axis places too")
-    with saved(path, 6.4, 3.6) as figure:
+    with saved(path, max(6.4, 3.2 * len(charts)), 3.6) as figure:
         row = figure.subplots(1, len(charts), sharey=True, squeeze=False)[0]
         for axes, chart in zip(row, charts, strict=True):
             _draw_chart(axes, chart, pens)
@@ -90,6 +90,7 @@ def _draw_chart(axes: Any, chart: Chart, pens: Mapping[str, Mapping[str, Any]]) 
             axes.set_xscale("log")
     if len(chart.ticks):
         axes.set_xticks(chart.ticks, [f"{tick:g}" for tick in chart.ticks])
+        axes.set_xticks([], minor=True)  # which a logarithmic axis shorter than a decade would name too
     axes.set_xlabel(short(chart.xlabel))
     for name, line in chart.lines.items():
         axes.plot(line.x, line.y, marker="o", clip_on=False, gid="named", label=short(name, 40), **pens[name])

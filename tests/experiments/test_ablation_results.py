@@ -1,14 +1,16 @@
 """Tables and claims about ablation runs, with numbers made up by hand."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from meshmatch.experiments.ablation_claims import Sample, claims, order, pairs_interval, seeds_interval
-from meshmatch.experiments.ablation_results import cost_table, number, tables
-from meshmatch.experiments.ablation_views import BASE, VIEWS, Known, Run, all_runs
+from meshmatch.experiments.ablation_results import cost_table, draw_views, number, tables
+from meshmatch.experiments.ablation_views import BASE, PAPER_SETS, VIEWS, Known, Run, all_runs, methods_of
 from meshmatch.experiments.runner import as_markdown
 
 SETS = ["scape"]
@@ -128,6 +130,15 @@ def test_table_7_says_what_each_rule_refuses() -> None:
     assert "| nodes by | template | rule refuses | steps |" in drawn["table7"]
     assert "| parts | T | 75.8 % | 7 | 2.00 |" in drawn["table7"] and "| uniform | T | 0.0 % | 7 |" in drawn["table7"]
     assert "refuses" not in drawn["table5"]
+
+
+def test_three_methods_are_drawn_at_every_place(tmp_path: Path) -> None:
+    runs = VIEWS["figure9"].runs
+    errors = {(run, where, how): {"mean_cm": 2.0} for run in runs for where in PAPER_SETS for how in methods_of(run)}
+    found = replace(known(dict.fromkeys(runs, 1.0)), errors=errors)
+    (path,) = draw_views(found, ["figure9"], PAPER_SETS, tmp_path)
+    with Image.open(path) as image:
+        assert path.name == "figure-9.png" and len(np.unique(np.asarray(image.convert("L")))) > 20
 
 
 def test_seeds_are_joined() -> None:
