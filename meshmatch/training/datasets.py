@@ -18,6 +18,7 @@ from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.generators.generator import Source
 from meshmatch.models.layers import BasisEncoder, PointEncoder
+from meshmatch.progress import Progress
 from meshmatch.templates.prepared_folder import ShapeSamples
 from meshmatch.training import scans
 from meshmatch.training.scans import ScanConfig, small_rotations
@@ -45,10 +46,12 @@ class DrawnOnce:
     others: Source
 
     @classmethod
-    def of(cls, source: Source, count: int, seed: int) -> Self:
+    def of(cls, source: Source, count: int, seed: int, progress: Progress) -> Self:
         """The first shapes that a source draws."""
-        generator = torch.Generator().manual_seed(seed)
-        blocks = [source(min(_BLOCK, count - start), generator) for start in range(0, count, _BLOCK)]
+        generator, blocks = torch.Generator().manual_seed(seed), []
+        for start in range(0, count, _BLOCK):
+            blocks.append(source(min(_BLOCK, count - start), generator))
+            progress(min(1.0, (start + _BLOCK) / count))
         return cls(registered_source(torch.cat(blocks)), source)
 
     def __call__(self, count: int, generator: torch.Generator) -> Float[Tensor, "B V 3"]:

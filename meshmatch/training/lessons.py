@@ -53,7 +53,9 @@ def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lesson
         kind = replace(kind, bodies=recipe.bodies)
     template = read_template(kind.template or recipe.template)
     source = people_source(template, kind, seed, progress)
-    return Lessons(template, DrawnOnce.of(source, kind.bodies, seed) if kind.bodies else source, "human", kind.words)
+    if kind.bodies:
+        source = DrawnOnce.of(source, kind.bodies, seed, progress)
+    return Lessons(template, source, "human", kind.words)
 
 
 def prepared(shapes: Path, recipe: Recipe) -> Lessons:
