@@ -1,7 +1,4 @@
-"""The atlas of a target: its own texture coordinates where they are valid, else new ones.
-
-New ones are made by xatlas: charts with little stretch, packed side by side.
-"""
+"""The atlas of a target: its own texture coordinates where they are valid, else new ones."""
 
 from __future__ import annotations
 
@@ -9,11 +6,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import xatlas
 
-from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.shape import Shape
+from meshmatch.transfer.new_charts import new_charts
 from meshmatch.transfer.texels import MOST_ROWS, faces_on, rows_of
 
 Keep = Literal["auto", "keep", "new"]
@@ -23,10 +20,6 @@ _OVERLAP = 0.002
 _MIN_USED, _MAX_STARVED = 0.05, 0.02
 # A triangle is starved if it has this share of the room that its area deserves.
 _STARVED = 1e-3
-# Charts are packed on a grid of at most this size, at several densities; the best result is taken.
-_GRID, _DENSITIES = 1024, (0.6, 0.5, 0.4)
-# Length of a chart's border, in units of sqrt(area): a longer one leaves much of a square empty.
-_MAX_BORDER = 3.0
 _MARGIN = 2
 # Length of an edge, in units of sqrt(area): xatlas takes seconds at this one, and hours at a few times as much.
 _MAX_EDGE = 500.0
@@ -99,7 +92,7 @@ def _flat_areas(corners: Floats) -> Floats:
 
 
 def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
-    """(F, 3, 2) new coordinates; `InputError` if xatlas cannot make them."""
+    """(F, 3, 2) new coordinates; `InputError` if none can be made."""
     real = np.flatnonzero(shape.face_areas > 0)
     used, corners = np.unique(shape.faces[real], return_inverse=True)
     verts = shape.verts[used]
@@ -109,19 +102,8 @@ def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
     try:
         if np.sqrt((edges**2).sum(axis=2).max()) > _MAX_EDGE:
             raise RuntimeError("it has triangles as thin as a thread")
-        maker, pack = xatlas.Atlas(), xatlas.PackOptions()
-        pack.resolution, pack.padding = 256, 0
-        maker.add_mesh(verts.astype(np.float32), corners.astype(np.uint32))
-        options = xatlas.ChartOptions()
-        options.max_boundary_length = _MAX_BORDER
-        maker.generate(options, pack)
-        origin, faces, uv = maker[0]
-        if not np.array_equal(origin[faces], corners):
-            raise RuntimeError("faces were lost")
-        charts = uv * (np.array([maker.width, maker.height]) / maker.texels_per_unit)
-        grid = min(size, _GRID)
-        uv = _packed(charts, faces, grid, padding * grid / size)
-    except (RuntimeError, IndexError) as error:
+        uv, faces = new_charts(verts, corners, size, padding)
+    except RuntimeError as error:
         problem = f"{shape.name or 'the target'} cannot be unwrapped ({error})"
         raise InputError(problem, "unwrap it in a modelling program, and use --uv keep") from error
     out = np.zeros((shape.F, 3, 2))
@@ -129,26 +111,3 @@ def unwrapped(shape: Shape, size: int, padding: int) -> Floats:
     margin = min(_MARGIN, padding) / size
     out[real] = margin + (1.0 - 2.0 * margin) * uv[faces]
     return out
-
-
-def _packed(charts: Floats, faces: Ints, grid: int, padding: float) -> Floats:
-    """(N, 2) charts side by side on about `grid` texels, `padding` apart: the most square of a few attempts of xatlas."""
-    area = float(_flat_areas(charts[faces]).sum())
-    best, most = charts, 0.0
-    for density in _DENSITIES:
-        packer, pack = xatlas.Atlas(), xatlas.PackOptions()
-        pack.texels_per_unit = grid * np.sqrt(density / area)
-        # what is shrunk to fit later must be further apart now
-        pack.padding, pack.bilinear = int(np.ceil(padding * np.sqrt(density / _DENSITIES[-1]))), True
-        packer.add_uv_mesh(charts.astype(np.float32), faces.astype(np.uint32))
-        packer.generate(xatlas.ChartOptions(), pack)
-        origin, again, uv = packer[0]
-        longest = max(packer.width, packer.height)
-        reached = area * (pack.texels_per_unit / longest) ** 2
-        if reached > most and np.array_equal(origin[again], faces):
-            placed = np.empty_like(charts)
-            placed[origin] = uv * (np.array([packer.width, packer.height]) / longest)
-            best, most = placed, reached
-    if not most:
-        raise RuntimeError("its charts could not be packed")
-    return best

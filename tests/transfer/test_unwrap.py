@@ -6,7 +6,7 @@ import pytest
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.triangles import face_parts
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer import unwrap
+from meshmatch.transfer import new_charts, unwrap
 from meshmatch.transfer.texels import faces_on, grown
 from meshmatch.transfer.unwrap import atlas_of, unwrapped
 from tests.conftest import icosphere
@@ -124,7 +124,7 @@ def test_what_cannot_be_unwrapped(torus: Shape, monkeypatch: pytest.MonkeyPatch)
     def fails(*_: object) -> None:
         raise RuntimeError("no")
 
-    monkeypatch.setattr(unwrap, "_packed", fails)
+    monkeypatch.setattr(unwrap, "new_charts", fails)
     with pytest.raises(InputError, match="cannot be unwrapped"):
         unwrapped(torus, 64, 2)
 
@@ -138,3 +138,18 @@ def test_a_thread_is_refused_before_it_takes_hours(thin: float, fine: bool) -> N
         return
     with pytest.raises(InputError, match="as thin as a thread"):
         unwrapped(thread, 64, 1)
+
+
+def test_charts_are_made_by_another_process(torus: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
+    # an atlas that is freed can stop its process for ever
+    monkeypatch.setattr(new_charts.xatlas, "Atlas", lambda: pytest.fail("an atlas was made here"))
+    assert np.isfinite(unwrapped(torus, 64, 2)).all()
+
+
+def test_what_goes_wrong_in_the_other_process_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    nowhere = np.array([[0, 1, 7]])
+    with pytest.raises(RuntimeError, match=r"\w"):
+        new_charts.new_charts(CORNERS, nowhere, 64, 2)
+    monkeypatch.setattr(new_charts, "_PROGRAM", "import os; os.abort()")
+    with pytest.raises(RuntimeError, match="ended with status -6"):
+        new_charts.new_charts(CORNERS, FACES, 64, 2)
