@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from meshmatch.api.matching import Matcher
-from meshmatch.experiments.bench import Method, OurMethod
+from meshmatch.experiments.bench_methods import Method, OurMethod
 from meshmatch.experiments.classical_baselines import Registration, ZoomOut
 from meshmatch.experiments.orientation import upright
 from meshmatch.fitting.fit import Fit

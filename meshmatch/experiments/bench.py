@@ -3,6 +3,8 @@
 A pair that cannot be matched is not left out: it counts as the map that sends every vertex to vertex 0. --limit-pairs
 measures a stated part and says so.
 
+--output FOLDER keeps fits and maps: the same command goes on where it was stopped, and `--maps FOLDER/maps` measures anew.
+
 --oriented-by MODEL asks what --model is worth where the orientation is no question: every shape is first turned into the
 frame of that model's unrefined fit, and up and front are told. Maps are between the same vertices, and measured as ever.
 """
@@ -17,73 +19,30 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 from rich.table import Table
 from typer import Option
 
-from meshmatch.api.matching import Matcher
+from meshmatch.api.inputs import as_model
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import MeshmatchError, OptionError
 from meshmatch.experiments import runner
-from meshmatch.experiments.orientation import upright
+from meshmatch.experiments.bench_methods import Method, OurMethod
 from meshmatch.experiments.scores import SetScores, evaluate_set
 from meshmatch.experiments.sets import ALL_SETS, SET_NAMES, BenchSet, Pair, load_set
-from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.fit_config import ON_NODES, FitConfig, Partial, Refine
+from meshmatch.fitting.fit_config import Refine
 from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.geodesics import GEODESIC
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.models.registry import find_model
 from meshmatch.outputs import make_folder
 from meshmatch.render.charts import draw_curves
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import set_threads
 
 Maps = Mapping[Pair, Int[Ints, " V_src"]]
-
-
-class Method(Protocol):
-    """What is measured: something that fits one shape, and makes a map of two fits. It must survive a pickle."""
-
-    def fit(self, shape: Shape) -> Any:
-        """Whatever is worth knowing about one shape."""
-
-    def map(self, source: Shape, source_fit: Any, target: Shape, target_fit: Any) -> VertexMap:
-        """The map between two shapes that were fitted."""
-
-
-@dataclass(frozen=True)
-class OurMethod:
-    """This project with its options.
-
-    ``oriented_by``: a model whose unrefined fit finds the orientation; then a fit searches only what is left of it.
-    """
-
-    model: str = "human"
-    refine: Refine = "nodes"
-    seed: int = 0
-    partial: Partial = "auto"
-    threads: int = 1
-    oriented_by: str = ""  # a model; empty: the fitted model searches by itself
-
-    def _matcher(self) -> Matcher:
-        config = FitConfig(refine=self.refine, seed=self.seed, partial=self.partial)
-        return Matcher(self.model, config, self.threads)
-
-    def fit(self, shape: Shape) -> Fit:
-        """Fit the model's template to the shape."""
-        matcher = self._matcher()
-        if not self.oriented_by:
-            return matcher.fit(shape)
-        told = replace(matcher.config, up="y", front="z")
-        return matcher.fit(upright(self.oriented_by, shape, self.seed), told)
-
-    def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:
-        """Build the map from two fits."""
-        return self._matcher().map(source_fit, target_fit, agree=self.refine in ON_NODES)
 
 
 @dataclass(frozen=True)
@@ -94,6 +53,15 @@ class _Work:
     method: Method
     threads: int
     fits: dict[str, Any]
+    kept: Path | None  # folder of fits and maps, of `OurMethod` only
+
+    def fit_file(self, name: str) -> Path | None:
+        """Where the fit of a shape is kept, if at all."""
+        return None if self.kept is None else self.kept / "fits" / self.bench.name / f"{name}.safetensors"
+
+    def map_file(self, pair: Pair) -> Path | None:
+        """Where the map of a pair is kept, if at all."""
+        return None if self.kept is None else _map_path(self.kept / "maps", self.bench, pair)
 
 
 _work: _Work | None = None
@@ -112,13 +80,20 @@ def _seen(bench: BenchSet, name: str) -> Shape:
 
 def _fit_one(name: str) -> tuple[str, Any, float]:
     assert _work is not None
-    shape = _seen(_work.bench, name)
+    shape, method, file = _seen(_work.bench, name), _work.method, _work.fit_file(name)
+    if file is not None and file.is_file():
+        fit = method.recall(file, shape)  # type: ignore[attr-defined]
+        return name, fit, fit.seconds
     started = time.perf_counter()
     try:
-        fit = _work.method.fit(shape)
+        fit = method.fit(shape)
     except MeshmatchError as error:
-        fit = error
-    return name, fit, time.perf_counter() - started
+        return name, error, time.perf_counter() - started
+    seconds = time.perf_counter() - started
+    if file is not None:
+        make_folder(file.parent)
+        method.keep(file, replace(fit, seconds=seconds))  # type: ignore[attr-defined]
+    return name, fit, seconds
 
 
 def _map_one(pair: Pair) -> tuple[Pair, Ints | MeshmatchError, float]:
@@ -128,12 +103,19 @@ def _map_one(pair: Pair) -> tuple[Pair, Ints | MeshmatchError, float]:
         if isinstance(fit, MeshmatchError):
             return pair, fit, 0.0
     source, target = (_seen(_work.bench, name) for name in pair)
+    file = _work.map_file(pair)
+    if file is not None and file.is_file():
+        return pair, load_map(file, source, target).index, 0.0
     started = time.perf_counter()
     try:
         index = _work.method.map(source, fits[0], target, fits[1]).index
     except MeshmatchError as error:
         return pair, error, time.perf_counter() - started
-    return pair, index, time.perf_counter() - started
+    seconds = time.perf_counter() - started
+    if file is not None:
+        make_folder(file.parent)
+        save_map(file, VertexMap(*pair, index))
+    return pair, index, seconds
 
 
 def _each(task: Any, items: Sequence[Any], work: _Work, jobs: int) -> Iterator[Any]:
@@ -185,39 +167,35 @@ def run_set(
     cache: Path | None = None,
     jobs: int = 1,
     threads: int = 1,
-    save: Path | None = None,
+    kept: Path | None = None,
 ) -> SetRun:
-    """Fit every shape of ``pairs`` once, map every pair, measure all of them."""
+    """Fit every shape of ``pairs`` once, map every pair, measure all of them.
+
+    With ``kept``, a folder, fits and maps of `OurMethod` are written there, and those that are there are not made again.
+    """
     names = sorted({name for pair in pairs for name in pair}, key=bench.shapes.index)
     fits: dict[str, Any] = {}
     fit_seconds: dict[str, float] = {}
-    work = _each(_fit_one, names, _Work(bench, method, threads, {}), jobs)
+    work = _each(_fit_one, names, _Work(bench, method, threads, {}, kept), jobs)
     for name, fit, seconds in runner.track(work, f"{bench.name}: fitting", len(names)):
         fits[name], fit_seconds[name] = fit, seconds
     maps: dict[Pair, Ints] = {}
     map_seconds: dict[Pair, float] = {}
     failed: dict[Pair, str] = {}
-    work = _each(_map_one, pairs, _Work(bench, method, threads, fits), jobs)
+    work = _each(_map_one, pairs, _Work(bench, method, threads, fits, kept), jobs)
     for pair, index, seconds in runner.track(work, f"{bench.name}: mapping", len(pairs)):
         if isinstance(index, MeshmatchError):
             failed[pair] = index.message
             maps[pair] = np.zeros(bench.shape(pair[0]).V, dtype=np.int64)
         else:
-            maps[pair], map_seconds[pair] = index, seconds
-    if save is not None:
-        save_maps(save, bench, maps)
+            maps[pair] = index
+            if seconds:
+                map_seconds[pair] = seconds
     return SetRun(evaluate_set(bench, maps, pairs=pairs, cache=cache), fit_seconds, map_seconds, failed, fits)
 
 
 def _map_path(folder: Path, bench: BenchSet, pair: Pair) -> Path:
     return folder / bench.name / f"{pair[0]}-{pair[1]}.npy"
-
-
-def save_maps(folder: Path, bench: BenchSet, maps: Maps) -> None:
-    """Keep maps as ``folder/set/source-target.npy``, where `load_maps` finds them."""
-    make_folder(folder / bench.name)
-    for pair, index in maps.items():
-        save_map(_map_path(folder, bench, pair), VertexMap(*pair, index))
 
 
 def load_maps(folder: Path, bench: BenchSet, pairs: Iterable[Pair]) -> dict[Pair, Ints]:
@@ -258,14 +236,18 @@ def main(
     threads: runner.Threads = 1,
     cache: runner.Cache = None,
     maps: Annotated[Path | None, Option(help="measure DIR/set/source-target.npy instead")] = None,
-    save_maps: Annotated[Path | None, Option(help="keep the maps in this folder")] = None,
+    output: Annotated[Path | None, Option(help="keep fits and maps in this folder, and go on with those there")] = None,
     curve: Annotated[Path | None, Option(help="draw the cumulative curves into this file")] = None,
 ) -> runner.Report:
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
     if oriented_by and maps is not None:
         raise OptionError("maps that are given cannot be oriented anew", "leave out --oriented-by or --maps")
-    if oriented_by:
-        find_model(oriented_by)  # else a wrong name would cost every pair
+    if maps is None:
+        weights = as_model(model).card.weights_sha256  # a wrong name would cost every pair
+        told = as_model(oriented_by).card.weights_sha256 if oriented_by else ""
+        if output is not None:
+            asked = {"weights": weights, "oriented_by": told, "refine": refine, "seed": seed, "threads": threads}
+            runner.once(output / "asked.json", asked, lambda: runner.circumstances(threads, jobs))
     method = OurMethod(model, refine, seed, threads=threads, oriented_by=oriented_by)
     runs: list[SetRun] = []
     for bench in benches:
@@ -274,7 +256,7 @@ def main(
             given = evaluate_set(bench, load_maps(maps, bench, pairs), pairs=pairs, cache=cache)
             runs.append(SetRun(given, {}, {}, {}, {}))
         else:
-            runs.append(run_set(bench, method, pairs, cache=cache, jobs=jobs, threads=threads, save=save_maps))
+            runs.append(run_set(bench, method, pairs, cache=cache, jobs=jobs, threads=threads, kept=output))
     scores = [each.scores for each in runs]
     if curve is not None:
         draw_curves({each.bench.name: each.joined for each in scores}, curve)

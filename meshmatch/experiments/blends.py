@@ -22,7 +22,7 @@ from typer import BadParameter, Option
 
 from meshmatch.api.inputs import as_model, validated
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench import OurMethod
+from meshmatch.experiments.bench_methods import OurMethod
 from meshmatch.experiments.sets import BenchSet, load_set
 from meshmatch.fields.field import arap_energy, volume_energy
 from meshmatch.fitting.blend import WAYS, Blend, Way

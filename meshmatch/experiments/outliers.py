@@ -19,7 +19,7 @@ from typer import Option
 
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench import Method, OurMethod
+from meshmatch.experiments.bench_methods import Method, OurMethod
 from meshmatch.experiments.scores import summary
 from meshmatch.maps.evaluate import CM_PER_UNIT, LOST_CM, Errors
 from meshmatch.shapes.shape import Shape

@@ -21,7 +21,7 @@ from typer import Option
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench import OurMethod
+from meshmatch.experiments.bench_methods import OurMethod
 from meshmatch.experiments.scores import TruthDistances, area_under_curve, joined_errors, summary
 from meshmatch.experiments.sets import SET_NAMES, BenchSet, load_set
 from meshmatch.fitting.fit import Fit

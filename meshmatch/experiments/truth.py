@@ -35,7 +35,8 @@ from meshmatch.api.results import shape_of
 from meshmatch.arrays import Ints
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench import Maps, Method, OurMethod
+from meshmatch.experiments.bench import Maps
+from meshmatch.experiments.bench_methods import Method, OurMethod
 from meshmatch.experiments.scores import summary
 from meshmatch.experiments.sets import BenchSet, Pair, load_set
 from meshmatch.experiments.truths import Truths, consensus_points

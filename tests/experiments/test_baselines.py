@@ -15,7 +15,7 @@ from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.experiments import baseline_methods, classical_baselines, learned_baselines, orientation
 from meshmatch.experiments.baseline_methods import METHODS, Baseline, Choices, Coded
 from meshmatch.experiments.baselines import main
-from meshmatch.experiments.bench import Method
+from meshmatch.experiments.bench_methods import Method
 from meshmatch.experiments.classical_baselines import Registration, ZoomOut, carried, library, placed
 from meshmatch.experiments.learned_baselines import (
     TransBatch,

@@ -1,6 +1,7 @@
 """The benchmark's command: fits once, maps every pair, speaks in a table and a JSON line."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.experiments import bench as command
-from meshmatch.experiments import orientation
-from meshmatch.experiments.bench import OurMethod, main, run_set, save_maps
+from meshmatch.experiments import bench_methods, orientation
+from meshmatch.experiments.bench import main, run_set
+from meshmatch.experiments.bench_methods import OurMethod
 from meshmatch.experiments.sets import load_set
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.geometry.frames import Frame
@@ -17,6 +19,16 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from tests.experiments.small_bench import BODY, Oracle, build, truth
+
+SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
+
+
+@dataclass(frozen=True)
+class Named:
+    """A fit that is only a shape's name, and how long it took."""
+
+    name: str
+    seconds: float = 0.0
 
 
 @pytest.fixture(scope="module")
@@ -82,11 +94,21 @@ def test_a_bug_is_not_a_failed_pair(small: Path, kept: Path, monkeypatch: pytest
 def test_the_command(
     small: Path, kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(command.OurMethod, "fit", lambda self, shape: Oracle().fit(shape))
-    monkeypatch.setattr(command.OurMethod, "map", lambda self, *pair: Oracle().map(*pair))
+    fitted: list[str] = []
+
+    def fit(self: OurMethod, shape: Shape) -> Named:
+        fitted.append(shape.name)
+        return Named(Oracle().fit(shape))
+
+    monkeypatch.setattr(command.OurMethod, "fit", fit)
+    monkeypatch.setattr(command.OurMethod, "keep", lambda self, path, fit: path.write_text(fit.name))
+    monkeypatch.setattr(command.OurMethod, "recall", lambda self, path, shape: Named(path.read_text(), 7.0))
+    monkeypatch.setattr(
+        command.OurMethod, "map", lambda self, a, fit_a, b, fit_b: Oracle().map(a, fit_a.name, b, fit_b.name)
+    )
     words = ["--data", str(small), "--cache", str(kept), "--refine", "none", "--seed", "3"]
-    saved, curve = tmp_path / "maps", tmp_path / "curve.png"
-    assert main([*words, "--save-maps", str(saved), "--curve", str(curve)]) == 0
+    output, curve = tmp_path / "kept", tmp_path / "curve.png"
+    assert main([*words, "--output", str(output), "--curve", str(curve)]) == 0
     lines = capsys.readouterr().out.strip().splitlines()
     record = json.loads(lines[-1])
     assert {name: part["pairs"] for name, part in record["sets"].items()} == {"shrec19": 3, "scape": 2, "faust": 6}
@@ -96,8 +118,20 @@ def test_the_command(
     assert {"date", "commit", "machine", "geodesic", "seconds"} <= set(record)
     assert all(words in "".join(lines[:-1]) for words in ("shrec19", "same subject", "Dijkstra"))
     assert curve.stat().st_size > 1000
-    # The saved maps give the same numbers.
-    assert main(["--data", str(small), "--cache", str(kept), "--maps", str(saved), "--sets", "faust,scape"]) == 0
+    # What was kept is not made again, what is missing is, and other choices are refused.
+    (output / "fits" / "faust" / "tr_reg_001.safetensors").unlink()
+    (output / "maps" / "faust" / "tr_reg_000-tr_reg_001.npy").unlink()
+    fitted.clear()
+    assert main([*words, "--output", str(output), "--sets", "faust"]) == 0
+    again = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert [Path(name).stem for name in fitted] == ["tr_reg_001"]
+    assert again["sets"]["faust"]["mean_cm"] == 0
+    assert again["sets"]["faust"]["fit_seconds_max"] == 7.0
+    assert main([*words[:-1], "4", "--output", str(output), "--sets", "faust"]) == 1
+    assert "other choices (seed)" in capsys.readouterr().err
+    # The kept maps give the same numbers.
+    maps = str(output / "maps")
+    assert main(["--data", str(small), "--cache", str(kept), "--maps", maps, "--sets", "faust,scape"]) == 0
     again = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
     assert again["sets"]["faust"]["mean_cm"] == 0
     assert list(again["sets"]) == ["faust", "scape"]
@@ -116,7 +150,9 @@ def test_the_command_speaks_of_the_users_mistakes(
     assert main(["--data", str(small), "--sets", "tosca"]) == 1
     assert "unknown set 'tosca'" in capsys.readouterr().err
     bench = load_set("scape", small)
-    save_maps(tmp_path, bench, {pair: truth(*pair) for pair in bench.pairs})
+    (tmp_path / "scape").mkdir()
+    for pair in bench.pairs:
+        np.save(tmp_path / "scape" / f"{pair[0]}-{pair[1]}.npy", truth(*pair))
     words = ["--data", str(small), "--cache", str(kept), "--maps", str(tmp_path), "--sets", "scape"]
     assert main(words) == 0
     np.save(tmp_path / "scape" / "mesh000-mesh001.npy", np.full(BODY.V, BODY.V + 3))
@@ -138,7 +174,7 @@ def test_shapes_are_turned_upright_and_the_orientation_is_told(
         """Knows every map, and keeps what it was asked to fit."""
 
         def __init__(self, model: str, config: FitConfig, threads: int) -> None:
-            assert model == "another"
+            assert model == "hand"
             self.config = config
 
         def fit(self, shape: Shape, config: FitConfig | None = None) -> str:
@@ -152,9 +188,9 @@ def test_shapes_are_turned_upright_and_the_orientation_is_told(
         assert (model, seed) == ("human", 3)
         return frames[Path(shape.name).stem]
 
-    monkeypatch.setattr(command, "Matcher", Told)
+    monkeypatch.setattr(bench_methods, "Matcher", Told)
     monkeypatch.setattr(orientation, "frame_by", frame_by)
-    words = ["--data", str(small), "--cache", str(kept), "--sets", "scape", "--model", "another", "--seed", "3"]
+    words = ["--data", str(small), "--cache", str(kept), "--sets", "scape", "--model", "hand", "--seed", "3"]
     assert main(words) == 0
     plain = capsys.readouterr().out.strip().splitlines()
     assert [config for _, config in told] == [None, None] and "oriented" not in plain[0]
@@ -195,3 +231,17 @@ def test_what_cannot_orient_is_named_before_anything_is_fitted(
     assert "nobody" in capsys.readouterr().err
     assert main(["--data", str(small), "--oriented-by", "human", "--maps", str(tmp_path)]) == 1
     assert "cannot be oriented anew" in capsys.readouterr().err
+
+
+def test_a_fit_that_was_kept_maps_as_before(tmp_path: Path) -> None:
+    """In the frame that another model found, too."""
+    shapes = [load_shape(SAMPLES / name) for name in ("dancer.ply", "climber.ply")]
+    method = OurMethod(oriented_by="human")
+    fits = [method.fit(shape) for shape in shapes]
+    again = []
+    for shape, fit in zip(shapes, fits, strict=True):
+        method.keep(tmp_path / "fit.safetensors", fit)
+        again.append(method.recall(tmp_path / "fit.safetensors", shape))
+    before, after = (method.map(shapes[0], pair[0], shapes[1], pair[1]) for pair in (fits, again))
+    np.testing.assert_array_equal(before.index, after.index)
+    assert again[0].seconds == fits[0].seconds > 0

@@ -1,0 +1,67 @@
+"""What the benchmark measures: the interface of a method, and this project behind it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.matching import Matcher
+from meshmatch.collections.fit_files import load_fit, save_fit
+from meshmatch.experiments.orientation import upright
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import ON_NODES, FitConfig, Partial, Refine
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.shape import Shape
+
+
+class Method(Protocol):
+    """What is measured: something that fits one shape, and makes a map of two fits. It must survive a pickle."""
+
+    def fit(self, shape: Shape) -> Any:
+        """Whatever is worth knowing about one shape."""
+
+    def map(self, source: Shape, source_fit: Any, target: Shape, target_fit: Any) -> VertexMap:
+        """The map between two shapes that were fitted."""
+
+
+@dataclass(frozen=True)
+class OurMethod:
+    """This project with its options.
+
+    ``oriented_by``: a model whose unrefined fit finds the orientation; then a fit searches only what is left of it.
+    """
+
+    model: str = "human"
+    refine: Refine = "nodes"
+    seed: int = 0
+    partial: Partial = "auto"
+    threads: int = 1
+    oriented_by: str = ""  # a model; empty: the fitted model searches by itself
+
+    def _matcher(self) -> Matcher:
+        config = FitConfig(refine=self.refine, seed=self.seed, partial=self.partial)
+        return Matcher(self.model, config, self.threads)
+
+    def fit(self, shape: Shape) -> Fit:
+        """Fit the model's template to the shape."""
+        matcher = self._matcher()
+        if not self.oriented_by:
+            return matcher.fit(shape)
+        told = replace(matcher.config, up="y", front="z")
+        return matcher.fit(upright(self.oriented_by, shape, self.seed), told)
+
+    def keep(self, path: Path, fit: Fit) -> None:
+        """Write a fit, for `recall`."""
+        save_fit(path, fit, words={"seconds": fit.seconds})
+
+    def recall(self, path: Path, shape: Shape) -> Fit:
+        """The fit of this shape from a file that `keep` wrote; `MeshmatchError` if it is of another template, or damaged."""
+        known = load_fit(path, as_model(self.model).template)
+        clean = validated(upright(self.oriented_by, shape, self.seed) if self.oriented_by else shape)
+        return replace(known.fit, verts=clean.shape.verts, repaired=clean, seconds=float(known.words["seconds"]))
+
+    def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:
+        """Build the map from two fits."""
+        return self._matcher().map(source_fit, target_fit, agree=self.refine in ON_NODES)
