@@ -152,7 +152,9 @@ class TrainOptions:
         help="Learn without correspondence even if the shapes are registered; others always are.",
     )
     preset: Literal["default", "paper"] = Option(
-        "default", help="The recipe: what measured best, or the paper's network, losses and rates."
+        "default",
+        help="The recipe: what measured best, or the paper's network, losses and rates; with "
+        "--implicit DIF-Net's as published.",
     )
     field: Literal["mls", "rbf", "pointwise"] | None = Option(
         None,

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 _ENERGIES = ("volume", "arap", "blend")
 _IMPLICIT = (
-    *("implicit", "shapes", "field", "rate", *_ENERGIES, "name", "category", "licence", "steps"),
+    *("implicit", "preset", "shapes", "field", "rate", *_ENERGIES, "name", "category", "licence", "steps"),
     *("minutes", "workers", "threads", "seed", "picture", "fresh"),
 )
 
@@ -23,11 +23,17 @@ def train_shapes(output: Path, how: Any, json: bool, console: Console) -> None:
     refuse_given(how, _IMPLICIT, "--implicit")
     if how.shapes is None or how.field == "rbf":
         raise OptionError("--implicit needs --shapes, and the field mls or pointwise", "give a folder of shapes")
-    if how.field == "pointwise":  # DIF-Net's deformation: these are energies of the other
-        refuse_given(how, set(_IMPLICIT).difference(_ENERGIES), "--implicit --field pointwise")
+    published = how.preset == "paper"
+    if published and how.field == "mls":
+        raise OptionError(
+            "--implicit --preset paper is DIF-Net as published, of the field pointwise", "leave out --field"
+        )
+    if published or how.field == "pointwise":  # DIF-Net's deformation: these are energies of the other
+        other = "--preset paper" if published else "--field pointwise"
+        refuse_given(how, set(_IMPLICIT).difference(_ENERGIES), f"--implicit {other}")
     with needs("torch", "implicit"):
         from meshmatch.implicit.network import ImplicitConfig
-        from meshmatch.implicit.training import TRAINING, train_implicit
+        from meshmatch.implicit.training import AS_PUBLISHED, DIF_NET, TRAINING, train_implicit
         from meshmatch.models.implicit_card import read_implicit_card
         from meshmatch.training.train import CHECKPOINT, CardFacts
     if how.picture is not None:
@@ -37,8 +43,9 @@ def train_shapes(output: Path, how: Any, json: bool, console: Console) -> None:
     check_writable(how.picture)
     weights = {name: value for name in _ENERGIES if (value := getattr(how, name)) is not None}
     chosen = {name: value for name in ("rate", "steps", "workers") if (value := getattr(how, name)) is not None}
-    loss = replace(TRAINING.loss, **weights)
-    training = replace(TRAINING, minutes=how.minutes, threads=how.threads, seed=how.seed, loss=loss, **chosen)
+    usual = AS_PUBLISHED if published else TRAINING
+    loss = replace(usual.loss, **weights)
+    training = replace(usual, minutes=how.minutes, threads=how.threads, seed=how.seed, loss=loss, **chosen)
     facts = CardFacts(how.name or "", how.category or "", "", how.licence)
     if not how.fresh and (output / CHECKPOINT).is_file():
         console.say(f"going on from the checkpoint in {output}; --fresh starts anew")
@@ -49,7 +56,7 @@ def train_shapes(output: Path, how: Any, json: bool, console: Console) -> None:
             reports.append(now)
             progress(now.words, "training", now.step / now.steps)
 
-        config = ImplicitConfig(how.field or "mls")
+        config = DIF_NET if published else ImplicitConfig(how.field or "mls")
         train_implicit(
             output, how.shapes, config=config, training=training, facts=facts, resume=not how.fresh, report=report
         )

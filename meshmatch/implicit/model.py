@@ -35,7 +35,7 @@ _FAIR_SHARE, _POOR_SHARE = 0.03, 0.1  # shares without counterpart above which a
 _REACH = 4.0  # % of the longest side: what is further from the other surface has no counterpart; set by hand
 _NEWTON, _ONTO, _STEP = 12, 3, 0.1  # steps back to a shape, steps onto its surface, and their longest
 _COARSE = 48  # resolution of the surface that a fit is judged by
-_MOST = {"code": 1024, "width": 2048, "depth": 16, "inner": 512}  # that a card may ask for
+_MOST = {"code": 1024, "width": 2048, "depth": 16, "inner": 512, "layers": 16, "maker": 4096}  # that a card may ask for
 
 
 @dataclass(frozen=True, eq=False)

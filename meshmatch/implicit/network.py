@@ -33,8 +33,9 @@ _GAIN = 5.0
 
 @dataclass(frozen=True)
 class ImplicitConfig:
-    """Sizes: of codes, of the template's network, and of the networks that a code makes (``inner``); nodes near surfaces,
-    their radius in mean distances to the next node, and the frequency that sines begin with.
+    """Sizes: of codes, of the template's network, of the networks that a code makes (``inner`` wide, ``layers`` deep) and of
+    what makes them (``maker``); nodes near surfaces, their radius in mean distances to the next node, the frequency that
+    sines begin with, and how long a code is at first.
     """
 
     field: Deformation = "mls"
@@ -46,6 +47,9 @@ class ImplicitConfig:
     reach: float = 1.7
     frequency: float = 15.0
     kernel: Kernel = "smooth"
+    layers: int = 2
+    maker: int = 128
+    length: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +88,10 @@ class HyperNetwork(nn.Module):
 
     def __init__(self, config: ImplicitConfig, outputs: int) -> None:
         super().__init__()
-        self.frequency, self.sizes = config.frequency, [3, config.inner, config.inner, outputs]
+        self.frequency, self.sizes = config.frequency, [3, *[config.inner] * config.layers, outputs]
         self.counts = [count for a, b in pairwise(self.sizes) for count in (a * b, b)]
-        last = nn.Linear(128, sum(self.counts))
-        self.maker = nn.Sequential(nn.Linear(config.code, 128), nn.ReLU(), last)
+        last = nn.Linear(config.maker, sum(self.counts))
+        self.maker = nn.Sequential(nn.Linear(config.code, config.maker), nn.ReLU(), last)
         bounds = np.repeat(_sine_bounds(self.sizes, self.frequency), 2)
         bounds[-2:] *= 0.1  # hardly a deformation at first
         start = [float(bound) * (2 * torch.rand(n) - 1) for n, bound in zip(self.counts, bounds, strict=True)]
@@ -166,7 +170,7 @@ class ImplicitNetwork(nn.Module):
     def __init__(self, config: ImplicitConfig, S: int, nodes: torch.Tensor, radii: torch.Tensor) -> None:
         super().__init__()
         self.config = config
-        self.codes = nn.Parameter(torch.randn(S, config.code) / math.sqrt(config.code))
+        self.codes = nn.Parameter(torch.randn(S, config.code) * config.length / math.sqrt(config.code))
         self.template = SineNetwork(config.width, config.depth, config.frequency)
         kind = ReducedDeformation if config.field == "mls" else PointwiseDeformation
         self.deformation = kind(config, nodes, radii)

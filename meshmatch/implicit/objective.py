@@ -9,12 +9,13 @@ import torch
 
 from meshmatch.arrays import Float, Int
 from meshmatch.fields.field import arap_energy, volume_energy
-from meshmatch.implicit.network import ImplicitNetwork, ReducedDeformation
+from meshmatch.implicit.network import Evaluated, ImplicitNetwork, ReducedDeformation
 from meshmatch.implicit.samples import FAR
 from meshmatch.training.datasets import OnDevice
 from meshmatch.training.losses import Objective, Terms
 
 _BLENDED = 4  # every so many-th point for the energies between codes
+_CLAMPED = 0.5  # signed distances of ``published``
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +30,8 @@ class ImplicitBatch(OnDevice):
 class ImplicitLoss(Objective):
     """DIF-Net's terms (docs/method.md); volume, arap and blend (L_Z) are of the reduced field alone.
 
-    Where a distance is not known (NaN), only ``off`` and ``eikonal`` act.
+    Where a distance is not known (NaN), only ``off`` and ``eikonal`` act. ``published``: the terms as DIF-Net has them;
+    then distances are clamped, smoothness is the mean over rows, and of every second free point no distance is used.
     """
 
     needs_correspondence: ClassVar[bool] = False
@@ -43,6 +45,7 @@ class ImplicitLoss(Objective):
     off: float = 0.1
     smooth: float = 5e-3
     prior: float = 1e-3
+    published: bool = False
 
     def __call__(self, model: Any, batch: ImplicitBatch, points: None, generator: torch.Generator) -> Terms:
         return self.of(model, model.codes[batch.shape], batch.rows, generator)
@@ -60,6 +63,8 @@ class ImplicitLoss(Objective):
         said = distance[..., 0].isfinite()
         truth = distance[..., 0].nan_to_num(nan=1.0)
         found = model(at, code)
+        if self.published:
+            return self._published(found, code, truth, said, normals)
         known = normals.square().sum(-1) > 0
         angles = (
             2 - sum(torch.cosine_similarity(g, normals, -1) for g in (found.gradient, found.template_gradient))
@@ -80,4 +85,24 @@ class ImplicitLoss(Objective):
             F = eye + model.deformation.at(at[:, ::_BLENDED]).jacobian(between)
             terms |= self.rigidity(found.F)
             terms["blend"] = self.blend * (volume_energy(F).mean() + arap_energy(F).mean())
+        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+    def _published(
+        self, found: Evaluated, code: torch.Tensor, truth: torch.Tensor, said: torch.Tensor, normals: torch.Tensor
+    ) -> Terms:
+        half = said.shape[1] // 2  # the first half lies on the surface
+        said = said.clone()
+        said[:, half::2] = False
+        near, goal = (each.clamp(-_CLAMPED, _CLAMPED) for each in (found.distance, truth))
+        angles = sum(1 - torch.cosine_similarity(g, normals, -1) for g in (found.gradient, found.template_gradient))
+        turned = found.F - torch.eye(3).to(found.F)
+        terms = {
+            "sdf": self.sdf * ((near - goal).abs() * said).mean(),
+            "normal": self.normal * (angles * (normals.square().sum(-1) > 0)).mean(),
+            "eikonal": self.eikonal * ((found.gradient.square().sum(-1) + 1e-12).sqrt() - 1).abs().mean(),
+            "off": self.off * (torch.exp(-100 * found.distance.abs()) * ~said).mean(),
+            "smooth": self.smooth * (turned.square().sum(-1) + 1e-12).sqrt().mean(),
+            "correct": self.correct * found.correction.abs().mean(),
+            "prior": self.prior * code.square().mean(),
+        }
         return {"total": torch.stack(list(terms.values())).sum(), **terms}

@@ -30,6 +30,12 @@ TRAINING = TrainConfig(
     steps=1500, shapes=6, warm_up=50, decay=0.7, weight_decay=0.0, average=0.99, workers=0, loss=ImplicitLoss()
 )
 """How an implicit model is trained unless said otherwise."""
+DIF_NET = ImplicitConfig("pointwise", 128, 128, 4, 128, frequency=30.0, layers=4, maker=256, length=0.01 * 128**0.5)
+"""The sizes that DIF-Net was published with; and its terms and weights, relative to each other, at its rate:"""
+AS_PUBLISHED = replace(
+    TRAINING, rate=1e-4, warm_up=0, decay=0.0, average=0.0, momentum=0.999, clip=None,
+    loss=ImplicitLoss(volume=0.0, arap=0.0, blend=0.0, off=0.5, prior=1e3, published=True),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from meshmatch.cli import main
 from meshmatch.geometry.triangles import is_watertight
 from meshmatch.implicit import training
 from meshmatch.implicit.codes import fit_implicit
+from meshmatch.implicit.model import load_implicit
 from meshmatch.implicit.training import train_implicit
 from meshmatch.models.implicit_card import IMPLICIT, is_implicit, read_implicit_card
 from meshmatch.training.train import CHECKPOINT
@@ -61,7 +62,8 @@ def test_a_folder_becomes_a_model_and_goes_on(folder: Path, tmp_path: Path, caps
     [
         (["--field", "rbf"], "mls or pointwise"),
         (["--unsupervised"], "--unsupervised does not go"),
-        (["--preset", "paper"], "--preset does not go"),
+        (["--preset", "paper", "--field", "mls"], "leave out --field"),
+        (["--preset", "paper", "--arap", "0.001"], "--arap does not go with --implicit --preset paper"),
         (["--bf16"], "--bf16 does not go"),
         *(
             (["--field", "pointwise", energy, "0.001"], f"{energy} does not go with --implicit --field pointwise")
@@ -76,6 +78,16 @@ def test_what_does_not_go_with_it_is_told(
     assert main(["train", "--implicit", "--shapes", str(folder), "-o", str(output), *words]) == 1
     assert said in capsys.readouterr().err
     assert not (output / IMPLICIT).exists()
+
+
+def test_dif_net_as_it_was_published(folder: Path, tmp_path: Path) -> None:
+    words = ["train", "--implicit", "--shapes", str(folder), "-o", str(tmp_path), "--preset", "paper", "--steps", "1"]
+    assert main(words) == 0
+    card = read_implicit_card(tmp_path)
+    assert card.network["field"] == "pointwise"
+    assert [card.network[name] for name in ("code", "width", "inner", "maker", "frequency")] == [128, 128, 128, 256, 30]
+    assert (card.recipe["rate"], card.recipe["loss"]["published"], card.recipe["loss"]["off"]) == (1e-4, True, 0.5)
+    assert load_implicit(tmp_path).network.config.layers == 4
 
 
 def test_a_folder_is_needed(tmp_path: Path, capsys: Capture) -> None:

@@ -10,7 +10,7 @@ import torch
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.implicit.model import load_implicit
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
-from meshmatch.implicit.training import train_implicit
+from meshmatch.implicit.training import AS_PUBLISHED, build_implicit, train_implicit
 from meshmatch.models.implicit_card import IMPLICIT
 from meshmatch.models.registry import WEIGHTS
 from meshmatch.shapes.sampling import sample_surface
@@ -45,6 +45,43 @@ def test_a_stopped_training_ends_where_an_unbroken_one_does(
     torch.rand(17)  # another process has another global stream
     train_implicit(broken, samples, **settings)
     assert (broken / WEIGHTS).read_bytes() == (whole / WEIGHTS).read_bytes()
+
+
+def test_published_terms_are_dif_nets(samples: ImplicitSamples) -> None:
+    """By gradients that torch makes, for one shape."""
+    made = build_implicit(samples, replace(config("pointwise"), length=0.1), 0).double()
+    rows = torch.from_numpy(samples.rows[:1, ::400].astype(np.float64))
+    at, distance, normals = rows[..., :3].clone().requires_grad_(), rows[..., 3].clone(), rows[..., 4:]
+    half = at.shape[1] // 2
+    distance[0, half + 1] = 3.0  # beyond what is told apart
+    rows = torch.cat([rows[..., :3], distance[..., None], normals], -1)
+    loss = AS_PUBLISHED.loss
+    terms = loss.of(made, made.codes[:1], rows, torch.Generator())
+
+    def slope(values: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
+        return torch.autograd.grad(values.sum(), of, retain_graph=True)[0][0]
+
+    f, there = made.distance(at, made.codes[:1])
+    u = there - at
+    base = there.detach().requires_grad_()
+    turned, steep = (slope(*each) for each in ((f, at), (made.template(base), base)))
+    known = torch.ones(at.shape[1], dtype=torch.bool)
+    known[half::2] = False
+    off = 1 - torch.nn.functional.cosine_similarity(turned, normals[0], dim=-1)
+    off = off + 1 - torch.nn.functional.cosine_similarity(steep, normals[0], dim=-1)
+    expected = {
+        "sdf": 3.0 * ((f[0].clamp(-0.5, 0.5) - distance[0].clamp(-0.5, 0.5)).abs() * known).mean(),
+        "normal": 0.1 * (off * (normals[0].norm(dim=-1) > 0)).mean(),
+        "eikonal": 0.05 * (turned.norm(dim=-1) - 1).abs().mean(),
+        "off": 0.5 * ((-100 * f[0].abs()).exp() * ~known).mean(),
+        "smooth": 5e-3 * torch.stack([slope(u[..., k], at).norm(dim=-1) for k in range(3)]).mean(),
+        "correct": 0.1 * (f - made.template(there)[..., 0]).abs().mean(),
+        "prior": 1e3 * made.codes[0].square().mean(),
+    }
+    assert {name: float(value.detach()) for name, value in terms.items() if name != "total"} == pytest.approx(
+        {name: float(value.detach()) for name, value in expected.items()}, rel=1e-4
+    )
+    assert float(terms["total"].detach()) == pytest.approx(float(sum(expected.values()).detach()), rel=1e-4)
 
 
 def every_step(stop):
