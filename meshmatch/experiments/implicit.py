@@ -2,7 +2,8 @@
 
 For each kind both learn the same shapes with the same template, correction, losses, batches and steps
 (`meshmatch.implicit`); only the deformation differs, and that the reduced field has energies (volume, rigidity,
-also between codes) which are cheap for it. Measured on the shapes of the training, whose parts are known:
+also between codes) which are cheap for it. `published` is DIF-Net with its own sizes, terms, weights and rate. Measured on
+the shapes of the training, whose parts are known:
 
 reconstruction: Chamfer distance (both ways, mean, % of the longest side) and IoU of the insides;
 labels: part IoU where each point of one shape takes the part of the nearest point of another on the template, by position
@@ -40,7 +41,7 @@ from meshmatch.fields.field import arap_energy, volume_energy
 from meshmatch.implicit.model import ImplicitFit, ImplicitModel, load_implicit, nearest_on_template
 from meshmatch.implicit.network import ImplicitConfig
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
-from meshmatch.implicit.training import TRAINING, ImplicitDataset, build_implicit, train_implicit
+from meshmatch.implicit.training import AS_PUBLISHED, DIF_NET, TRAINING, ImplicitDataset, build_implicit, train_implicit
 from meshmatch.models.implicit_card import IMPLICIT
 from meshmatch.outputs import make_folder
 from meshmatch.render.figures import Panel
@@ -50,7 +51,7 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.training.loop import TrainConfig, Trainer
 
-METHODS = {"DIF-Net": "pointwise", "reduced": "mls"}
+METHODS = {"DIF-Net": "pointwise", "reduced": "mls", "published": "published"}  # and what their folders are called
 FRAMES = 5
 _POINTS = 2000
 _LABELLED, _PAIRS = 64, 50  # shapes whose points have labels, and pairs of them for each that is compared
@@ -241,7 +242,7 @@ def draw(path: Path, models: Mapping[tuple[str, str], ImplicitModel], pair: tupl
 def main(
     work: Annotated[Path, Option(help="where finished work is kept")] = Path("runs/implicit"),
     kinds: Annotated[str, Option(help=f"of {', '.join(KINDS)}")] = ",".join(KINDS),
-    methods: Annotated[str, Option(help=f"of {', '.join(METHODS)}")] = ",".join(METHODS),
+    methods: Annotated[str, Option(help=f"of {', '.join(METHODS)}")] = "DIF-Net,reduced",
     shapes: Annotated[int, Option(min=4, help="of each kind")] = 500,
     steps: Annotated[int, Option(min=1)] = 1000,
     seeds: Annotated[int, Option(min=1, help="trainings of each, on the same shapes")] = 1,
@@ -259,11 +260,13 @@ def main(
         points = labelled_points(kind, chosen, seed)
         pairs = [(chosen[a], chosen[b]) for a, b in pairs_of(len(chosen), _PAIRS * compared, seed)]
         for method in runner.names_of(methods, METHODS, "method"):
-            config = ImplicitConfig(METHODS[method])  # type: ignore[arg-type]
+            published = method == "published"
+            config = DIF_NET if published else ImplicitConfig(METHODS[method])  # type: ignore[arg-type]
+            usual = AS_PUBLISHED if published else TRAINING
             trainings = []
             for number in range(seed, seed + seeds):
-                loss = replace(TRAINING.loss, correct=correct)
-                training = replace(TRAINING, steps=steps, seed=number, checkpoint_minutes=1.0, loss=loss)
+                loss = replace(usual.loss, correct=correct)
+                training = replace(usual, steps=steps, seed=number, checkpoint_minutes=1.0, loss=loss)
                 folder = work / f"{kind}-{METHODS[method]}-{number}"
                 if correct != _CORRECT:
                     folder = folder.with_name(f"{folder.name}-correct{correct:g}")

@@ -73,7 +73,7 @@ def main(
     data: runner.Data = runner.DATA,
     work: Annotated[Path, Option(help="where `experiments.implicit` keeps its models")] = Path("runs/implicit"),
     kinds: Annotated[str, Option(help=f"of {', '.join(KINDS)}")] = ",".join(KINDS),
-    methods: Annotated[str, Option(help=f"of {', '.join(METHODS)}")] = ",".join(METHODS),
+    methods: Annotated[str, Option(help=f"of {', '.join(METHODS)}")] = "DIF-Net,reduced",
     steps: Annotated[int, Option(min=1, help="on the code of a shape")] = 200,
     model_seed: Annotated[int, Option(min=0, help="of the trainings")] = 0,
     seed: runner.Seed = 0,

@@ -9,6 +9,7 @@ import torch
 
 from meshmatch.errors import ModelError, OptionError
 from meshmatch.implicit.model import load_implicit
+from meshmatch.implicit.objective import ImplicitLoss
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
 from meshmatch.implicit.training import AS_PUBLISHED, build_implicit, train_implicit
 from meshmatch.models.implicit_card import IMPLICIT
@@ -82,6 +83,25 @@ def test_published_terms_are_dif_nets(samples: ImplicitSamples) -> None:
         {name: float(value.detach()) for name, value in expected.items()}, rel=1e-4
     )
     assert float(terms["total"].detach()) == pytest.approx(float(sum(expected.values()).detach()), rel=1e-4)
+
+
+def test_energies_between_codes_are_those_of_the_blended_field(samples: ImplicitSamples) -> None:
+    """L_Z: of the deformation that a random blend of neighbouring codes makes."""
+    made = build_implicit(samples, config("mls"), 0).double()
+    with torch.no_grad():
+        made.deformation.decoder[-1].weight.mul_(100)  # a deformation that is seen
+    rows = torch.from_numpy(samples.rows[:2, ::400].astype(np.float64))
+    loss = ImplicitLoss(blend=0.7)
+    found = loss.of(made, made.codes[:2], rows, torch.Generator().manual_seed(5))["blend"]
+    share = torch.rand(2, 1, generator=torch.Generator().manual_seed(5)).to(rows)
+    code = share * made.codes[:2] + (1 - share) * made.codes[[1, 0]]
+    at, h = rows[:, ::4, :3], 1e-5
+    ends = [[made.distance(at + s * h * torch.eye(3).to(at)[k], code)[1] for s in (1, -1)] for k in range(3)]
+    F = torch.stack([(a - b) / (2 * h) for a, b in ends], -1)
+    volume = (torch.linalg.det(F) - 1).square().mean()
+    arap = torch.linalg.matrix_norm(F.transpose(-1, -2) @ F - torch.eye(3).to(F)).mean()
+    assert volume > 1e-3
+    assert float(found.detach()) == pytest.approx(0.7 * float((volume + arap).detach()), rel=1e-3)
 
 
 def every_step(stop):

@@ -145,6 +145,16 @@ def test_the_positional_encoding_lies_on_a_sphere() -> None:
     assert there[64 + 5] == pytest.approx(0.0, abs=1e-6)
 
 
+def test_the_positional_encodings_frequencies_are_gaussian() -> None:
+    torch.manual_seed(0)
+    waves = torch.cat([PointEncoder(8, latent=8).frequencies for _ in range(50)])  # 3,200
+    assert waves.mean(0).abs().max() < 0.1
+    assert (waves.std(0) - 1.5).abs().max() < 0.1  # alike along every axis
+    assert waves.T.cov().fill_diagonal_(0).abs().max() < 0.15
+    fourth = (waves / waves.std(0)).pow(4).mean(0)
+    assert (fourth - 3).abs().max() < 0.5  # 1.8 where they are uniform, 1 where they are two numbers
+
+
 def test_basis_features_are_offsets() -> None:
     encoder = BasisEncoder(torch.tensor([[0.0, 0, 0], [1, 1, 1]]), 8, 1, 4)
     points = torch.tensor([[[0.2, 0, 0], [1, 1, 1.4]]])

@@ -1,6 +1,7 @@
 """Control nodes: whatever the strategy, every vertex has four non-coplanar ones in reach, or an error names it."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -188,6 +189,20 @@ def test_spectral_clusters_tell_two_parts_apart(sphere: Shape) -> None:
     labels = spectral_clusters(two, 2, np.random.default_rng(0))
     assert set(labels[: sphere.V]) != set(labels[sphere.V :])
     assert len(set(labels)) == 2
+
+
+def test_spectral_clusters_are_of_the_first_four_eigenfunctions(sphere: Shape, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in the paper, beside the constant one."""
+    asked: list[int] = []
+    solve = make.eigsh
+
+    def counted(matrix: Any, count: int, *others: Any, **more: Any) -> Any:
+        asked.append(count)
+        return solve(matrix, count, *others, **more)
+
+    monkeypatch.setattr(make, "eigsh", counted)
+    spectral_clusters(sphere, 3, np.random.default_rng(0))
+    assert asked == [1 + 4]
 
 
 def test_spectral_clusters_are_all_used_and_connected_pieces(ring: Shape) -> None:
