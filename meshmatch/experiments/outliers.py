@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
 from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,6 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 from typer import Option
 
+from meshmatch.api.inputs import as_model
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench_methods import Method, OurMethod
@@ -51,24 +53,43 @@ def load_clouds(data: Path) -> list[Shape]:
     return [Shape(cloud, np.empty((0, 3), np.int64), f"cloud {k}") for k, cloud in enumerate(points)]
 
 
-def measure(clouds: Sequence[Shape], method: Method, limit: int | None) -> dict[str, Any]:
-    """Match every ordered pair of corresponding clouds, or ``limit`` of them evenly spread, and measure every row."""
-    fits = [method.fit(cloud) for cloud in runner.track(clouds, "fitting")]
+def measure(
+    clouds: Sequence[Shape],
+    method: Method,
+    limit: int | None,
+    work: Path | None = None,
+    asked: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Match every ordered pair of corresponding clouds, or ``limit`` of them evenly spread, and measure every row.
+
+    What is finished is kept in ``work``, with what was ``asked`` for.
+    """
+    fit_of = cache(lambda number: method.fit(clouds[number]))
     every = list(permutations(range(len(clouds)), 2))
     pairs = runner.spread(every, limit)
-    errors, trusted = [], []
-    for a, b in runner.track(pairs, "matching"):
-        found = method.map(clouds[a], fits[a], clouds[b], fits[b])
+
+    def matched(a: int, b: int) -> dict[str, Any]:
+        found = method.map(clouds[a], fit_of(a), clouds[b], fit_of(b))
         there = clouds[b].verts
-        errors.append(100 * np.linalg.norm(there[found.index] - there, axis=1))
-        trusted.append(found.confidence > 0.5)
-    joined, confident = np.concatenate(errors), np.concatenate(trusted)
+        cm = 100 * np.linalg.norm(there[found.index] - there, axis=1)
+        return {"cm": cm, "trusted": (found.confidence > 0.5).tolist()}
+
+    told = [
+        runner.at_work(work, f"cloud-{k}", asked or {}, lambda: {"verdict": fit_of(k).verdict})["verdict"]  # noqa: B023
+        for k in runner.track(range(len(clouds)), "fitting")
+    ]
+    results = [
+        runner.at_work(work, f"{a}-{b}", asked or {}, partial(matched, a, b))
+        for a, b in runner.track(pairs, "matching")
+    ]
+    errors = [np.array(each["cm"], np.float32) for each in results]
+    joined, confident = np.concatenate(errors), np.concatenate([each["trusted"] for each in results])
     return {
         "pairs": f"{len(pairs)} of {len(every)}",
         **summary([Errors(each / CM_PER_UNIT) for each in errors]),
         "confident_share": float(confident.mean()),
         "confident_mean_cm": float(joined[confident].mean()) if confident.any() else None,
-        "verdicts": dict(Counter(fit.verdict for fit in fits)),
+        "verdicts": dict(Counter(told)),
     }
 
 
@@ -79,8 +100,10 @@ def main(
     limit_pairs: runner.LimitPairs = None,
     model: runner.Model = "human",
     seed: runner.Seed = 0,
+    work: runner.Work = None,
 ) -> runner.Report:
-    record = measure(load_clouds(data)[:limit], OurMethod(model, seed=seed), limit_pairs)
+    asked = {"weights": as_model(model).card.weights_sha256, "seed": seed}
+    record = measure(load_clouds(data)[:limit], OurMethod(model, seed=seed), limit_pairs, work, asked)
     words = ", ".join(f"{count} {verdict}" for verdict, count in record["verdicts"].items())
     title = "Clouds with outliers, straight distance in cm, outliers counted"
     return runner.Report(record, [runner.table(title, [record | {"words": words}], COLUMNS)])

@@ -13,12 +13,16 @@ those above; 0.5 is guessing. --partial auto is what `meshmatch match` does, no 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
+from functools import cache as remembered
+from functools import partial as bound
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from typer import Option
 
+from meshmatch.api.inputs import as_model
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench_methods import OurMethod
@@ -68,29 +72,48 @@ def seen_faces(shape: Shape, centers: Float[Floats, "F 3"], direction: Float[Flo
 
 
 def measure(
-    bench: BenchSet, kind: Kind, whole: OurMethod, part: OurMethod, limit: int | None, cache: Path | None
+    bench: BenchSet,
+    kind: Kind,
+    whole: OurMethod,
+    part: OurMethod,
+    limit: int | None,
+    cache: Path | None,
+    work: Path | None = None,
+    asked: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Errors of ``limit`` pairs, evenly spread; every pair counts. ``part`` fits the sources, ``whole`` the targets."""
-    fits: dict[str, Fit] = {}
-    parts: dict[str, tuple[Shape, Ints, Fit]] = {}
-    errors, confidence = [], []
-    pairs = runner.spread(bench.pairs, limit)
-    for source, target in runner.track(pairs, f"{bench.name}: {kind}"):
-        if target not in fits:
-            fits[target] = whole.fit(bench.shape(target))
-        if source not in parts:
-            piece, used = part_of(bench.shape(source), kind, whole.seed + bench.shapes.index(source))
-            parts[source] = piece, used, part.fit(piece)
-        piece, used, fit = parts[source]
-        found = whole.map(piece, fit, bench.shape(target), fits[target])
+    """Errors of ``limit`` pairs, evenly spread; every pair counts. ``part`` fits the sources, ``whole`` the targets.
+
+    Distances are kept in ``cache``, and finished pairs in ``work``, with what was ``asked`` for.
+    """
+
+    @remembered
+    def fit_of(target: str) -> Fit:
+        return whole.fit(bench.shape(target))
+
+    @remembered
+    def piece_of(source: str) -> tuple[Shape, Ints, Fit]:
+        piece, used = part_of(bench.shape(source), kind, whole.seed + bench.shapes.index(source))
+        return piece, used, part.fit(piece)
+
+    def matched(source: str, target: str) -> dict[str, Any]:
+        piece, used, fit = piece_of(source)
+        found = whole.map(piece, fit, bench.shape(target), fit_of(target))
         landmarks = bench.landmarks(source)
         left = np.flatnonzero(np.isin(landmarks, used))
         at = np.searchsorted(used, landmarks[left])
         answers = bench.landmarks(target).copy()
         answers[left] = found.index[at]
         truth = TruthDistances(bench.shape(target), bench.landmarks(target), cache)
-        errors.append(Errors(truth.errors([answers])[0][left]))
-        confidence.append(found.confidence[at])
+        errors = truth.errors([answers])[0][left]
+        return {"errors": errors, "confidence": found.confidence[at], "partial": fit.partial}
+
+    pairs = runner.spread(bench.pairs, limit)
+    results = [
+        runner.at_work(work, f"{bench.name}-{kind}-{source}-{target}", asked or {}, bound(matched, source, target))
+        for source, target in runner.track(pairs, f"{bench.name}: {kind}")
+    ]
+    errors = [Errors(np.array(each["errors"])) for each in results]
+    taken = {source: each["partial"] for (source, _), each in zip(pairs, results, strict=True)}
     joined = joined_errors(errors)
     return {
         "set": bench.name,
@@ -98,8 +121,8 @@ def measure(
         "pairs": f"{len(pairs)} of {len(bench.pairs)}",
         **summary(errors),
         "mean_cm": float(np.mean([each.mean_cm for each in errors])),
-        "auc": area_under_curve(np.concatenate(confidence), joined.cm <= LOST_CM),
-        "taken_for_parts": sum(fit.partial for _, _, fit in parts.values()) / len(parts),
+        "auc": area_under_curve(np.concatenate([each["confidence"] for each in results]), joined.cm <= LOST_CM),
+        "taken_for_parts": sum(taken.values()) / len(taken),
     }
 
 
@@ -112,10 +135,12 @@ def main(
     seed: runner.Seed = 0,
     data: runner.Data = runner.DATA,
     cache: runner.Cache = None,
+    work: runner.Work = None,
 ) -> runner.Report:
     benches = [load_set(name, data) for name in runner.names_of(sets, SET_NAMES, "set")]
     methods = OurMethod(model, seed=seed), OurMethod(model, seed=seed, partial=partial)
-    rows = [measure(bench, kind, *methods, limit_pairs, cache) for bench in benches for kind in KINDS]
+    asked = {"weights": as_model(model).card.weights_sha256, "seed": seed, "partial": partial}
+    rows = [measure(bench, kind, *methods, limit_pairs, cache, work, asked) for bench in benches for kind in KINDS]
     return runner.Report({"rows": rows}, [runner.table("Parts matched to wholes, cm at 1.9 m2", rows, COLUMNS)])
 
 

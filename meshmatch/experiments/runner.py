@@ -44,6 +44,7 @@ Seed = Annotated[int, typer.Option(min=0)]
 Threads = Annotated[int, typer.Option(min=1, help="threads of each process")]
 Jobs = Annotated[int, typer.Option(min=1, help="processes")]
 LimitPairs = Annotated[int | None, typer.Option(min=1, help="pairs of each set, evenly spread")]
+Work = Annotated[Path | None, typer.Option(help="keep what is finished in this folder, and go on with what is there")]
 Cache = Annotated[Path | None, typer.Option(help="folder of kept geodesic distances (10 GB for all sets)")]
 
 
@@ -264,3 +265,10 @@ def once(path: Path, asked: Mapping[str, Any], measure: Callable[[], Mapping[str
     """A kept result, measured and written where there is none: a run that was stopped goes on with what is missing."""
     found = recall(path, asked)
     return keep(path, asked, measure()) if found is None else found
+
+
+def at_work(
+    work: Path | None, name: str, asked: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]
+) -> dict[str, Any]:
+    """As `once`, in a file of this name; measured anew where there is no folder for it."""
+    return plain(measure()) if work is None else once(work / f"{name}.json", asked, measure)

@@ -72,8 +72,13 @@ def test_the_command_counts_what_is_left(
             known.used[part.hash] = used
     monkeypatch.setattr(partial, "OurMethod", lambda *_, **__: known)
     words = ["--sets", "shrec19", "--data", str(data), "--cache", str(tmp_path / "kept"), "--partial", "yes"]
+    words += ["--work", str(tmp_path / "work")]
     assert main(words) == 0
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    # again, of what was kept
+    monkeypatch.setattr(Known, "map", lambda *_: pytest.fail("a pair was matched again"))
+    assert main(words) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["rows"] == record["rows"]
     assert [row["part"] for row in record["rows"]] == list(partial.KINDS)
     for found in record["rows"]:
         assert (found["set"], found["pairs"]) == ("shrec19", "3 of 3")
