@@ -246,6 +246,7 @@ def descend(
         how = refinement_of(run, method, measure)
         assert how is not None
         errors, seconds = [], []
+        refined(model, starts[0], replace(how, steps=1), measure.seed)  # what is made once is no step's
         for steps in counts:
             began = time.process_time()
             changed: Refinement = replace(how, steps=steps) if steps else None

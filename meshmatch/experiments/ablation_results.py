@@ -43,9 +43,9 @@ def errors_table(view: View, known: Known, sets: Sequence[str], budget: str) -> 
     rows = []
     for each in view.rows:
         run, record = each.run, known.trained.get(each.run, {})
-        words = [word.format(rule=record.get("rule", run.strategy)) for word in each.words]
+        words = [word.format(rule=known.rule(run)) for word in each.words]
         row: dict[str, Any] = dict(zip(view.heads, words, strict=True))
-        row["refused"] = known.refused.get(run.name)
+        row["refused"] = known.refused.get(run.name, {}).get("refused")
         rows.append(row)
         if "skipped" in record:
             row["steps"] = "cannot be"
@@ -125,7 +125,7 @@ def _draw_bars(view: View, known: Known, sets: Sequence[str], path: Path) -> boo
             errors = known.error(row.run, where)
             if errors and row.method == "code":
                 words = ", ".join(
-                    f"{head} {word.format(rule=row.run.strategy)}"
+                    f"{head} {word.format(rule=known.rule(row.run))}"
                     for head, word in zip(view.heads, row.words, strict=True)
                 )
                 bar = Bar(words, fmean(errors), f"{number(errors)} cm", row.run == BASE)

@@ -170,7 +170,7 @@ VIEWS = {
         "Table 7",
         ("nodes by", "template"),
         tuple(
-            Row((how, pose), replace(BASE, strategy=how, pose=pose), _PAPER7[how, pose])
+            Row(("{rule}", pose), replace(BASE, strategy=how, pose=pose), _PAPER7[how, pose])
             for how in STRATEGIES
             for pose in "TA"
         ),
@@ -258,7 +258,7 @@ class Known:
     trained : {run: record}
     errors : {(run, set, method): record}
     times, memory : {name of a run: record}
-    refused : {name of a run: share of the candidates that its rule refuses}
+    refused : {name of a run: {"refused": share of the candidates that its rule refuses, "milder": rules tried after it}}
     descent : what `meshmatch.experiments.ablation_errors.descend` found, if it was measured
     """
 
@@ -267,7 +267,12 @@ class Known:
     times: Mapping[str, Mapping[str, Any]]
     memory: Mapping[str, Mapping[str, Any]]
     descent: Mapping[str, Any] | None = None
-    refused: Mapping[str, float] = field(default_factory=dict)
+    refused: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def rule(self, run: Run) -> str:
+        """How nodes were chosen in the end, in words."""
+        words = str(self.trained.get(run, {}).get("rule", run.strategy))
+        return f"{words}, milder" if self.refused.get(run.name, {}).get("milder") else words
 
     def error(self, run: Run, where: str, method: str | None = None, what: str = "mean_cm") -> list[float]:
         """Errors in cm of a run and its repetitions with other seeds; ``where`` is a set, or `HELD_OUT`.

@@ -194,16 +194,16 @@ class Kept:
         return self.answer(self.folder / "figure6.json", asked, measured)
 
     def _refused(self, run: Run) -> dict[str, Any]:
-        return {**self.here(), "refused": self.setting.refused(run)}
+        return {**self.here(), "refused": self.setting.refused(run), "milder": self.setting.milder(run)}
 
-    def refused(self) -> dict[str, float]:
-        """By name of table 7's runs, the share of candidates that their rules refuse."""
+    def refused(self) -> dict[str, dict[str, Any]]:
+        """By name of table 7's runs, the share of candidates that their rules refuse, and whether milder ones were taken."""
         shares = {}
         for run in VIEWS["table7"].runs:
             path = self.folder / run.name / "refused.json"
             found = self.answer(path, self.asked(run), partial(self._refused, run))
             if found is not None:
-                shares[run.name] = float(found["refused"])
+                shares[run.name] = found
         return shares
 
     def known(self, runs: Sequence[Run], views: Sequence[str], rounds: int) -> Known:

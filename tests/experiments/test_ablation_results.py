@@ -125,10 +125,18 @@ def test_costs_are_told_by_their_ratios() -> None:
 
 def test_table_7_says_what_each_rule_refuses() -> None:
     uniform = replace(BASE, strategy="uniform")
-    found = replace(known({BASE: 2.0, uniform: 3.0}), refused={BASE.name: 0.758, uniform.name: 0.0})
+    found = known({BASE: 2.0, uniform: 3.0})
+    found = replace(
+        found,
+        trained={run: {**record, "rule": run.strategy} for run, record in found.trained.items()},
+        refused={BASE.name: {"refused": 0.758, "milder": 2}, uniform.name: {"refused": 0.0}},
+    )
     drawn = {view: as_markdown(tables(found, [view], [], "")[0]) for view in ("table7", "table5")}
     assert "| nodes by | template | rule refuses | steps |" in drawn["table7"]
-    assert "| parts | T | 75.8 % | 7 | 2.00 |" in drawn["table7"] and "| uniform | T | 0.0 % | 7 |" in drawn["table7"]
+    assert (
+        "| parts, milder | T | 75.8 % | 7 | 2.00 |" in drawn["table7"]
+        and "| uniform | T | 0.0 % | 7 |" in drawn["table7"]
+    )
     assert "refuses" not in drawn["table5"]
 
 
