@@ -90,7 +90,13 @@ def _coded(choices: Choices) -> list[Baseline]:
     if choices.coded is None:
         return [Baseline("coded", "3D-CODED", None, _NOT_GIVEN.format("coded"))]
     card, method = find_model(choices.coded)[1], Coded(choices.coded, choices.coded_steps, choices.seed)
-    return [Baseline("coded", "3D-CODED", method, "", card.training_minutes, card.weights_sha256)]
+    oriented = replace(method, oriented_by=choices.model)
+    told = f"{card.weights_sha256} {find_model(choices.model)[1].weights_sha256}"
+    minutes = card.training_minutes
+    return [
+        Baseline("coded", "3D-CODED", method, "", minutes, card.weights_sha256),
+        Baseline("coded-oriented", "3D-CODED, our orientation", oriented, "", minutes, told),
+    ]
 
 
 def _transmatch(choices: Choices) -> list[Baseline]:

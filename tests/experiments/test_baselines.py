@@ -249,7 +249,7 @@ def test_what_is_not_there_is_skipped_with_a_reason(
     late = [*words, "--sets", "scape", "--minutes", "0", "--methods", "rigid,coded", "--coded", "human"]
     assert main([*late, "--output", str(tmp_path / "new"), "--coded-steps", "7"]) == 0
     skipped = answer(capsys)[1]["skipped"]
-    assert len(skipped) == 2 and all("the time was up" in why for why in skipped.values())
+    assert len(skipped) == 3 and all("the time was up" in why for why in skipped.values())
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -272,7 +272,7 @@ def test_our_own_rows() -> None:
     plain, refined = METHODS["ours"](choices)
     assert (plain.method.refine, refined.method.refine, refined.method.seed) == ("none", "nodes", 5)  # type: ignore[union-attr]
     assert refined.minutes and refined.minutes > 0
-    assert [row.method for row in METHODS["coded"](choices)] == [Coded("human", 7, 5)]
+    assert [row.method for row in METHODS["coded"](choices)] == [Coded("human", 7, 5), Coded("human", 7, 5, "human")]
     assert [row.method for row in METHODS["transmatch"](choices)] == [None]
 
 
