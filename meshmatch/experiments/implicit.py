@@ -248,6 +248,7 @@ def main(
     seeds: Annotated[int, Option(min=1, help="trainings of each, on the same shapes")] = 1,
     compared: Annotated[int, Option(min=1, help="shapes reconstructed, and pairs of interpolations")] = 6,
     correct: Annotated[float, Option(min=0, help="weight of the correction's size in the loss")] = _CORRECT,
+    energies: Annotated[float, Option(min=0, help="of the reduced field, in units of the usual weights")] = 1.0,
     picture: Annotated[Path | None, Option(help="figure 12, a PNG")] = None,
     seed: runner.Seed = 0,
     threads: runner.Threads = 1,
@@ -265,11 +266,14 @@ def main(
             usual = AS_PUBLISHED if published else TRAINING
             trainings = []
             for number in range(seed, seed + seeds):
-                loss = replace(usual.loss, correct=correct)
+                weights = {name: energies * getattr(usual.loss, name) for name in ("volume", "arap", "blend")}
+                loss = replace(usual.loss, correct=correct, **weights)
                 training = replace(usual, steps=steps, seed=number, checkpoint_minutes=1.0, loss=loss)
                 folder = work / f"{kind}-{METHODS[method]}-{number}"
                 if correct != _CORRECT:
                     folder = folder.with_name(f"{folder.name}-correct{correct:g}")
+                if energies != 1.0:
+                    folder = folder.with_name(f"{folder.name}-energies{energies:g}")
                 model = trained(folder, samples, config, training)
                 models.setdefault((kind, method), model)
                 asked = {"shapes": shapes, "steps": steps, "compared": compared, "seed": seed}
