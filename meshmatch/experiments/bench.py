@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -53,15 +53,11 @@ class _Work:
     method: Method
     threads: int
     fits: dict[str, Any]
-    kept: Path | None  # folder of fits and maps, of `OurMethod` only
-
-    def fit_file(self, name: str) -> Path | None:
-        """Where the fit of a shape is kept, if at all."""
-        return None if self.kept is None else self.kept / "fits" / self.bench.name / f"{name}.safetensors"
+    kept: Path | None  # folder of maps
 
     def map_file(self, pair: Pair) -> Path | None:
         """Where the map of a pair is kept, if at all."""
-        return None if self.kept is None else _map_path(self.kept / "maps", self.bench, pair)
+        return None if self.kept is None else _map_path(self.kept, self.bench, pair)
 
 
 _work: _Work | None = None
@@ -80,20 +76,14 @@ def _seen(bench: BenchSet, name: str) -> Shape:
 
 def _fit_one(name: str) -> tuple[str, Any, float]:
     assert _work is not None
-    shape, method, file = _seen(_work.bench, name), _work.method, _work.fit_file(name)
-    if file is not None and file.is_file():
-        fit = method.recall(file, shape)  # type: ignore[attr-defined]
-        return name, fit, fit.seconds
+    shape = _seen(_work.bench, name)
     started = time.perf_counter()
     try:
-        fit = method.fit(shape)
+        fit = _work.method.fit(shape)
     except MeshmatchError as error:
-        return name, error, time.perf_counter() - started
-    seconds = time.perf_counter() - started
-    if file is not None:
-        make_folder(file.parent)
-        method.keep(file, replace(fit, seconds=seconds))  # type: ignore[attr-defined]
-    return name, fit, seconds
+        fit = error
+    # one that was kept took longer than to read it
+    return name, fit, max(time.perf_counter() - started, getattr(fit, "seconds", 0.0))
 
 
 def _map_one(pair: Pair) -> tuple[Pair, Ints | MeshmatchError, float]:
@@ -171,7 +161,7 @@ def run_set(
 ) -> SetRun:
     """Fit every shape of ``pairs`` once, map every pair, measure all of them.
 
-    With ``kept``, a folder, fits and maps of `OurMethod` are written there, and those that are there are not made again.
+    With ``kept``, a folder, maps are written there, and those that are there are not made again.
     """
     names = sorted({name for pair in pairs for name in pair}, key=bench.shapes.index)
     fits: dict[str, Any] = {}
@@ -248,7 +238,8 @@ def main(
         if output is not None:
             asked = {"weights": weights, "oriented_by": told, "refine": refine, "seed": seed, "threads": threads}
             runner.once(output / "asked.json", asked, lambda: runner.circumstances(threads, jobs))
-    method = OurMethod(model, refine, seed, threads=threads, oriented_by=oriented_by)
+    fits, made = (None, None) if output is None else (output / "fits", output / "maps")
+    method = OurMethod(model, refine, seed, threads=threads, oriented_by=oriented_by, kept=fits)
     runs: list[SetRun] = []
     for bench in benches:
         pairs = runner.spread(bench.pairs, limit_pairs)
@@ -256,7 +247,7 @@ def main(
             given = evaluate_set(bench, load_maps(maps, bench, pairs), pairs=pairs, cache=cache)
             runs.append(SetRun(given, {}, {}, {}, {}))
         else:
-            runs.append(run_set(bench, method, pairs, cache=cache, jobs=jobs, threads=threads, kept=output))
+            runs.append(run_set(bench, method, pairs, cache=cache, jobs=jobs, threads=threads, kept=made))
     scores = [each.scores for each in runs]
     if curve is not None:
         draw_curves({each.bench.name: each.joined for each in scores}, curve)

@@ -13,6 +13,7 @@ from meshmatch.experiments.orientation import upright
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import ON_NODES, FitConfig, Partial, Refine
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.outputs import make_folder
 from meshmatch.shapes.shape import Shape
 
 
@@ -31,6 +32,7 @@ class OurMethod:
     """This project with its options.
 
     ``oriented_by``: a model whose unrefined fit finds the orientation; then a fit searches only what is left of it.
+    ``kept``: a folder of fits, of this method alone; a shape that has one there is not fitted again.
     """
 
     model: str = "human"
@@ -39,28 +41,26 @@ class OurMethod:
     partial: Partial = "auto"
     threads: int = 1
     oriented_by: str = ""  # a model; empty: the fitted model searches by itself
+    kept: Path | None = None
 
     def _matcher(self) -> Matcher:
         config = FitConfig(refine=self.refine, seed=self.seed, partial=self.partial)
         return Matcher(self.model, config, self.threads)
 
     def fit(self, shape: Shape) -> Fit:
-        """Fit the model's template to the shape."""
-        matcher = self._matcher()
-        if not self.oriented_by:
-            return matcher.fit(shape)
-        told = replace(matcher.config, up="y", front="z")
-        return matcher.fit(upright(self.oriented_by, shape, self.seed), told)
-
-    def keep(self, path: Path, fit: Fit) -> None:
-        """Write a fit, for `recall`."""
-        save_fit(path, fit, words={"seconds": fit.seconds})
-
-    def recall(self, path: Path, shape: Shape) -> Fit:
-        """The fit of this shape from a file that `keep` wrote; `MeshmatchError` if it is of another template, or damaged."""
-        known = load_fit(path, as_model(self.model).template)
-        clean = validated(upright(self.oriented_by, shape, self.seed) if self.oriented_by else shape)
-        return replace(known.fit, verts=clean.shape.verts, repaired=clean, seconds=float(known.words["seconds"]))
+        """Fit the model's template to the shape; `MeshmatchError` of a kept fit of another template, or a damaged one."""
+        matcher, config = self._matcher(), None
+        path = None if self.kept is None else self.kept / f"{shape.hash}.safetensors"
+        if self.oriented_by:
+            shape, config = upright(self.oriented_by, shape, self.seed), replace(matcher.config, up="y", front="z")
+        if path is not None and path.is_file():
+            known, clean = load_fit(path, as_model(self.model).template), validated(shape)
+            return replace(known.fit, verts=clean.shape.verts, repaired=clean, seconds=float(known.words["seconds"]))
+        fit = matcher.fit(shape, config)
+        if path is not None:
+            make_folder(path.parent)
+            save_fit(path, fit, words={"seconds": fit.seconds})
+        return fit
 
     def map(self, source: Shape, source_fit: Fit, target: Shape, target_fit: Fit) -> VertexMap:
         """Build the map from two fits."""

@@ -110,28 +110,17 @@ def main(
     bodies: Annotated[int, Option(min=0, help="generated, 2 or more")] = 0,
     data: runner.Data = runner.DATA,
     seed: runner.Seed = 0,
-    work: runner.Work = None,
 ) -> runner.Report:
     if bodies == 1:
         raise BadParameter("between fewer than two bodies there is nothing")
     asked: list[Way] = runner.names_of(ways, WAYS, "way to blend")  # type: ignore[assignment]
     bench, named = load_set(set, data), models.split(",")
-    rows, alone = [], []
-    for number, model in enumerate(named):
-        about = {"weights": as_model(model).card.weights_sha256, "ways": ways, "set": set, "pairs": limit_pairs}
-        about |= {"bodies": bodies, "seed": seed}
-
-        def measured() -> dict[str, Any]:
-            found = {"rows": measure(bench, model, asked, limit_pairs, seed)}  # noqa: B023
-            return found | {"alone": {"model": model, **decoded(model, bodies, seed)} if bodies else None}  # noqa: B023
-
-        found = runner.at_work(work, f"model-{number}", about, measured)
-        rows += found["rows"]
-        alone += [found["alone"]] if bodies else []
+    rows = [row for model in named for row in measure(bench, model, asked, limit_pairs, seed)]
     short = [row | {"model": Path(row["model"]).name} for row in rows]
     columns = {"model": "model", "blended": "way", "pairs": "pairs"}
     columns |= {name.replace("_", " "): f"{name}:.4f" for name in (*DEVIATIONS, "residual")}
     tables = [runner.table(f"Between two shapes, {bench.name}", short, columns)]
+    alone = [{"model": model, **decoded(model, bodies, seed)} for model in named] if bodies else []
     if alone:
         columns = {"model": "model"} | {name.replace("_", " "): f"{name}:.4f" for name in list(alone[0])[1:]}
         tables.append(runner.table(f"The decoder alone, {bodies} bodies", alone, columns))

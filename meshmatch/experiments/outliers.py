@@ -54,11 +54,7 @@ def load_clouds(data: Path) -> list[Shape]:
 
 
 def measure(
-    clouds: Sequence[Shape],
-    method: Method,
-    limit: int | None,
-    work: Path | None = None,
-    asked: Mapping[str, Any] | None = None,
+    clouds: Sequence[Shape], method: Method, limit: int | None, work: Path | None, asked: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Match every ordered pair of corresponding clouds, or ``limit`` of them evenly spread, and measure every row.
 
@@ -75,12 +71,11 @@ def measure(
         return {"cm": cm, "trusted": (found.confidence > 0.5).tolist()}
 
     told = [
-        runner.at_work(work, f"cloud-{k}", asked or {}, lambda: {"verdict": fit_of(k).verdict})["verdict"]  # noqa: B023
+        runner.at_work(work, f"cloud-{k}", asked, lambda: {"verdict": fit_of(k).verdict})["verdict"]  # noqa: B023
         for k in runner.track(range(len(clouds)), "fitting")
     ]
     results = [
-        runner.at_work(work, f"{a}-{b}", asked or {}, partial(matched, a, b))
-        for a, b in runner.track(pairs, "matching")
+        runner.at_work(work, f"{a}-{b}", asked, partial(matched, a, b)) for a, b in runner.track(pairs, "matching")
     ]
     errors = [np.array(each["cm"], np.float32) for each in results]
     joined, confident = np.concatenate(errors), np.concatenate([each["trusted"] for each in results])

@@ -78,8 +78,8 @@ def measure(
     part: OurMethod,
     limit: int | None,
     cache: Path | None,
-    work: Path | None = None,
-    asked: Mapping[str, Any] | None = None,
+    work: Path | None,
+    asked: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Errors of ``limit`` pairs, evenly spread; every pair counts. ``part`` fits the sources, ``whole`` the targets.
 
@@ -109,7 +109,7 @@ def measure(
 
     pairs = runner.spread(bench.pairs, limit)
     results = [
-        runner.at_work(work, f"{bench.name}-{kind}-{source}-{target}", asked or {}, bound(matched, source, target))
+        runner.at_work(work, f"{bench.name}-{kind}-{source}-{target}", asked, bound(matched, source, target))
         for source, target in runner.track(pairs, f"{bench.name}: {kind}")
     ]
     errors = [Errors(np.array(each["errors"])) for each in results]

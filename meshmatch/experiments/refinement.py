@@ -22,7 +22,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any
@@ -195,22 +194,16 @@ def main(
     seed: runner.Seed = 0,
     data: runner.Data = runner.DATA,
     cache: runner.Cache = None,
-    work: runner.Work = None,
 ) -> runner.Report:
     loaded = as_model(model)
     names = runner.names_of(sets, ("bodies", *SET_NAMES), "set")
     chosen = {name: choose_shapes(loaded, name, shapes, seed, data) for name in names}  # before the long work
     rows = []
-    asked = {"weights": loaded.card.weights_sha256, "shapes": shapes, "steps": steps, "seed": seed}
-
-    def measured(name: str) -> dict[str, Any]:
-        subjects = refined(loaded, chosen[name], steps, seed)
+    for name, some in chosen.items():
+        subjects = refined(loaded, some, steps, seed)
         bodies = name == "bodies"
         errors = body_errors(loaded, subjects) if bodies else pair_errors(loaded, subjects, name, data, cache)
-        return {"rows": rows_of(name, subjects, errors)}
-
-    for name in chosen:
-        rows += runner.at_work(work, name, asked, partial(measured, name))["rows"]
+        rows += rows_of(name, subjects, errors)
     record = {"steps": {"nodes": NodeRefineConfig().steps, "code": steps}, "bar": BAR, "rows": rows}
     return runner.Report(record, [runner.table("Refinement from the same start, one thread", rows, COLUMNS)])
 

@@ -185,7 +185,6 @@ def main(
     samples: Annotated[int, Option(min=1, help="as of the command")] = BakeOptions().samples,
     threads: runner.Threads = 2,
     keep: Annotated[Path | None, Option(help="a folder for the textured shapes, to look at them")] = None,
-    work: runner.Work = None,
     timed: Annotated[bool, Option("--clock/--no-clock", help="time the whole command too")] = True,
 ) -> runner.Report:
     names = runner.names_of("" if cases == "none" else cases, CASES, "case")
@@ -199,8 +198,7 @@ def main(
         if name in CHARACTERS and not (data / "textured" / CHARACTERS[name]).is_file():
             notes.append(f"{name}: no data")
         else:
-            asked = {"size": size, "samples": samples, "weights": as_model("human").card.weights_sha256}
-            rows.append(runner.at_work(work, name, asked, lambda: measure(name, trip_of(name, data), choices, keep)))  # noqa: B023
+            rows.append(measure(name, trip_of(name, data), choices, keep))
     record: dict[str, Any] = {"cases": rows, "kept_to_cores": kept}
     if timed:
         with tempfile.TemporaryDirectory() as place:

@@ -41,6 +41,12 @@ def new_charts(
         return answer["uv"], answer["faces"]
 
 
+def flat_areas(corners: Float[Floats, "F 3 2"]) -> Float[Floats, " F"]:
+    """Areas of triangles in the plane."""
+    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.asarray(0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
+
+
 def main() -> None:
     """Answer the question on stdin, and end without freeing an atlas."""
     status = 0
@@ -76,8 +82,7 @@ def _made(verts: Floats, corners: Ints, size: int, padding: int, atlases: list[x
 
 def _packed(charts: Floats, faces: Ints, grid: int, padding: float, atlases: list[xatlas.Atlas]) -> Floats:
     """(N, 2) charts side by side on about `grid` texels, `padding` apart: the most square of a few attempts of xatlas."""
-    one, two = (charts[faces[:, k]] - charts[faces[:, 0]] for k in (1, 2))
-    area = float(0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]).sum())
+    area = float(flat_areas(charts[faces]).sum())
     best, most = charts, 0.0
     for density in _DENSITIES:
         packer, pack = xatlas.Atlas(), xatlas.PackOptions()

@@ -10,7 +10,7 @@ import numpy as np
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.new_charts import new_charts
+from meshmatch.transfer.new_charts import flat_areas, new_charts
 from meshmatch.transfer.texels import MOST_ROWS, faces_on, rows_of
 
 Keep = Literal["auto", "keep", "new"]
@@ -71,7 +71,7 @@ def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str]:
     if beyond:
         return out, f"{beyond} faces reach out of range, over the edge of the image"
     uv = np.clip(out, 0.0, 1.0)
-    room = _flat_areas(uv)
+    room = flat_areas(uv)
     if room.sum() < _MIN_USED:
         return uv, f"they use only {100 * room.sum():.1f} % of the image"
     if room.sum() > 1.0 + _OVERLAP or rows_of(uv * size).sum() > MOST_ROWS:
@@ -83,12 +83,6 @@ def _checked(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str]:
     found, twice = faces_on(uv * size, size)
     share = twice / max(int((found >= 0).sum()), 1)
     return uv, f"they overlap on {100 * share:.1f} % of their texels" if share > _OVERLAP else ""
-
-
-def _flat_areas(corners: Floats) -> Floats:
-    """(F,) areas of triangles (F, 3, 2) in the plane."""
-    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return np.asarray(0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
 
 
 def unwrapped(shape: Shape, size: int, padding: int) -> Floats:

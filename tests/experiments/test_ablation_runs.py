@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
 from meshmatch.errors import TemplateError
-from meshmatch.experiments import ablation_training, ablation_transmatch
+from meshmatch.experiments import ablation_setting, ablation_training, ablation_transmatch
 from meshmatch.experiments.ablation_setting import SCANS, Setting, pool_of
 from meshmatch.experiments.ablation_training import (
     built,
@@ -39,6 +39,7 @@ from meshmatch.experiments.learned_baselines import TransConfig
 from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.geometry.frames import kabsch
 from meshmatch.models.registry import load_model
+from meshmatch.templates.make import Laid
 from meshmatch.templates.template import read_template
 from meshmatch.training.train import build_loss_points
 from tests.experiments.egg_runs import make_small, prepare_eggs
@@ -321,3 +322,9 @@ def test_a_template_of_heavy_people_stands_as_the_usual_one() -> None:
     tall, short = (np.ptp(each.shape.verts[:, 1]) for each in (usual, heavy))
     assert short < 0.95 * tall  # of the same area
     assert POSES == ("T", "A", "I", "T-heavy")
+
+
+def test_how_many_milder_rules_were_tried_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ablation_setting, "lay_nodes", lambda *_: Laid(np.zeros((4, 3)), 0.17, 0.9, 2))
+    run = replace(BASE, strategy="geodesic", nodes=4, radius=0.123)  # of no other test, whose nodes are remembered
+    assert (Setting().rule(run), Setting().milder(run)) == ("geodesic", 2)

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -94,18 +95,19 @@ def test_a_bug_is_not_a_failed_pair(small: Path, kept: Path, monkeypatch: pytest
 def test_the_command(
     small: Path, kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    fitted: list[str] = []
+    mapped: list[tuple[str, str]] = []
+    kept_in: set[Path | None] = set()
 
     def fit(self: OurMethod, shape: Shape) -> Named:
-        fitted.append(shape.name)
-        return Named(Oracle().fit(shape))
+        kept_in.add(self.kept)
+        return Named(Oracle().fit(shape), 7.0)
+
+    def mapping(self: OurMethod, source: Shape, source_fit: Named, target: Shape, target_fit: Named) -> VertexMap:
+        mapped.append((source_fit.name, target_fit.name))
+        return Oracle().map(source, source_fit.name, target, target_fit.name)
 
     monkeypatch.setattr(command.OurMethod, "fit", fit)
-    monkeypatch.setattr(command.OurMethod, "keep", lambda self, path, fit: path.write_text(fit.name))
-    monkeypatch.setattr(command.OurMethod, "recall", lambda self, path, shape: Named(path.read_text(), 7.0))
-    monkeypatch.setattr(
-        command.OurMethod, "map", lambda self, a, fit_a, b, fit_b: Oracle().map(a, fit_a.name, b, fit_b.name)
-    )
+    monkeypatch.setattr(command.OurMethod, "map", mapping)
     words = ["--data", str(small), "--cache", str(kept), "--refine", "none", "--seed", "3"]
     output, curve = tmp_path / "kept", tmp_path / "curve.png"
     assert main([*words, "--output", str(output), "--curve", str(curve)]) == 0
@@ -119,14 +121,15 @@ def test_the_command(
     assert all(words in "".join(lines[:-1]) for words in ("shrec19", "same subject", "Dijkstra"))
     assert curve.stat().st_size > 1000
     # What was kept is not made again, what is missing is, and other choices are refused.
-    (output / "fits" / "faust" / "tr_reg_001.safetensors").unlink()
-    (output / "maps" / "faust" / "tr_reg_000-tr_reg_001.npy").unlink()
-    fitted.clear()
+    missing = output / "maps" / "faust" / "tr_reg_000-tr_reg_001.npy"
+    missing.unlink()
+    mapped.clear()
     assert main([*words, "--output", str(output), "--sets", "faust"]) == 0
     again = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    assert [Path(name).stem for name in fitted] == ["tr_reg_001"]
+    assert mapped == [("tr_reg_000", "tr_reg_001")] and missing.is_file()
     assert again["sets"]["faust"]["mean_cm"] == 0
     assert again["sets"]["faust"]["fit_seconds_max"] == 7.0
+    assert kept_in == {output / "fits"}
     assert main([*words[:-1], "4", "--output", str(output), "--sets", "faust"]) == 1
     assert "other choices (seed)" in capsys.readouterr().err
     # The kept maps give the same numbers.
@@ -233,15 +236,14 @@ def test_what_cannot_orient_is_named_before_anything_is_fitted(
     assert "cannot be oriented anew" in capsys.readouterr().err
 
 
-def test_a_fit_that_was_kept_maps_as_before(tmp_path: Path) -> None:
+def test_a_fit_that_was_kept_maps_as_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the frame that another model found, too."""
     shapes = [load_shape(SAMPLES / name) for name in ("dancer.ply", "climber.ply")]
-    method = OurMethod(oriented_by="human")
+    method = OurMethod(oriented_by="human", kept=tmp_path / "fits")
     fits = [method.fit(shape) for shape in shapes]
-    again = []
-    for shape, fit in zip(shapes, fits, strict=True):
-        method.keep(tmp_path / "fit.safetensors", fit)
-        again.append(method.recall(tmp_path / "fit.safetensors", shape))
+    monkeypatch.setattr(OurMethod, "_matcher", lambda _: SimpleNamespace(config=FitConfig()))  # which fits nothing
+    again = [method.fit(shape) for shape in shapes]
+    monkeypatch.undo()
     before, after = (method.map(shapes[0], pair[0], shapes[1], pair[1]) for pair in (fits, again))
     np.testing.assert_array_equal(before.index, after.index)
     assert again[0].seconds == fits[0].seconds > 0

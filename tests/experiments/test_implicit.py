@@ -11,6 +11,7 @@ from PIL import Image
 
 pytest.importorskip("skimage", reason="scikit-image is of the extra `implicit`")
 
+from meshmatch.errors import InputError
 from meshmatch.experiments import implicit
 from meshmatch.experiments.implicit import (
     FRAMES,
@@ -206,3 +207,28 @@ def test_undeformed_shapes_are_matched_in_the_cube() -> None:
     small, large = box(np.array([0.5, 0.2, 0.3])), box(np.array([5.0, 2.0, 3.0]))
     fits = [ImplicitFit("box", torch.zeros(1), Frame(size, np.eye(3), np.zeros(3))) for size in (1.0, 10.0)]
     assert np.array_equal(undeformed(small, large, *fits).index, np.arange(8))
+
+
+@pytest.mark.parametrize(
+    ("words", "folder", "weights"),
+    [
+        (["--methods", "reduced"], "table-mls-0", (1e-3, 0.1, False)),
+        (["--methods", "reduced", "--energies", "5"], "table-mls-0-energies5", (5e-3, 0.1, False)),
+        (["--methods", "reduced", "--correct", "0.5"], "table-mls-0-correct0.5", (1e-3, 0.5, False)),
+        (["--methods", "published"], "table-published-0", (0.0, 0.1, True)),
+    ],
+)
+def test_what_is_trained_with_other_weights_has_its_own_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], folder: str, weights: tuple[float, float, bool]
+) -> None:
+    asked: dict[str, tuple[ImplicitConfig, Any]] = {}
+
+    def stopped(path: Path, _: object, config: ImplicitConfig, training: Any) -> None:
+        asked[path.name] = config, training.loss
+        raise InputError("that is enough")
+
+    monkeypatch.setattr(implicit, "trained", stopped)
+    assert implicit.main(["--work", str(tmp_path), "--kinds", "table", "--shapes", "4", *words]) == 1
+    config, loss = asked[folder]
+    assert (loss.volume, loss.correct, loss.published) == weights
+    assert config.field == ("pointwise" if loss.published else "mls")

@@ -153,3 +153,9 @@ def test_what_goes_wrong_in_the_other_process_is_told(monkeypatch: pytest.Monkey
     monkeypatch.setattr(new_charts, "_PROGRAM", "import os; os.abort()")
     with pytest.raises(RuntimeError, match="ended with status -6"):
         new_charts.new_charts(CORNERS, FACES, 64, 2)
+
+
+def test_no_atlas_is_freed_before_the_process_ends(torus: Shape) -> None:
+    alive: list[object] = []
+    new_charts._made(torus.verts, torus.faces, 64, 2, alive)
+    assert len(alive) == 1 + len(new_charts._DENSITIES)
