@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Bool, Bools, Float, Floats
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.fitting.network_fit import two_way_residual, weighted_mean
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.tears import neighbours, torn_share
@@ -32,11 +32,13 @@ _NEAR, _HOME = 0.06, 0.06
 # More noise than this (units of sqrt(area), 3.4 cm on a person) is a wrong fit rather than noise.
 _MAX_NOISE = 0.025
 _TEAR_SAMPLES = 4096  # enough to see tears
+_SHORTEST = 0.2  # what is shortened more is torn
+_EVEN = 0.2  # a stretch that varies less says no more
 USUAL_SPREAD = 0.03  # of fits that no network read
 _LEAST_SPREAD = 0.01  # less of it says no more
 _MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
 # Of the logit of a wrong fit, in the order of `Signs.trust`.
-_WEIGHTS, _OFFSET = (1.459, 5.303, 0.928, 1.259, 6.89, 2.481), 5.474
+_WEIGHTS, _OFFSET = (0.909, 3.628, 1.163, 2.653, 5.308, 2.133), 9.935
 # Residual (units of sqrt(area)) of even a right fit of a figure built of many solids, which no skin follows; between so many
 # parts of equal area and so many it grows to that. Set by hand, on robots that are not those of docs/results.md.
 _BUILT, _FEW, _MANY = 0.02, 2.0, 8.0
@@ -53,8 +55,10 @@ class Signs:
         explains (units of sqrt(area))
     missed : share (0..1) of the shape that the template does not reach
     empty : share (0..1) of the template where the shape has no surface; a part has none of it
-    torn : share (0..1) of neighbours on the shape that belong far apart on the template
+    torn : share (0..1) of neighbours on the shape that belong far apart on the template, further than it is shortened there
     stretch : root mean square of the logarithms of the template's stretches
+    uneven : median over the template of how far the logarithm of the stretch there is from its mean over the body part,
+        which proportions explain: short legs are no worse a sign than long ones
     against : share (0..1) of the shape that faces the other way than the template
     partial : whether the shape was taken for a part
     hidden : share (0..1) of the template that a part does not show
@@ -66,18 +70,20 @@ class Signs:
     empty: float = 0.0
     torn: float = 0.0
     stretch: float = 0.0
+    uneven: float = 0.0
     against: float = 0.0
     partial: bool = False
     hidden: float = 0.0
     spread: float = USUAL_SPREAD
 
     def values(self) -> tuple[float, ...]:
-        """Numbers that grow about as the doubt does; ``empty``, ``against`` and ``partial`` told nothing beside them."""
+        """Numbers that grow about as the doubt does; ``empty``, ``stretch``, ``against`` and ``partial`` told nothing beside
+        them."""
         return (
             100 * self.residual,
             float(np.sqrt(10 * min(self.missed, 0.2))),
             float(np.log(self.torn + 0.003)),
-            float(np.log(max(self.stretch, 0.3))),
+            float(np.log(max(self.uneven, _EVEN))),
             self.hidden,
             float(np.log(max(self.spread, _LEAST_SPREAD))),
         )
@@ -93,11 +99,12 @@ def signs_of(
     vectors: Float[Floats, "K 3"],
     local: OrientedPoints,
     residual: float,
+    parts: Int[Ints, " V"],
     partial: bool = False,
     spread_at: Callable[[Bool[Bools, " V"]], float] | None = None,
 ) -> Signs:
-    """The signs of a fit; ``local`` are samples of the shape in the core frame, ``spread_at`` gives the spread over the
-    vertices that the shape shows (a usual one if there is no network).
+    """The signs of a fit; ``local`` are samples of the shape in the core frame, ``parts`` the body parts of the template's
+    vertices, ``spread_at`` gives the spread over those that the shape shows (a usual one if there is no network).
     """
     shown = visible_vertices(system, local, vectors)
     surface = system.surface(vectors)
@@ -110,13 +117,37 @@ def signs_of(
         residual,
         float(weighted_mean(gap > _REACH, local.weights)),
         0.0 if partial else empty_share(local, surface.points),
-        torn_share(system, neighbours(some), some, vectors),
+        torn_share(system, neighbours(some), some, vectors, shortened_to(system, gradient)),
         float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
+        unevenness(stretches, parts[system.strain_points]),
         float(weighted_mean(against, local.weights)) if local.signed else _AGAINST_IF_UNSIGNED,
         partial,
         1 - area_share(system, shown) if partial else 0.0,
         USUAL_SPREAD if spread_at is None or not shown.any() else spread_at(shown),
     )
+
+
+def unevenness(stretches: Float[Floats, "G 3 3"], parts: Int[Ints, " G"]) -> float:
+    """Median norm of the logarithms of stretches about the mean of their part."""
+    member = np.eye(int(parts.max()) + 1)[parts]
+    means = np.einsum("gp,gij->pij", member, stretches) / np.maximum(member.sum(0), 1)[:, None, None]
+    return float(np.median(np.linalg.norm(stretches - means[parts], axis=(1, 2))))
+
+
+def shortened_to(system: NodeSystem, gradient: Float[Floats, "G 3 3"]) -> Float[Floats, " V"]:
+    """By the deformation gradient at the strain points: the share of its length that a line on the template's surface keeps
+    around each vertex, in the direction in which it keeps least; from `_SHORTEST` to 1.
+    """
+    points = system.strain_points
+    normals = system.normals(system.verts)[points]
+    along = gradient - (gradient @ normals[:, :, None]) @ normals[:, None]  # of what lies in the surface
+    a, b, c = gradient.transpose(2, 0, 1)
+    x, y, z = normals.T[:, :, None]
+    area = np.linalg.norm(x * np.cross(b, c) + y * np.cross(c, a) + z * np.cross(a, b), axis=1)
+    half = 0.5 * np.square(along).sum((1, 2))  # of the sum of both squared stretches, whose product is the area's
+    least = np.sqrt(np.maximum(half - np.sqrt(np.maximum(half**2 - area**2, 0.0)), 0.0))
+    near = cKDTree(system.verts[points]).query(system.verts)[1]
+    return np.asarray(np.clip(least, _SHORTEST, 1.0)[near])
 
 
 def unexplained(residual: float, allowance: float) -> float:

@@ -22,13 +22,26 @@ def neighbours(samples: OrientedPoints) -> Pairs:
     return np.repeat(np.arange(len(index)), index.shape[1] - 1), index[:, 1:].reshape(-1)
 
 
-def torn_share(system: NodeSystem, pairs: Pairs, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> float:
-    """Share (0..1) of pairs of samples (core frame) that belong far apart on the resting template."""
+def torn_share(
+    system: NodeSystem,
+    pairs: Pairs,
+    local: OrientedPoints,
+    vectors: Float[Floats, "K 3"],
+    shortened: Float[Floats, " V"] | None = None,
+) -> float:
+    """Share (0..1) of pairs of samples (core frame) that belong far apart on the resting template.
+
+    ``shortened`` says of each of its vertices to which share of their length lines through it shrink: neighbours on a limb
+    that is a third as long as the template's belong three times as far apart without a tear.
+    """
     surface = system.surface(vectors)
     local = local.facing(surface)
-    home = system.verts[surface.tree.query(local.features)[1]]
+    foot = surface.tree.query(local.features)[1]
+    home = system.verts[foot]
     start, end = pairs
     length = np.linalg.norm(local.points[start] - local.points[end], axis=1)
+    if shortened is not None:
+        length = length / np.minimum(shortened[foot[start]], shortened[foot[end]])
     apart = is_discontinuous(np.linalg.norm(home[start] - home[end], axis=1), length)
     weights = None if local.weights is None else local.weights[start] * local.weights[end]
     return float(weighted_mean(apart, weights))

@@ -12,13 +12,14 @@ from meshmatch.fitting.network_fit import reads_alike
 from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, signs_of, unexplained
 from meshmatch.fitting.task import Registration
 
-# Trust from which on a fit is good, and fair; a part is fair at best.
-GOOD_TRUST, FAIR_TRUST = 0.99, 0.7
+# Trust from which on a fit is good, and fair: more likely right than wrong; a part is fair at best.
+GOOD_TRUST, FAIR_TRUST = 0.99, 0.5
 EVEN_TRUST = 0.5  # at most, where nearness says nothing: as likely wrong as right
 # Shares without counterpart up to which a fit is good; and of the template, up to which it is fair. Set by hand.
 _GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
 _HIDDEN = 0.6  # share of the template: of a part that shows less than the rest, such as a leg, too little can be told
-_CRUSHED = 1.0  # a stretch of the template from which on no fit is good
+# A stretch of the template from which on no fit is good, and from which on it is poor. Set by hand.
+_CRUSHED, _FLAT = 1.0, 2.0
 # A residual (units of sqrt(area)) from which on a fit may be one of a part, and the search for parts goes on. Set by hand.
 FAIR_RESIDUAL = 0.031
 
@@ -49,8 +50,9 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
     def spread_at(vertices: Bool[Bools, " V"]) -> float:
         return task.predictor.spread(found.local, vectors, vertices)
 
+    parts = task.model.template.labels
     told = task.model.has_nodes and reads_alike(task.model)
-    return judge(signs_of(task.system, vectors, found.local, residual, partial, spread_at if told else None))
+    return judge(signs_of(task.system, vectors, found.local, residual, parts, partial, spread_at if told else None))
 
 
 def judge(signs: Signs) -> Judgement:
@@ -60,7 +62,7 @@ def judge(signs: Signs) -> Judgement:
     if signs.partial:
         lost = f"{100 * signs.hidden:.0f} % of the template has no counterpart"
         reasons.append(Reason("part", f"taken for a part: {lost}"))
-    if trust < FAIR_TRUST or signs.empty > _FAIR_SHARE or signs.hidden > _HIDDEN:
+    if trust < FAIR_TRUST or signs.empty > _FAIR_SHARE or signs.hidden > _HIDDEN or signs.stretch > _FLAT:
         verdict: Verdict = "poor"
     elif trust < GOOD_TRUST or signs.partial or lacking > _GOOD_SHARE or signs.stretch > _CRUSHED:
         verdict = "fair"

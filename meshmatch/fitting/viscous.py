@@ -109,7 +109,7 @@ def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: 
     vectors = viscous_vectors(system, local, config)
     points = system.moved(vectors)
     residual = two_way_residual(system, local, vectors)
-    judged = judge(signs_of(system, vectors, local, residual))
+    judged = judge(signs_of(system, vectors, local, residual, template.labels))
     unsure = Reason("unsupervised", "fitted without a model that was learned: near may be wrong")
     return Fit(
         template_hash=template.hash,

@@ -67,11 +67,11 @@ def test_what_is_not_visible_is_not_held_against_a_part() -> None:
     half = samples.points[:, 1] > 0
     scan, still = OrientedPoints(samples.points[half], samples.normals[half]), np.zeros((system.K, 3))
     assert 0.3 < empty_share(scan, system.verts) < 0.6
-    assert judge(signs_of(system, still, scan, 0.02)).verdict == "poor"
-    judged = judge(replace(signs_of(system, still, scan, 0.02, partial=True), hidden=0.5))
+    assert judge(signs_of(system, still, scan, 0.02, egg_model().template.labels)).verdict == "poor"
+    judged = judge(replace(signs_of(system, still, scan, 0.02, egg_model().template.labels, partial=True), hidden=0.5))
     assert judged.verdict == "fair"
     assert judged.reasons == ("taken for a part: 50 % of the template has no counterpart",)
-    assert judge(signs_of(system, still, scan, 0.05, partial=True)).verdict == "poor"
+    assert judge(signs_of(system, still, scan, 0.05, egg_model().template.labels, partial=True)).verdict == "poor"
     whole = OrientedPoints(samples.points, samples.normals)
     assert one_way_residual(system, scan, still) == pytest.approx(one_way_residual(system, whole, still), rel=0.1)
 

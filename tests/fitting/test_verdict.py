@@ -9,10 +9,12 @@ import pytest
 import trimesh
 
 from meshmatch.api.matching import Matcher
+from meshmatch.arrays import Ints
 from meshmatch.fitting.fit import Reason
 from meshmatch.fitting.fitter import doubted
-from meshmatch.fitting.signs import Signs, built_allowance, signs_of
+from meshmatch.fitting.signs import Signs, built_allowance, shortened_to, signs_of, unevenness
 from meshmatch.fitting.system import NodeSystem, node_system
+from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.fitting.verdict import FAIR_TRUST, GOOD_TRUST, judge
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
@@ -21,13 +23,14 @@ from tests.conftest import some_fit
 from tests.fitting.eggs import egg_model, scan_of
 
 RANK = {"good": 0, "fair": 1, "poor": 2}
-SOUND = Signs(0.023, torn=0.001, stretch=0.5, against=0.015, spread=0.02)
+SOUND = Signs(0.023, torn=0.001, stretch=0.5, uneven=0.22, against=0.015, spread=0.02)
 RISING = {
     "residual": np.linspace(0.02, 0.1, 30),
     "missed": np.linspace(0, 1, 30),
     "empty": np.linspace(0, 1, 30),
     "torn": np.linspace(0, 1, 30),
     "stretch": np.linspace(0.1, 4, 30),
+    "uneven": np.linspace(0.05, 2, 30),
     "against": np.linspace(0, 1, 30),
     "partial": [False, True],
     "hidden": np.linspace(0, 1, 30),
@@ -35,7 +38,7 @@ RISING = {
 }
 
 
-APART = {"empty", "against", "partial"}  # bound the verdict by themselves, or are reasons alone
+APART = {"empty", "stretch", "against", "partial"}  # bound the verdict by themselves, or are reasons alone
 
 
 def test_all_signs_are_tried() -> None:
@@ -58,7 +61,7 @@ def test_trust_falls_as_a_sign_rises_and_verdicts_never_improve(sign: str) -> No
 
 
 def test_where_verdicts_change() -> None:
-    found = [judge(replace(SOUND, residual=value)) for value in np.linspace(0.02, 0.08, 200)]
+    found = [judge(replace(SOUND, residual=value)) for value in np.linspace(0.02, 0.12, 200)]
     assert {each.verdict for each in found} == {"good", "fair", "poor"}
     for each in found:
         expected = "good" if each.trust >= GOOD_TRUST else "fair" if each.trust >= FAIR_TRUST else "poor"
@@ -96,9 +99,13 @@ def system() -> NodeSystem:
     return node_system(egg_model())
 
 
+def labels() -> Ints:
+    return egg_model().template.labels
+
+
 def test_signs_of_a_template_on_itself() -> None:
     still = np.zeros((system().K, 3))
-    signs = signs_of(system(), still, scan_of(egg_model().template.shape, 2000), 0.02)
+    signs = signs_of(system(), still, scan_of(egg_model().template.shape, 2000), 0.02, labels())
     assert (signs.residual, signs.missed, signs.empty, signs.partial) == (0.02, 0.0, 0.0, False)
     assert signs.stretch < 0.01 and signs.against < 0.02 and signs.torn < 0.02
 
@@ -106,10 +113,10 @@ def test_signs_of_a_template_on_itself() -> None:
 def test_signs_of_a_template_on_a_part_and_on_more() -> None:
     still, scan = np.zeros((system().K, 3)), scan_of(egg_model().template.shape, 2000)
     half = replace(scan.rows(scan.points[:, 1] > 0))
-    assert 0.3 < signs_of(system(), still, half, 0.02).empty < 0.6
-    assert signs_of(system(), still, half, 0.02, partial=True).empty == 0.0
+    assert 0.3 < signs_of(system(), still, half, 0.02, labels()).empty < 0.6
+    assert signs_of(system(), still, half, 0.02, labels(), partial=True).empty == 0.0
     more = replace(scan, points=scan.points + np.where(scan.points[:, 1:2] > 0, [0.0, 1.0, 0.0], 0.0))
-    assert 0.3 < signs_of(system(), still, more, 0.02).missed < 0.6
+    assert 0.3 < signs_of(system(), still, more, 0.02, labels()).missed < 0.6
 
 
 def test_signs_of_a_template_pressed_flat() -> None:
@@ -118,11 +125,39 @@ def test_signs_of_a_template_pressed_flat() -> None:
     flat[:, 2] = -0.98 * nodes[:, 2]
     scan = scan_of(egg_model().template.shape, 2000)
     pressed = replace(scan, points=scan.points * [1, 1, 0.02])
-    signs = signs_of(system(), flat, pressed, 0.025)
+    signs = signs_of(system(), flat, pressed, 0.025, labels())
     assert signs.stretch > 2 and judge(signs).verdict == "poor"
     assert "crushed" in {reason.code for reason in judge(signs).reasons}
     turned = replace(scan, normals=-scan.normals)
-    assert signs_of(system(), np.zeros_like(flat), turned, 0.025).against > 0.9
+    assert signs_of(system(), np.zeros_like(flat), turned, 0.025, labels()).against > 0.9
+
+
+def test_how_much_a_surface_is_shortened_is_its_least_stretch() -> None:
+    rng, points = np.random.default_rng(0), system().strain_points
+    gradient = np.eye(3) + 0.4 * rng.normal(size=(len(points), 3, 3))
+    normals = system().normals(system().verts)[points]
+    inside = np.linalg.svd(normals[:, None])[2][:, 1:]  # two directions of each surface
+    least = np.linalg.svd(gradient @ inside.transpose(0, 2, 1), compute_uv=False)[:, 1]
+    assert shortened_to(system(), gradient)[points] == pytest.approx(np.clip(least, 0.2, 1), abs=1e-6)
+    assert np.allclose(shortened_to(system(), np.broadcast_to(2 * np.eye(3), gradient.shape)), 1)
+
+
+def test_stretch_is_uneven_about_the_mean_of_its_part() -> None:
+    rng, parts = np.random.default_rng(0), np.repeat([0, 2, 3], 40)
+    own = rng.normal(size=(4, 3, 3))[parts]
+    assert unevenness(own, parts) == pytest.approx(0, abs=1e-12)
+    away = rng.normal(size=(60, 3, 3)).repeat(2, 0) * np.tile([1, -1], 60)[:, None, None]
+    assert unevenness(own + away, parts) == pytest.approx(np.median(np.linalg.norm(away, axis=(1, 2))))
+
+
+def test_a_shortened_template_is_not_torn() -> None:
+    nodes = egg_model().template.nodes
+    short = np.zeros_like(nodes)
+    short[:, 1] = -0.7 * nodes[:, 1]
+    scan = scan_of(egg_model().template.shape, 2000)
+    pressed = replace(scan, points=scan.points * [1, 0.3, 1])
+    assert torn_share(system(), neighbours(pressed), pressed, short) > 0.03
+    assert signs_of(system(), short, pressed, 0.02, labels()).torn < 0.005
 
 
 def test_the_network_reads_what_it_knows_alike_and_a_box_in_many_ways() -> None:
