@@ -28,7 +28,7 @@ FAMILIAR, STRANGE = 0.0465, 0.062
 for arms: a fit tells, see `is_of_kind`."""
 SURE = 0.042
 """Up to this a reading needs no other model's beside it: another kind's were 0.0439 at least (docs/results.md)."""
-_BELONGS = 0.7  # trust from which on such a fit tells the kind: heads reach 0.59 on the benchmark's hearts
+_BELONGS = 0.7  # trust from which on such a fit tells the kind; a fair one of heads can be of a heart
 _SAMPLES, _THIN = 2048, 768  # how many the reading is of, and how many rank the orientations
 
 

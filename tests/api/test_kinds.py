@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from meshmatch.api.inputs import as_model, validated
 from meshmatch.api.kinds import Installed
 from meshmatch.api.matching import Matcher
 from meshmatch.errors import InputError, ModelError, OptionError
+from meshmatch.fitting import kind
 from meshmatch.fitting.fit_config import FitConfig, Partial
 from meshmatch.models import registry
 from meshmatch.models.trained import TrainedModel
@@ -82,6 +84,16 @@ def test_later_shapes_are_of_the_kind_before(models: list[TrainedModel]) -> None
 def test_a_complete_shape_of_no_kind_is_refused() -> None:
     with pytest.raises(InputError, match=r"chair 7 7 6 is of no kind .*: human, quadruped"):
         choose(ball("man 3 4 6"), ball("chair 7 7 6"))
+
+
+@pytest.mark.parametrize(
+    ("verdict", "trust", "of_kind"), [("fair", 0.75, True), ("fair", 0.65, False), ("poor", 0.95, False)]
+)
+def test_a_strange_shape_needs_more_trust_than_a_fair_fit(
+    monkeypatch: pytest.MonkeyPatch, verdict: str, trust: float, of_kind: bool
+) -> None:
+    monkeypatch.setattr(kind.Fitter, "fit", lambda *_: SimpleNamespace(verdict=verdict, trust=trust))
+    assert kind.is_of_kind(as_model("human"), ball("man"), 0.055, CONFIG) is of_kind
 
 
 @pytest.mark.usefixtures("models")
@@ -155,11 +167,11 @@ def test_samples_are_told_apart() -> None:
 
 def test_hands_and_heads_are_told_apart() -> None:
     models = kinds.installed_models()
-    for name, kind in (("waving", "hand"), ("pointing", "hand"), ("laughing", "head"), ("child", "head")):
+    for name, category in (("waving", "hand"), ("pointing", "hand"), ("laughing", "head"), ("child", "head")):
         shape = validated(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape
         readings = kinds.read_kinds(models, [shape], [CONFIG])
-        assert kinds.kinds_of(models, readings, [shape], [CONFIG]) == [kind], name
-        own = [model.card.category for model in models].index(kind)
+        assert kinds.kinds_of(models, readings, [shape], [CONFIG]) == [category], name
+        own = [model.card.category for model in models].index(category)
         assert np.delete(readings[:, 0], own).min() > readings[own, 0] + 0.005, name
 
 

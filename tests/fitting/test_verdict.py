@@ -9,13 +9,14 @@ import pytest
 import trimesh
 
 from meshmatch.api.matching import Matcher
-from meshmatch.arrays import Ints
+from meshmatch.arrays import Floats, Ints
 from meshmatch.fitting.fit import Reason
 from meshmatch.fitting.fitter import doubted
 from meshmatch.fitting.signs import Signs, built_allowance, shortened_to, signs_of, unevenness
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.fitting.verdict import FAIR_TRUST, GOOD_TRUST, judge
+from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
@@ -119,12 +120,16 @@ def test_signs_of_a_template_on_a_part_and_on_more() -> None:
     assert 0.3 < signs_of(system(), still, more, 0.02, labels()).missed < 0.6
 
 
+def pressed_egg(axis: int, left: float) -> tuple[Floats, OrientedPoints]:
+    """Node vectors that press the egg along an axis to so much of its length, and a scan of it."""
+    nodes, scan = egg_model().template.nodes, scan_of(egg_model().template.shape, 2000)
+    along = np.eye(3)[axis]
+    return (left - 1) * nodes * along, replace(scan, points=scan.points * (1 + (left - 1) * along))
+
+
 def test_signs_of_a_template_pressed_flat() -> None:
-    nodes = egg_model().template.nodes
-    flat = np.zeros_like(nodes)
-    flat[:, 2] = -0.98 * nodes[:, 2]
     scan = scan_of(egg_model().template.shape, 2000)
-    pressed = replace(scan, points=scan.points * [1, 1, 0.02])
+    flat, pressed = pressed_egg(2, 0.02)
     signs = signs_of(system(), flat, pressed, 0.025, labels())
     assert signs.stretch > 2 and judge(signs).verdict == "poor"
     assert "crushed" in {reason.code for reason in judge(signs).reasons}
@@ -150,12 +155,18 @@ def test_stretch_is_uneven_about_the_mean_of_its_part() -> None:
     assert unevenness(own + away, parts) == pytest.approx(np.median(np.linalg.norm(away, axis=(1, 2))))
 
 
-def test_a_shortened_template_is_not_torn() -> None:
-    nodes = egg_model().template.nodes
-    short = np.zeros_like(nodes)
-    short[:, 1] = -0.7 * nodes[:, 1]
+def test_parts_of_other_proportions_are_even() -> None:
+    upper, nodes = system().verts[:, 1] > 0, egg_model().template.nodes
+    short = -0.7 * np.maximum(nodes, 0) * [0, 1, 0]
     scan = scan_of(egg_model().template.shape, 2000)
-    pressed = replace(scan, points=scan.points * [1, 0.3, 1])
+    one, two = (signs_of(system(), short, scan, 0.02, parts).uneven for parts in (0 * labels(), upper.astype(int)))
+    assert 0.2 < one and two < 0.5 * one
+    even, level = (replace(SOUND, uneven=value).trust for value in (0.05, 0.2))
+    assert even == level > replace(SOUND, uneven=0.3).trust
+
+
+def test_a_shortened_template_is_not_torn() -> None:
+    short, pressed = pressed_egg(1, 0.3)
     assert torn_share(system(), neighbours(pressed), pressed, short) > 0.03
     assert signs_of(system(), short, pressed, 0.02, labels()).torn < 0.005
 
