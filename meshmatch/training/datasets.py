@@ -38,24 +38,13 @@ def registered_source(shapes: Float[Tensor, "N V 3"]) -> Source:
     return lambda count, generator: shapes[torch.randint(len(shapes), (count,), generator=generator)]
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnOnce:
-    """A source of ``few`` shapes alone, which another one drew; that one is there for ``others``, to be measured on."""
-
-    few: Source
-    others: Source
-
-    @classmethod
-    def of(cls, source: Source, count: int, seed: int, progress: Progress) -> Self:
-        """The first shapes that a source draws."""
-        generator, blocks = torch.Generator().manual_seed(seed), []
-        for start in range(0, count, _BLOCK):
-            blocks.append(source(min(_BLOCK, count - start), generator))
-            progress(min(1.0, (start + _BLOCK) / count))
-        return cls(registered_source(torch.cat(blocks)), source)
-
-    def __call__(self, count: int, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
-        return self.few(count, generator)
+def drawn_once(source: Source, count: int, seed: int, progress: Progress) -> Source:
+    """The first ``count`` shapes that a source draws, and no others."""
+    generator, blocks = torch.Generator().manual_seed(seed), []
+    for start in range(0, count, _BLOCK):
+        blocks.append(source(min(_BLOCK, count - start), generator))
+        progress(min(1.0, (start + _BLOCK) / count))
+    return registered_source(torch.cat(blocks))
 
 
 def step_generator(seed: int, step: int) -> torch.Generator:

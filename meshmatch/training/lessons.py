@@ -25,7 +25,7 @@ from meshmatch.templates.prepared_folder import (
     read_samples,
 )
 from meshmatch.templates.template import Template, read_template
-from meshmatch.training.datasets import DrawnOnce, deformed_source, registered_source
+from meshmatch.training.datasets import deformed_source, drawn_once, registered_source
 from meshmatch.training.recipes import Recipe
 
 
@@ -39,6 +39,7 @@ class Lessons:
     data: str  # a few words
     frame: dict[str, str] | None = None  # how fits find it, where the shapes say so
     mirror: Mirroring = "no"  # "auto" where shapes come in two sides
+    unseen: Source | None = None  # draws shapes to be measured on, where the source draws but few again and again
 
 
 def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lessons:
@@ -53,9 +54,8 @@ def generated(kind: Kind | Bodies, recipe: Recipe, progress: Progress) -> Lesson
         kind = replace(kind, bodies=recipe.bodies)
     template = read_template(kind.template or recipe.template)
     source = people_source(template, kind, seed, progress)
-    if kind.bodies:
-        source = DrawnOnce.of(source, kind.bodies, seed, progress)
-    return Lessons(template, source, "human", kind.words)
+    few = drawn_once(source, kind.bodies, seed, progress) if kind.bodies else source
+    return Lessons(template, few, "human", kind.words, unseen=source)
 
 
 def prepared(shapes: Path, recipe: Recipe) -> Lessons:

@@ -117,7 +117,7 @@ def train(
         if report is not None:
             report(now)
 
-    return train_model(learned.template, learned.source, output, recipe, facts, resume, both)
+    return train_model(learned.template, learned.source, output, recipe, facts, resume, both, learned.unseen)
 
 
 def _inherited(facts: CardFacts, card: ModelCard) -> CardFacts:
@@ -138,13 +138,14 @@ def train_model(
     facts: CardFacts,
     resume: bool = True,
     report: Callable[[StepReport], None] | None = None,
+    unseen: Source | None = None,
 ) -> Path:
-    """`train` on shapes with the template's vertices, or on samples without correspondence; returns the folder.
+    """`train` on shapes with the template's vertices, validated on ``unseen`` ones or on more of the same, or on samples
+    without correspondence; returns the folder.
 
     `InputError` of a single shape; `OptionError` if the model to start from has another template, network or kernel.
     """
-    output = Path(output)
-    checkpoint = output / CHECKPOINT
+    checkpoint = (output := Path(output)) / CHECKPOINT
     make_folder(checkpoint.parent)
     config, kernel = recipe.train, recipe.kernel
     if recipe.scan.sphere and getattr(source, "scale", "sphere") == "sphere":  # the paper's lengths are in it
@@ -154,8 +155,7 @@ def train_model(
     data: Any = source
     if isinstance(source, ShapeSamples):
         if len(source.points) < 2:
-            hint = "prepare a folder of several; ten or more are better"
-            raise InputError("one shape is too few to learn from", hint)
+            raise InputError("one shape is too few to learn from", "prepare several; ten or more are better")
         data = build_cloud_dataset(source, config, recipe.scan)
     model = build_deformer(template, data, recipe.network, recipe.scan, kernel, config.seed)
     if isinstance(start := facts.start, TrainedModel):
@@ -173,9 +173,9 @@ def train_model(
         turned = {"orientation": "searched", "scale": "sphere"} if recipe.scan.sphere else None
         facts = replace(facts, frame=facts.frame or turned)
         points = build_loss_points(template, kernel, model)
-        size = config.shapes, config.scans_per_shape
-        data = build_dataset(template, source, model, recipe.scan, *size, config.seed, config.steps)
-        few = {"shapes": 32, "scans_per_shape": 1, "source": getattr(source, "others", source)}
+        size = config.shapes, config.scans_per_shape, config.seed, config.steps
+        data = build_dataset(template, source, model, recipe.scan, *size)
+        few = {"shapes": 32, "scans_per_shape": 1, "source": unseen or source}
     resumed = resume and checkpoint.is_file()
     if config.align_steps and not resumed and isinstance(data, BatchDataset) and model.aligner is not None:
         torch.set_num_threads(config.threads)

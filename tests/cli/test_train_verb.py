@@ -41,9 +41,9 @@ class Recorder:
         return torch.rand(count, 4, 3, generator=generator)
 
     def train_model(self, *given: Any) -> Path:
-        template, source, output, recipe, facts, resume, report = given
+        template, source, output, recipe, facts, resume, report, unseen = given
         told = {"template": template.name, "source": source, "output": output, "recipe": recipe, "resume": resume}
-        self.called = told | vars(facts)
+        self.called = told | vars(facts) | {"unseen": unseen}
         report(StepReport(1, 2, 1e-3, 4.0, {"total": 0.5}))
         report(StepReport(2, 2, 1e-3, 8.0, {"total": 0.25}, 0.0321))
         card = read_card(bundled_folder() / "models" / "human" / "card.json")
@@ -95,7 +95,7 @@ def test_bodies_are_drawn_once_where_so_many_are_asked_for(run: Run, stub: Recor
     assert stub.drawn == 70 and "70 bodies, drawn once" in stub.called["data"]
     many = source(1000, torch.Generator().manual_seed(1))
     assert len(many.unique(dim=0)) == 70 and stub.drawn == 70
-    assert len(source.others(5, torch.Generator())) == 5 and stub.drawn == 75  # what is measured on is new
+    assert len(stub.called["unseen"](5, torch.Generator())) == 5 and stub.drawn == 75  # what is measured on is new
     assert run("train", "-o", tmp_path / "paper", "--preset", "paper").status == 0
     assert stub.drawn == 1075 and "1000 bodies, drawn once" in stub.called["data"]
     assert run("train", "-o", tmp_path / "paper", "--preset", "paper", "--bodies", 0).status == 0
