@@ -253,7 +253,7 @@ def main(
     test: Annotated[int, Option(min=1, help="held-out generated shapes")] = 25,
     paper_steps: Annotated[int, Option(min=1, help="of the paper's training")] = 200,
     steps: Annotated[int, Option(min=1, help="of ours")] = 600,
-    templates: Annotated[int, Option(min=1, help="of ours; each has a model")] = 3,
+    templates: Annotated[int, Option(min=1, help="of ours; each has a model")] = 6,
     pictures: Annotated[Path | None, Option(help="draw labels as they are carried into this folder")] = None,
     work: category.Work = None,
     threads: runner.Threads = 1,
