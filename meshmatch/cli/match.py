@@ -92,12 +92,14 @@ def _match_implicit(
     with needs("torch", "implicit"):
         from meshmatch.implicit.codes import fit_implicit
         from meshmatch.implicit.model import load_implicit
+        from meshmatch.implicit.samples import read_source
     console, names = Console(run.quiet), words.names_of([source, target])
     with replace_on_success(output) as temporary, thread_limit(1):  # tensors are small
         model = load_implicit(how.model)
-        shapes = meshmatch.load_shape(source), meshmatch.load_shape(target)
+        (first, given_a), (second, given_b) = read_source(source), read_source(target)
+        shapes = first, second
         with console.progress() as progress:
-            a, b = (fit_implicit(model, shape, seed=how.seed, progress=progress) for shape in shapes)
+            a, b = (fit_implicit(model, each, seed=how.seed, progress=progress) for each in (given_a, given_b))
         found = model.match(a, b, *shapes)
         words.refuse_poor(run.strict, found.verdict, found.reasons, "the map")
         meshmatch.save_map(temporary, found)
@@ -177,12 +179,13 @@ def _register_implicit(
     with needs("torch", "implicit"):
         from meshmatch.implicit.codes import fit_implicit
         from meshmatch.implicit.model import load_implicit
+        from meshmatch.implicit.samples import read_source
     console = Console(run.quiet)
     with replace_on_success(output) as temporary, thread_limit(1):  # tensors are small
         model = load_implicit(how.model)
-        loaded = meshmatch.load_shape(shape)
+        loaded, given = read_source(shape)
         with console.progress() as progress:
-            fit = fit_implicit(model, loaded, seed=how.seed, progress=progress)
+            fit = fit_implicit(model, given, seed=how.seed, progress=progress)
         words.refuse_poor(run.strict, fit.verdict, fit.reasons)
         fitted = model.register(fit)
         meshmatch.save_shape(temporary, fitted)

@@ -152,7 +152,7 @@ class TrainOptions:
         help="Learn without correspondence even if the shapes are registered; others always are.",
     )
     preset: Literal["default", "paper"] = Option(
-        "default", help="The recipe: what measured best, or the paper's; with --implicit DIF-Net's as it was published."
+        "default", help="The recipe: what measured best, or the paper's; with --implicit DIF-Net's, of either --field."
     )
     field: Literal["mls", "rbf", "pointwise"] | None = Option(
         None,

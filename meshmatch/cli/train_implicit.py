@@ -9,6 +9,7 @@ from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import OptionError, needs
 
 if TYPE_CHECKING:
+    from meshmatch.implicit.network import Deformation
     from meshmatch.training.loop import StepReport
 
 _ENERGIES = ("volume", "arap", "blend")
@@ -24,12 +25,9 @@ def train_shapes(output: Path, how: Any, json: bool, console: Console) -> None:
     if how.shapes is None or how.field == "rbf":
         raise OptionError("--implicit needs --shapes, and the field mls or pointwise", "give a folder of shapes")
     published = how.preset == "paper"
-    if published and how.field == "mls":
-        raise OptionError(
-            "--implicit --preset paper is DIF-Net as published, of the field pointwise", "leave out --field"
-        )
-    if published or how.field == "pointwise":  # DIF-Net's deformation: these are energies of the other
-        other = "--preset paper" if published else "--field pointwise"
+    field: Deformation = how.field or ("pointwise" if published else "mls")
+    if field == "pointwise":  # DIF-Net's deformation: these are energies of the other
+        other = "--field pointwise" if how.field else "--preset paper"
         refuse_given(how, set(_IMPLICIT).difference(_ENERGIES), f"--implicit {other}")
     with needs("torch", "implicit"):
         from meshmatch.implicit.network import ImplicitConfig
@@ -56,7 +54,7 @@ def train_shapes(output: Path, how: Any, json: bool, console: Console) -> None:
             reports.append(now)
             progress(now.words, "training", now.step / now.steps)
 
-        config = DIF_NET if published else ImplicitConfig(how.field or "mls")
+        config = replace(DIF_NET if published else ImplicitConfig(), field=field)
         train_implicit(
             output, how.shapes, config=config, training=training, facts=facts, resume=not how.fresh, report=report
         )

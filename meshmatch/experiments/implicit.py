@@ -2,8 +2,9 @@
 
 For each kind both learn the same shapes with the same template, correction, losses, batches and steps
 (`meshmatch.implicit`); only the deformation differs, and that the reduced field has energies (volume, rigidity,
-also between codes) which are cheap for it. `published` is DIF-Net with its own sizes, terms, weights and rate. Measured on
-the shapes of the training, whose parts are known:
+also between codes) which are cheap for it. `published` is DIF-Net with its own sizes, terms, weights and rate,
+`published-reduced` the same with the reduced field and its energies. Measured on the shapes of the training, whose parts are
+known:
 
 reconstruction: Chamfer distance (both ways, mean, % of the longest side) and IoU of the insides;
 labels: part IoU where each point of one shape takes the part of the nearest point of another on the template, by position
@@ -51,7 +52,8 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.training.loop import TrainConfig, Trainer
 
-METHODS = {"DIF-Net": "pointwise", "reduced": "mls", "published": "published"}  # and what their folders are called
+METHODS = {"DIF-Net": "pointwise", "reduced": "mls", "published": "published", "published-reduced": "published-mls"}
+"""And what their folders are called."""
 FRAMES = 5
 _POINTS = 2000
 _LABELLED, _PAIRS = 64, 50  # shapes whose points have labels, and pairs of them for each that is compared
@@ -261,8 +263,10 @@ def main(
         points = labelled_points(kind, chosen, seed)
         pairs = [(chosen[a], chosen[b]) for a, b in pairs_of(len(chosen), _PAIRS * compared, seed)]
         for method in runner.names_of(methods, METHODS, "method"):
-            published = method == "published"
-            config = DIF_NET if published else ImplicitConfig(METHODS[method])  # type: ignore[arg-type]
+            published = method.startswith("published")
+            config = replace(
+                DIF_NET if published else ImplicitConfig(), field="mls" if method.endswith("reduced") else "pointwise"
+            )
             usual = AS_PUBLISHED if published else TRAINING
             trainings = []
             for number in range(seed, seed + seeds):

@@ -15,13 +15,14 @@ import torch
 from meshmatch.arrays import Float
 from meshmatch.errors import OptionError
 from meshmatch.implicit.model import ImplicitFit, ImplicitModel, percent_of_side
-from meshmatch.implicit.objective import ImplicitLoss
-from meshmatch.implicit.samples import samples_of
+from meshmatch.implicit.objective import PUBLISHED, ImplicitLoss
+from meshmatch.implicit.samples import is_samples, samples_of
+from meshmatch.models.implicit_card import ImplicitCard
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
 
 _SAMPLES, _POINTS, _FEW = 8192, 1024, 512  # of the shape, in a step, and to choose where to begin
-_RATE = 1e-2
+_RATE = 1e-2  # of codes of length 1
 _THIN, _ENOUGH = 0.02, 100  # nearer than this, samples are taken for the surface if there are so many
 
 
@@ -38,19 +39,18 @@ def fit_implicit(
     """
     if steps < 1:
         raise OptionError(f"a code is not found in {steps} steps", "200 are usual")
-    path = isinstance(shape, str | Path) and Path(shape).suffix.lower() == ".npz"
-    source = Path(shape) if path else as_shape(shape)  # type: ignore[arg-type]
+    source = Path(shape) if is_samples(shape) else as_shape(shape)  # type: ignore[arg-type]
     name = Path(source).stem if isinstance(source, str | Path) else source.name or "shape"
     rng = np.random.default_rng(seed)
     frame, found = samples_of(source, _SAMPLES, rng, closed=False)
     rows, half = torch.from_numpy(found), _SAMPLES // 2
-    network, loss = model.network, ImplicitLoss()
+    network, loss, rate = model.network, loss_of(model.card), _RATE * model.network.config.length
     generator = torch.Generator().manual_seed(seed)
     code = nearest_code(model, rows[:: _SAMPLES // _FEW]).clone().requires_grad_(True)
-    descent = torch.optim.Adam([code], _RATE)
+    descent = torch.optim.Adam([code], rate)
     for step in range(steps):
         for group in descent.param_groups:
-            group["lr"] = _RATE * (1 - step / steps)
+            group["lr"] = rate * (1 - step / steps)
         drawn = rng.integers(half, size=(2, _POINTS // 2))
         some = rows[np.concatenate([drawn[0], drawn[1] + half])]
         total = loss.of(network, code[None], some[None], generator)["total"]
@@ -67,6 +67,12 @@ def fit_implicit(
         return fit
     missed, invented = model.shares(fit, surface, seed)
     return replace(fit, missed=missed, invented=invented)
+
+
+def loss_of(card: ImplicitCard) -> ImplicitLoss:
+    """The terms and weights that the model was trained by, as far as they act on a code: DIF-Net's, or the usual ones."""
+    known = card.recipe.get("loss")
+    return PUBLISHED if isinstance(known, dict) and known.get("published") is True else ImplicitLoss()
 
 
 @torch.no_grad()

@@ -36,6 +36,7 @@ _REACH = 4.0  # % of the longest side: what is further from the other surface ha
 _NEWTON, _ONTO, _STEP = 12, 3, 0.1  # steps back to a shape, steps onto its surface, and their longest
 _COARSE = 48  # resolution of the surface that a fit is judged by
 _MOST = {"code": 1024, "width": 2048, "depth": 16, "inner": 512, "layers": 16, "maker": 4096}  # that a card may ask for
+_LONGEST = 100.0  # code at first
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +259,7 @@ def load_implicit(folder: str | Path) -> ImplicitModel:
         config = ImplicitConfig(**card.network)
         known = config.kernel in KERNELS and config.field in get_args(Deformation)
         small = (type(getattr(config, key)) is int and 0 < getattr(config, key) <= most for key, most in _MOST.items())
-        if not (known and all(small)):
+        if not (known and all(small) and 0 < config.length <= _LONGEST):
             raise ValueError("its network cannot be")
         held = read_header(folder / WEIGHTS)
         K = held["deformation.nodes"].shape[:1]

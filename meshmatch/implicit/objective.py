@@ -28,7 +28,7 @@ class ImplicitBatch(OnDevice):
 
 @dataclass(frozen=True)
 class ImplicitLoss(Objective):
-    """DIF-Net's terms (docs/method.md); volume, arap and blend (L_Z) are of the reduced field alone.
+    """DIF-Net's terms (docs/method.md); volume, arap and blend (L_Z) are of the reduced field alone, where they are added.
 
     Where a distance is not known (NaN), only ``off`` and ``eikonal`` act. ``published``: the terms as DIF-Net has them;
     then distances are clamped, smoothness is the mean over rows, and of every second free point no distance is used.
@@ -58,34 +58,37 @@ class ImplicitLoss(Objective):
         generator: torch.Generator,
     ) -> Terms:
         """The weighted terms for samples of shapes with these codes; their sum under ``total``."""
-        eye = torch.eye(3).to(rows)
         at, distance, normals = rows.split((3, 1, 3), -1)
         said = distance[..., 0].isfinite()
         truth = distance[..., 0].nan_to_num(nan=1.0)
         found = model(at, code)
-        if self.published:
-            return self._published(found, code, truth, said, normals)
+        terms = (self._published if self.published else self._usual)(found, code, truth, said, normals)
+        if isinstance(model.deformation, ReducedDeformation):
+            share = torch.rand(len(code), 1, generator=generator).to(code)
+            between = model.deformation.vectors(share * code + (1 - share) * code.roll(1, 0))
+            F = torch.eye(3).to(rows) + model.deformation.at(at[:, ::_BLENDED]).jacobian(between)
+            terms |= self.rigidity(found.F)
+            terms["blend"] = self.blend * (volume_energy(F).mean() + arap_energy(F).mean())
+        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+    def _usual(
+        self, found: Evaluated, code: torch.Tensor, truth: torch.Tensor, said: torch.Tensor, normals: torch.Tensor
+    ) -> Terms:
         known = normals.square().sum(-1) > 0
         angles = (
             2 - sum(torch.cosine_similarity(g, normals, -1) for g in (found.gradient, found.template_gradient))
         ) * known
         far = (truth.abs() > FAR) * torch.exp(-100 * found.distance.abs())
-        terms = {
+        turned = found.F - torch.eye(3).to(found.F)
+        return {
             "sdf": self.sdf * ((found.distance - truth).abs() * said).sum() / said.sum().clamp_min(1),
             "normal": self.normal * angles.sum() / known.sum().clamp_min(1),
             "eikonal": self.eikonal * ((found.gradient.square().sum(-1) + 1e-12).sqrt() - 1).abs().mean(),
             "off": self.off * far.mean(),
-            "smooth": self.smooth * ((found.F - eye).square().sum((-1, -2)) + 1e-12).sqrt().mean(),
+            "smooth": self.smooth * (turned.square().sum((-1, -2)) + 1e-12).sqrt().mean(),
             "correct": self.correct * found.correction.abs().mean(),
             "prior": self.prior * code.square().sum(-1).mean(),
         }
-        if isinstance(model.deformation, ReducedDeformation):
-            share = torch.rand(len(code), 1, generator=generator).to(code)
-            between = model.deformation.vectors(share * code + (1 - share) * code.roll(1, 0))
-            F = eye + model.deformation.at(at[:, ::_BLENDED]).jacobian(between)
-            terms |= self.rigidity(found.F)
-            terms["blend"] = self.blend * (volume_energy(F).mean() + arap_energy(F).mean())
-        return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
     def _published(
         self, found: Evaluated, code: torch.Tensor, truth: torch.Tensor, said: torch.Tensor, normals: torch.Tensor
@@ -96,7 +99,7 @@ class ImplicitLoss(Objective):
         near, goal = (each.clamp(-_CLAMPED, _CLAMPED) for each in (found.distance, truth))
         angles = sum(1 - torch.cosine_similarity(g, normals, -1) for g in (found.gradient, found.template_gradient))
         turned = found.F - torch.eye(3).to(found.F)
-        terms = {
+        return {
             "sdf": self.sdf * ((near - goal).abs() * said).mean(),
             "normal": self.normal * (angles * (normals.square().sum(-1) > 0)).mean(),
             "eikonal": self.eikonal * ((found.gradient.square().sum(-1) + 1e-12).sqrt() - 1).abs().mean(),
@@ -105,4 +108,7 @@ class ImplicitLoss(Objective):
             "correct": self.correct * found.correction.abs().mean(),
             "prior": self.prior * code.square().mean(),
         }
-        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+
+PUBLISHED = ImplicitLoss(off=0.5, prior=1e3, published=True)
+"""DIF-Net's terms and weights, relative to each other."""

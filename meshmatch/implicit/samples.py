@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeGuard
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -68,7 +69,7 @@ def samples_of(
 
     Where it need not be ``closed``, a mesh with holes is taken as a cloud with normals. `InputError` as above.
     """
-    if isinstance(source, str | Path) and Path(source).suffix.lower() == ".npz":
+    if is_samples(source):
         points, distances, normals = _arrays(Path(source))
         solid = False
     else:
@@ -98,6 +99,18 @@ def samples_of(
     else:
         rows = free_and_surface(points, normals, N, rng) if solid else off_surface(points, normals, N, rng)
     return frame, rows.astype(np.float32)
+
+
+def is_samples(source: Shape | str | Path) -> TypeGuard[str | Path]:
+    """Whether this is the path of `.npz` samples."""
+    return isinstance(source, str | Path) and Path(source).suffix.lower() == ".npz"
+
+
+def read_source(file: Path) -> tuple[Shape, Shape | Path]:
+    """The shape of a file, of `.npz` samples their points in order, and what its code is found from: all that is known."""
+    if is_samples(file):
+        return Shape(_arrays(file)[0], np.empty((0, 3), np.int64), file.name), file
+    return (shape := load_shape(file)), shape
 
 
 def _name(source: Shape | str | Path) -> str:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError
 from meshmatch.implicit.network import ImplicitConfig, ImplicitNetwork
-from meshmatch.implicit.objective import ImplicitBatch, ImplicitLoss
+from meshmatch.implicit.objective import PUBLISHED, ImplicitBatch, ImplicitLoss
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
 from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
 from meshmatch.models.card import check_name
@@ -31,10 +31,9 @@ TRAINING = TrainConfig(
 )
 """How an implicit model is trained unless said otherwise."""
 DIF_NET = ImplicitConfig("pointwise", 128, 128, 4, 128, frequency=30.0, layers=4, maker=256, length=0.01 * 128**0.5)
-"""The sizes that DIF-Net was published with; and its terms and weights, relative to each other, at its rate:"""
+"""The sizes that DIF-Net was published with, for either field; and its terms, weights and rate:"""
 AS_PUBLISHED = replace(
-    TRAINING, rate=1e-4, warm_up=0, decay=0.0, average=0.0, momentum=0.999, clip=None,
-    loss=ImplicitLoss(volume=0.0, arap=0.0, blend=0.0, off=0.5, prior=1e3, published=True),
+    TRAINING, rate=1e-4, warm_up=0, decay=0.0, average=0.0, momentum=0.999, clip=None, loss=PUBLISHED
 )  # fmt: skip
 
 

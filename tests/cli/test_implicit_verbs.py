@@ -14,12 +14,12 @@ import meshmatch
 from meshmatch.cli import main
 from meshmatch.geometry.triangles import is_watertight
 from meshmatch.implicit import training
-from meshmatch.implicit.codes import fit_implicit
+from meshmatch.implicit.codes import fit_implicit, loss_of
 from meshmatch.implicit.model import load_implicit
-from meshmatch.implicit.training import train_implicit
+from meshmatch.implicit.training import AS_PUBLISHED, train_implicit
 from meshmatch.models.implicit_card import IMPLICIT, is_implicit, read_implicit_card
 from meshmatch.training.train import CHECKPOINT
-from tests.implicit.boxes import TRAIN, box, boxes, config
+from tests.implicit.boxes import TRAIN, box, box_sdf, boxes, config
 
 Capture = pytest.CaptureFixture[str]
 
@@ -62,7 +62,6 @@ def test_a_folder_becomes_a_model_and_goes_on(folder: Path, tmp_path: Path, caps
     [
         (["--field", "rbf"], "mls or pointwise"),
         (["--unsupervised"], "--unsupervised does not go"),
-        (["--preset", "paper", "--field", "mls"], "leave out --field"),
         (["--preset", "paper", "--arap", "0.001"], "--arap does not go with --implicit --preset paper"),
         (["--bf16"], "--bf16 does not go"),
         *(
@@ -88,6 +87,16 @@ def test_dif_net_as_it_was_published(folder: Path, tmp_path: Path) -> None:
     assert [card.network[name] for name in ("code", "width", "inner", "maker", "frequency")] == [128, 128, 128, 256, 30]
     assert (card.recipe["rate"], card.recipe["loss"]["published"], card.recipe["loss"]["off"]) == (1e-4, True, 0.5)
     assert load_implicit(tmp_path).network.config.layers == 4
+    assert loss_of(card) == AS_PUBLISHED.loss
+
+
+def test_the_reduced_field_in_dif_net_as_it_was_published(folder: Path, tmp_path: Path) -> None:
+    words = ["train", "--implicit", "--shapes", str(folder), "-o", str(tmp_path), "--preset", "paper", "--steps", "1"]
+    assert main([*words, "--field", "mls", "--arap", "0.004"]) == 0
+    card = read_implicit_card(tmp_path)
+    assert [card.network[name] for name in ("field", "code", "layers", "frequency")] == ["mls", 128, 4, 30]
+    loss = card.recipe["loss"]
+    assert (card.recipe["rate"], loss["published"], loss["off"], loss["arap"]) == (1e-4, True, 0.5, 0.004)
 
 
 def test_a_folder_is_needed(tmp_path: Path, capsys: Capture) -> None:
@@ -140,6 +149,27 @@ def test_a_map_through_the_template(model: Path, folder: Path, tmp_path: Path, c
     found = meshmatch.load_map(output, *shapes)
     assert found.verdict == record["verdict"]
     assert np.array_equal(np.sign(shapes[1].verts[found.index]), np.sign(shapes[0].verts))  # corner to corner
+
+
+def test_samples_of_distances_are_matched_and_fitted(
+    model: Path, folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    """Their points take the place of vertices, in the file's order; to a file with its own sides they all agree."""
+    half = np.array([0.8, 0.35, 0.6])
+    points = np.random.default_rng(0).uniform(-1.2, 1.2, (3000, 3)) * half
+    np.savez(tmp_path / "box.npz", points=points, distances=box_sdf(points, half))
+    files = [str(tmp_path / "box.npz"), str(folder / "box1.ply")]
+    output = tmp_path / "map.npy"
+    assert main(["match", *files, "--model", str(model), "-o", str(output), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["source_vertices"] == 3000
+    corner = np.flatnonzero((np.abs(points / half) > 0.8).all(1))
+    assert len(corner) > 5
+    target = meshmatch.load_shape(files[1])
+    assert np.array_equal(np.sign(target.verts[np.load(output)[corner]]), np.sign(points[corner]))
+    words = ["register", files[0], "--model", str(model), "-o", str(tmp_path / "fit.ply")]
+    assert main(words) == 0
+    assert np.abs(meshmatch.load_shape(tmp_path / "fit.ply").bounds - [-half, half]).max() < 0.3
+    assert main(["match", files[1], str(tmp_path / "none.npz"), "--model", str(model), "-o", str(output)]) == 1
 
 
 def test_the_template_on_a_shape(model: Path, folder: Path, tmp_path: Path, capsys: Capture) -> None:

@@ -215,7 +215,8 @@ def test_undeformed_shapes_are_matched_in_the_cube() -> None:
         (["--methods", "reduced"], "table-mls-0", (1e-3, 0.1, False)),
         (["--methods", "reduced", "--energies", "5"], "table-mls-0-energies5", (5e-3, 0.1, False)),
         (["--methods", "reduced", "--correct", "0.5"], "table-mls-0-correct0.5", (1e-3, 0.5, False)),
-        (["--methods", "published"], "table-published-0", (0.0, 0.1, True)),
+        (["--methods", "published"], "table-published-0", (1e-3, 0.1, True)),
+        (["--methods", "published-reduced"], "table-published-mls-0", (1e-3, 0.1, True)),
     ],
 )
 def test_what_is_trained_with_other_weights_has_its_own_folder(
@@ -231,4 +232,5 @@ def test_what_is_trained_with_other_weights_has_its_own_folder(
     assert implicit.main(["--work", str(tmp_path), "--kinds", "table", "--shapes", "4", *words]) == 1
     config, loss = asked[folder]
     assert (loss.volume, loss.correct, loss.published) == weights
-    assert config.field == ("pointwise" if loss.published else "mls")
+    assert config.field == ("pointwise" if folder == "table-published-0" else "mls")
+    assert config.layers == (4 if loss.published else 2)

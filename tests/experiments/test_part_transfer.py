@@ -1,6 +1,8 @@
 """Labels carried by models of generated shapes: the templates, one small training of ours, its tests."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,8 +22,9 @@ from meshmatch.experiments.furniture_models import (
 from meshmatch.experiments.part_votes import Electorate, VoteConfig, box_of, boxed, vote
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.templates.template import template_radius
-from meshmatch.training.recipes import clouds
+from meshmatch.models.network import PAPER
+from meshmatch.templates.template import Template, template_radius
+from meshmatch.training.recipes import Recipe, clouds
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +69,36 @@ def test_a_model_gives_labels_to_held_out_shapes(learned: Learned, tmp_path: Pat
     config = FitConfig(refine="none", partial="no", samples=500)
     found = part_transfer.part_overlap(part_transfer.by_models([model], config), "plane", range(4, 5), 0)
     assert 0.3 < found["generated_iou"] == found["shapenet_iou"] <= 1 and set(found["parts_iou"]) == set(KINDS["plane"])
+
+
+def test_the_papers_way_is_the_papers(learned: Learned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cloud as the template, its network and weights, as it is fitted and after 200 steps on the code."""
+    asked: dict[str, Any] = {}
+
+    def learn(folder: Path, template: Template, shapes: Learned, recipe: Recipe) -> Any:
+        asked.update(template=template, recipe=recipe)
+        return SimpleNamespace(card=SimpleNamespace(training_minutes=1.0))
+
+    def overlap(give: Any, kind: str, numbers: range, seed: int) -> dict[str, Any]:
+        asked.setdefault("configs", []).append(give)
+        return {"generated_iou": 0.5}
+
+    monkeypatch.setattr(part_transfer, "learn", learn)
+    monkeypatch.setattr(part_transfer, "by_models", lambda models, config: config)
+    monkeypatch.setattr(part_transfer, "part_overlap", overlap)
+    monkeypatch.setattr(part_transfer, "best_maps", lambda *given: {})
+    monkeypatch.setattr(part_transfer, "real_shapes", lambda *given: ({}, {}))
+    monkeypatch.setattr(part_transfer, "real_errors", lambda *given: {"arrived": 1.0})
+    monkeypatch.setattr(part_transfer, "learned_shapes", lambda *given: learned)
+    plan = part_transfer.Plan(tmp_path, tmp_path, 4, 1, {"paper": 7}, 3, 1, 0)
+    rows = part_transfer.measure("plane", plan, ["paper"], None)
+    assert [row["method"] for row in rows] == ["paper, network alone", "paper, 200 steps"]
+    assert asked["template"].dense is asked["template"].shape and 300 <= asked["template"].K < 330
+    recipe = asked["recipe"]
+    assert (recipe.network, recipe.train.steps, recipe.train.loss.plain) == (PAPER, 7, True)
+    assert (recipe.train.loss.volume, recipe.train.loss.arap, recipe.train.loss.blend) == (1e-4, 1e-3, 1e-4)
+    alone, searched = asked["configs"]
+    assert (alone.refine, searched.refine, searched.latent.steps) == ("none", "latent", 200)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -11,6 +11,7 @@ from meshmatch.errors import ModelError, OptionError
 from meshmatch.implicit.model import load_implicit
 from meshmatch.implicit.objective import ImplicitLoss
 from meshmatch.implicit.samples import ImplicitSamples, read_implicit_samples
+from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
 from meshmatch.implicit.training import AS_PUBLISHED, build_implicit, train_implicit
 from meshmatch.models.implicit_card import IMPLICIT
 from meshmatch.models.registry import WEIGHTS
@@ -83,6 +84,30 @@ def test_published_terms_are_dif_nets(samples: ImplicitSamples) -> None:
         {name: float(value.detach()) for name, value in expected.items()}, rel=1e-4
     )
     assert float(terms["total"].detach()) == pytest.approx(float(sum(expected.values()).detach()), rel=1e-4)
+
+
+def test_the_reduced_field_adds_its_energies_to_dif_nets_terms(samples: ImplicitSamples) -> None:
+    made = build_implicit(samples, config("mls"), 0)
+    rows = torch.from_numpy(samples.rows[:2, ::200])
+    found = {}
+    for scale in (1.0, 3.0):
+        weights = {name: scale * getattr(AS_PUBLISHED.loss, name) for name in ("volume", "arap", "blend")}
+        loss = replace(AS_PUBLISHED.loss, **weights)
+        found[scale] = loss.of(made, made.codes[:2], rows, torch.Generator().manual_seed(0))
+    assert found[1.0]["arap"] > 0
+    for name in ("volume", "arap", "blend"):
+        assert torch.isclose(found[3.0][name], 3 * found[1.0][name])
+    for each in found.values():
+        assert torch.isclose(each.pop("total"), torch.stack(list(each.values())).sum())
+
+
+def test_nodes_of_the_cube_reach_further_than_those_near_the_surfaces(samples: ImplicitSamples) -> None:
+    made = build_implicit(samples, config("mls"), 0)
+    nodes, radii = made.deformation.nodes, made.deformation.radii
+    near, cube = slice(0, len(nodes) - len(cube_nodes())), slice(len(nodes) - len(cube_nodes()), None)
+    assert np.array_equal(nodes[cube].numpy(), cube_nodes().astype(np.float32))
+    assert nodes[cube].abs().amax(1).min() == 1  # on its edges and corners
+    assert (radii[cube] == CUBE_RADIUS).all() and radii[near].max() < CUBE_RADIUS
 
 
 def test_energies_between_codes_are_those_of_the_blended_field(samples: ImplicitSamples) -> None:
