@@ -132,8 +132,8 @@ class Setting:
         """By which rule its nodes are chosen: its own, or none ("uniform") where that one leaves too few."""
         return self._chosen(run)[1]
 
-    def milder(self, run: Run) -> int:
-        """How many milder versions of that rule were tried before every vertex had nodes."""
+    def taken(self, run: Run) -> float:
+        """Which share of the candidates is refused by the rule that was taken: a milder one, where vertices went without."""
         return self._chosen(run)[2]
 
     def refused(self, run: Run) -> float:
@@ -145,7 +145,7 @@ class Setting:
     def _radius(self, run: Run) -> float:
         return run.radius * (SPHERE if self.unit == "sphere" else diameter(self.resting(run.pose).shape))
 
-    def _chosen(self, run: Run) -> tuple[Template, Strategy, int]:
+    def _chosen(self, run: Run) -> tuple[Template, Strategy, float]:
         return _with_nodes(self.resting(run.pose), run.nodes, self._radius(run), run.strategy)
 
     def resting(self, pose: str) -> Template:
@@ -172,11 +172,11 @@ def _resting(folder: str | None, pose: str) -> Template:
 
 
 @lru_cache(maxsize=32)
-def _with_nodes(template: Template, K: int, radius: float, strategy: Strategy) -> tuple[Template, Strategy, int]:
+def _with_nodes(template: Template, K: int, radius: float, strategy: Strategy) -> tuple[Template, Strategy, float]:
     for rule in dict.fromkeys((strategy, "uniform")):
         try:
             laid = lay_nodes(template.shape, NodeConfig(rule, K, radius, grow=True), template.labels)
-            return replace(template, nodes=laid.nodes, radius=laid.radius), rule, laid.milder
+            return replace(template, nodes=laid.nodes, radius=laid.radius), rule, laid.taken
         except TemplateError:
             if rule == "uniform":
                 raise

@@ -258,7 +258,7 @@ class Known:
     trained : {run: record}
     errors : {(run, set, method): record}
     times, memory : {name of a run: record}
-    refused : {name of a run: {"refused": share of the candidates that its rule refuses, "milder": rules tried after it}}
+    refused : {name of a run: {"refused": share of the candidates that its rule refuses, "taken": that of the rule taken}}
     descent : what `meshmatch.experiments.ablation_errors.descend` found, if it was measured
     """
 
@@ -272,7 +272,9 @@ class Known:
     def rule(self, run: Run) -> str:
         """How nodes were chosen in the end, in words."""
         words = str(self.trained.get(run, {}).get("rule", run.strategy))
-        return f"{words}, milder" if self.refused.get(run.name, {}).get("milder") else words
+        shares = self.refused.get(run.name, {})
+        milder = words == run.strategy and shares.get("taken", 1.0) < shares.get("refused", 0.0)
+        return f"{words}, milder: {shares['taken']:.1%}" if milder else words
 
     def error(self, run: Run, where: str, method: str | None = None, what: str = "mean_cm") -> list[float]:
         """Errors in cm of a run and its repetitions with other seeds; ``where`` is a set, or `HELD_OUT`.

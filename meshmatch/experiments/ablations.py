@@ -194,10 +194,10 @@ class Kept:
         return self.answer(self.folder / "figure6.json", asked, measured)
 
     def _refused(self, run: Run) -> dict[str, Any]:
-        return {**self.here(), "refused": self.setting.refused(run), "milder": self.setting.milder(run)}
+        return {**self.here(), "refused": self.setting.refused(run), "taken": self.setting.taken(run)}
 
     def refused(self) -> dict[str, dict[str, Any]]:
-        """By name of table 7's runs, the share of candidates that their rules refuse, and whether milder ones were taken."""
+        """By name of table 7's runs, which share of candidates their rules refuse, and those that were taken."""
         shares = {}
         for run in VIEWS["table7"].runs:
             path = self.folder / run.name / "refused.json"

@@ -135,7 +135,7 @@ class Laid:
     nodes: Float[Floats, "K 3"]
     radius: float | Float[Floats, " K"]
     refused: float
-    milder: int = 0  # how many milder rules than the strategy itself had to be tried
+    taken: float  # the same of the rule that was taken: a milder one, where vertices went without nodes
 
 
 def choose_nodes(
@@ -159,10 +159,10 @@ def lay_nodes(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None =
     samples, candidates = _candidates(shape, config, noisy)
     failure: TemplateError | None = None
     refused: float | None = None
-    for milder, allowed in enumerate(_allowed(shape, config, candidates, labels, samples)):
+    for allowed in _allowed(shape, config, candidates, labels, samples):
         chosen = candidates[allowed]
-        if refused is None:  # by the strategy itself; what follows are milder ones
-            refused = 1 - float(allowed.mean())
+        taken = 1 - float(allowed.mean())
+        refused = taken if refused is None else refused  # by the strategy itself; what follows are milder ones
         if len(chosen) < 4:
             problem = f"strategy {config.strategy!r} rejects all nodes: each moves vertices that do not belong together"
             failure = TemplateError(problem, "use a smaller radius or another strategy")
@@ -170,8 +170,8 @@ def lay_nodes(shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None =
         nodes = chosen[farthest_points(chosen, min(config.K, len(chosen)))]
         try:
             if config.grow:
-                return Laid(nodes, grown_radii(shape.verts, nodes, config.radius), refused, milder)
-            return Laid(_complete(shape, config, nodes, chosen), config.radius, refused, milder)
+                return Laid(nodes, grown_radii(shape.verts, nodes, config.radius), refused, taken)
+            return Laid(_complete(shape, config, nodes, chosen), config.radius, refused, taken)
         except TemplateError as error:
             failure = error
     assert failure is not None

@@ -129,12 +129,12 @@ def test_table_7_says_what_each_rule_refuses() -> None:
     found = replace(
         found,
         trained={run: {**record, "rule": run.strategy} for run, record in found.trained.items()},
-        refused={BASE.name: {"refused": 0.758, "milder": 2}, uniform.name: {"refused": 0.0}},
+        refused={BASE.name: {"refused": 0.758, "taken": 0.2}, uniform.name: {"refused": 0.0, "taken": 0.0}},
     )
     drawn = {view: as_markdown(tables(found, [view], [], "")[0]) for view in ("table7", "table5")}
     assert "| nodes by | template | rule refuses | steps |" in drawn["table7"]
     assert (
-        "| parts, milder | T | 75.8 % | 7 | 2.00 |" in drawn["table7"]
+        "| parts, milder: 20.0 % | T | 75.8 % | 7 | 2.00 |" in drawn["table7"]
         and "| uniform | T | 0.0 % | 7 |" in drawn["table7"]
     )
     assert "refuses" not in drawn["table5"]

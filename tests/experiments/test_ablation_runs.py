@@ -324,7 +324,7 @@ def test_a_template_of_heavy_people_stands_as_the_usual_one() -> None:
     assert POSES == ("T", "A", "I", "T-heavy")
 
 
-def test_how_many_milder_rules_were_tried_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ablation_setting, "lay_nodes", lambda *_: Laid(np.zeros((4, 3)), 0.17, 0.9, 2))
+def test_what_a_milder_rule_refuses_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ablation_setting, "lay_nodes", lambda *_: Laid(np.zeros((4, 3)), 0.17, 0.9, 0.2))
     run = replace(BASE, strategy="geodesic", nodes=4, radius=0.123)  # of no other test, whose nodes are remembered
-    assert (Setting().rule(run), Setting().milder(run)) == ("geodesic", 2)
+    assert (Setting().rule(run), Setting().taken(run)) == ("geodesic", 0.2)

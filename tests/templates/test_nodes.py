@@ -156,7 +156,8 @@ def test_what_rules_reject(ring: Shape) -> None:
 
 def test_a_rejection_that_leaves_nothing_becomes_milder_or_names_the_vertices(monkeypatch: pytest.MonkeyPatch) -> None:
     fold, config = two_plates(0.1), NodeConfig(strategy="geodesic", K=60, radius=0.2, depth=0.0)
-    assert badly_held(fold.verts, choose_nodes(fold, config), 0.2) == []
+    laid = lay_nodes(fold, config)
+    assert badly_held(fold.verts, laid.nodes, 0.2) == [] and laid.taken < laid.refused
     monkeypatch.setattr("meshmatch.templates.make._GEODESIC_SHARES", (0.2,))
     with pytest.raises(TemplateError, match="vertices"):
         choose_nodes(fold, config)
@@ -263,7 +264,7 @@ def test_radii_grow_under_the_strategy_itself() -> None:
     laid = lay_nodes(fold, replace(config, grow=True))
     assert cKDTree(candidates[allowed]).query(laid.nodes)[0].max() == 0
     assert laid.refused == pytest.approx(1 - allowed.mean())
-    assert 0.5 < laid.refused < 0.9
+    assert 0.5 < laid.refused < 0.9 and laid.taken == laid.refused
     assert isinstance(laid.radius, np.ndarray)
 
 
