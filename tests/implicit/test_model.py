@@ -1,6 +1,7 @@
 """Models come back as they were, or not at all; their surfaces are closed, and their maps go through the template."""
 
 import json
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,6 +93,19 @@ def test_an_unseen_shape_finds_its_code(model: ImplicitModel, tmp_path: Path) ->
     assert given.residual < 3
     with pytest.raises(OptionError, match="steps"):
         fit_implicit(model, moved, steps=0)
+
+
+def test_a_code_is_searched_as_its_model_was_trained(model: ImplicitModel) -> None:
+    """By its terms, in steps of the length of its codes."""
+    shape = box(np.array([0.8, 0.35, 0.6]))
+    usual = fit_implicit(model, shape, steps=1).code
+    published = ImplicitModel(replace(model.card, recipe={"loss": {"published": True}}), model.network)
+    assert not torch.equal(fit_implicit(published, shape, steps=3).code, fit_implicit(model, shape, steps=3).code)
+    short = deepcopy(model.network)
+    short.config = replace(short.config, length=0.01 * short.config.length)
+    moved = fit_implicit(ImplicitModel(model.card, short), shape, steps=1).code
+    start = min(model.network.codes.detach(), key=lambda code: float((code - moved).norm()))
+    assert 0 < (moved - start).abs().max() < 0.02 * (usual - start).abs().max()
 
 
 def test_what_a_model_invents_is_told(model: ImplicitModel) -> None:
