@@ -16,6 +16,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.experiments.other_triangles import other_triangles
 from meshmatch.generators.bodies import draw_identities, template_rig
 from meshmatch.generators.characters import Cast, sample_layers, standing
 from meshmatch.generators.figure import PARTS, SIDED, Figure, joints_of
@@ -26,7 +27,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 
 TRAINED_SEED = 0
-_FACES = 9_000  # of a clothed body
+_FACES = 18_000  # of a clothed body
 _EDGE = 0.08  # metres, of a robot
 # How wide a part of a robot is, across and out, in units of its length.
 _WIDTHS = {"hips": (2.2, 1.3), "belly": (1.7, 1.0), "chest": (1.5, 0.9), "neck": (0.9, 0.9), "head": (1.2, 1.2),
@@ -60,14 +61,15 @@ class Designer:
         """People in clothes, of these kinds of `meshmatch.generators.proportions`."""
         cast = Cast(self.figure, 1.0, kinds=tuple(float(kind in kinds) for kind in range(len(SHARES))))
         generator = torch.Generator().manual_seed(7919 * (self.seed + 1) + sum(kinds))
-        clothed, naked = (layer.double().numpy() for layer in sample_layers(cast, count, generator))
-        faces, bones = self.figure.rig.faces.numpy(), self.figure.share.argmax(1).numpy()
+        faces, share = self.figure.rig.faces.numpy(), self.figure.share.double().numpy()
+        weights, fine = other_triangles(faces, len(share))
+        bones = (weights @ share).argmax(1)
         found = []
-        for k in range(count):
-            fine = trimesh.Trimesh(clothed[k], faces, process=False).subdivide()
-            shape = decimate(Shape(fine.vertices, fine.faces, f"{tag}{k}"), _FACES + 500 * (k % 3))
-            places = cKDTree(clothed[k]).query(shape.verts)[1]
-            found.append(Character(shape, bones[places], Shape(naked[k], faces, f"body {k}"), places))
+        for k, (clothed, naked) in enumerate(zip(*sample_layers(cast, count, generator), strict=True)):
+            seen, below = (weights @ layer.double().numpy() for layer in (clothed, naked))
+            shape = decimate(Shape(seen, fine, f"{tag}{k}"), _FACES + 1000 * (k % 3))
+            places = cKDTree(seen).query(shape.verts)[1]
+            found.append(Character(shape, bones[places], Shape(below, fine, f"body {k}"), places))
         return found
 
     def robots(self, count: int) -> list[Character]:
