@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.experiments.other_triangles import other_triangles
 from meshmatch.experiments.scores import TruthDistances
 from meshmatch.experiments.sets import Pair
 from meshmatch.generators.cutouts import CutShapes
@@ -68,8 +69,8 @@ def _scan(
 ) -> CutScan:
     faces = np.asarray(template.shape.faces)
     length = length_of(template, verts)
-    fine = trimesh.Trimesh(verts, faces, process=False).subdivide()
-    small = decimate(Shape(fine.vertices, fine.faces, name), int(rng.uniform(0.8, 2.4) * len(faces)))
+    weights, fine = other_triangles(faces, len(verts))
+    small = decimate(Shape(weights @ verts, fine, name), int(rng.uniform(0.8, 2.4) * len(faces)))
     own = cKDTree(trimesh.Trimesh(small.verts, small.faces, process=False).sample(40_000, seed=0)).query(places)[0]
     marks = np.where(own < _NEAR * length, cKDTree(small.verts).query(places)[1], -1)
     if rng.uniform() < 0.5:
