@@ -1,7 +1,7 @@
 """Hands and heads that no training drew: other people, other triangles, cut at random, turned anywhere, clutter beside half;
 of hands, which come in two sides, about half are mirror images: left ones.
 
-Landmarks are places of the whole body, the forearm or the shoulders included; a shape that ends before one lacks it.
+Truth is a place of the whole body, the forearm or the shoulders included; a shape that ends before one lacks it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments.other_triangles import other_triangles
 from meshmatch.experiments.scores import TruthDistances
 from meshmatch.experiments.sets import Pair
@@ -24,7 +24,6 @@ from meshmatch.generators.cutouts import CutShapes
 from meshmatch.generators.kinds import Kind
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.decimate import decimate
-from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.sides import mirrored
 from meshmatch.templates.template import Template
@@ -32,16 +31,22 @@ from meshmatch.templates.template import Template
 STUMPS = {"hand": "wrist", "head": "neck"}
 """The part of each kind that is cut, which does not count as its length."""
 _SEED = 7001  # further from that of a training than anyone counts
-_LANDMARKS = 300
-_NEAR = 0.02  # of the length: a landmark further from the surface is cut off
+_EVERY = 20  # vertex of the whole is a place where errors are measured
+_NEAR = 0.02  # of the length: a place further from the surface is cut off, and a vertex further from the whole is none of it
 
 
 @dataclass(frozen=True, eq=False)
 class CutScan:
-    """A shape, the vertex at each landmark (-1: cut off), and the length of the hand or head in the shape's unit."""
+    """A shape, and the whole that it is cut from.
+
+    ``places`` are the vertices of the whole where those of the shape lie (-1: on what is none of it); ``kept`` says which of
+    the whole's the shape shows; ``length`` is that of the hand or head in the unit of the whole.
+    """
 
     shape: Shape
-    landmarks: Int[Ints, " L"]
+    whole: Shape
+    places: Int[Ints, " V"]
+    kept: Bool[Bools, " W"]
     length: float
     mirrored: bool = False
 
@@ -51,11 +56,11 @@ def make_scans(kind: str, count: int, seed: int = 0) -> list[CutScan]:
     made = Kind(kind, 64).generator(_SEED + seed)
     source, template = made.draw, made.template
     assert isinstance(source, CutShapes)
-    whole, cut = (each.double().numpy() for each in source.both(count, torch.Generator().manual_seed(_SEED + seed)))
-    marks = farthest_points(whole[0], _LANDMARKS)
+    wholes, cut = (each.double().numpy() for each in source.both(count, torch.Generator().manual_seed(_SEED + seed)))
+    faces = source.faces.numpy()
+    bodies = [Shape(verts, faces, f"whole {kind}-{k:02d}") for k, verts in enumerate(wholes)]
     scans = [
-        _scan(template, verts, places[marks], f"{kind}-{number:02d}", np.random.default_rng([seed, number]))
-        for number, (places, verts) in enumerate(zip(whole, cut, strict=True))
+        _scan(template, bodies[k], cut[k], f"{kind}-{k:02d}", np.random.default_rng([seed, k])) for k in range(count)
     ]
     left = np.random.default_rng(_SEED + seed).random(count) < (0.5 if made.mirror == "auto" else 0.0)
     return [
@@ -64,20 +69,23 @@ def make_scans(kind: str, count: int, seed: int = 0) -> list[CutScan]:
     ]
 
 
-def _scan(
-    template: Template, verts: Float[Floats, "V 3"], places: Float[Floats, "L 3"], name: str, rng: np.random.Generator
-) -> CutScan:
+def _scan(template: Template, body: Shape, verts: Float[Floats, "V 3"], name: str, rng: np.random.Generator) -> CutScan:
     faces = np.asarray(template.shape.faces)
     length = length_of(template, verts)
     weights, fine = other_triangles(faces, len(verts))
     small = decimate(Shape(weights @ verts, fine, name), int(rng.uniform(0.8, 2.4) * len(faces)))
-    own = cKDTree(trimesh.Trimesh(small.verts, small.faces, process=False).sample(40_000, seed=0)).query(places)[0]
-    marks = np.where(own < _NEAR * length, cKDTree(small.verts).query(places)[1], -1)
+    weights, fine = other_triangles(np.asarray(body.faces), body.V)
+    whole = Shape(weights @ body.verts, fine, body.name)
+    surface = trimesh.Trimesh(small.verts, small.faces, process=False).sample(40_000, seed=0)
+    kept = cKDTree(surface).query(whole.verts)[0] < _NEAR * length
+    gap, places = cKDTree(whole.verts).query(small.verts)
+    places = np.where(gap < _NEAR * length, places, -1)
     if rng.uniform() < 0.5:
         small = with_clutter(small, length, rng)
+        places = np.pad(places, (0, small.V - len(places)), constant_values=-1)
     turn, unit = Rotation.random(random_state=rng).as_matrix(), 10.0 ** rng.uniform(-1, 3)
     shape = Shape(unit * (small.verts @ turn.T + rng.normal(size=3)), small.faces, name)
-    return CutScan(shape, marks.astype(np.int64), unit * length)
+    return CutScan(shape, whole, places.astype(np.int64), kept, length)
 
 
 def length_of(template: Template, verts: Float[Floats, "V 3"]) -> float:
@@ -103,15 +111,18 @@ def with_clutter(shape: Shape, length: float, rng: np.random.Generator) -> Shape
 def scan_errors(
     scans: Mapping[str, CutScan], maps: Mapping[Pair, VertexMap], cache: Path | None
 ) -> dict[Pair, np.ndarray]:
-    """Distances along the target at every landmark that both shapes have, in units of the target's length."""
+    """Distances along the target's whole between matched and true places, in units of its length: of the source's vertices
+    at every twentieth vertex of its whole, where the target shows it. What is matched to no place is a length off.
+    """
     found: dict[Pair, np.ndarray] = {}
-    for target in sorted({b for _, b in maps}):
-        scan = scans[target]
-        has = scan.landmarks >= 0
-        mine = [pair for pair in maps if pair[1] == target]
-        predicted = [np.where(scans[a].landmarks >= 0, maps[a, b].index[scans[a].landmarks], 0)[has] for a, b in mine]
-        errors = TruthDistances(scan.shape, scan.landmarks[has], cache).errors(predicted)
-        for pair, values in zip(mine, errors, strict=True):
-            common = scans[pair[0]].landmarks[has] >= 0
-            found[pair] = values[common] * float(np.sqrt(scan.shape.area)) / scan.length
+    for pair, made in maps.items():
+        source, target = (scans[name] for name in pair)
+        known = np.arange(0, target.whole.V, _EVERY)
+        asked = (source.places >= 0) & (source.places % _EVERY == 0)
+        at = np.flatnonzero(asked)
+        at = at[target.kept[source.places[at]]]
+        rows = TruthDistances(target.whole, known, cache).of(source.places[at] // _EVERY)
+        matched = target.places[made.index[at]]
+        apart = rows[np.arange(len(at)), matched] * (target.whole.area**0.5 / target.length)
+        found[pair] = np.where(matched < 0, 1.0, apart)
     return found

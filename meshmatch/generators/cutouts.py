@@ -162,9 +162,12 @@ class Cutout:
 
 @dataclass(frozen=True, eq=False)
 class CutShapes:
-    """Shapes that end at random cuts: ``whole`` draws them with what is cut off, in axes whose rows are ``axes``."""
+    """Shapes that end at random cuts: ``whole`` draws the vertices of ``faces`` with what is cut off, in axes whose rows are
+    ``axes``.
+    """
 
     whole: Source
+    faces: Int[Tensor, "M 3"]
     cutout: Cutout
     axes: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
 

