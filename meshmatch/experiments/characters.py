@@ -13,12 +13,13 @@ import itertools
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from rich.table import Table
 from scipy.spatial.transform import Rotation
 from typer import Option
 
@@ -124,6 +125,15 @@ def row_of(group: str, cast: list[Character], matcher: Matcher, cache: Path | No
     }
 
 
+def measured_groups(
+    data: Path, groups: Sequence[str], matcher: Matcher, count: int = 4, cache: Path | None = None
+) -> tuple[list[dict[str, Any]], Table]:
+    """Rows and table of some groups, of generated ones so many characters each, by the matcher's seed."""
+    designer = Designer.unseen(read_template("human-T"), matcher.config.seed)
+    rows = [row_of(group, characters_of(group, count, designer, data), matcher, cache) for group in groups]
+    return rows, runner.table(f"Characters with {matcher.model.card.name}", rows, COLUMNS)
+
+
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
@@ -134,13 +144,9 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    designer = Designer.unseen(read_template("human-T"), seed)
-    matcher = Matcher(model, FitConfig(), threads)
-    rows = [
-        row_of(group, characters_of(group, count, designer, data), matcher, cache)
-        for group in runner.names_of(groups, GROUPS, "group")
-    ]
-    return runner.Report({"rows": rows}, [runner.table("Characters", rows, COLUMNS)])
+    matcher = Matcher(model, FitConfig(seed=seed), threads)
+    rows, table = measured_groups(data, runner.names_of(groups, GROUPS, "group"), matcher, count, cache)
+    return runner.Report({"rows": rows}, [table])
 
 
 if __name__ == "__main__":

@@ -10,12 +10,13 @@ are bodies too; where a cloud cannot be told alone it takes the kind of the shap
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import trimesh
+from rich.table import Table
 from typer import Option
 
 from meshmatch.api.inputs import validated
@@ -106,18 +107,24 @@ def row_of(name: str, shapes: list[Shape]) -> dict[str, Any]:
     return record | {"wrong": len(wrong), "own": own or None, "others": others, "which": wrong}
 
 
+def measured_sets(
+    data: Path, sets: Sequence[str] = SETS, limit_shapes: int | None = None
+) -> tuple[dict[str, Any], Table, list[str]]:
+    """Record and table of some sets, and what is wrong."""
+    rows = [row_of(name, runner.spread(list(shapes_of(name, data)), limit_shapes)) for name in sets]
+    notes = [f"wrong: {word}" for row in rows for word in row["which"]]
+    record = {"known": KNOWN, "models": [model.card.name for model in installed_models()], "rows": rows}
+    return record, runner.table("The kind of every shape", rows, COLUMNS), notes
+
+
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
     sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
     limit_shapes: Annotated[int | None, Option(min=1, help="of each set, evenly spread")] = None,
 ) -> runner.Report:
-    rows = []
-    for name in runner.names_of(sets, SETS, "set"):
-        rows.append(row_of(name, runner.spread(list(shapes_of(name, data)), limit_shapes)))
-    notes = [f"wrong: {word}" for row in rows for word in row["which"]]
-    record = {"known": KNOWN, "models": [model.card.name for model in installed_models()], "rows": rows}
-    return runner.Report(record, [runner.table("The kind of every shape", rows, COLUMNS)], notes)
+    record, table, notes = measured_sets(data, runner.names_of(sets, SETS, "set"), limit_shapes)
+    return runner.Report(record, [table], notes)
 
 
 if __name__ == "__main__":

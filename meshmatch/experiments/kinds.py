@@ -11,6 +11,9 @@ Hands and heads are generated (meshmatch/experiments/cut_scans.py): of people an
 triangles, cut at random, turned anywhere, every other one with a thing beside it, and hands of both sides; a table says
 how many sides were found, and how many pairs of one wrong side were called good. Their errors are in percent of the length
 of the hand (wrist to fingertips) or the head (chin to crown).
+
+Characters, and the kind that `--model auto` finds of every shape of every set, are those of
+meshmatch.experiments.characters and meshmatch.experiments.chosen_models, which have more choices.
 """
 
 from __future__ import annotations
@@ -32,6 +35,8 @@ from meshmatch.arrays import Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.animals import TRUTH, animal_errors, kind_of
 from meshmatch.experiments.category import Shapes, ordered_pairs
+from meshmatch.experiments.characters import GROUPS, measured_groups
+from meshmatch.experiments.chosen_models import measured_sets
 from meshmatch.experiments.cut_scans import make_scans, scan_errors
 from meshmatch.experiments.scores import TruthDistances
 from meshmatch.experiments.sets import Pair, load_folder
@@ -45,7 +50,9 @@ from meshmatch.maps.vertex_map import VertexMap
 OFF = 0.1
 """In units of sqrt(area): a point further off is lost."""
 VERDICTS = ("good", "fair", "poor")
-SETS = ("animals", "hand", "head")
+SETS = ("animals", "hand", "head", "characters", "auto")
+MODELS = {"animals": "quadruped", "characters": "human"}
+"""Of the sets that are not named as theirs."""
 BARS = {"hand": 4.0, "head": 2.0}
 """Percent of the length."""
 _COLUMNS = {"pairs": "pairs:d", "mean": "mean_x100:.2f", "median": "median_x100:.2f", "off": "off:.1%"}
@@ -178,7 +185,7 @@ def measured_scans(
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
-    sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = "animals",
+    sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
     model: Annotated[str | None, Option(help="default: the kind's own")] = None,
     agree: Annotated[Agree, Option(help="which fits agree before they are composed")] = "pairs",
     limit_pairs: runner.LimitPairs = None,
@@ -189,17 +196,25 @@ def main(
     seed: runner.Seed = 0,
 ) -> runner.Report:
     record: dict[str, Any] = {}
-    tables = []
+    tables: list[Table] = []
+    notes: list[str] = []
     for name in runner.names_of(sets, SETS, "set"):
-        matcher = Matcher(model or {"animals": "quadruped"}.get(name, name), FitConfig(seed=seed), threads)
-        if name == "animals":
-            found, drawn = measured_animals(data, matcher, agree, (limit_shapes, limit_pairs), cache)
+        if name == "auto":
+            record[name], drawn, notes = measured_sets(data)
+            tables.append(drawn)
+            continue
+        matcher = Matcher(model or MODELS.get(name, name), FitConfig(seed=seed), threads)
+        if name == "characters":
+            record[name], drawn = measured_groups(data, GROUPS, matcher, cache=cache)
+            tables.append(drawn)
+        elif name == "animals":
+            found, several = measured_animals(data, matcher, agree, (limit_shapes, limit_pairs), cache)
             record |= found
+            tables += several
         else:
-            found, drawn = measured_scans(name, scans, matcher, agree, cache)
-            record[name] = found
-        tables += drawn
-    return runner.Report(record, tables)
+            record[name], several = measured_scans(name, scans, matcher, agree, cache)
+            tables += several
+    return runner.Report(record, tables, notes)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.table import Table
 
 from meshmatch.api.inputs import as_model
 from meshmatch.experiments import kinds
@@ -31,7 +32,18 @@ def test_every_pair_counts(agree: str, tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "faust").rename(tmp_path / "animal")
     spoiled = tmp_path / "animal" / "tr_reg_010.landmarks.npy"  # of the same body each: the maps are perfect
     np.save(spoiled, np.roll(np.load(spoiled), 1))
-    words = ["--data", str(tmp_path), "--model", "human", "--agree", agree, "--cache", str(tmp_path / "cache")]
+    words = [
+        "--sets",
+        "animals",
+        "--data",
+        str(tmp_path),
+        "--model",
+        "human",
+        "--agree",
+        agree,
+        "--cache",
+        str(tmp_path / "cache"),
+    ]
     assert kinds.main(words) == 0
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert record["all"]["pairs"] == 6
@@ -45,15 +57,15 @@ def test_every_pair_counts(agree: str, tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_without_data_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert kinds.main(["--data", str(tmp_path)]) == 1
+    assert kinds.main(["--data", str(tmp_path), "--sets", "animals"]) == 1
     assert "no shapes" in capsys.readouterr().err
 
 
 def test_hands_with_any_model_of_theirs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
     """Bumpy balls stand for hands, and are matched by a model of a body."""
     balls = [load_shape(file) for file in sorted(build(tmp_path).glob("faust/*.ply"))]
-    marks = np.arange(0, 70, 7)
-    made = [CutScan(ball, np.where(marks < 20 * number, -1, marks), 2.0) for number, ball in enumerate(balls)]
+    own, kept = np.arange(balls[0].V), np.ones(balls[0].V, bool)
+    made = [CutScan(ball, ball, np.where(own < 7 * number, -1, own), kept, 2.0) for number, ball in enumerate(balls)]
     monkeypatch.setattr(kinds, "make_scans", lambda kind, count, seed: made[:count])
     words = ["--sets", "hand", "--model", "human", "--scans", "3", "--cache", str(tmp_path / "cache")]
     assert kinds.main(words) == 0
@@ -67,7 +79,8 @@ def test_hands_with_any_model_of_theirs(monkeypatch: pytest.MonkeyPatch, tmp_pat
 def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
     """Balls of which one is said to be a left hand; nothing is mirrored by a model of what is symmetric."""
     balls = [load_shape(file) for file in sorted(build(tmp_path).glob("faust/*.ply"))]
-    made = [CutScan(ball, np.arange(0, 70, 7), 2.0, mirrored=number == 1) for number, ball in enumerate(balls)]
+    own, kept = np.arange(balls[0].V), np.ones(balls[0].V, bool)
+    made = [CutScan(ball, ball, own, kept, 2.0, mirrored=number == 1) for number, ball in enumerate(balls)]
     monkeypatch.setattr(kinds, "make_scans", lambda kind, count, seed: made[:count])
     human = as_model("human")
     both = TrainedModel(replace(human.card, mirror="auto"), human.template, human.inference)
@@ -81,3 +94,21 @@ def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caps
     good = [name for name, verdict in record["verdicts"].items() if verdict == "good"]
     pairs = [1 for name in good for other in good if name != other and balls[1].name in (name, other)]
     assert sides["wrong_called_good"] == len(pairs)
+
+
+def test_characters_and_kinds_are_printed_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
+    asked = []
+
+    def groups(data: Path, names: tuple[str, ...], matcher: kinds.Matcher, cache: Path) -> tuple[list[str], Table]:
+        asked.append((names, matcher.model.card.name))
+        return ["a row"], Table("of characters")
+
+    monkeypatch.setattr(kinds, "measured_groups", groups)
+    monkeypatch.setattr(kinds, "measured_sets", lambda data: ({"rows": []}, Table("of auto"), ["wrong: a chair"]))
+    assert kinds.main(["--data", str(tmp_path), "--sets", "characters,auto"]) == 0
+    out, err = capsys.readouterr()
+    record = json.loads(out.splitlines()[-1])
+    assert (record["characters"], record["auto"]) == (["a row"], {"rows": []})
+    assert asked == [(kinds.GROUPS, "human")]
+    for word in ("of characters", "of auto", "wrong: a chair"):
+        assert word in out + err
