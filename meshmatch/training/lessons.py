@@ -35,7 +35,7 @@ class Lessons:
 
     template: Template
     source: Source | ShapeSamples
-    category: str
+    category: str  # empty where nothing says what the shapes are
     data: str  # a few words
     frame: dict[str, str] | None = None  # how fits find it, where the shapes say so
     mirror: Mirroring = "no"  # "auto" where shapes come in two sides
@@ -67,11 +67,11 @@ def prepared(shapes: Path, recipe: Recipe) -> Lessons:
     if recipe.train.loss.needs_correspondence:
         verts = torch.from_numpy(read_registered(shapes, template))
         source = (deformed_source if recipe.deform else registered_source)(verts)
-        return Lessons(template, source, name, f"{len(verts)} registered shapes of {name}", frame, mirror)
+        return Lessons(template, source, "", f"{len(verts)} registered shapes of {name}", frame, mirror)
     samples = read_samples(shapes, template)
     known = f" and {len(samples.template_landmarks)} known points" if len(samples.template_landmarks) else ""
     data = f"{len(samples.points)} shapes of {name}, without correspondence{known}"
-    return Lessons(template, samples, name, data, frame, mirror)
+    return Lessons(template, samples, "", data, frame, mirror)
 
 
 def kind_named(name: str) -> Kind | Bodies:

@@ -58,7 +58,7 @@ class CardFacts:
     """
 
     name: str = ""  # the output folder's
-    category: str = ""  # the name of the folder of shapes; "human" for bodies
+    category: str = ""  # of a folder of shapes the model's name; "human" for bodies
     data: str = ""  # a sentence about the shapes
     licence: str = "unstated"
     stiffness: float = 1.0  # 0.05 suits what differs more from shape to shape than bodies do, such as organs
@@ -108,7 +108,8 @@ def train(
             raise OptionError(f"{output} is the model that made the fits", "choose another folder")
         facts, recipe = _inherited(facts, start.card), recipe or going_on(start)
     learned = lessons(shapes, kind, recipe, Progress(progress, "shapes").stage("making shapes (once)"))
-    facts = replace(facts, category=facts.category or learned.category, data=facts.data or learned.data)
+    category = facts.category or learned.category or facts.name
+    facts = replace(facts, category=category, data=facts.data or learned.data)
     facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
 
     def both(now: StepReport) -> None:
@@ -161,7 +162,9 @@ def train_model(
     if isinstance(start := facts.start, TrainedModel):
         theirs = start.template.hash, start.network.config, start.card.field["kernel"]
         if theirs != (template.hash, recipe.network, kernel):
-            hint = "start from a model of the same template and preset, or from nothing"
+            hint = (
+                f"start from one of the same template and preset, or fit with {start.card.name} and learn from the fits"
+            )
             raise OptionError(f"model {start.card.name} has another template, network or kernel", hint)
         model.load_state_dict(start.network.state_dict())
     if isinstance(source, ShapeSamples):

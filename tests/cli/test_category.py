@@ -63,7 +63,7 @@ def test_from_a_folder_to_a_map(run: Run, eggs: Path, tmp_path: Path) -> None:
     assert "learned from 3 shapes of out, without correspondence" in answer.err
     card = read_card(tmp_path / "mine" / "card.json")
     assert card.frame == {"orientation": "none", "scale": "area"}
-    assert (card.steps, card.category) == (3, "out")
+    assert (card.steps, card.category) == (3, "mine")
     assert "without correspondence" in card.data
     answer = run(
         *("match", eggs / "egg0.ply", eggs / "egg1.ply", "-o", tmp_path / "map.npy"),

@@ -224,7 +224,7 @@ def test_poses_of_a_file_are_mixed_in(run: Run, stub: Recorder, tmp_path: Path) 
     assert "dance" not in stub.called["data"]
 
 
-def test_a_prepared_folder_brings_template_and_category(
+def test_a_prepared_folder_brings_its_template(
     run: Run, stub: Recorder, tmp_path: Path, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("meshmatch.render.compose.render_shapes", lambda *_: None)
@@ -235,7 +235,7 @@ def test_a_prepared_folder_brings_template_and_category(
     assert run("prepare", tmp_path / "eggs", *words).status == 0
     assert run("train", "-o", tmp_path / "mine", "--shapes", tmp_path / "ready").status == 0
     assert stub.bodies == ()
-    assert (stub.called["template"], stub.called["category"]) == ("eggs", "ready")
+    assert (stub.called["template"], stub.called["category"]) == ("eggs", "mine")
     assert stub.called["data"] == "2 registered shapes of ready"
 
 
