@@ -1,6 +1,8 @@
 """``meshmatch models``: the trained models that are at hand."""
 
+import re
 from pathlib import Path
+from textwrap import shorten
 from typing import Annotated
 
 import typer
@@ -23,7 +25,7 @@ def list_all(json: options.Json = False) -> None:
     """List built-in models and your own."""
     entries = registry.list_models()
     if json:
-        keys = ("category", "created", "licence")
+        keys = ("category", "created", "licence", "data")
         record = [
             {"name": entry.name, "built_in": entry.built_in, "folder": str(entry.folder)}
             | {key: getattr(entry.card, key, None) for key in keys}
@@ -32,16 +34,23 @@ def list_all(json: options.Json = False) -> None:
         ]
         print_json({"models": record})
         return
-    rows = [("NAME", "CATEGORY", "CREATED", "FROM", "LICENCE")]
+    rows = [("NAME", "CATEGORY", "CREATED", "FROM", "LICENCE", "LEARNED FROM")]
     for entry in entries:
         where = "package" if entry.built_in else "own"
         card = entry.card
-        about = ("", "", where, "damaged") if card is None else (card.category, card.created, where, card.licence)
-        rows.append((entry.name, *about))
+        if card is None:
+            rows.append((entry.name, "", "", where, "damaged", ""))
+        else:
+            rows.append((entry.name, card.category, card.created, where, card.licence, _in_short(card.data)))
     print_rows(rows)
     for entry in entries:
         if entry.problem:
             Console().warn(f"model {entry.name}: {entry.problem}")
+
+
+def _in_short(data: str) -> str:
+    """The first words of what a model learned from, without what stands in brackets."""
+    return shorten(re.sub(r" \([^)]*\)", "", data), 64, placeholder=" ...")
 
 
 @models.command()

@@ -41,6 +41,9 @@ def test_list_knows_the_model_that_ships(run: Run) -> None:
     rows = [line.split() for line in answer.out.splitlines()]
     assert rows[0][0] == "NAME"
     assert {(name, name) for name in SHIPPED} <= {tuple(row[:2]) for row in rows}
+    words = next(line for line in answer.out.splitlines() if line.startswith("hand "))
+    assert words.endswith("right hands of 1024 generated people in sampled poses, cut ...")
+    assert "cut off above the wrist (anny" in run("models", "list", "--json").out
 
 
 def test_show_is_the_card(run: Run) -> None:
