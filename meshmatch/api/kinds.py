@@ -141,11 +141,13 @@ def kinds_of(
     found: list[str | None] = []
     for shape, config, column in zip(shapes, configs, readings.T, strict=True):
         best = int(column.argmin())
+        kind = models[best].card.category
         whole = not shape.is_cloud and not may_show_part(shape, config)
         known = column[best] <= KNOWN
         if whole and np.isfinite(column[best]):
-            known = is_of_kind(models[best].load(), shape, column[best], config)
-        found.append(models[best].card.category if known else None)
+            rivals = [reading for model, reading in zip(models, column, strict=True) if model.card.category != kind]
+            known = is_of_kind(models[best].load(), shape, column[best], config, min(rivals, default=np.inf))
+        found.append(kind if known else None)
         if whole and not known:
             names = ", ".join(sorted({model.card.category for model in models}))
             problem = f"{shape.name} is of no kind that the installed models know: {names}"

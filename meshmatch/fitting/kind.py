@@ -28,7 +28,9 @@ FAMILIAR, STRANGE = 0.0465, 0.062
 for arms: a fit tells, see `is_of_kind`."""
 SURE = 0.042
 """Up to this a reading needs no other model's beside it: another kind's were 0.0439 at least (docs/results.md)."""
-_BELONGS = 0.7  # trust from which on such a fit tells the kind; a fair one of heads can be of a heart
+# Trust from which on such a fit tells the kind; any that is not poor where every other kind's reading is so many times as
+# high. A fair one of heads can be of a heart (1.08 times at most), one of people is of a Rogue (1.10 at least).
+_BELONGS, _ALONE = 0.7, 1.09
 _SAMPLES, _THIN = 2048, 768  # how many the reading is of, and how many rank the orientations
 
 
@@ -52,9 +54,12 @@ def read_kind(model: TrainedModel, shape: Shape, samples: OrientedPoints, config
     return predictor.fit(placed, best.pose, draws=1).residual
 
 
-def is_of_kind(model: TrainedModel, shape: Shape, reading: float, config: FitConfig) -> bool:
-    """Whether a complete shape is of a model's kind: its reading says so, or the fit of one that reads strangely."""
+def is_of_kind(model: TrainedModel, shape: Shape, reading: float, config: FitConfig, rival: float) -> bool:
+    """Whether a complete shape is of a model's kind: its reading says so, or the fit of one that reads strangely.
+
+    ``rival`` is the lowest reading of another kind.
+    """
     if FAMILIAR < reading <= STRANGE:
         fit = Fitter(model, replace(config, refine="nodes", partial="no")).fit(shape)
-        return fit.verdict != "poor" and fit.trust >= _BELONGS
+        return fit.verdict != "poor" and (fit.trust >= _BELONGS or rival >= _ALONE * reading)
     return reading <= FAMILIAR

@@ -87,13 +87,19 @@ def test_a_complete_shape_of_no_kind_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("verdict", "trust", "of_kind"), [("fair", 0.75, True), ("fair", 0.65, False), ("poor", 0.95, False)]
+    ("verdict", "trust", "rival", "of_kind"),
+    [
+        ("fair", 0.75, 0.056, True),
+        ("fair", 0.65, 0.059, False),
+        ("fair", 0.65, 0.061, True),
+        ("poor", 0.95, 0.1, False),
+    ],
 )
-def test_a_strange_shape_needs_more_trust_than_a_fair_fit(
-    monkeypatch: pytest.MonkeyPatch, verdict: str, trust: float, of_kind: bool
+def test_a_strange_shape_needs_more_trust_than_a_fair_fit_unless_nothing_else_is_near(
+    monkeypatch: pytest.MonkeyPatch, verdict: str, trust: float, rival: float, of_kind: bool
 ) -> None:
     monkeypatch.setattr(kind.Fitter, "fit", lambda *_: SimpleNamespace(verdict=verdict, trust=trust))
-    assert kind.is_of_kind(as_model("human"), ball("man"), 0.055, CONFIG) is of_kind
+    assert kind.is_of_kind(as_model("human"), ball("man"), 0.055, CONFIG, rival) is of_kind
 
 
 @pytest.mark.usefixtures("models")
