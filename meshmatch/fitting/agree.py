@@ -6,8 +6,8 @@ mean of all. The mean is taken of logarithms, so that doubling and halving cance
 Fillard, Pennec and Ayache, 2006). Pairs of points hold tighter across the surface than along it, where the stretch
 decides.
 
-Shapes that are not alike, such as people in different clothes, do not stretch the template alike: where the fits of such
-shapes differ, each keeps the stretch that it had alone.
+Shapes that are not alike, such as people in different clothes, do not stretch the template alike: the more the fits
+differ, the more each keeps the stretch that it had alone.
 """
 
 from __future__ import annotations
@@ -31,8 +31,7 @@ from meshmatch.shapes.shape import Shape
 
 _PAIRING = ("point_share", "pair_normals", "back_points", "shared")
 _MIN_STRETCH = 1e-3  # smaller ones count as this: a logarithm must stay finite
-# How suddenly shapes cease to be alike, as a whole and around a point; set by hand.
-_SUDDEN, _STEEP = 24, 8
+_STEEP = 8  # how suddenly shapes cease to be alike; set by hand
 _SAME = 0.99  # shapes so much alike share the stretch
 
 
@@ -46,9 +45,7 @@ class AgreeConfig:
     strain: float = 0.0001  # weight of the common stretch
     scale: float = 0.05  # of the robust weight (units of sqrt(area))
     momentum: float = 0.6  # how far each step goes on along the last: what slides along the surface has far to go
-    # Two whose logarithms of stretch lie further apart (median) are not alike, and follow their mean only where they differ
-    # by less: bodies of SCAPE, FAUST and SHREC'19 lie 0.15 to 0.36 apart, and 0.41 at most; people in clothes 0.39 to 0.69.
-    alike: float = 0.38
+    alike: float = 0.4  # two whose logarithms of stretch lie so far apart (median) follow their mean half way
     point_share: float = 0.01
     pair_normals: float = 0.012
     back_points: int = 8000
@@ -146,7 +143,7 @@ def agree(
 
     refined = before = [member.vectors for member in members]
     own = [log_stretch(system.deformation_gradient(vectors)) for vectors in refined]
-    follows = [likeness(system, log, own, each.config.alike) for log, each in zip(own, members, strict=True)]
+    follows = [likeness(log, own, member.config.alike) for log, member in zip(own, members, strict=True)]
     with ThreadPoolExecutor(threads) as pool:
         for _ in range(members[0].config.steps):
             paths = zip(members, refined, before, strict=True)
@@ -155,7 +152,7 @@ def agree(
             mean = mean_log([log_stretch(F) for F in gradients])
             shared = stretch_of(mean)
             wanted = [
-                shared if share.min() > _SAME else stretch_of(log + share * (mean - log))
+                shared if share > _SAME else stretch_of(log + share * (mean - log))
                 for log, share in zip(own, follows, strict=True)
             ]
             refined = list(
@@ -164,18 +161,14 @@ def agree(
     return refined
 
 
-def likeness(
-    system: NodeSystem, log: Float[Floats, "G 3 3"], others: Sequence[Float[Floats, "G 3 3"]], alike: float
-) -> Float[Floats, "G 1 1"]:
-    """How far (0..1) one of several shapes follows their mean at every strain point, by the logarithms of their stretches.
+def likeness(log: Float[Floats, "G 3 3"], others: Sequence[Float[Floats, "G 3 3"]], half: float) -> float:
+    """How much (0..1) one of several shapes is like all of them, by the logarithms of their stretches.
 
-    Where the median over the template of how far it differs (of two, of their distance from one another) is below
-    ``alike``, fully; otherwise where it differs by less around the point.
+    It is a half where it differs by ``half``, at the median over the template; of two, their distance from one another.
     """
-    apart = 2 * np.linalg.norm((log - mean_log(others)).reshape(len(log), -1), axis=1) / alike
-    unlike = 1 - 1 / (1 + np.median(apart) ** _SUDDEN)
-    around = 1 / (1 + system.mean_around(apart) ** _STEEP)
-    return (1 - unlike * (1 - around))[:, None, None]
+    apart = 2 * (log - mean_log(others))
+    distance = float(np.median(np.linalg.norm(apart.reshape(len(log), -1), axis=1)))
+    return 1 / (1 + (distance / half) ** _STEEP)
 
 
 def agree_step(

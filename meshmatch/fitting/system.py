@@ -77,12 +77,6 @@ class NodeSystem:
     def strain_points(self) -> Int[Ints, " G"]:
         return self._once("strain points", lambda: farthest_points(self.verts, self._strained))
 
-    def mean_around(self, values: Float[Floats, " G"]) -> Float[Floats, " G"]:
-        """Values of the strain points, each the mean over those that the same nodes move."""
-        shares = self._once("shares", lambda: abs(self.phi[self.strain_points]))
-        of_nodes, of_points = (np.maximum(np.asarray(shares.sum(axis)).ravel(), 1e-12) for axis in (0, 1))
-        return np.asarray(shares @ ((shares.T @ values) / of_nodes)).ravel() / of_points
-
     @property
     def equations(self) -> Equations:
         field = self.field
