@@ -177,9 +177,7 @@ class TrainOptions:
         "what differs more from shape to shape, such as organs.",
     )
     name: str | None = optional("NAME", "The model's name; default: the folder's.")
-    category: str | None = optional(
-        "NAME", "What it matches; default: the kind, or of a folder of shapes the model's name."
-    )
+    category: str | None = optional("NAME", "What it matches; default: the kind, or of a folder the model's name.")
     licence: str = Option("unstated", help="Terms of use of the weights; written on the card.")
     steps: int | None = Option(None, min=1, help="Training steps; default: the preset's.")
     minutes: float | None = Option(None, min=0.0, help="Stop after so many minutes; the same command goes on later.")

@@ -108,8 +108,7 @@ def train(
             raise OptionError(f"{output} is the model that made the fits", "choose another folder")
         facts, recipe = _inherited(facts, start.card), recipe or going_on(start)
     learned = lessons(shapes, kind, recipe, Progress(progress, "shapes").stage("making shapes (once)"))
-    category = facts.category or learned.category or facts.name
-    facts = replace(facts, category=category, data=facts.data or learned.data)
+    facts = replace(facts, category=facts.category or learned.category or facts.name, data=facts.data or learned.data)
     facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
 
     def both(now: StepReport) -> None:
@@ -162,9 +161,7 @@ def train_model(
     if isinstance(start := facts.start, TrainedModel):
         theirs = start.template.hash, start.network.config, start.card.field["kernel"]
         if theirs != (template.hash, recipe.network, kernel):
-            hint = (
-                f"start from one of the same template and preset, or fit with {start.card.name} and learn from the fits"
-            )
+            hint = f"start from one of the same template and preset, or learn from fits by {start.card.name}"
             raise OptionError(f"model {start.card.name} has another template, network or kernel", hint)
         model.load_state_dict(start.network.state_dict())
     if isinstance(source, ShapeSamples):
