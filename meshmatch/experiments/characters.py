@@ -126,10 +126,10 @@ def row_of(group: str, cast: list[Character], matcher: Matcher, cache: Path | No
 
 
 def measured_groups(
-    data: Path, groups: Sequence[str], matcher: Matcher, count: int = 4, cache: Path | None = None
+    data: Path, groups: Sequence[str], matcher: Matcher, count: int = 4, seed: int = 0, cache: Path | None = None
 ) -> tuple[list[dict[str, Any]], Table]:
-    """Rows and table of some groups, of generated ones so many characters each, by the matcher's seed."""
-    designer = Designer.unseen(read_template("human-T"), matcher.config.seed)
+    """Rows and table of some groups, of generated ones so many characters each, drawn by a seed."""
+    designer = Designer.unseen(read_template("human-T"), seed)
     rows = [row_of(group, characters_of(group, count, designer, data), matcher, cache) for group in groups]
     return rows, runner.table(f"Characters with {matcher.model.card.name}", rows, COLUMNS)
 
@@ -144,8 +144,8 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    matcher = Matcher(model, FitConfig(seed=seed), threads)
-    rows, table = measured_groups(data, runner.names_of(groups, GROUPS, "group"), matcher, count, cache)
+    matcher = Matcher(model, FitConfig(), threads)
+    rows, table = measured_groups(data, runner.names_of(groups, GROUPS, "group"), matcher, count, seed, cache)
     return runner.Report({"rows": rows}, [table])
 
 

@@ -205,7 +205,7 @@ def main(
             continue
         matcher = Matcher(model or MODELS.get(name, name), FitConfig(seed=seed), threads)
         if name == "characters":
-            record[name], drawn = measured_groups(data, GROUPS, matcher, cache=cache)
+            record[name], drawn = measured_groups(data, GROUPS, matcher, seed=seed, cache=cache)
             tables.append(drawn)
         elif name == "animals":
             found, several = measured_animals(data, matcher, agree, (limit_shapes, limit_pairs), cache)

@@ -32,18 +32,8 @@ def test_every_pair_counts(agree: str, tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "faust").rename(tmp_path / "animal")
     spoiled = tmp_path / "animal" / "tr_reg_010.landmarks.npy"  # of the same body each: the maps are perfect
     np.save(spoiled, np.roll(np.load(spoiled), 1))
-    words = [
-        "--sets",
-        "animals",
-        "--data",
-        str(tmp_path),
-        "--model",
-        "human",
-        "--agree",
-        agree,
-        "--cache",
-        str(tmp_path / "cache"),
-    ]
+    words = ["--data", str(tmp_path), "--cache", str(tmp_path / "cache")]
+    words += ["--sets", "animals", "--model", "human", "--agree", agree]
     assert kinds.main(words) == 0
     record = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert record["all"]["pairs"] == 6
@@ -99,16 +89,16 @@ def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caps
 def test_characters_and_kinds_are_printed_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
     asked = []
 
-    def groups(data: Path, names: tuple[str, ...], matcher: kinds.Matcher, cache: Path) -> tuple[list[str], Table]:
-        asked.append((names, matcher.model.card.name))
+    def groups(data: Path, names: tuple[str, ...], matcher: kinds.Matcher, **how: object) -> tuple[list[str], Table]:
+        asked.append((names, matcher.model.card.name, how["seed"]))
         return ["a row"], Table("of characters")
 
     monkeypatch.setattr(kinds, "measured_groups", groups)
     monkeypatch.setattr(kinds, "measured_sets", lambda data: ({"rows": []}, Table("of auto"), ["wrong: a chair"]))
-    assert kinds.main(["--data", str(tmp_path), "--sets", "characters,auto"]) == 0
+    assert kinds.main(["--data", str(tmp_path), "--sets", "characters,auto", "--seed", "3"]) == 0
     out, err = capsys.readouterr()
     record = json.loads(out.splitlines()[-1])
     assert (record["characters"], record["auto"]) == (["a row"], {"rows": []})
-    assert asked == [(kinds.GROUPS, "human")]
+    assert asked == [(kinds.GROUPS, "human", 3)]
     for word in ("of characters", "of auto", "wrong: a chair"):
         assert word in out + err
