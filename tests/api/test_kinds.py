@@ -103,6 +103,15 @@ def test_a_strange_shape_needs_more_trust_than_a_fair_fit_unless_nothing_else_is
 
 
 @pytest.mark.usefixtures("models")
+def test_its_rival_is_the_nearest_reading_of_another_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    rivals: list[float] = []
+    monkeypatch.setattr(kinds, "is_of_kind", lambda *given: rivals.append(given[-1]) or True)
+    choose(ball("robot 5.5 5.6 7"))
+    choose(ball("robot 5.5 7 5.6"))
+    assert rivals == pytest.approx([0.07, 0.056])
+
+
+@pytest.mark.usefixtures("models")
 def test_what_reads_strangely_is_of_the_kind_that_fits_it() -> None:
     dancer = load_shape(SAMPLES / "dancer.ply")
     strange = Shape(dancer.verts, dancer.faces, "robot 5.5 5.6 7")
