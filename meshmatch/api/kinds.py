@@ -134,9 +134,9 @@ def choose_model(
 def kinds_of(
     models: Sequence[Installed], readings: Float[Floats, "M S"], shapes: Sequence[Shape], configs: Sequence[FitConfig]
 ) -> list[str | None]:
-    """The category of each shape's best reading, None where it is too high for a shape that may hide some of itself.
+    """The category of each shape's best reading, None for a cloud or a part that is not known to be of that kind.
 
-    `InputError` for a complete shape that is not of that kind (`is_of_kind`).
+    `InputError` for a complete mesh that is not of that kind (`is_of_kind`).
     """
     found: list[str | None] = []
     for shape, config, column in zip(shapes, configs, readings.T, strict=True):
@@ -144,7 +144,7 @@ def kinds_of(
         kind = models[best].card.category
         whole = not shape.is_cloud and not may_show_part(shape, config)
         known = column[best] <= KNOWN
-        if whole and np.isfinite(column[best]):
+        if (whole or (shape.is_cloud and config.partial != "yes")) and np.isfinite(column[best]):
             rivals = [reading for model, reading in zip(models, column, strict=True) if model.card.category != kind]
             known = is_of_kind(models[best].load(), shape, column[best], config, min(rivals, default=np.inf))
         found.append(kind if known else None)
@@ -153,3 +153,13 @@ def kinds_of(
             problem = f"{shape.name} is of no kind that the installed models know: {names}"
             raise InputError(problem, "if it is of one of them, name its model with --model (model=...)")
     return found
+
+
+def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | None:
+    """The kind that a repaired shape is of by the installed models, if that is another one than the model's."""
+    try:
+        models = installed_models()
+        (kind,) = kinds_of(models, read_kinds(models, [shape], [config]), [shape], [config])
+    except (InputError, ModelError):
+        return None
+    return None if kind == model.card.category else kind

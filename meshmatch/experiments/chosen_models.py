@@ -3,7 +3,8 @@
 Bodies, animals, hands and heads have a model; hearts, furniture and plain solids have none and must be refused. Hands and
 heads are generated (meshmatch/experiments/cut_scans.py), and so are characters (character_designs.py), but for the
 evaluation data's two, and the chairs, tables and planes of "furniture". Clouds with noise, and sparse ones with outliers,
-are bodies too; where a cloud cannot be told alone it takes the kind of the shape that it is matched with ("unsure" here).
+are bodies too; where a cloud cannot be told alone it takes the kind of the shape that it is matched with ("unsure" here),
+which is all that can be said of "clouds" of hearts, chairs, tables and planes, every other one with a tenth of strays.
 *Reading* is the mean distance of the shape and a model's unrefined template (units of sqrt(area)).
 """
 
@@ -31,6 +32,7 @@ from meshmatch.experiments.sets import CLOUD_SET, SET_NAMES, load_set
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.kind import KNOWN
 from meshmatch.shapes.files import as_shape
+from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import read_template
 from meshmatch.threads import thread_limit
@@ -39,8 +41,9 @@ FOLDERS = {"faust_scans": "human", "animal": "quadruped", "heart": "", "chair": 
 """Folders of meshes, and their kind; empty: none."""
 MADE = ("hand", "head")
 CHARACTERS = ("stylised", "robots", "soldiers", "rogues")
-SETS = (*SET_NAMES, CLOUD_SET, "outliers", *FOLDERS, *MADE, *CHARACTERS, "solids", "furniture")
+SETS = (*SET_NAMES, CLOUD_SET, "outliers", *FOLDERS, "clouds", *MADE, *CHARACTERS, "solids", "furniture")
 _SCANS, _CAST, _PIECES = 20, 12, 20
+_POINTS, _STRAYS = (4000, 1000), (0, 100)  # of one cloud and the next
 COLUMNS = {
     **{
         "set": "set",
@@ -61,6 +64,9 @@ def shapes_of(name: str, data: Path) -> Iterator[Shape]:
         yield from (bench.seen(shape) for shape in bench.shapes)
     elif name == "outliers":
         yield from (as_shape(np.asarray(points, float)) for points in np.load(data / "faust_outliers.npy"))
+    elif name == "clouds":
+        none = [each for folder, kind in FOLDERS.items() if not kind for each in shapes_of(folder, data)]
+        yield from (as_cloud(each, number) for number, each in enumerate(none))
     elif name in MADE:
         yield from (scan.shape for scan in make_scans(name, _SCANS))
     elif name in CHARACTERS:
@@ -81,9 +87,19 @@ def shapes_of(name: str, data: Path) -> Iterator[Shape]:
         yield from (as_shape(file) for file in sorted((data / name).glob("*.ply")))
 
 
+def as_cloud(shape: Shape, number: int) -> Shape:
+    """Points of a shape's surface, and strays in its box."""
+    rng = np.random.default_rng(number)
+    points = sample_surface(shape, _POINTS[number % 2], rng).points
+    low, high = points.min(0), points.max(0)
+    points = np.concatenate([points, rng.uniform(low, high, (_STRAYS[number % 2], 3))])
+    return Shape(points, np.empty((0, 3), np.int64), f"cloud of {shape.name}")
+
+
 def row_of(name: str, shapes: list[Shape]) -> dict[str, Any]:
     """How many of a set's shapes are taken for what they are; the highest reading of their kind, the lowest of others."""
-    wanted = FOLDERS.get(name, name if name in MADE else "" if name in ("solids", "furniture") else "human")
+    nothing = name in ("clouds", "solids", "furniture")
+    wanted = FOLDERS.get(name, name if name in MADE else "" if nothing else "human")
     models, config = installed_models(), [FitConfig()]
     right, unsure, wrong, own, others = 0, 0, list[str](), 0.0, np.inf
     for shape in runner.track(shapes, name):

@@ -1,7 +1,7 @@
 """Of what kind a shape is, read coarsely: how near a model's network alone brings its template to the shape.
 
-A complete shape that reads strangely, such as a robot, is fitted: where the fit can be trusted, it is of the kind.
-A reading takes the shape for complete: of a part, and of a sparse or noisy cloud, a high one says little.
+What reads strangely, such as a robot or a cloud with many outliers, is fitted: where the fit can be trusted, it is of the
+kind. Reading and fit take the shape for complete: of a part a high reading says little.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ KNOWN = 0.0485
 """Readings up to this (units of sqrt(area)) are of a shape that the model knows. The benchmark's bodies, scans and animals
 have 0.046 at most, its hearts and furniture 0.051 at least (docs/results.md)."""
 FAMILIAR, STRANGE = 0.0465, 0.062
-"""Between these a complete shape may be a strange one of the kind, such as a robot, or none, such as an aeroplane with wings
-for arms: a fit tells, see `is_of_kind`."""
+"""Between these a shape may be a strange one of the kind, such as a robot, or none, such as an aeroplane with wings for
+arms: a fit tells, see `is_of_kind`."""
 SURE = 0.042
 """Up to this a reading needs no other model's beside it: another kind's were 0.0439 at least (docs/results.md)."""
-# Trust from which on such a fit tells the kind; any that is not poor where every other kind's reading is so many times as
-# high. A fair one of heads can be of a heart (1.08 times at most), one of people is of a Rogue (1.10 at least).
+# Trust from which on such a fit tells the kind; of a mesh any that is not poor where every other kind's reading is so many
+# times as high. A fair one of heads can be of a heart (1.08 times at most), one of people is of a Rogue (1.10 at least), but
+# also of an aeroplane's cloud (1.14).
 _BELONGS, _ALONE = 0.7, 1.09
 _SAMPLES, _THIN = 2048, 768  # how many the reading is of, and how many rank the orientations
 
@@ -55,11 +56,12 @@ def read_kind(model: TrainedModel, shape: Shape, samples: OrientedPoints, config
 
 
 def is_of_kind(model: TrainedModel, shape: Shape, reading: float, config: FitConfig, rival: float) -> bool:
-    """Whether a complete shape is of a model's kind: its reading says so, or the fit of one that reads strangely.
+    """Whether a shape, taken for complete, is of a model's kind: by its reading or, where that is strange, by its fit.
 
     ``rival`` is the lowest reading of another kind.
     """
     if FAMILIAR < reading <= STRANGE:
         fit = Fitter(model, replace(config, refine="nodes", partial="no")).fit(shape)
-        return fit.verdict != "poor" and (fit.trust >= _BELONGS or rival >= _ALONE * reading)
+        alone = rival >= _ALONE * reading and not shape.is_cloud
+        return fit.verdict != "poor" and (fit.trust >= _BELONGS or alone)
     return reading <= FAMILIAR

@@ -124,6 +124,14 @@ def test_what_reads_strangely_is_of_the_kind_that_fits_it() -> None:
 
 
 @pytest.mark.usefixtures("models")
+def test_a_cloud_that_reads_strangely_is_of_the_kind_that_fits_it() -> None:
+    dancer = load_shape(SAMPLES / "dancer.ply")
+    for points, word in ((dancer.verts, "human"), (ball("").verts, "may be a part, or a rough cloud: taken for human")):
+        _, words = choose(Shape(points[::4], np.empty((0, 3), np.int64), "rough 5 5.6 7"))
+        assert word in words[0]
+
+
+@pytest.mark.usefixtures("models")
 @pytest.mark.parametrize("unsure", [cloud("half 7 7 6"), ball("half 7 7 6", opened=True)])
 def test_what_may_be_a_part_takes_the_other_shapes_kind(unsure: Shape) -> None:
     for shapes in ((unsure, ball("man 3 4 6")), (ball("man 3 4 6"), unsure)):
