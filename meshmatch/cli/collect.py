@@ -12,7 +12,7 @@ from meshmatch.cli import options
 from meshmatch.cli.options import FitOptions, grouped, optional, output_option
 from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import OptionError, PoorFit
-from meshmatch.models.registry import check_model
+from meshmatch.models.registry import AUTO, check_model
 
 if TYPE_CHECKING:
     from meshmatch.collections.setting import Record
@@ -73,7 +73,8 @@ def fit(
         )  # fmt: skip
     counts = made.counts
     told = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
-    console.say(f"wrote {len(made.records) - counts[FAILED]} fits to {output}: {told}")
+    chosen = f" (model {made.model})" if how.model == AUTO else ""
+    console.say(f"wrote {len(made.records) - counts[FAILED]} fits to {output}{chosen}: {told}")
     if made.agreed:
         console.say(f"{made.agreed} fits agreed on how the template stretches")
     if json:

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from meshmatch.api.inputs import validated
+from meshmatch.api.kinds import other_kind
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.fit_files import StoredFit, load_words, save_fit
 from meshmatch.collections.setting import AGREEING, ALONE, FITS, SUFFIX, Record, Setting, Source, digest_of
@@ -21,6 +22,7 @@ from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.fitting.agree import AgreeConfig, Member, agree_step, log_stretch, member_of
 from meshmatch.fitting.system import node_system
+from meshmatch.fitting.viscous import NO_MODEL
 from meshmatch.maps.places import Places
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_npy
@@ -51,7 +53,10 @@ def fit_alone(task: FitTask) -> Record:
         last = None if task.last is None else setting.read(task.folder, task.last.name).fit
         fit = setting.fit(source.load(setting.only, setting.without), last)
         assert fit.repaired is not None
-        samples = None
+        reasons, samples = "; ".join(fit.reasons), None
+        if fit.verdict == "poor" and setting.model != NO_MODEL:
+            other = other_kind(setting.trained, fit.repaired.shape, setting.config)
+            reasons = f"it is of another kind: {other}; {reasons}" if other else reasons
         if setting.agrees:
             how = AgreeConfig.for_collection(setting.trained)
             samples = member_of(node_system(setting.trained), fit.repaired.shape, fit, setting.config, how).samples
@@ -60,7 +65,7 @@ def fit_alone(task: FitTask) -> Record:
             file=source.path,
             verdict=fit.verdict,
             trust=round(fit.trust, 4),
-            reasons="; ".join(fit.reasons),
+            reasons=reasons,
             residual=float(fit.residual),
             up=fit.up,
             front=fit.front,

@@ -115,9 +115,14 @@ class ModelCard:
                     _refuse(f"metrics.{name}.{key} must be a number or an object of numbers")
 
 
+def is_name(name: str) -> bool:
+    """Whether a model can be called so. It can then be used as the name of a folder."""
+    return _NAME.fullmatch(name) is not None
+
+
 def check_name(name: str) -> str:
-    """The name, if it can be one; `ModelError` otherwise. It can then be used as the name of a folder."""
-    if not _NAME.fullmatch(name):
+    """The name, if `is_name`; `ModelError` otherwise."""
+    if not is_name(name):
         hint = "use small letters, digits, '.', '_' and '-', beginning with a letter or digit, at most 64"
         raise ModelError(f"{name[:80]!r} cannot be the name of a model", hint)
     return name

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from meshmatch.errors import MeshmatchError, ModelError, OutputError
-from meshmatch.models.card import ModelCard, check_name, read_card
+from meshmatch.models.card import ModelCard, check_name, is_name, read_card
 from meshmatch.models.implicit_card import IMPLICIT, ImplicitCard, is_implicit, read_implicit_card
 from meshmatch.models.tensor_file import read_header
 from meshmatch.models.unfinished import changing, copy_for, needs_settling, put, settle
@@ -230,16 +230,17 @@ def remove_model(name: str) -> None:
 
 def _registered(name: str) -> Path:
     """The folder of a registered model; `ModelError` if there is none."""
-    check_name(name)
     for act in (lambda: None, lambda: settle(user_folder())):
         act()
         for parent in (built_in_folder(), user_folder()):
-            if (parent / name).is_dir():
+            if is_name(name) and (parent / name).is_dir():
                 return parent / name
     names = [entry.name for entry in list_models()]
-    near = get_close_matches(name, names, n=3, cutoff=0.5)
+    near = get_close_matches(name[:80].lower(), names, n=3, cutoff=0.5)
+    if not near:
+        check_name(name)
     hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {', '.join(names) or 'none'}"
-    raise ModelError(f"there is no model {name!r}", f"{hint} (see `meshmatch models list`)")
+    raise ModelError(f"there is no model {name[:80]!r}", f"{hint} (see `meshmatch models list`)")
 
 
 def _is_registered(folder: Path) -> bool:

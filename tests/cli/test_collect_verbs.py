@@ -50,7 +50,7 @@ def test_what_is_said(fits: Path, run: Run) -> None:
     assert re.search(r"^dancer +good +[01]\.\d\d +\d\.\d % +\+y +\+z +4,002 +\d+\.\d$", answer.err, re.MULTILINE)
     assert re.search("^empty +failed$", answer.err, re.MULTILINE)
     assert "warning: empty: not fitted: empty.obj is empty (0 bytes)" in answer.err
-    assert f"wrote 2 fits to {fits}: 2 good, 1 failed" in answer.err
+    assert f"wrote 2 fits to {fits} (model human): 2 good, 1 failed" in answer.err
     record = json.loads(answer.out)
     assert record["verdicts"] == {"good": 2, "fair": 0, "poor": 0, "failed": 1}
     assert (record["model"], record["agreed"], record["seed"]) == ("human", 2, 0)

@@ -425,3 +425,9 @@ def egg(rings: int) -> tuple[np.ndarray, np.ndarray]:
     top = np.stack([np.full(n, count), ring[0], np.roll(ring[0], -1)], 1)
     low = np.stack([np.full(n, count + 1), np.roll(ring[-1], -1), ring[-1]], 1)
     return verts, np.concatenate([np.stack([p, q, r], 1), np.stack([p, r, t], 1), top, low])
+
+
+def test_a_shape_of_another_kind_is_called_so(tmp_path: Path) -> None:
+    shutil.copy(SAMPLES / "dancer.ply", tmp_path)
+    (record,) = meshmatch.Collection(tmp_path / "fits", workers=1).fit(tmp_path, model="quadruped").records
+    assert (record.verdict, record.reasons.split("; ")[0]) == ("poor", "it is of another kind: human")

@@ -74,9 +74,10 @@ def test_a_model_is_found_by_name_or_by_folder(blob: Path, tmp_path: Path, monke
     assert find_model(Path("human"))[1].name == "mine"
 
 
-def test_a_mistyped_name_is_told_its_neighbours() -> None:
-    with pytest.raises(ModelError, match="there is no model 'humna'") as caught:
-        find_model("humna")
+@pytest.mark.parametrize("wrong", ["humna", "Human", "human "])
+def test_a_mistyped_name_is_told_its_neighbours(wrong: str) -> None:
+    with pytest.raises(ModelError, match=f"there is no model '{wrong}'") as caught:
+        find_model(wrong)
     assert "did you mean human?" in caught.value.hint
     with pytest.raises(ModelError, match="there is no model 'zebra'") as caught:
         find_model("zebra")
