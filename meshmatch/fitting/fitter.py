@@ -17,7 +17,7 @@ from meshmatch.fitting.fit import Fit, Reason, Verdict, axis_name
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.network_fit import mirror_of
 from meshmatch.fitting.nodes import Landmarks
-from meshmatch.fitting.refinement import REFINEMENTS, Refinement
+from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.signs import empty_share
 from meshmatch.fitting.task import FitTask, Registration
 from meshmatch.fitting.verdict import EVEN_TRUST, FAIR_RESIDUAL, judge_registration
@@ -63,35 +63,40 @@ class Fitter:
         began, progress, card = time.monotonic(), Progress(self.progress, shape.name), self.model.card
         notes: tuple[str, ...] = ()
         doubts: list[Reason] = []
-        if (self.config.mirror or card.mirror) == "no" or mirror_of(self.model) is not None:
-            found, partial = self._found(shape, landmarks, progress, mirrored=False)
-        else:
-            half = progress.between(0, 0.5), progress.between(0.5, 1)
-            sides = [self._found(shape, landmarks, half[side], mirrored=bool(side)) for side in (0, 1)]
-            (found, partial), (other, _) = sorted(sides, key=lambda side: side[0].candidate.cost)
-            if found.core_frame.mirrored:
-                notes = (f"{shape.name}: taken for the mirror image of what {card.name} knows",)
-            if found.candidate.cost > _SURE_SIDE * other.candidate.cost:
-                doubts.append(Reason("side", "it fits nearly as well in the mirror: left and right may be exchanged"))
+        both = (self.config.mirror or card.mirror) != "no" and mirror_of(self.model) is None
+        wholes = []
+        for k, mirrored in enumerate((False, True) if both else (False,)):
+            stretch = progress.between(k / 2, (k + 1) / 2) if both else progress
+            task = FitTask.of(self.model, self.config, shape, landmarks, stretch, mirrored)
+            wholes.append(fit_whole(task, REFINEMENTS[task.config.refine].whole))
+        # A shape that one side explains as a whole is no part in the mirror.
+        parts = landmarks is None and _may_be_part(min(wholes, key=_cost))
+        sides = [_as_part_if_closer(whole) if parts else (whole, False) for whole in wholes]
+        (found, partial), *others = sorted(sides, key=lambda side: _cost(side[0]))
+        if found.core_frame.mirrored:
+            notes = (f"{shape.name}: taken for the mirror image of what {card.name} knows",)
+        if others and _cost(found) > _SURE_SIDE * _cost(others[0][0]):
+            doubts.append(Reason("side", "it fits nearly as well in the mirror: left and right may be exchanged"))
         if not card.correspondence:
             doubts.append(Reason("unsupervised", f"{card.name} was learned without correspondence: near may be wrong"))
         fit = replace(as_fit(found, partial, began), notes=notes)
         return doubted(fit, doubts)
 
-    def _found(
-        self, shape: Shape, landmarks: Landmarks | None, progress: Progress, mirrored: bool
-    ) -> tuple[Registration, bool]:
-        """The registration of a shape, or of its mirror image, and whether as a part."""
-        task = FitTask.of(self.model, self.config, shape, landmarks, progress, mirrored)
-        refinement = REFINEMENTS[task.config.refine]
-        found, partial = fit_whole(task, refinement.whole), False
-        if landmarks is None and _may_be_part(found, refinement):
-            part = fit_part(task.bare, refinement.part)
-            # A part explains the shape better than the whole, and lacks some of it.
-            closer = part.candidate.cost < _CLOSER * found.candidate.residual
-            partial = closer and part.candidate.share < 1 - _MISSING
-            found = part if partial else found
-        return found, partial
+
+def _cost(found: Registration) -> float:
+    return found.candidate.cost
+
+
+def _as_part_if_closer(whole: Registration) -> tuple[Registration, bool]:
+    """A fit of the whole, or one as a part if that may be and is better; and which it is."""
+    if not _may_be_part(whole):
+        return whole, False
+    task = whole.task
+    part = fit_part(task.bare, REFINEMENTS[task.config.refine].part)
+    # A part explains the shape better than the whole, and lacks some of it.
+    closer = part.candidate.cost < _CLOSER * whole.candidate.residual
+    partial = closer and part.candidate.share < 1 - _MISSING
+    return (part, True) if partial else (whole, False)
 
 
 def doubted(fit: Fit, doubts: Sequence[Reason]) -> Fit:
@@ -102,12 +107,12 @@ def doubted(fit: Fit, doubts: Sequence[Reason]) -> Fit:
     return replace(fit, verdict=verdict, reasons=(*fit.reasons, *doubts), trust=min(fit.trust, EVEN_TRUST))
 
 
-def _may_be_part(whole: Registration, refinement: Refinement) -> bool:
+def _may_be_part(whole: Registration) -> bool:
     """Whether a fit as a part is worth its time: asked for, or a bad fit of an open shape, or one that leaves it bare."""
     task = whole.task
     if task.config.partial != "auto":
         return task.config.partial == "yes"
-    if not refinement.tries_parts:
+    if not REFINEMENTS[task.config.refine].tries_parts:
         return False
     if not may_show_part(task.shape, task.config):
         return False

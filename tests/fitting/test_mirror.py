@@ -26,16 +26,16 @@ DANCER = Path(__file__).parents[2] / "templates" / "samples" / "dancer.ply"
 @pytest.fixture
 def one_sided(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bodies as if left and right were not alike, and the mirror image always lay nearer."""
-    found = fitter.Fitter._found
+    fit_whole = fitter.fit_whole
 
-    def mirror_alone(self, shape, landmarks, progress, mirrored):
-        registration, partial = found(self, shape, landmarks, progress, mirrored)
-        if self.config.mirror == "auto" and not mirrored:
+    def mirror_alone(task, *given):
+        registration = fit_whole(task, *given)
+        if task.config.mirror == "auto" and not registration.core_frame.mirrored:
             object.__setattr__(registration.candidate, "residual", 1.0)
-        return registration, partial
+        return registration
 
     monkeypatch.setattr(fitter, "mirror_of", lambda model: None)
-    monkeypatch.setattr(fitter.Fitter, "_found", mirror_alone)
+    monkeypatch.setattr(fitter, "fit_whole", mirror_alone)
 
 
 def volume(shape: Shape) -> float:
@@ -80,6 +80,13 @@ def test_what_fits_either_way_is_not_called_good(monkeypatch: pytest.MonkeyPatch
     fit = meshmatch.register(DANCER, model="human", config=FitConfig(mirror="auto"))
     assert fit.verdict == "fair"
     assert [reason.code for reason in fit.reasons] == ["side"]
+
+
+def test_what_is_whole_on_one_side_is_no_part_on_the_other(one_sided: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+    monkeypatch.setattr(fitter, "_may_be_part", lambda whole: tried.append(whole.core_frame.mirrored))
+    meshmatch.register(DANCER, model="human", config=FitConfig(mirror="auto"))
+    assert tried == [True]
 
 
 def test_what_is_symmetric_has_no_sides() -> None:
