@@ -138,9 +138,9 @@ def draw_histogram(
 def draw_losses(
     path: str | Path, steps: Sequence[int], terms: Mapping[str, Sequence[float]], validation: Mapping[int, float]
 ) -> None:
-    """Draw the losses of a training over its steps (N,) on logarithmic axes: the total and the validation error (on
-    held-out shapes, at some steps) large, the other terms small below. ``terms`` have a name and (N,) values, of which
-    those not positive or not finite are left out.
+    """Draw the losses of a training over its steps (N,) on logarithmic axes: the validation error (on held-out shapes, at
+    some steps) and the error, or the total where there is none, large, the other terms small below. ``terms`` have a name
+    and (N,) values, of which those not positive or not finite are left out.
     """
     known = {name: list(zip(steps, values, strict=True)) for name, values in list(terms.items())[:_MOST_TERMS]}
     known["validation"] = sorted(validation.items())
@@ -148,7 +148,8 @@ def draw_losses(
     lines = {name: np.array(points, float).T for name, points in positive.items() if points}
     if not lines:
         raise OptionError("the training has no losses to draw", "train for more steps")
-    large = [name for name in ("validation", "total") if name in lines]
+    main = "error" if "error" in lines else "total"
+    large = [name for name in ("validation", main) if name in lines]
     groups = [group for group in (large, [name for name in lines if name not in large]) if group]
     pens = {name: pen(k) for k, name in enumerate(name for group in groups for name in group)}
     with saved(path, 6.4, 3.4 + 1.6 * (len(groups) - 1)) as figure:
@@ -169,7 +170,7 @@ def draw_losses(
             axes.minorticks_off()
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
             axes.legend(loc="upper left", bbox_to_anchor=(1, 1), fontsize=9.5 if len(group) < 6 else 6.5)
-        column[0].set_ylabel("loss")
+        column[0].set_ylabel("loss" if main == "total" else "error")
         if len(groups) == 2:
             column[1].set_ylabel("terms of the loss")
         column[-1].set_xlabel("step")

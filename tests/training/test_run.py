@@ -172,8 +172,9 @@ def test_a_training_may_begin_with_a_models_weights(prepared: Path, tmp_path: Pa
     begun = second.card.recipe["start"]
     assert begun == {"model": "eggs", "weights_sha256": first.card.weights_sha256, "steps": 4}
     assert "start" not in scratch.card.recipe
-    with pytest.raises(OptionError, match="another template, network or kernel"):
+    with pytest.raises(OptionError, match="another template, network or kernel") as caught:
         trained(prepared, tmp_path / "other", replace(SMALL, kernel="cubic"), start=first)
+    assert "`meshmatch fit ... --model eggs`" in caught.value.hint
 
 
 def test_a_model_goes_on_with_shapes_that_it_has_fitted(prepared: Path, tmp_path: Path) -> None:
