@@ -11,18 +11,21 @@ import numpy as np
 from meshmatch.api.inputs import as_model
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, MeshmatchError, ModelError, OptionError
+from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import may_show_part
-from meshmatch.fitting.kind import KNOWN, SURE, is_of_kind, kind_samples, read_kind
+from meshmatch.fitting.kind import KNOWN, SURE, kind_samples, read_kind, told
 from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import list_models
 from meshmatch.models.trained import TrainedModel
+from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import beside
 
 _PEOPLE = "human"
 _NAME_IT = "name the model with --model (model=...) if that is wrong"
+_NONE = "if it is of one of them, name its model with --model (model=...); --without leaves out what is no part of it"
 
 
 @dataclass(frozen=True)
@@ -100,10 +103,33 @@ def _is_part(shape: Shape, config: FitConfig) -> bool:
     return config.partial == "yes" and may_show_part(shape, replace(config, partial="auto"))
 
 
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What is known of one shape: its kind, None where that cannot be told; the card of the model that reads it best; and
+    the fit by it, with refined nodes, that had to tell, if any.
+    """
+
+    kind: str | None
+    card: ModelCard
+    fit: Fit | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The model that knows all of some shapes; for each a few words, and a fit by it that telling its kind took, if any."""
+
+    model: TrainedModel
+    words: list[str]
+    fits: list[Fit | None]
+
+
 def choose_model(
-    clean: Sequence[Repaired], configs: Sequence[FitConfig], settled: TrainedModel | None = None
-) -> tuple[TrainedModel, list[str]]:
-    """The installed model that knows the kind of all the shapes, and a few words on each; or ``settled``, if it does.
+    clean: Sequence[Repaired],
+    configs: Sequence[FitConfig],
+    settled: TrainedModel | None = None,
+    progress: ProgressCallback | None = None,
+) -> Choice:
+    """The installed model that knows the kind of all the shapes; or ``settled``, if it does.
 
     A cloud, or a shape that may be a part of something, is of the other shapes' kind where its own cannot be told.
     `InputError` if two shapes are of different kinds, or one of none; `ModelError` if no model is installed.
@@ -115,43 +141,58 @@ def choose_model(
     readings = read_kinds(models, shapes, configs)
     if np.isinf(readings).all():
         raise _no_model()
-    kinds = kinds_of(models, readings, shapes, configs)
-    told: dict[str, str] = {} if settled is None else {settled.card.category: "the shapes before"}
-    for shape, kind in zip(shapes, kinds, strict=True):
-        if kind is not None and kind not in told and told:
-            ((other, name),) = told.items()
+    found = tell_kinds(models, readings, shapes, configs, progress)
+    names: dict[str, str] = {} if settled is None else {settled.card.category: "the shapes before"}
+    for shape, kind in zip(shapes, [each.kind for each in found], strict=True):
+        if kind is not None and kind not in names and names:
+            ((other, name),) = names.items()
             problem = f"two kinds of shapes: {name}: {other}; {shape.name}: {kind}"
             raise InputError(problem, f"match shapes of one kind; {_NAME_IT}")
         if kind is not None:
-            told.setdefault(kind, shape.name)
-    common = next(iter(told), models[int(readings.sum(1).argmin())].card.category)
+            names.setdefault(kind, shape.name)
+    common = next(iter(names), models[int(readings.sum(1).argmin())].card.category)
     rows = [row for row, model in enumerate(models) if model.card.category == common]
     chosen = settled or models[min(rows, key=lambda row: readings[row].sum())].load()
-    unsure = f"may be a part, or a rough cloud: taken for {common}; {_NAME_IT}"
-    return chosen, [f"{s.name}: {k}" if k else f"{s.name} {unsure}" for s, k in zip(shapes, kinds, strict=True)]
+    by = "" if chosen.card.name == common else f" (model {chosen.card.name})"
+    unsure = f"may be a part, or a rough cloud: taken for {common}{by}; {_NAME_IT}"
+    words = [
+        f"{shape.name}: {each.kind}{by}" if each.kind else f"{shape.name} {unsure}"
+        for shape, each in zip(shapes, found, strict=True)
+    ]
+    usable = [
+        each.fit if each.card == chosen.card and config.refine == "nodes" else None
+        for each, config in zip(found, configs, strict=True)
+    ]
+    return Choice(chosen, words, usable)
 
 
-def kinds_of(
-    models: Sequence[Installed], readings: Float[Floats, "M S"], shapes: Sequence[Shape], configs: Sequence[FitConfig]
-) -> list[str | None]:
-    """The category of each shape's best reading, None for a cloud or a part that is not known to be of that kind.
+def tell_kinds(
+    models: Sequence[Installed],
+    readings: Float[Floats, "M S"],
+    shapes: Sequence[Shape],
+    configs: Sequence[FitConfig],
+    progress: ProgressCallback | None = None,
+) -> list[Told]:
+    """What the readings, and fits of those that read strangely, tell of each shape (`meshmatch.fitting.kind.told`).
 
-    `InputError` for a complete mesh that is not of that kind (`is_of_kind`).
+    `InputError` for a complete mesh that is not of the kind that reads it best.
     """
-    found: list[str | None] = []
-    for shape, config, column in zip(shapes, configs, readings.T, strict=True):
-        best = int(column.argmin())
-        kind = models[best].card.category
-        whole = not shape.is_cloud and not may_show_part(shape, config)
-        known = column[best] <= KNOWN
-        if (whole or (shape.is_cloud and config.partial != "yes")) and np.isfinite(column[best]):
-            rivals = [reading for model, reading in zip(models, column, strict=True) if model.card.category != kind]
-            known = is_of_kind(models[best].load(), shape, column[best], config, min(rivals, default=np.inf))
-        found.append(kind if known else None)
-        if whole and not known:
+
+    def tell(shape: Shape, config: FitConfig, column: Float[Floats, " M"]) -> Told:
+        best = models[row := int(column.argmin())]
+        kind = best.card.category
+        if np.isinf(column[row]):
+            return Told(None, best.card)
+        rivals = [reading for model, reading in zip(models, column, strict=True) if model.card.category != kind]
+        known, fit = told(best.load(), shape, column[row], config, min(rivals, default=np.inf), progress)
+        return Told(kind if known else None, best.card, fit)
+
+    found = beside(tell, shapes, configs, readings.T)
+    for shape, config, each in zip(shapes, configs, found, strict=True):
+        if each.kind is None and not shape.is_cloud and not may_show_part(shape, config):
             names = ", ".join(sorted({model.card.category for model in models}))
             problem = f"{shape.name} is of no kind that the installed models know: {names}"
-            raise InputError(problem, "if it is of one of them, name its model with --model (model=...)")
+            raise InputError(problem, _NONE)
     return found
 
 
@@ -159,7 +200,7 @@ def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | No
     """The kind that a repaired shape is of by the installed models, if that is another one than the model's."""
     try:
         models = installed_models()
-        (kind,) = kinds_of(models, read_kinds(models, [shape], [config]), [shape], [config])
+        (found,) = tell_kinds(models, read_kinds(models, [shape], [config]), [shape], [config])
     except (InputError, ModelError):
         return None
-    return None if kind == model.card.category else kind
+    return None if found.kind == model.card.category else found.kind

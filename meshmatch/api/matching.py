@@ -87,8 +87,8 @@ class Matcher:
         """
         clean = [validated(shape) for shape in as_shapes(shapes)]
         configs = self._configs(config, len(clean))
-        kinds = self._choose(clean, configs)
-        fits = self._fit_all(clean, configs)
+        kinds, begun = self._choose(clean, configs)
+        fits = self._fit_all(clean, configs, begun)
         return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kinds, fits, strict=True)]
 
     def follow(self, shape: ShapeLike, last: Fit) -> Fit:
@@ -137,7 +137,7 @@ class Matcher:
         began = time.monotonic()
         clean = [validated(as_shape(source, "source")), validated(as_shape(target, "target"))]
         configs = self._configs(config, 2)
-        kinds = self._choose(clean, configs)
+        kinds, begun = self._choose(clean, configs)
         if landmarks is not None:
             for each in configs:
                 if not each.moves_nodes:
@@ -146,7 +146,7 @@ class Matcher:
             check_landmarks(self.model)
             landmark_places(clean, landmarks)  # before the long work
         with thread_limit(1):
-            fits = self._fit_all(clean, configs)
+            fits = self._fit_all(clean, configs, begun)
             known = None
             if landmarks is not None:
                 pairs = np.asarray(landmarks[0]), np.asarray(landmarks[1])
@@ -160,15 +160,18 @@ class Matcher:
         notes = tuple(dict.fromkeys((*(words for kind in kinds for words in kind), *fits[0].notes, *fits[1].notes)))
         return MatchResult(found, *agreed, time.monotonic() - began, notes, before, self.threads)
 
-    def _choose(self, clean: Sequence[Repaired], configs: Sequence[FitConfig]) -> list[tuple[str, ...]]:
-        """Let the shapes decide on the model, if nobody did; what is to be said of each."""
+    def _choose(
+        self, clean: Sequence[Repaired], configs: Sequence[FitConfig]
+    ) -> tuple[list[tuple[str, ...]], list[Fit | None]]:
+        """Let the shapes decide on the model, if nobody did; what is to be said of each, and its fit if that took one."""
         if not self._auto:
-            return [()] * len(clean)
+            return [()] * len(clean), [None] * len(clean)
         from meshmatch.api.kinds import choose_model
 
         with self._choosing, thread_limit(1), one_of(threading.Semaphore(self.threads)):
-            self._model, words = choose_model(clean, configs, self._model)
-        return [(each,) for each in words]
+            choice = choose_model(clean, configs, self._model, self.progress)
+            self._model = choice.model
+        return [(each,) for each in choice.words], choice.fits
 
     def _configs(self, config: FitConfig | Sequence[FitConfig] | None, count: int) -> list[FitConfig]:
         config = self.config if config is None else config
@@ -179,7 +182,9 @@ class Matcher:
             check_config(each)
         return configs
 
-    def _fit_all(self, clean: Sequence[Repaired], configs: Sequence[FitConfig]) -> list[Fit]:
+    def _fit_all(
+        self, clean: Sequence[Repaired], configs: Sequence[FitConfig], begun: Sequence[Fit | None]
+    ) -> list[Fit]:
         stop, threads = threading.Event(), threading.Semaphore(self.threads)
         names = [part.shape.name for part in clean]
         labels = [f"{name} ({number + 1})" if names.count(name) > 1 else name for number, name in enumerate(names)]
@@ -193,7 +198,7 @@ class Matcher:
 
             try:
                 with one_of(threads):
-                    found = Fitter(self.model, configs[number], report).fit(clean[number].shape)
+                    found = begun[number] or Fitter(self.model, configs[number], report).fit(clean[number].shape)
             except BaseException:
                 stop.set()
                 raise

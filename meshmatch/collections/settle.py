@@ -113,7 +113,7 @@ def _chosen(sources: Sequence[Source], config: FitConfig) -> str:
     trouble: MeshmatchError | None = None
     for source in sources[:_READ_AHEAD]:
         try:
-            chosen = choose_model([validated(source.load())], [config])[0]
+            chosen = choose_model([validated(source.load())], [config]).model
         except MeshmatchError as error:
             trouble = trouble or error
         else:

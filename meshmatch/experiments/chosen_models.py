@@ -1,10 +1,11 @@
 """Of what kind `--model auto` takes every shape of the benchmark, and things that are of none.
 
-Bodies, animals, hands and heads have a model; hearts, furniture and plain solids have none and must be refused. Hands and
-heads are generated (meshmatch/experiments/cut_scans.py), and so are characters (character_designs.py), but for the
-evaluation data's two, and the chairs, tables and planes of "furniture". Clouds with noise, and sparse ones with outliers,
-are bodies too; where a cloud cannot be told alone it takes the kind of the shape that it is matched with ("unsure" here),
-which is all that can be said of "clouds" of hearts, chairs, tables and planes, every other one with a tenth of strays.
+Bodies, animals, hands and heads have a model ("spot" is the textured cow, of stylised proportions); hearts, furniture and
+plain solids have none and must be refused. Hands and heads are generated (meshmatch/experiments/cut_scans.py), and so are
+characters (character_designs.py), but for the evaluation data's two, and the chairs, tables and planes of "furniture".
+Clouds with noise, and sparse ones with outliers, are bodies too; where a cloud cannot be told alone it takes the kind of
+the shape that it is matched with ("unsure" here), which is all that can be said of "clouds" of hearts, chairs, tables and
+planes, every other one with a tenth of strays.
 *Reading* is the mean distance of the shape and a model's unrefined template (units of sqrt(area)).
 """
 
@@ -21,7 +22,7 @@ from rich.table import Table
 from typer import Option
 
 from meshmatch.api.inputs import validated
-from meshmatch.api.kinds import installed_models, kinds_of, read_kinds
+from meshmatch.api.kinds import installed_models, read_kinds, tell_kinds
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.character_designs import Designer
@@ -41,7 +42,7 @@ FOLDERS = {"faust_scans": "human", "animal": "quadruped", "heart": "", "chair": 
 """Folders of meshes, and their kind; empty: none."""
 MADE = ("hand", "head")
 CHARACTERS = ("stylised", "robots", "soldiers", "rogues")
-SETS = (*SET_NAMES, CLOUD_SET, "outliers", *FOLDERS, "clouds", *MADE, *CHARACTERS, "solids", "furniture")
+SETS = (*SET_NAMES, CLOUD_SET, "outliers", *FOLDERS, "spot", "clouds", *MADE, *CHARACTERS, "solids", "furniture")
 _SCANS, _CAST, _PIECES = 20, 12, 20
 _POINTS, _STRAYS = (4000, 1000), (0, 100)  # of one cloud and the next
 COLUMNS = {
@@ -64,6 +65,8 @@ def shapes_of(name: str, data: Path) -> Iterator[Shape]:
         yield from (bench.seen(shape) for shape in bench.shapes)
     elif name == "outliers":
         yield from (as_shape(np.asarray(points, float)) for points in np.load(data / "faust_outliers.npy"))
+    elif name == "spot":
+        yield as_shape(data / "textured" / "spot_triangulated.obj")
     elif name == "clouds":
         none = [each for folder, kind in FOLDERS.items() if not kind for each in shapes_of(folder, data)]
         yield from (as_cloud(each, number) for number, each in enumerate(none))
@@ -99,7 +102,8 @@ def as_cloud(shape: Shape, number: int) -> Shape:
 def row_of(name: str, shapes: list[Shape]) -> dict[str, Any]:
     """How many of a set's shapes are taken for what they are; the highest reading of their kind, the lowest of others."""
     nothing = name in ("clouds", "solids", "furniture")
-    wanted = FOLDERS.get(name, name if name in MADE else "" if nothing else "human")
+    made = name if name in MADE else "" if nothing else "quadruped" if name == "spot" else "human"
+    wanted = FOLDERS.get(name, made)
     models, config = installed_models(), [FitConfig()]
     right, unsure, wrong, own, others = 0, 0, list[str](), 0.0, np.inf
     for shape in runner.track(shapes, name):
@@ -112,7 +116,7 @@ def row_of(name: str, shapes: list[Shape]) -> dict[str, Any]:
             else:
                 others = min(others, float(reading))
         try:
-            (kind,) = kinds_of(models, readings, clean, config)
+            kind = tell_kinds(models, readings, clean, config)[0].kind
         except InputError:
             kind = ""
         right += kind == wanted

@@ -1,7 +1,7 @@
 """Of what kind a shape is, read coarsely: how near a model's network alone brings its template to the shape.
 
 What reads strangely, such as a robot or a cloud with many outliers, is fitted: where the fit can be trusted, it is of the
-kind. Reading and fit take the shape for complete: of a part a high reading says little.
+kind. A reading takes the shape for complete: of a part a high one says little.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.initial_frames import frames_to_try, scan_frame
@@ -17,6 +18,7 @@ from meshmatch.fitting.network_fit import Predictor, best_first
 from meshmatch.fitting.task import without_outliers
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
+from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -25,7 +27,7 @@ KNOWN = 0.0485
 have 0.046 at most, its hearts and furniture 0.051 at least (docs/results.md)."""
 FAMILIAR, STRANGE = 0.0465, 0.062
 """Between these a shape may be a strange one of the kind, such as a robot, or none, such as an aeroplane with wings for
-arms: a fit tells, see `is_of_kind`."""
+arms: a fit tells, see `told`."""
 SURE = 0.042
 """Up to this a reading needs no other model's beside it: another kind's were 0.0439 at least (docs/results.md)."""
 # Trust from which on such a fit tells the kind; of a mesh any that is not poor where every other kind's reading is so many
@@ -55,13 +57,23 @@ def read_kind(model: TrainedModel, shape: Shape, samples: OrientedPoints, config
     return predictor.fit(placed, best.pose, draws=1).residual
 
 
-def is_of_kind(model: TrainedModel, shape: Shape, reading: float, config: FitConfig, rival: float) -> bool:
-    """Whether a shape, taken for complete, is of a model's kind: by its reading or, where that is strange, by its fit.
+def told(
+    model: TrainedModel,
+    shape: Shape,
+    reading: float,
+    config: FitConfig,
+    rival: float,
+    progress: ProgressCallback | None,
+) -> tuple[bool, Fit | None]:
+    """Whether a shape is known to be of a model's kind, and the fit of one that reads strangely, which had to tell.
 
-    ``rival`` is the lowest reading of another kind.
+    ``rival`` is the lowest reading of another kind. The fit is made as ``config`` says, with refined nodes; one of a part
+    tells nothing that the reading does not.
     """
-    if FAMILIAR < reading <= STRANGE:
-        fit = Fitter(model, replace(config, refine="nodes", partial="no")).fit(shape)
-        alone = rival >= _ALONE * reading and not shape.is_cloud
-        return fit.verdict != "poor" and (fit.trust >= _BELONGS or alone)
-    return reading <= FAMILIAR
+    if not FAMILIAR < reading <= STRANGE:
+        return reading <= FAMILIAR, None
+    fit = Fitter(model, replace(config, refine="nodes"), progress).fit(shape)
+    if fit.partial:
+        return reading <= KNOWN, fit
+    alone = rival >= _ALONE * reading and not shape.is_cloud
+    return fit.verdict != "poor" and (fit.trust >= _BELONGS or alone), fit

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 import meshmatch
-from meshmatch.api import kinds
+from meshmatch.api import kinds, matching
 from meshmatch.api.inputs import as_model, validated
 from meshmatch.api.kinds import Installed
 from meshmatch.api.matching import Matcher
@@ -53,8 +53,8 @@ def models(monkeypatch: pytest.MonkeyPatch) -> list[TrainedModel]:
 
 
 def choose(*shapes: Shape, settled: TrainedModel | None = None) -> tuple[str, list[str]]:
-    found, words = kinds.choose_model([validated(shape) for shape in shapes], [CONFIG] * len(shapes), settled)
-    return found.card.name, words
+    choice = kinds.choose_model([validated(shape) for shape in shapes], [CONFIG] * len(shapes), settled)
+    return choice.model.card.name, choice.words
 
 
 @pytest.mark.usefixtures("models")
@@ -98,24 +98,37 @@ def test_a_complete_shape_of_no_kind_is_refused() -> None:
 def test_a_strange_shape_needs_more_trust_than_a_fair_fit_unless_nothing_else_is_near(
     monkeypatch: pytest.MonkeyPatch, verdict: str, trust: float, rival: float, of_kind: bool
 ) -> None:
-    monkeypatch.setattr(kind.Fitter, "fit", lambda *_: SimpleNamespace(verdict=verdict, trust=trust))
-    assert kind.is_of_kind(as_model("human"), ball("man"), 0.055, CONFIG, rival) is of_kind
+    fit = SimpleNamespace(verdict=verdict, trust=trust, partial=False)
+    monkeypatch.setattr(kind.Fitter, "fit", lambda *_: fit)
+    assert kind.told(as_model("human"), ball("man"), 0.055, CONFIG, rival, None) == (of_kind, fit)
+    if verdict != "poor":  # a cloud is of no kind just because it is of no other
+        assert kind.told(as_model("human"), cloud("man"), 0.055, CONFIG, rival, None)[0] is (trust > 0.7)
+
+
+def test_a_fit_as_a_part_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = SimpleNamespace(verdict="good", trust=1.0, partial=True)
+    monkeypatch.setattr(kind.Fitter, "fit", lambda *_: fit)
+    for reading, known in ((0.048, True), (0.055, False)):
+        assert kind.told(as_model("human"), ball("half"), reading, CONFIG, 0.1, None) == (known, fit)
 
 
 @pytest.mark.usefixtures("models")
 def test_its_rival_is_the_nearest_reading_of_another_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     rivals: list[float] = []
-    monkeypatch.setattr(kinds, "is_of_kind", lambda *given: rivals.append(given[-1]) or True)
+    monkeypatch.setattr(kinds, "told", lambda *given: (rivals.append(given[-2]) or True, None))
     choose(ball("robot 5.5 5.6 7"))
     choose(ball("robot 5.5 7 5.6"))
     assert rivals == pytest.approx([0.07, 0.056])
 
 
 @pytest.mark.usefixtures("models")
-def test_what_reads_strangely_is_of_the_kind_that_fits_it() -> None:
+def test_what_reads_strangely_is_of_the_kind_that_fits_it(monkeypatch: pytest.MonkeyPatch) -> None:
     dancer = load_shape(SAMPLES / "dancer.ply")
     strange = Shape(dancer.verts, dancer.faces, "robot 5.5 5.6 7")
     assert choose(strange) == ("human", ["robot 5.5 5.6 7: human"])
+    monkeypatch.setattr(matching, "Fitter", None)  # what told the kind is not fitted again
+    fit = Matcher().fit(strange)
+    assert fit.verdict == "good" and fit.repaired is not None
     for words in ("robot 7 7.1 7.2", "robot 7 7.1 5.5"):  # too strange; and no animal
         with pytest.raises(InputError, match="is of no kind"):
             choose(Shape(dancer.verts, dancer.faces, words))
@@ -181,7 +194,8 @@ def test_samples_are_told_apart() -> None:
     assert (found[0, :2] < 0.042).all() and found[1, 0] > 0.05
     assert found[1, 1] == np.inf  # the dancer is what the climber is: nobody else was asked
     assert (found[1, 2:] < 0.046).all() and (found[0, 2:] > 0.05).all()
-    assert kinds.kinds_of(models, found, shapes, [CONFIG] * 4) == ["human", "human", "quadruped", "quadruped"]
+    told = kinds.tell_kinds(models, found, shapes, [CONFIG] * 4)
+    assert [each.kind for each in told] == ["human", "human", "quadruped", "quadruped"]
     # the same turned and scaled: a reading knows no up
     turned = Shape(7 * shapes[2].verts[:, [2, 0, 1]], shapes[2].faces, "turned")
     (again,) = kinds.read_kinds(models[1:], [turned], [CONFIG])
@@ -193,7 +207,7 @@ def test_hands_and_heads_are_told_apart() -> None:
     for name, category in (("waving", "hand"), ("pointing", "hand"), ("laughing", "head"), ("child", "head")):
         shape = validated(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape
         readings = kinds.read_kinds(models, [shape], [CONFIG])
-        assert kinds.kinds_of(models, readings, [shape], [CONFIG]) == [category], name
+        assert kinds.tell_kinds(models, readings, [shape], [CONFIG])[0].kind == category, name
         own = [model.card.category for model in models].index(category)
         assert np.delete(readings[:, 0], own).min() > readings[own, 0] + 0.005, name
 
@@ -209,7 +223,7 @@ def test_a_matcher_decides_with_its_first_shapes(monkeypatch: pytest.MonkeyPatch
     matcher = Matcher()
     with pytest.raises(OptionError, match="no model is chosen yet"):
         _ = matcher.model
-    monkeypatch.setattr(matcher, "_fit_all", lambda clean, configs: [_Fit() for _ in clean])
+    monkeypatch.setattr(matcher, "_fit_all", lambda clean, *_: [_Fit() for _ in clean])
     (fit,) = matcher.fit_all([ball("dog 6 6 4")])
     assert fit.notes == ("dog 6 6 4: quadruped", "of the fit")
     assert matcher.model.card.name == "quadruped"
