@@ -200,7 +200,9 @@ def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | No
     """The kind that a repaired shape is of by the installed models, if that is another one than the model's."""
     try:
         models = installed_models()
-        (found,) = tell_kinds(models, read_kinds(models, [shape], [config]), [shape], [config])
+        readings = read_kinds(models, [shape], [config])
+        if models[int(readings.argmin())].card.category == model.card.category:
+            return None
+        return tell_kinds(models, readings, [shape], [config])[0].kind
     except (InputError, ModelError):
         return None
-    return None if found.kind == model.card.category else found.kind
