@@ -161,9 +161,7 @@ def train_model(
     if isinstance(start := facts.start, TrainedModel):
         theirs = start.template.hash, start.network.config, start.card.field["kernel"]
         if theirs != (template.hash, recipe.network, kernel):
-            hint = (
-                f"fit your shapes with it (`meshmatch fit ... --model {start.card.name}`); train with these as --shapes"
-            )
+            hint = f"fit your shapes with it (`meshmatch fit ... --model {start.card.name}`), and train on the fits"
             raise OptionError(f"model {start.card.name} has another template, network or kernel", hint)
         model.load_state_dict(start.network.state_dict())
     if isinstance(source, ShapeSamples):
