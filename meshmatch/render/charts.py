@@ -148,7 +148,7 @@ def draw_losses(
     lines = {name: np.array(points, float).T for name, points in positive.items() if points}
     if not lines:
         raise OptionError("the training has no losses to draw", "train for more steps")
-    main = "error" if "error" in lines else "total"
+    main = next((name for name in ("error", "error_corrected", "error_code") if name in lines), "total")
     large = [name for name in ("validation", main) if name in lines]
     groups = [group for group in (large, [name for name in lines if name not in large]) if group]
     pens = {name: pen(k) for k, name in enumerate(name for group in groups for name in group)}

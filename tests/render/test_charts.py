@@ -57,9 +57,10 @@ def test_a_loss_that_falls_evenly_is_a_straight_line(tmp_path: Path) -> None:
     assert slope < -0.3
     assert np.abs(line[:, 1] - (slope * line[:, 0] + start)).max() < 6
     assert np.ptp(flat[:, 1]) <= 4 and flat[:, 1].max() < line[:, 1].min()  # terms stand below
-    draw_losses(tmp_path / "e.png", STEPS, {"total": [0.1] * 40, "error": falling}, {})
-    line, flat = (spots(tmp_path / "e.png", k, top=0.0) for k in (0, 1))
-    assert np.ptp(flat[:, 1]) <= 4 < np.ptp(line[:, 1]) and flat[:, 1].max() < line[:, 1].min()  # so does a total then
+    for error in ("error", "error_corrected"):  # below stands the total then
+        draw_losses(tmp_path / "e.png", STEPS, {"total": [0.1] * 40, error: falling}, {})
+        line, flat = (spots(tmp_path / "e.png", k, top=0.0, right=0.7) for k in (0, 1))
+        assert np.ptp(flat[:, 1]) <= 4 < np.ptp(line[:, 1]) and flat[:, 1].max() < line[:, 1].min()
     draw_losses(tmp_path / "v.png", STEPS, {"total": falling}, {50: 0.02, 1000: 0.02, 2000: 0.02})
     dots = spots(tmp_path / "v.png", 0, top=0.0, right=0.81)
     thick = np.flatnonzero(np.bincount(dots[:, 0]) > 8)
