@@ -126,6 +126,8 @@ def test_what_reads_strangely_is_of_the_kind_that_fits_it(monkeypatch: pytest.Mo
     dancer = load_shape(SAMPLES / "dancer.ply")
     strange = Shape(dancer.verts, dancer.faces, "robot 5.5 5.6 7")
     assert choose(strange) == ("human", ["robot 5.5 5.6 7: human"])
+    unrefined = kinds.choose_model([validated(strange)], [FitConfig(refine="none")])
+    assert (unrefined.model.card.name, unrefined.fits) == ("human", [None])  # a refined fit is not what was asked for
     monkeypatch.setattr(matching, "Fitter", None)  # what told the kind is not fitted again
     fit = Matcher().fit(strange)
     assert fit.verdict == "good" and fit.repaired is not None
