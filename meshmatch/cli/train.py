@@ -137,8 +137,8 @@ class TrainOptions:
     )
     kind: Literal["human", "quadruped", "hand", "head"] | None = Option(
         None,
-        help="Learn from generated people, four-legged animals (needs dm_control: pip install --no-deps dm_control), right "
-        "hands or heads; all need the extra `train`. Default: human.",
+        help="Learn from generated people, four-legged animals, right hands or heads (needs the extra `train`). "
+        "Default: human.",
     )
     implicit: bool = Option(
         False,

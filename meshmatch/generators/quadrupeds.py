@@ -16,57 +16,12 @@ from scipy.spatial.transform import Rotation
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.generators.generator import Generator, Resting
 from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig, ramp, skinned, smooth_step
+from meshmatch.generators.quadruped_traits import NONE, TRAITS, draw_traits
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.progress import Progress
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
 
-# Proportions against the dog's, 1 (or 0) where they are the same.
-TRAITS = {
-    # name: the spread of its logarithm, or, where the dog has 0, its own spread
-    "leg": 0.13, "thick": 0.15, "cannon": 0.12, "wide": 0.1, "tall": 0.08, "long": 0.09, "belly": 0.2, "hump": 0.25,
-    "neck": 0.15, "neck_thick": 0.1, "neck_down": 12.0, "head": 0.1, "snout": 0.18, "snout_wide": 0.12,
-    "snout_deep": 0.1, "muzzle": 0.1, "ear": 0.22, "ear_out": 0.25, "tail": 0.25, "tail_thick": 0.2, "bush": 0.3,
-    "tuft": 0.2, "mane": 0.18, "fleece": 0.08, "hoof": 0.12, "straight": 0.25,
-}  # fmt: skip
-_NONE = {"belly", "hump", "neck_down", "muzzle", "ear_out", "bush", "tuft", "mane", "fleece", "hoof", "straight"}
-KINDS: dict[str, dict[str, float]] = {
-    "dog": {"ear": 0.7, "tail": 0.8, "tail_thick": 1.3, "belly": 0.1},
-    "wolf": {"wide": 1.1, "neck": 0.9, "neck_thick": 1.3, "neck_down": 20, "ear": 0.65, "tail": 0.75, "bush": 1.0,
-             "mane": 0.3, "snout_wide": 1.1, "tail_thick": 1.5, "belly": 0.2},
-    "cat": {"leg": 0.9, "thick": 1.3, "wide": 1.1, "long": 1.1, "belly": 0.35, "neck": 0.7, "neck_thick": 1.3,
-            "neck_down": 30, "head": 1.05, "snout": 0.45, "snout_wide": 1.25, "snout_deep": 1.1, "ear": 0.4,
-            "ear_out": 0.3, "tail": 1.15, "tail_thick": 1.5, "tuft": 0.3},
-    "lion": {"leg": 0.9, "thick": 1.55, "wide": 1.2, "tall": 1.05, "long": 1.08, "belly": 0.4, "neck": 0.65,
-             "neck_thick": 1.6, "neck_down": 30, "head": 1.25, "snout": 0.6, "snout_wide": 1.4, "snout_deep": 1.2,
-             "ear": 0.35, "ear_out": 0.3, "tail": 1.05, "tail_thick": 1.5, "tuft": 0.7, "mane": 0.7},
-    "cow": {"leg": 0.95, "thick": 1.25, "cannon": 1.5, "wide": 1.5, "tall": 1.25, "long": 1.25, "belly": 0.65,
-            "hump": 0.2, "neck": 0.75, "neck_thick": 1.35, "neck_down": 40, "head": 1.15, "snout": 1.25,
-            "snout_wide": 1.2, "snout_deep": 1.15, "muzzle": 0.2, "ear": 0.6, "ear_out": 1.0, "tail": 0.95,
-            "tail_thick": 1.2, "tuft": 0.5, "hoof": 1.0, "straight": 0.6},
-    "horse": {"leg": 1.1, "thick": 1.15, "cannon": 1.6, "wide": 1.35, "tall": 1.2, "long": 1.05, "belly": 0.5,
-              "hump": 0.1, "neck": 1.15, "neck_thick": 1.5, "neck_down": 10, "head": 1.15, "snout": 1.6,
-              "snout_wide": 1.05, "snout_deep": 1.2, "ear": 0.45, "tail": 0.7, "tail_thick": 1.8, "bush": 0.7,
-              "mane": 0.3, "hoof": 1.0, "straight": 0.7},
-    "deer": {"leg": 1.1, "thick": 0.95, "cannon": 1.6, "wide": 1.15, "long": 1.0, "belly": 0.5, "neck": 1.15,
-             "neck_down": 5, "head": 1.0, "snout": 1.15, "snout_wide": 0.95, "ear": 0.75, "ear_out": 0.5,
-             "tail": 0.25, "tail_thick": 1.5, "hoof": 0.9, "straight": 0.5},
-    "hippo": {"leg": 0.8, "thick": 1.8, "cannon": 0.9, "wide": 2.0, "tall": 1.6, "long": 1.3, "belly": 0.9,
-              "neck": 0.5, "neck_thick": 2.0, "neck_down": 45, "head": 1.4, "snout": 1.7, "snout_wide": 1.8,
-              "snout_deep": 1.4, "muzzle": 0.6, "ear": 0.22, "ear_out": 0.3, "tail": 0.3, "tail_thick": 1.4,
-              "hoof": 0.6, "straight": 0.8},
-    "bear": {"leg": 0.88, "thick": 2.0, "cannon": 0.7, "wide": 1.6, "tall": 1.3, "long": 1.05, "belly": 0.65,
-             "hump": 0.4, "neck": 0.65, "neck_thick": 1.8, "neck_down": 40, "head": 1.2, "snout": 0.8,
-             "snout_wide": 1.1, "ear": 0.3, "ear_out": 0.4, "tail": 0.15, "tail_thick": 1.8, "mane": 0.3,
-             "fleece": 0.2, "straight": 0.7},
-    "sheep": {"leg": 0.75, "thick": 1.15, "cannon": 1.2, "wide": 1.45, "tall": 1.2, "long": 1.1, "belly": 0.65,
-              "neck": 0.65, "neck_thick": 1.4, "neck_down": 25, "head": 1.05, "snout": 0.95, "ear": 0.5,
-              "ear_out": 1.0, "tail": 0.35, "tail_thick": 2.0, "mane": 0.3, "fleece": 0.7, "hoof": 0.9,
-              "straight": 0.6},
-    "pig": {"leg": 0.7, "thick": 1.35, "wide": 1.55, "tall": 1.25, "long": 1.15, "belly": 0.8, "neck": 0.45,
-            "neck_thick": 1.8, "neck_down": 40, "head": 1.25, "snout": 1.2, "snout_wide": 1.1, "snout_deep": 1.2,
-            "ear": 0.6, "ear_out": 0.5, "tail": 0.3, "hoof": 0.8, "straight": 0.6},
-}  # fmt: skip
 _NODES = NodeConfig("geodesic", 320, 0.13)
 # Beginnings of the names of a group's bones.
 _TRUNK, _LIMBS = ("torso", "L_", "pelvis"), ("upper_leg", "scapula", "upper_arm")
@@ -86,27 +41,6 @@ _STILL: dict[str, tuple[dict[str, float], dict[str, float]]] = {
     "jump": ({"hip": 25, "knee": -20, "hock": 22, "toe": 20}, {"shoulder": -25, "elbow": -60, "wrist": 70}),
 }  # fmt: skip
 _FOLDED = {"elbow": -85.0, "wrist": 120.0}  # instead, of forelegs that lie under the body
-
-
-def draw_traits(rng: np.random.Generator) -> dict[str, float]:
-    """Proportions between those of two kinds, varied."""
-    first, second = rng.choice(list(KINDS), 2)
-    share = rng.beta(0.45, 0.45)
-    found = {}
-    for name, spread in TRAITS.items():
-        plain = 1.0 if name not in _NONE else 0.0
-        a, b = (KINDS[kind].get(name, plain) for kind in (first, second))
-        if name in _NONE:
-            found[name] = share * a + (1 - share) * b + spread * rng.normal()
-        else:
-            found[name] = float(np.exp(share * np.log(a) + (1 - share) * np.log(b) + spread * rng.normal()))
-    for name in ("bush", "tuft", "mane", "fleece", "muzzle", "hump"):
-        found[name] = max(found[name], 0.0)
-    if rng.uniform() < 0.35:  # tails are as they like
-        found["tail"] = rng.uniform(0.5, 1.3)
-    if rng.uniform() < 0.2:
-        found["bush"] = rng.uniform(0.4, 1.5)
-    return found | {"shoulder": found["tall"]}
 
 
 def morphed(rig: AnimalRig, traits: dict[str, float]) -> Float[Floats, "V 3"]:
@@ -209,7 +143,7 @@ def draw_angles(rig: AnimalRig, traits: dict[str, float], rng: np.random.Generat
                 chain = {"scapula": 0.3 * back, "shoulder": 0.7 * back, "elbow": -lift, "wrist": 1.2 * lift}
             if kind == "lie" and not hind and rng.uniform() < 0.4:
                 chain = chain | _FOLDED
-            share = rng.uniform(0.75, 1.1) * np.clip(1.35 / traits["thick"], 0.5, 1)
+            share = rng.uniform(0.75, 1.1) * np.clip(1.35 / traits["thick"], 0.3, 1)
             for group, bend in chain.items():
                 add(group, bend, side, share)
     add("pelvis", {"sit": -25.0, "lie": -10.0, "gallop": -10 * np.cos(phase)}.get(kind, 0.0))
@@ -233,6 +167,8 @@ def draw_angles(rig: AnimalRig, traits: dict[str, float], rng: np.random.Generat
     add("skull", -rng.uniform(0.4, 0.9) * (traits["neck_down"] if carriage == "down" else bow))
     wide = 0.25 + 0.3 * min(traits["muzzle"], 1.0)  # as hippos like to
     gape = rng.choice([rng.uniform(-34, -28), rng.uniform(-28, -8), rng.uniform(-8, 65)], p=[0.8 - wide, 0.2, wide])
+    if traits["plush"] > 0.5:
+        gape = -30.0
     add("jaw", gape)
     add("skull", -max(gape, 0.0) * rng.uniform(0.1, 1.1))
     found = np.zeros((len(rig.names), 3))
@@ -259,6 +195,17 @@ def with_fur(rig: AnimalRig, verts: Float[Floats, "V 3"], traits: dict[str, floa
     return verts + amount[:, None] * rig.smoothed(vertex_normals(verts, rig.faces), 4)
 
 
+def plush(rig: AnimalRig, verts: Float[Floats, "V 3"]) -> Float[Floats, "V 3"]:
+    """The animal as a toy that is stuffed: without creases and edges, its feet the ends of its legs."""
+    feet = rig.smoothed(rig.share("toe", "finger", "hand", "foot"), 6)
+    for _ in range(3):
+        swollen = 0.012 + 0.03 * feet
+        stuffed = verts + swollen[:, None] * rig.smoothed(vertex_normals(verts, rig.faces), 6)
+        stuffed = rig.smoothed(stuffed, 12)
+        verts = stuffed + feet[:, None] * (rig.smoothed(stuffed, 20) - stuffed)
+    return verts
+
+
 def make_animal(rig: AnimalRig, seed: int, number: int) -> Float[Floats, "V 3"]:
     """One animal, the same for the same seed and number, about as large as a dog."""
     rng = np.random.default_rng([seed, number])
@@ -270,6 +217,7 @@ def make_animal(rig: AnimalRig, seed: int, number: int) -> Float[Floats, "V 3"]:
     heavy = np.clip(1.5 * (traits["thick"] * np.sqrt(traits["wide"]) - 1.2), 0, 1)
     soft += heavy * rig.smoothed(rig.share(*_SOFT), 3)
     posed += np.clip(soft, 0, 1)[:, None] * (rig.smoothed(posed, 10) - posed)
+    posed += np.clip(traits["plush"], 0, 1) * (plush(rig, posed) - posed)
     centers = posed[rng.integers(len(posed), size=12)]
     reach = rng.uniform(0.08, 0.25, 12)
     near = np.exp(-np.square(np.linalg.norm(posed[:, None] - centers, axis=2) / reach))
@@ -278,7 +226,7 @@ def make_animal(rig: AnimalRig, seed: int, number: int) -> Float[Floats, "V 3"]:
 
 def resting_animal(rig: AnimalRig) -> Float[Floats, "V 3"]:
     """The symmetric animal that becomes the template: of middling proportions, its mouth a little open."""
-    traits = {name: float(name not in _NONE) for name in TRAITS}
+    traits = {name: float(name not in NONE) for name in TRAITS}
     traits |= {"leg": 0.85, "thick": 1.3, "wide": 1.25, "tall": 1.1, "belly": 0.5, "neck_thick": 1.25, "ear": 0.6,
                "ear_out": 0.3, "tail_thick": 1.6, "neck": 0.85, "straight": 0.3, "shoulder": 1.0}  # fmt: skip
     angles = np.zeros((len(rig.names), 3))
@@ -295,7 +243,7 @@ def body_parts(rig: AnimalRig) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
 
 
 def quadruped_generator(identities: int, seed: int, progress: Progress | None = None) -> Generator:
-    """So many animals, each in a pose of its own. `OptionError` if dm_control, which has the dog, is not installed."""
+    """So many animals, each in a pose of its own."""
     rig = load_rig()
     labels, parts = body_parts(rig)
     source = "the dog of dm_control (Apache-2.0), at rest, proportions changed"

@@ -1,6 +1,5 @@
 """`train` hands everything on to the training run; the run itself has tests of its own."""
 
-import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -200,15 +199,6 @@ def test_people_are_the_kind_that_needs_no_name(run: Run, stub: Recorder, tmp_pa
     run("train", "-o", tmp_path / "mine", "--kind", "human", "--identities", 10)
     assert stub.bodies == ("human-T", 10, 0)
     assert stub.called["recipe"] == recipe_for()
-
-
-def test_animals_without_the_dog(run: Run, stub: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    answer = run("train", "-o", tmp_path / "mine", "--kind", "quadruped")
-    assert answer.status == 1
-    assert "dm_control" in answer.err
-    assert "pip install --no-deps dm_control" in answer.err
-    assert stub.called == {}
 
 
 def test_poses_of_a_file_are_mixed_in(run: Run, stub: Recorder, tmp_path: Path) -> None:
