@@ -2,20 +2,16 @@
 
 ``python -m meshmatch.experiments.dog_rig [-o FILE]``, after ``pip install --no-deps dm_control``.
 
-Its skin is a file of MuJoCo: vertices, and the bones that carry them. It is welded, turned so that the animal faces +z,
-stands along y and has its left at +x, its eyeballs are closed over, and one half is decimated and mirrored. Decimation
-differs from machine to machine in a few vertices, so that the result is laid on those of the included template.
+Its eyeballs are closed over, and one half is decimated and mirrored. Decimation differs from machine to machine in a few
+vertices, so that the result is laid on those of the included template.
 """
 
 from __future__ import annotations
 
-import importlib.util
-import struct
 import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
-from xml.etree import ElementTree
 
 import numpy as np
 from scipy.sparse import diags
@@ -24,8 +20,8 @@ from scipy.spatial import cKDTree
 from typer import Option
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.errors import InputError
 from meshmatch.experiments import runner
+from meshmatch.experiments.mujoco_skin import find_files, read_animal
 from meshmatch.generators.quadruped_rig import AnimalRig, mean_of_neighbours, rig_file, save_rig, smooth_step
 from meshmatch.generators.quadrupeds import resting_animal
 from meshmatch.shapes.decimate import decimate
@@ -34,9 +30,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import Template, read_template
 
-SKIN, SKELETON = "dog_skin.skn", "dog.xml"
-_INSIDE = Path("locomotion", "walkers", "assets", "dog_v2")  # of the installed package
-_NAME_BYTES = 40
+FILES = ("dog_v2/dog_skin.skn", "dog_v2/dog.xml")
 FACES = 9_800
 """Triangles of the rig: no more than a template's low resolution has, so that `prepare` keeps all of them."""
 # Metres, in the rig's frame: the sphere around the left eye whose vertices become a flat membrane.
@@ -53,7 +47,7 @@ def main(
     ] = None,
 ) -> runner.Report:
     template = read_template(bundled_folder() / "models" / "quadruped" / "template.safetensors")
-    rig = laid_on(read_rig(), template)
+    rig = laid_on(read_dog(), template)
     path = output or rig_file()
     save_rig(rig, path)
     record = {"vertices": len(rig.verts), "triangles": len(rig.faces), "bones": len(rig.names)}
@@ -81,109 +75,18 @@ def symmetric(weights: Float[Floats, "V B"], mirror: Int[Ints, " V"], names: tup
     return np.asarray(0.5 * (weights + weights[mirror][:, [names.index(_other_side(name)) for name in names]]))
 
 
-def find_assets(folder: str | Path | None = None) -> Path:
-    """The folder of the dog's files: the one that is named, or that of the installed dm_control.
-
-    Raises
-    ------
-    InputError
-        There are none.
-    """
-    if folder is None:
-        found = importlib.util.find_spec("dm_control")
-        roots = list(found.submodule_search_locations or []) if found is not None else []
-        folder = Path(roots[0]) / _INSIDE if roots else None
-    hint = "pip install --no-deps dm_control: its dog is all that is needed"
-    if folder is None:
-        raise InputError("dm_control, which has the dog, is not installed", hint)
-    if missing := [name for name in (SKIN, SKELETON) if not (Path(folder) / name).is_file()]:
-        raise InputError(f"{folder} lacks {missing[0]}", hint)
-    return Path(folder)
-
-
-def read_rig(folder: str | Path | None = None, faces: int = FACES) -> AnimalRig:
+def read_dog(faces: int = FACES) -> AnimalRig:
     """The dog as a symmetric rig with about so many triangles; `InputError` if its files are missing or damaged."""
-    assets = find_assets(folder)
-    verts, triangles, names, joints, weights = read_skin(assets / SKIN)
-    parents = read_parents(assets / SKELETON, names)
-    return build_rig(verts, triangles, names, parents, joints, weights, faces)
+    return symmetric_rig(read_animal(*find_files(*FILES)), faces)
 
 
-def read_skin(
-    path: Path,
-) -> tuple[Float[Floats, "V 3"], Int[Ints, "F 3"], tuple[str, ...], Float[Floats, "B 3"], Float[Floats, "V B"]]:
-    """Vertices, triangles, names and places of the bones, and weights of a MuJoCo skin, as the file has them.
-
-    Raises
-    ------
-    InputError
-        It is damaged.
-    """
-    content = path.read_bytes()
-    at = 16
-
-    def take(count: int, kind: str) -> np.ndarray:
-        nonlocal at
-        at += 4 * count
-        return np.frombuffer(content, kind, count, at - 4 * count)
-
-    try:
-        nv, nt, nf, nb = struct.unpack("<4i", content[:16])
-        verts = take(3 * nv, "<f4").reshape(-1, 3).astype(np.float64)
-        take(2 * nt, "<f4")
-        faces = take(3 * nf, "<i4").reshape(-1, 3).astype(np.int64)
-        names, joints, weights = [], np.zeros((nb, 3)), np.zeros((nv, nb))
-        for bone in range(nb):
-            names.append(content[at : at + _NAME_BYTES].split(b"\0")[0].decode())
-            at += _NAME_BYTES
-            joints[bone] = take(7, "<f4")[:3]  # a rotation follows, which the dog's bones do not use
-            (count,) = take(1, "<i4")
-            ids = take(int(count), "<i4")
-            weights[ids, bone] = take(int(count), "<f4")
-        weights /= weights.sum(1, keepdims=True)
-    except (struct.error, ValueError, IndexError) as error:
-        raise InputError(f"{path.name} is not a skin of MuJoCo", "install dm_control again") from error
-    return verts, faces, tuple(names), joints, weights
-
-
-def read_parents(path: Path, names: tuple[str, ...]) -> Int[Ints, " B"]:
-    """The nearest ancestor of every bone in a MuJoCo model that is a bone itself; -1 for the root."""
-    parents = np.full(len(names), -1, np.int64)
-
-    def visit(element: ElementTree.Element, above: int) -> None:
-        for child in element:
-            name, own = child.get("name"), above
-            if child.tag == "body" and name in names:
-                own = names.index(name)
-                parents[own] = above
-            visit(child, own)
-
-    try:
-        visit(ElementTree.parse(path).getroot(), -1)
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path.name} is not a model of MuJoCo", "install dm_control again") from error
-    return parents
-
-
-def build_rig(
-    verts: Float[Floats, "N 3"],
-    faces: Int[Ints, "M 3"],
-    names: tuple[str, ...],
-    parents: Int[Ints, " B"],
-    joints: Float[Floats, "B 3"],
-    weights: Float[Floats, "N B"],
-    count: int,
-) -> AnimalRig:
-    """Weld, turn (from x forward, y left, z up), decimate one half to ``count`` / 2 triangles, and mirror it."""
-    verts, faces, weights = _weld(verts, faces, weights)
-    verts, joints = verts[:, [1, 2, 0]], joints[:, [1, 2, 0]]
-    order = _parents_first(parents)
-    names, joints, weights = tuple(names[k] for k in order), joints[order], weights[:, order]
-    parents = np.array([-1 if parents[k] < 0 else int(np.flatnonzero(order == parents[k])[0]) for k in order])
-    verts = harmonic(verts, faces, _eyes_and_tongue(verts))
+def symmetric_rig(dog: AnimalRig, count: int) -> AnimalRig:
+    """One half decimated to ``count`` / 2 triangles, and mirrored."""
+    names, joints = dog.names, dog.joints.copy()
+    verts = harmonic(dog.verts, dog.faces, _eyes_and_tongue(dog.verts))
     # On the left, with the plane of symmetry as its border.
-    left = (verts[faces, 0] > -1e-9).all(1)
-    half = decimate(Shape(verts, faces[left], "half"), count // 2)
+    left = (verts[dog.faces, 0] > -1e-9).all(1)
+    half = decimate(Shape(verts, dog.faces[left], "half"), count // 2)
     points = np.array(half.verts)
     points[np.abs(points[:, 0]) < 1e-6, 0] = 0.0
     middle = points[:, 0] <= 0
@@ -192,32 +95,12 @@ def build_rig(
     whole = np.concatenate([points, points[~middle] * [-1, 1, 1]])
     mirror = np.concatenate([other, np.flatnonzero(~middle)]).astype(np.int64)
     triangles = np.concatenate([half.faces, other[half.faces][:, ::-1]])
-    own = weights[cKDTree(verts).query(whole)[1]]
+    own = dog.weights[cKDTree(verts).query(whole)[1]]
     own = _jaw_apart(symmetric(own, mirror, names), names)
     for bone in (k for k, name in enumerate(names) if name.startswith("C_")):
         # Halfway from the spine to the middle of the neck, so that necks grow thick on both sides.
         joints[bone] = 0.5 * (joints[bone] + own[:, bone] @ whole / own[:, bone].sum())
-    return AnimalRig(whole, triangles.astype(np.int64), mirror, names, parents, joints, own)
-
-
-def _weld(
-    verts: Float[Floats, "N 3"], faces: Int[Ints, "M 3"], weights: Float[Floats, "N B"]
-) -> tuple[Float[Floats, "V 3"], Int[Ints, "F 3"], Float[Floats, "V B"]]:
-    """One vertex where several lie, and no triangle without three of them."""
-    places, first, own = np.unique(np.round(verts, 6), axis=0, return_index=True, return_inverse=True)
-    corners = own.reshape(-1)[faces]
-    a, b, c = corners.T
-    return places, corners[(a != b) & (b != c) & (c != a)], weights[first]
-
-
-def _parents_first(parents: Int[Ints, " B"]) -> Int[Ints, " B"]:
-    depth = np.zeros(len(parents), np.int64)
-    for bone in range(len(parents)):
-        above = parents[bone]
-        while above >= 0:
-            depth[bone] += 1
-            above = parents[above]
-    return np.argsort(depth, kind="stable")
+    return AnimalRig(whole, triangles.astype(np.int64), mirror, names, dog.parents, joints, own)
 
 
 def _other_side(name: str) -> str:

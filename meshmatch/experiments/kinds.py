@@ -12,6 +12,9 @@ triangles, cut at random, turned anywhere, every other one with a thing beside i
 how many sides were found, and how many pairs of one wrong side were called good. Their errors are in percent of the length
 of the hand (wrist to fingertips) or the head (chin to crown).
 
+Rats are a species that the model has never seen: the share of vertices whose partner is on the same part of the body counts,
+among rats in random poses and animals that it could have drawn itself (meshmatch/experiments/rats.py).
+
 Characters, and the kind that `--model auto` finds of every shape of every set, are those of
 meshmatch.experiments.characters and meshmatch.experiments.chosen_models, which have more choices.
 """
@@ -32,12 +35,14 @@ from typer import Option
 from meshmatch.api.inputs import validated
 from meshmatch.api.matching import Matcher
 from meshmatch.arrays import Ints
+from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.animals import TRUTH, animal_errors, kind_of
 from meshmatch.experiments.category import Shapes, ordered_pairs
-from meshmatch.experiments.characters import GROUPS, measured_groups
+from meshmatch.experiments.characters import COLUMNS, GROUPS, measured_groups, row_of
 from meshmatch.experiments.chosen_models import measured_sets
 from meshmatch.experiments.cut_scans import make_scans, scan_errors
+from meshmatch.experiments.rats import rats_and_dogs
 from meshmatch.experiments.scores import TruthDistances
 from meshmatch.experiments.sets import Pair, load_folder
 from meshmatch.fitting.agree import agreed_fits
@@ -50,8 +55,8 @@ from meshmatch.maps.vertex_map import VertexMap
 OFF = 0.1
 """In units of sqrt(area): a point further off is lost."""
 VERDICTS = ("good", "fair", "poor")
-SETS = ("animals", "hand", "head", "characters", "auto")
-MODELS = {"animals": "quadruped", "characters": "human"}
+SETS = ("animals", "rats", "hand", "head", "characters", "auto")
+MODELS = {"animals": "quadruped", "rats": "quadruped", "characters": "human"}
 """Of the sets that are not named as theirs."""
 BARS = {"hand": 4.0, "head": 2.0}
 """Percent of the length."""
@@ -191,6 +196,7 @@ def main(
     limit_pairs: runner.LimitPairs = None,
     limit_shapes: Annotated[int | None, Option(min=2, help="animals, evenly spread")] = None,
     scans: Annotated[int, Option(min=2, help="hands, and heads")] = 10,
+    rats: Annotated[int, Option(min=2, help="rats, and as many generated animals")] = 4,
     cache: runner.Cache = None,
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
@@ -200,13 +206,22 @@ def main(
     notes: list[str] = []
     for name in runner.names_of(sets, SETS, "set"):
         if name == "auto":
-            record[name], drawn, notes = measured_sets(data)
+            record[name], drawn, more = measured_sets(data)
+            notes += more
             tables.append(drawn)
             continue
         matcher = Matcher(model or MODELS.get(name, name), FitConfig(seed=seed), threads)
         if name == "characters":
             record[name], drawn = measured_groups(data, GROUPS, matcher, seed=seed, cache=cache)
             tables.append(drawn)
+        elif name == "rats":
+            try:
+                cast = rats_and_dogs(rats, seed)
+            except InputError as error:
+                notes.append(f"rats are left out: {error.message}; {error.hint}")
+                continue
+            record[name] = row_of(name, cast, matcher, cache)
+            tables.append(runner.table(f"Rats and animals with {matcher.model.card.name}", [record[name]], COLUMNS))
         elif name == "animals":
             found, several = measured_animals(data, matcher, agree, (limit_shapes, limit_pairs), cache)
             record |= found

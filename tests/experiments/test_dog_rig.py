@@ -3,12 +3,14 @@
 import importlib.util
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.experiments import dog_rig
+from meshmatch.experiments import dog_rig, rats
+from meshmatch.experiments.mujoco_skin import find_files, read_animal
 from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig
 from meshmatch.generators.quadrupeds import resting_animal
 from meshmatch.geometry.triangles import is_watertight
@@ -16,6 +18,7 @@ from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
 
+SKIN, SKELETON = "dog_skin.skn", "dog.xml"
 # Name: parent, place (x forward, y left, z up); those of a side have a partner on the other.
 _LEGS = {
     "upper_leg_L": ("pelvis", (-0.3, 0.05, 0.45)), "lower_leg_L": ("upper_leg_L", (-0.34, 0.06, 0.3)),
@@ -66,19 +69,19 @@ def assets(tmp_path_factory: pytest.TempPathFactory) -> Path:
         content += name.encode().ljust(40, b"\0") + np.array([*place, 1, 0, 0, 0], "<f4").tobytes()
         content += struct.pack("<i", len(soup)) + corners.astype("<i4").tobytes()
         content += weights[soup, bone].astype("<f4").tobytes()
-    (folder / dog_rig.SKIN).write_bytes(content)
+    (folder / SKIN).write_bytes(content)
 
     def body(name: str) -> str:
         inside = "".join(body(child) for child, (parent, _) in bones.items() if parent == name)
         return f'<body name="{name}">{"<body>" + inside + "</body>" if name == "torso" else inside}</body>'
 
-    (folder / dog_rig.SKELETON).write_text(f"<mujoco><worldbody>{body('torso')}</worldbody></mujoco>")
+    (folder / SKELETON).write_text(f"<mujoco><worldbody>{body('torso')}</worldbody></mujoco>")
     return folder
 
 
 @pytest.fixture(scope="module")
 def rig(assets: Path) -> AnimalRig:
-    return dog_rig.read_rig(assets, faces=1200)
+    return dog_rig.symmetric_rig(read_animal(assets / SKIN, assets / SKELETON), 1200)
 
 
 def check_rig(rig: AnimalRig) -> None:
@@ -103,21 +106,35 @@ def test_the_rig_is_closed_and_symmetric(rig: AnimalRig) -> None:
     assert rig.joints[rig.names.index("foot_L"), 0] > 0  # and its left at +x
 
 
-def test_missing_and_damaged_files_are_errors(assets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match=r"lacks dog_skin\.skn") as caught:
-        dog_rig.read_rig(tmp_path)
-    assert "dm_control" in caught.value.hint
-    skin = (assets / dog_rig.SKIN).read_bytes()
-    for name, content in ((dog_rig.SKIN, skin[:-50]), (dog_rig.SKELETON, b"<mujoco>")):
+def test_damaged_files_are_errors(assets: Path, tmp_path: Path) -> None:
+    skin = (assets / SKIN).read_bytes()
+    for name, content in ((SKIN, skin[:-50]), (SKELETON, b"<mujoco>")):
         for file in assets.iterdir():
             (tmp_path / file.name).write_bytes(file.read_bytes())
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match="of MuJoCo"):
-            dog_rig.read_rig(tmp_path)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match="not installed") as caught:
-        dog_rig.read_rig()
-    assert "pip install --no-deps dm_control" in caught.value.hint
+            read_animal(tmp_path / SKIN, tmp_path / SKELETON)
+
+
+def test_without_dm_control(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = SimpleNamespace(submodule_search_locations=[str(tmp_path)])
+    for found, told in ((None, "not installed"), (package, r"lacks rodent\.xml")):
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name, found=found: found)
+        with pytest.raises(InputError, match=told) as caught:
+            find_files("rodent.xml")
+        assert "pip install --no-deps dm_control" in caught.value.hint
+
+
+def test_rats_and_animals_share_their_parts(assets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rats, "find_files", lambda *names: [assets / SKIN, assets / SKELETON])
+    cast = rats.rats_and_dogs(2, seed=0)
+    assert [each.shape.name for each in cast] == ["rat 0", "rat 1", "animal 0", "animal 1"]
+    assert all(len(each.bones) == each.shape.V for each in cast)
+    ball, dog = cast[0], cast[2]
+    assert set(ball.bones) < set(dog.bones)  # the ball lacks no bone that the dog lacks
+    again = rats.rats_and_dogs(2, seed=0)
+    assert all(np.array_equal(a.shape.verts, b.shape.verts) for a, b in zip(cast, again, strict=True))
+    assert not np.allclose(rats.rats_and_dogs(2, seed=1)[1].shape.verts, cast[1].shape.verts)
 
 
 def test_another_decimation_is_laid_on_the_template(rig: AnimalRig, assets: Path) -> None:
@@ -125,7 +142,7 @@ def test_another_decimation_is_laid_on_the_template(rig: AnimalRig, assets: Path
     template = make_template(rest, "ball", NodeConfig("uniform", 60, 0.4))
     assert template.shape.V == len(rig.verts)
     for faces, apart in ((1200, 1e-4), (2000, 0.02)):
-        laid = dog_rig.laid_on(dog_rig.read_rig(assets, faces=faces), template)
+        laid = dog_rig.laid_on(dog_rig.symmetric_rig(read_animal(assets / SKIN, assets / SKELETON), faces), template)
         check_rig(laid)
         assert np.array_equal(laid.faces, template.shape.faces)
         own = sqrt_area_frame(rest).apply(resting_animal(laid))
