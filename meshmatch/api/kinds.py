@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -14,18 +15,21 @@ from meshmatch.errors import InputError, MeshmatchError, ModelError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import may_show_part
-from meshmatch.fitting.kind import KNOWN, SURE, kind_samples, read_kind, told
+from meshmatch.fitting.kind import FAMILIAR, KNOWN, SURE, kind_samples, read_kind, told
 from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import list_models
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes.repair import Repaired
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import beside
 
 _PEOPLE = "human"
+_MOST_READ = 40  # files of a folder whose kind is found out
 _NAME_IT = "name the model with --model (model=...) if that is wrong"
-_NONE = "if it is of one of them, name its model with --model (model=...); --without leaves out what is no part of it"
+_LEAVE_OUT = "--without leaves out what is no part of it"
+_NONE = f"if it is of one of them, name its model with --model (model=...); {_LEAVE_OUT}"
 
 
 @dataclass(frozen=True)
@@ -154,9 +158,8 @@ def choose_model(
     rows = [row for row, model in enumerate(models) if model.card.category == common]
     chosen = settled or models[min(rows, key=lambda row: readings[row].sum())].load()
     by = "" if chosen.card.name == common else f" (model {chosen.card.name})"
-    unsure = f"may be a part, or a rough cloud: taken for {common}{by}; {_NAME_IT}"
     words = [
-        f"{shape.name}: {each.kind}{by}" if each.kind else f"{shape.name} {unsure}"
+        f"{shape.name}: {each.kind}{by}" if each.kind else f"{shape.name} {_unsure(shape, common + by)}"
         for shape, each in zip(shapes, found, strict=True)
     ]
     usable = [
@@ -164,6 +167,12 @@ def choose_model(
         for each, config in zip(found, configs, strict=True)
     ]
     return Choice(chosen, words, usable)
+
+
+def _unsure(shape: Shape, taken: str) -> str:
+    why = "may be a part, or a rough cloud" if shape.is_cloud else "may be a part, or more than one thing"
+    hint = _NAME_IT if shape.is_cloud else f"{_NAME_IT}; {_LEAVE_OUT}"
+    return f"{why}: taken for {taken}; {hint}"
 
 
 def tell_kinds(
@@ -206,3 +215,36 @@ def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | No
         return tell_kinds(models, readings, [shape], [config])[0].kind
     except (InputError, ModelError):
         return None
+
+
+def kinds_of(files: Sequence[Path], seed: int = 0, progress: ProgressCallback | None = None) -> dict[str, str | None]:
+    """The kind of each shape, by its file's name, by readings alone: None where no installed model is sure of it.
+
+    Of many files as many as `_MOST_READ`, evenly spread.
+    """
+    models, config, found = installed_models(), FitConfig(seed=seed), dict[str, str | None]()
+    step = max(1, len(files) // _MOST_READ)
+    for number, path in enumerate(read := files[::step]):
+        shape = repair(load_shape(path)).shape
+        readings = read_kinds(models, [shape], [config])[:, 0]
+        best = int(readings.argmin())
+        found[path.name] = models[best].card.category if readings[best] <= FAMILIAR else None
+        if progress is not None:
+            progress("kinds read", "shapes", (number + 1) / len(read))
+    return found
+
+
+def kind_notes(kinds: Mapping[str, str | None], folder: Path) -> list[str]:
+    """What is to be said of the `kinds_of` a folder: that a model knows them already, or that they are of two kinds."""
+    names: dict[str, list[str]] = {}
+    for name, kind in kinds.items():
+        if kind is not None:
+            names.setdefault(kind, []).append(name)
+    if len(names) > 1:
+        each = (f"{kind} ({', '.join(own[:3])}{', ...' if len(own) > 3 else ''})" for kind, own in names.items())
+        return [f"shapes of {len(names)} kinds: {'; '.join(each)}; a model learns one kind: make a folder of each"]
+    if names and 2 * len(next(iter(names.values()))) > len(kinds):
+        (kind,) = names
+        begin = f"`meshmatch fit {folder} -o fits` and `meshmatch train --shapes fits` begin with it"
+        return [f"the included or installed models know the kind {kind}: {begin}"]
+    return []

@@ -13,7 +13,8 @@ from meshmatch.cli.interpolate import interpolate
 from meshmatch.cli.match import evaluate, match, register
 from meshmatch.cli.models import models
 from meshmatch.cli.picture import picture, view
-from meshmatch.cli.train import prepare, train
+from meshmatch.cli.prepare import prepare
+from meshmatch.cli.train import train
 from meshmatch.cli.transfer import transfer_color, transfer_labels, transfer_landmarks, transfer_weights
 from meshmatch.cli.transfer_texture import transfer_texture
 

@@ -1,11 +1,11 @@
-"""``meshmatch prepare`` and ``meshmatch train``: shapes made ready, and a model that is learned from them."""
+"""``meshmatch train``: a model that is learned from shapes."""
 
 import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from typer import Argument, Option
+from typer import Option
 
 from meshmatch.cli.options import Json, Quiet, Seed, Threads, check_writable, grouped, optional, output_option
 from meshmatch.cli.train_implicit import draw_reports, train_shapes
@@ -22,103 +22,6 @@ if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
     from meshmatch.templates.prepared_folder import RegisteredShapes
     from meshmatch.training.loop import StepReport
-
-
-@dataclass(frozen=True)
-class PrepareOptions:
-    """How shapes are made ready."""
-
-    template: str | None = optional(
-        "SHAPE",
-        "The shape that becomes the template: a name in the folder, or any mesh or cloud. Default: the folder's "
-        "first where all are registered, else the one nearest to all others.",
-    )
-    align: Literal["none", "near", "rigid"] | None = Option(
-        None,
-        help="How shapes are turned to the template, now and when fitted: as they are given, a little, or from any "
-        "orientation. Default: near where they are registered and stand alike, else rigid.",
-    )
-    scale: Literal["area", "sphere"] = Option(
-        "area", help="What is made equal to the template's: surface area, or the radius around the centroid."
-    )
-    mirror: Literal["auto", "no"] = Option(
-        "auto",
-        help="Whether shapes that are mirror images of the others, such as left hands among right ones, are found and "
-        "mirrored; the model then does the same. Of registered shapes none are.",
-    )
-    landmarks: str | None = optional(
-        "WHERE",
-        "Known points of the shapes: a folder of NAME.npy, or a suffix beside them such as .landmarks.npy "
-        "(docs/formats.md).",
-    )
-    strategy: Literal["parts", "spectral", "geodesic", "uniform"] = Option(
-        "geodesic",
-        help="Which nodes are rejected: those between two parts (needs --labels), between two spectral clusters, near "
-        "two points far apart along the surface, or none.",
-    )
-    labels: Path | None = optional("FILE", "The part of every vertex of a single shape: one number a line, from 0.")
-    nodes: int = Option(320, min=4, max=10_000, help="Number of control nodes.")
-    radius: float = Option(0.13, min=1e-6, help="Support radius of a node, in units of sqrt(surface area).")
-    grow_radii: bool = Option(
-        False,
-        "--grow-radii",
-        help="Where vertices have too few nodes in reach, widen the nodes around them, each to a radius of its own. "
-        "Default: add nodes, or take a milder strategy.",
-    )
-    faces: int = Option(10_000, min=100, help="Triangles of the low resolution.")
-    decimate: Literal["fast", "meshlab"] = Option(
-        "fast",
-        help="How the low resolution is made: fast, or slowly with better triangles by MeshLab (extra `meshlab`).",
-    )
-    seed: Seed = 0
-
-
-@grouped
-def prepare(
-    *,
-    shapes: Path = Argument(..., metavar="SHAPES", help="A folder of shapes, or the one shape of a template."),
-    output: Path = output_option("FOLDER", "The output folder; made if needed."),
-    how: PrepareOptions,
-    json: Json = False,
-    quiet: Quiet = False,
-) -> None:
-    """Make a template, and shapes to learn from.
-
-    A folder's shapes are checked, normalised, decimated and brought to the template's position, size and orientation.
-    `meshmatch train --shapes FOLDER` learns from them: from their correspondence if all share the template's vertices
-    and triangles, else without one. Writes template.safetensors, a picture of the nodes (nodes.png) and, from a
-    folder, shapes.safetensors, points.safetensors, normalised/ and prepared.json.
-    """
-    from meshmatch.maps.table_files import load_points
-    from meshmatch.render.compose import compose_shapes
-    from meshmatch.templates.make import NodeConfig
-    from meshmatch.templates.prepare import PrepareConfig
-    from meshmatch.templates.prepare import prepare as prepare_shapes
-
-    console = Console(quiet)
-    parts = None if how.labels is None else load_points(how.labels)
-    nodes = NodeConfig(how.strategy, how.nodes, how.radius, seed=how.seed, grow=how.grow_radii)
-    turned = how.align, how.scale, how.mirror
-    config = PrepareConfig(nodes, how.faces, how.decimate, how.template, *turned, how.landmarks, parts)
-    with console.progress() as progress:
-        made = prepare_shapes(shapes, output, config, progress)
-    found: dict[str, object] = {}
-    if shapes.is_dir():
-        found = {"align": made.align, "scale": how.scale, "mirrored": made.mirrored, "landmarks": made.landmarks}
-    template, registered, picture = made.template, len(made.shapes), output / "nodes.png"
-    compose_shapes([(template, None)]).render(picture)
-    console.say(*made.notes)
-    console.say(
-        f"wrote {output}: a template of {template.shape.V} vertices and {template.K} nodes"
-        + (f", {registered} registered shapes" if registered else "")
-        + (f", {len(made.names)} shapes without correspondence" if found and not registered else "")
-        + (f", {made.landmarks} known points" if made.landmarks else "")
-        + f"; look at {picture}"
-    )
-    if json:
-        record = {"output": output, "template": template.name, "template_hash": template.hash}
-        record |= {"vertices": template.shape.V, "nodes": template.K, "shapes": made.names, "registered": registered}
-        print_json(record | found | {"notes": made.notes})
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,9 @@ def test_what_may_be_a_part_takes_the_other_shapes_kind(unsure: Shape) -> None:
     for shapes in ((unsure, ball("man 3 4 6")), (ball("man 3 4 6"), unsure)):
         name, words = choose(*shapes)
         assert name == "human"
-        assert words[shapes.index(unsure)].startswith("half 7 7 6 may be a part, or a rough cloud: taken for human")
+        why = "may be a part, or a rough cloud" if unsure.is_cloud else "may be a part, or more than one thing"
+        assert words[shapes.index(unsure)].startswith(f"half 7 7 6 {why}: taken for human")
+        assert ("--without" in words[shapes.index(unsure)]) is not unsure.is_cloud
     assert choose(unsure)[0] == "quadruped"  # alone, what reads it best
 
 
@@ -266,3 +268,18 @@ def test_no_model_can_be_called_auto(tmp_path: Path, monkeypatch: pytest.MonkeyP
     card.write_text(card.read_text().replace('"name": "human"', '"name": "auto"', 1))
     with pytest.raises(ModelError, match="no model can be called auto"):
         registry.add_model(folder)
+
+
+def test_a_folder_of_two_kinds_is_told(tmp_path: Path) -> None:
+    names = ["calf.ply", "dancer.ply", "fox.ply"]
+    found = kinds.kinds_of([SAMPLES / name for name in names])
+    assert found == dict(zip(names, ["quadruped", "human", "quadruped"], strict=True))
+    (note,) = kinds.kind_notes(found, tmp_path)
+    assert note.startswith("shapes of 2 kinds: quadruped (calf.ply, fox.ply); human (dancer.ply);")
+
+
+def test_a_folder_that_a_model_knows_is_told() -> None:
+    note = kinds.kind_notes({"a.ply": "hand", "b.ply": None, "c.ply": "hand"}, Path("mine"))
+    assert "know the kind hand: `meshmatch fit mine -o fits`" in note[0]
+    assert kinds.kind_notes({"a.ply": "hand", "b.ply": None}, Path("mine")) == []
+    assert kinds.kind_notes({"a.ply": None}, Path("mine")) == []
