@@ -32,9 +32,9 @@ MIRRORINGS = ("auto", "no")
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 _OLD_FRAME = {"orientation": "searched", "scale": "area"}
 _SINCE: dict[int, dict[str, Any]] = {  # what cards of older schemas lack, and what they meant
-    1: {"frame": _OLD_FRAME, "stiffness": 1.0, "mirror": "no", "correspondence": True},
-    2: {"stiffness": 1.0, "mirror": "no", "correspondence": True},
-    3: {"mirror": "no", "correspondence": True},
+    1: {"frame": _OLD_FRAME, "stiffness": 1.0, "mirror": "no"},
+    2: {"stiffness": 1.0, "mirror": "no"},
+    3: {"mirror": "no"},
 }
 _KINDS: dict[str, tuple[type, str]] = {  # by annotation
     "str": (str, "text"),
@@ -167,14 +167,21 @@ def card_from_json(text: str) -> ModelCard:
         if schema > SCHEMA:
             _check_schema(schema)  # before its keys are judged, which a newer version is free to change
         old = _SINCE.get(schema, {})
-        if old and not old.keys() & found.keys():
-            found = found | old | {"schema": SCHEMA}
+        if old and not (old.keys() | {"correspondence"}) & found.keys():
+            found = found | old | {"schema": SCHEMA, "correspondence": _corresponded(found.get("recipe"))}
     known = [item.name for item in fields(ModelCard)]
     if unknown := sorted(set(found) - set(known)):
         _refuse(f"unknown entries: {', '.join(_shown(name) for name in unknown[:5])}")
     if missing := [name for name in known if name not in found]:
         _refuse(f"missing entries: {', '.join(missing)}")
     return ModelCard(**found)
+
+
+def _corresponded(recipe: Any) -> bool:
+    """Whether the recipe of an older card was one for known correspondence: the other loss weighs landmarks."""
+    for key in ("train", "loss"):
+        recipe = recipe.get(key) if isinstance(recipe, dict) else None
+    return not (isinstance(recipe, dict) and "landmarks" in recipe)
 
 
 def card_to_json(card: ModelCard) -> str:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from meshmatch.errors import MeshmatchError, ModelError, OutputError
 from meshmatch.models.card import ModelCard, check_name, is_name, read_card
 from meshmatch.models.implicit_card import IMPLICIT, ImplicitCard, is_implicit, read_implicit_card
-from meshmatch.models.tensor_file import read_header
+from meshmatch.models.tensor_file import is_whole, read_header
 from meshmatch.models.unfinished import changing, copy_for, needs_settling, put, settle
 from meshmatch.outputs import as_path, home_folder
 
@@ -262,6 +262,10 @@ def _expanded(path: str | Path) -> Path:
 
 def _entry(folder: Path, built_in: bool) -> Entry:
     try:
-        return Entry(folder.name, folder, built_in, read_any_card(folder))
+        card = read_any_card(folder)
     except ModelError as error:
         return Entry(folder.name, folder, built_in, None, error.message)
+    files = (TEMPLATE, WEIGHTS) if isinstance(card, ModelCard) else (WEIGHTS,)
+    if cut := [name for name in files if not is_whole(folder / name)]:
+        return Entry(folder.name, folder, built_in, None, f"{cut[0]} is missing or was cut short")
+    return Entry(folder.name, folder, built_in, card)
