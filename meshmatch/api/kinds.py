@@ -26,6 +26,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.threads import beside
 
 _PEOPLE = "human"
+_NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before all others; as many models as threads at a time
 _MOST_READ = 40  # files of a folder whose kind is found out
 _NAME_IT = "name the model with --model (model=...) if that is wrong"
 _LEAVE_OUT = "--without leaves out what is no part of it"
@@ -66,8 +67,8 @@ def read_kinds(
 ) -> Float[Floats, "M S"]:
     """`read_kind` of repaired shapes by models; infinite where a model cannot see a shape, or was not asked.
 
-    One shape decides first, if possible a whole one. The model of people, and the user's own, are asked about it, and all
-    others only where none of these is ``sure``. Models of its kind are then asked about the other shapes, and the rest
+    One shape decides first, if possible a whole one. The model of people, and the user's own, are asked about it, and the
+    others in turn where none of these is ``sure``. Models of its kind are then asked about the other shapes, and the rest
     where they do not know them: but not about a part of something whose kind is known.
     """
     samples = beside(kind_samples, shapes, [config.seed for config in configs])
@@ -91,8 +92,10 @@ def read_kinds(
     first, *others = sorted(range(len(shapes)), key=lambda number: shapes[number].is_cloud or parts[number])
     likely = [row for row, model in enumerate(models) if model.card.category == _PEOPLE or not model.built_in]
     ask(likely, [first])
-    if found[:, first].min() > sure:
-        ask([row for row in range(len(models)) if row not in likely], [first])
+    rest = sorted(set(range(len(models))) - set(likely), key=lambda row: models[row].card.category not in _NEXT)
+    while rest and found[:, first].min() > sure:
+        ask(rest[:_TOGETHER], [first])
+        del rest[:_TOGETHER]
     known = found[:, first].min() <= KNOWN
     kind = models[int(found[:, first].argmin())].card.category
     same = [row for row, model in enumerate(models) if model.card.category == kind and known]

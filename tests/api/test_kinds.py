@@ -270,6 +270,26 @@ def test_no_model_can_be_called_auto(tmp_path: Path, monkeypatch: pytest.MonkeyP
         registry.add_model(folder)
 
 
+def test_animals_are_told_before_the_rarer_kinds_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+    cards = {name: as_model(name).card for name in ("hand", "head", "human", "quadruped")}
+    models = [Installed(card, lambda name=name: name, True) for name, card in cards.items()]
+
+    def asked(name: str, known: str) -> list[str]:
+        calls.clear()
+        monkeypatch.setattr(
+            kinds, "read_kind", lambda model, *_: calls.append(model) or (0.03 if model == known else 0.07)
+        )
+        found = kinds.read_kinds(models, [ball(name)], [CONFIG])
+        assert [*cards][int(found.argmin())] == known
+        return calls
+
+    assert asked("dancer", "human") == ["human"]
+    assert asked("calf", "quadruped") == ["human", "quadruped", "hand"]  # two at a time
+    assert asked("waving", "hand") == ["human", "quadruped", "hand"]
+    assert asked("laughing", "head") == ["human", "quadruped", "hand", "head"]
+
+
 def test_a_folder_of_two_kinds_is_told(tmp_path: Path) -> None:
     names = ["calf.ply", "dancer.ply", "fox.ply"]
     found = kinds.kinds_of([SAMPLES / name for name in names])
