@@ -32,7 +32,7 @@ def metadata(wheel: zipfile.ZipFile) -> email.message.Message:
 
 def test_the_wheel_holds_templates_weights_and_samples(wheel: zipfile.ZipFile) -> None:
     held = set(wheel.namelist())
-    bundled = {f"human/human-{pose}.safetensors" for pose in "TAI"}
+    bundled = {f"human/human-{pose}.safetensors" for pose in "TAI"} | {"rigs/dog.safetensors"}
     for model in ("hand", "head", "human", "quadruped"):
         bundled |= {f"models/{model}/{name}" for name in ("card.json", "weights.safetensors", "template.safetensors")}
     assert {f"meshmatch/_templates/{name}" for name in bundled} <= held

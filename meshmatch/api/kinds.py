@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,7 +27,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.threads import beside
 
 _PEOPLE = "human"
-_NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before all others; as many models as threads at a time
+_NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before the others; how many models at a time
 _MOST_READ = 40  # files of a folder whose kind is found out
 _NAME_IT = "name the model with --model (model=...) if that is wrong"
 _LEAVE_OUT = "--without leaves out what is no part of it"
@@ -68,8 +69,8 @@ def read_kinds(
     """`read_kind` of repaired shapes by models; infinite where a model cannot see a shape, or was not asked.
 
     One shape decides first, if possible a whole one. The model of people, and the user's own, are asked about it, and the
-    others in turn where none of these is ``sure``. Models of its kind are then asked about the other shapes, and the rest
-    where they do not know them: but not about a part of something whose kind is known.
+    others where none of these is ``sure``: two at a time, animals first, until one is. Models of its kind are then asked
+    about the other shapes, and the rest where they do not know them: but not about a part of something whose kind is known.
     """
     samples = beside(kind_samples, shapes, [config.seed for config in configs])
 
@@ -220,34 +221,46 @@ def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | No
         return None
 
 
-def kinds_of(files: Sequence[Path], seed: int = 0, progress: ProgressCallback | None = None) -> dict[str, str | None]:
-    """The kind of each shape, by its file's name, by readings alone: None where no installed model is sure of it.
+def kinds_of(
+    files: Mapping[str, Path], seed: int = 0, progress: ProgressCallback | None = None
+) -> dict[str, str | None]:
+    """The kind of the shape in each file, by the readings of the included models: None where none is sure of it.
 
-    Of many files as many as `_MOST_READ`, evenly spread.
+    Of more than `_MOST_READ` files as many, evenly spread. `ModelError` if no model is included.
     """
-    models, config, found = installed_models(), FitConfig(seed=seed), dict[str, str | None]()
-    step = max(1, len(files) // _MOST_READ)
-    for number, path in enumerate(read := files[::step]):
-        shape = repair(load_shape(path)).shape
-        readings = read_kinds(models, [shape], [config])[:, 0]
+    models = [model for model in installed_models() if model.built_in]
+    if not models:
+        raise _no_model()
+    config, names = FitConfig(seed=seed), list(files)
+    read = [names[k] for k in np.linspace(0, len(names) - 1, min(len(names), _MOST_READ)).round().astype(int)]
+    found: dict[str, str | None] = {}
+    for number, name in enumerate(read):
+        try:
+            readings = read_kinds(models, [repair(load_shape(files[name])).shape], [config])[:, 0]
+        except InputError:  # of no use to any model
+            readings = np.full(len(models), np.inf)
         best = int(readings.argmin())
-        found[path.name] = models[best].card.category if readings[best] <= FAMILIAR else None
+        found[name] = models[best].card.category if readings[best] <= FAMILIAR else None
         if progress is not None:
             progress("kinds read", "shapes", (number + 1) / len(read))
     return found
 
 
 def kind_notes(kinds: Mapping[str, str | None], folder: Path) -> list[str]:
-    """What is to be said of the `kinds_of` a folder: that a model knows them already, or that they are of two kinds."""
+    """What is to be said of the `kinds_of` a folder, if most are known: which model knows them, or that they are of several
+    kinds. One shape of many is more likely misread than strange.
+    """
     names: dict[str, list[str]] = {}
     for name, kind in kinds.items():
         if kind is not None:
             names.setdefault(kind, []).append(name)
-    if len(names) > 1:
-        each = (f"{kind} ({', '.join(own[:3])}{', ...' if len(own) > 3 else ''})" for kind, own in names.items())
-        return [f"shapes of {len(names)} kinds: {'; '.join(each)}; a model learns one kind: make a folder of each"]
-    if names and 2 * len(next(iter(names.values()))) > len(kinds):
-        (kind,) = names
-        begin = f"`meshmatch fit {folder} -o fits` and `meshmatch train --shapes fits` begin with it"
-        return [f"the included or installed models know the kind {kind}: {begin}"]
-    return []
+    if 2 * sum(map(len, names.values())) <= len(kinds):
+        return []
+    several = {kind: own for kind, own in names.items() if 10 * len(own) >= len(kinds)}
+    if len(several) > 1:
+        each = (f"{kind} ({', '.join(own[:3])}{', ...' if len(own) > 3 else ''})" for kind, own in several.items())
+        return [
+            f"these seem to be {len(several)} kinds of shapes: {'; '.join(each)}; a model learns one: part the folder"
+        ]
+    begin = f"`meshmatch fit {shlex.quote(str(folder))} -o fits` and `meshmatch train --shapes fits -o MODEL`"
+    return [f"the model {next(iter(several))} knows these shapes: to begin with it, {begin}"]

@@ -1,5 +1,6 @@
 """``meshmatch prepare``: a template, and shapes made ready to learn from."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -8,6 +9,8 @@ from typer import Argument, Option
 
 from meshmatch.cli.options import Json, Quiet, Seed, grouped, optional, output_option
 from meshmatch.cli.words import Console, print_json
+from meshmatch.errors import MeshmatchError
+from meshmatch.progress import ProgressCallback
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,6 @@ def prepare(
     and triangles, else without one. Writes template.safetensors, a picture of the nodes (nodes.png) and, from a
     folder, shapes.safetensors, points.safetensors, normalised/ and prepared.json.
     """
-    from meshmatch.api.kinds import kind_notes, kinds_of
     from meshmatch.maps.table_files import load_points
     from meshmatch.render.compose import compose_shapes
     from meshmatch.templates.make import NodeConfig
@@ -93,14 +95,11 @@ def prepare(
     if shapes.is_dir():
         found = {"align": made.align, "scale": how.scale, "mirrored": made.mirrored, "landmarks": made.landmarks}
     template, registered, picture = made.template, len(made.shapes), output / "nodes.png"
-    notes = [*made.notes]
-    if found:
-        known = {name for each in made.names for name in (each, Path(each).stem)}  # not what an earlier run left
-        files = [path for path in sorted((output / "normalised").glob("*.ply")) if path.stem in known]
-        with console.progress() as progress:
-            kinds = kinds_of(files[:1] if registered else files, how.seed, progress)
-        notes += kind_notes(kinds, shapes)
     compose_shapes([(template, None)]).render(picture)
+    notes = [*made.notes]
+    if found and not registered and not (quiet and not json):
+        with console.progress() as progress:
+            notes += _kinds(made.names, output / "normalised", shapes, how.seed, progress)
     console.say(*notes)
     console.say(
         f"wrote {output}: a template of {template.shape.V} vertices and {template.K} nodes"
@@ -113,3 +112,15 @@ def prepare(
         record = {"output": output, "template": template.name, "template_hash": template.hash}
         record |= {"vertices": template.shape.V, "nodes": template.K, "shapes": made.names, "registered": registered}
         print_json(record | found | {"notes": notes})
+
+
+def _kinds(names: Sequence[str], normalised: Path, folder: Path, seed: int, progress: ProgressCallback) -> list[str]:
+    """What is to be said of the kinds of the shapes that were made ready; nothing of this stops `prepare`."""
+    from meshmatch.api.kinds import kind_notes, kinds_of
+
+    places = {name: [normalised / f"{stem}.ply" for stem in (name, Path(name).stem)] for name in names}
+    files = {name: path for name, paths in places.items() for path in paths if path.is_file()}
+    try:
+        return kind_notes(kinds_of(files, seed, progress), folder)
+    except MeshmatchError as error:
+        return [f"the kinds of these shapes were not read: {error.message}"]

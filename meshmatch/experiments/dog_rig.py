@@ -1,6 +1,6 @@
 """Make the rig of generated animals from the free dog of dm_control (Apache-2.0, `locomotion/walkers/assets/dog_v2`).
 
-``python -m meshmatch.experiments.dog_rig [-o FILE]``, after ``pip install --no-deps dm_control``.
+``python -m meshmatch.experiments.dog_rig -o FILE``, after ``pip install --no-deps dm_control``.
 
 Its eyeballs are closed over, and one half is decimated and mirrored. Decimation differs from machine to machine in a few
 vertices, so that the result is laid on those of the included template.
@@ -22,7 +22,7 @@ from typer import Option
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments import runner
 from meshmatch.experiments.mujoco_skin import find_files, read_animal
-from meshmatch.generators.quadruped_rig import AnimalRig, mean_of_neighbours, rig_file, save_rig, smooth_step
+from meshmatch.generators.quadruped_rig import AnimalRig, mean_of_neighbours, save_rig, smooth_step
 from meshmatch.generators.quadrupeds import resting_animal
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -30,6 +30,10 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import Template, read_template
 
+SOURCE = (
+    "the dog of dm_control, locomotion/walkers/assets/dog_v2, Copyright The dm_control Authors; changed: eyes closed, "
+    "decimated, mirrored, joints of the neck moved"
+)
 FILES = ("dog_v2/dog_skin.skn", "dog_v2/dog.xml")
 FACES = 9_800
 """Triangles of the rig: no more than a template's low resolution has, so that `prepare` keeps all of them."""
@@ -42,16 +46,13 @@ _JAW_FROM, _JAW_TO = 0.3, 0.75
 
 @runner.command
 def main(
-    output: Annotated[
-        Path | None, Option("-o", "--output", help="where to write it; default: where the package has it")
-    ] = None,
+    output: Annotated[Path, Option("-o", "--output", help="where to write it; the package has it in templates/rigs")],
 ) -> runner.Report:
     template = read_template(bundled_folder() / "models" / "quadruped" / "template.safetensors")
     rig = laid_on(read_dog(), template)
-    path = output or rig_file()
-    save_rig(rig, path)
+    save_rig(rig, output, source=SOURCE, licence="Apache-2.0")
     record = {"vertices": len(rig.verts), "triangles": len(rig.faces), "bones": len(rig.names)}
-    return runner.Report(record, notes=[f"wrote {path}"])
+    return runner.Report(record, notes=[f"wrote {output}"])
 
 
 def laid_on(rig: AnimalRig, template: Template) -> AnimalRig:

@@ -218,6 +218,8 @@ def main(
             try:
                 cast = rats_and_dogs(rats, seed)
             except InputError as error:
+                if sets == name:
+                    raise
                 notes.append(f"rats are left out: {error.message}; {error.hint}")
                 continue
             record[name] = row_of(name, cast, matcher, cache)

@@ -33,7 +33,7 @@ def find_files(*names: str) -> list[Path]:
 def read_animal(skin: Path, skeleton: Path) -> AnimalRig:
     """A welded mesh on its bones, parents first, turned so that it faces +z, stands along y and has its left at +x.
 
-    Every vertex is its own mirror image. `InputError` if a file is missing or damaged.
+    Its ``mirror`` is left as the identity. `InputError` if a file is missing or damaged.
     """
     verts, faces, names, joints, weights = read_skin(skin)
     parents = read_parents(skeleton, names)

@@ -1,6 +1,6 @@
 """Rats: the one of dm_control (Apache-2.0), which no training saw, in random poses, beside animals made of its dog.
 
-Both skeletons have the same bones, so that a truth comes for free: the share of vertices whose partner hangs on the same
+Both skeletons have the same parts, so that a truth comes for free: the share of vertices whose partner hangs on the same
 part of the body, left and right told apart. Where one part ends and the next begins is a matter of the rigs, so that no map
 reaches 1.
 """

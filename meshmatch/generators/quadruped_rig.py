@@ -12,11 +12,13 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from safetensors import SafetensorError
 from safetensors.numpy import load_file
 from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.errors import TemplateError
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import save_arrays
 
@@ -104,8 +106,12 @@ def rig_file() -> Path:
 
 
 def load_rig(path: Path | None = None) -> AnimalRig:
-    """The dog, or another rig that `save_rig` wrote."""
-    arrays = load_file(path or rig_file())
+    """The dog, or another rig that `save_rig` wrote; `TemplateError` if the file is missing or damaged."""
+    path = path or rig_file()
+    try:
+        arrays = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise TemplateError(f"the rig {path} is missing or damaged", "install meshmatch again") from error
     verts, joints = arrays["verts"].astype(np.float64), arrays["joints"].astype(np.float64)
     faces, mirror, parents = (arrays[name].astype(np.int64) for name in ("faces", "mirror", "parents"))
     weights = np.zeros((len(verts), len(joints)))
@@ -114,8 +120,8 @@ def load_rig(path: Path | None = None) -> AnimalRig:
     return AnimalRig(verts, faces, mirror, names, parents, joints, weights)
 
 
-def save_rig(rig: AnimalRig, path: Path) -> None:
-    """Write a rig as one safetensors file."""
+def save_rig(rig: AnimalRig, path: Path, **words: str) -> None:
+    """Write a rig as one safetensors file, with a few words such as its source."""
     carried, carriers = np.nonzero(rig.weights)
     arrays: dict[str, np.ndarray] = {
         "verts": rig.verts.astype(np.float32),
@@ -128,7 +134,7 @@ def save_rig(rig: AnimalRig, path: Path) -> None:
         "carriers": carriers.astype(np.int32),
         "weights": rig.weights[carried, carriers].astype(np.float32),
     }
-    save_arrays(path, arrays)
+    save_arrays(path, arrays, words)
 
 
 def mean_of_neighbours(faces: Int[Ints, "M 3"], count: int) -> csr_matrix:

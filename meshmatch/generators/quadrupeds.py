@@ -1,7 +1,7 @@
 """Four-legged animals for training, made from the free dog of dm_control: registered watertight meshes, seeded.
 
 All have the same vertices and triangles (left and right exchange exactly), face +z and stand along y. An animal mixes
-the proportions of two kinds (dog, cat, cow, horse, hippo, bear, sheep, deer) and varies them; its bones are scaled along
+the proportions of two kinds (`meshmatch.generators.quadruped_traits.KINDS`) and varies them; its bones are scaled along
 and across and turned within the limits of their joints; it stands, walks, runs, sits, lies, crouches, jumps or grazes,
 with its mouth open or closed; manes, bushy tails and fleeces are pushed out of the skin. The meshes are under the licence
 of the dog, Apache-2.0.
@@ -243,7 +243,7 @@ def body_parts(rig: AnimalRig) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
 
 
 def quadruped_generator(identities: int, seed: int, progress: Progress | None = None) -> Generator:
-    """So many animals, each in a pose of its own."""
+    """So many animals, each in a pose of its own; `TemplateError` if their rig is missing or damaged."""
     rig = load_rig()
     labels, parts = body_parts(rig)
     source = "the dog of dm_control (Apache-2.0), at rest, proportions changed"

@@ -168,7 +168,7 @@ def card_from_json(text: str) -> ModelCard:
             _check_schema(schema)  # before its keys are judged, which a newer version is free to change
         old = _SINCE.get(schema, {})
         if old and not (old.keys() | {"correspondence"}) & found.keys():
-            found = found | old | {"schema": SCHEMA, "correspondence": _corresponded(found.get("recipe"))}
+            found = found | old | {"schema": SCHEMA, "correspondence": _corresponded(found)}
     known = [item.name for item in fields(ModelCard)]
     if unknown := sorted(set(found) - set(known)):
         _refuse(f"unknown entries: {', '.join(_shown(name) for name in unknown[:5])}")
@@ -177,11 +177,18 @@ def card_from_json(text: str) -> ModelCard:
     return ModelCard(**found)
 
 
-def _corresponded(recipe: Any) -> bool:
-    """Whether the recipe of an older card was one for known correspondence: the other loss weighs landmarks."""
+def _corresponded(card: dict[str, Any]) -> bool:
+    """Whether an older card is of a model that learned from known correspondence, as far as it says so.
+
+    The oldest recipes have one loss for both ways of learning, which always weighs landmarks and says ``robust``; of these
+    the words about the data tell. Later ones weigh landmarks only without correspondence.
+    """
+    recipe: Any = card.get("recipe")
     for key in ("train", "loss"):
         recipe = recipe.get(key) if isinstance(recipe, dict) else None
-    return not (isinstance(recipe, dict) and "landmarks" in recipe)
+    if isinstance(recipe, dict) and "landmarks" in recipe and "robust" not in recipe:
+        return False
+    return "without correspondence" not in str(card.get("data"))
 
 
 def card_to_json(card: ModelCard) -> str:

@@ -267,5 +267,5 @@ def _entry(folder: Path, built_in: bool) -> Entry:
         return Entry(folder.name, folder, built_in, None, error.message)
     files = (TEMPLATE, WEIGHTS) if isinstance(card, ModelCard) else (WEIGHTS,)
     if cut := [name for name in files if not is_whole(folder / name)]:
-        return Entry(folder.name, folder, built_in, None, f"{cut[0]} is missing or was cut short")
+        return Entry(folder.name, folder, built_in, None, f"{cut[0]} is missing or damaged")
     return Entry(folder.name, folder, built_in, card)

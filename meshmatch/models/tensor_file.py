@@ -43,6 +43,8 @@ def read_header(path: str | Path) -> dict[str, TensorInfo]:
 def is_whole(path: Path) -> bool:
     """Whether a safetensors file is there, and as long as its header says; quickly, and without NumPy."""
     try:
+        if not path.is_file():
+            return False
         size = path.stat().st_size
         with path.open("rb") as file:
             length = int.from_bytes(file.read(8), "little")

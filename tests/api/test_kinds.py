@@ -291,15 +291,26 @@ def test_animals_are_told_before_the_rarer_kinds_are_asked(monkeypatch: pytest.M
 
 
 def test_a_folder_of_two_kinds_is_told(tmp_path: Path) -> None:
-    names = ["calf.ply", "dancer.ply", "fox.ply"]
-    found = kinds.kinds_of([SAMPLES / name for name in names])
-    assert found == dict(zip(names, ["quadruped", "human", "quadruped"], strict=True))
+    (tmp_path / "bad.ply").write_bytes(b"ply")
+    files = {name: SAMPLES / f"{name}.ply" for name in ("calf", "dancer", "fox")} | {"bad": tmp_path / "bad.ply"}
+    found = kinds.kinds_of(files)
+    assert found == {"calf": "quadruped", "dancer": "human", "fox": "quadruped", "bad": None}
     (note,) = kinds.kind_notes(found, tmp_path)
-    assert note.startswith("shapes of 2 kinds: quadruped (calf.ply, fox.ply); human (dancer.ply);")
+    assert note.startswith("these seem to be 2 kinds of shapes: quadruped (calf, fox); human (dancer);")
+
+
+def test_of_many_files_some_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kinds, "read_kinds", lambda models, *_: np.full((len(models), 1), 0.03))
+    for count, read in ((3, 3), (40, 40), (79, 40), (119, 40)):
+        found = list(kinds.kinds_of({f"{k}.ply": SAMPLES / "calf.ply" for k in range(count)}))
+        assert len(found) == read
+        assert (found[0], found[-1]) == ("0.ply", f"{count - 1}.ply")
 
 
 def test_a_folder_that_a_model_knows_is_told() -> None:
-    note = kinds.kind_notes({"a.ply": "hand", "b.ply": None, "c.ply": "hand"}, Path("mine"))
-    assert "know the kind hand: `meshmatch fit mine -o fits`" in note[0]
+    (note,) = kinds.kind_notes({"a.ply": "hand", "b.ply": None, "c.ply": "hand"}, Path("my hands"))
+    assert note.startswith("the model hand knows these shapes: to begin with it, `meshmatch fit 'my hands' -o fits`")
     assert kinds.kind_notes({"a.ply": "hand", "b.ply": None}, Path("mine")) == []
     assert kinds.kind_notes({"a.ply": None}, Path("mine")) == []
+    odd = {f"{k}.ply": "hand" for k in range(20)} | {"odd.ply": "head"}  # one of many is more likely misread
+    assert kinds.kind_notes(odd, Path("mine"))[0].startswith("the model hand knows")

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from meshmatch.api import kinds
+from meshmatch.errors import ModelError
 from meshmatch.models.card import read_card, write_card
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
@@ -44,6 +46,26 @@ def test_prepare_says_what_it_chose(run: Run, eggs: Path, tmp_path: Path) -> Non
     assert (record["registered"], record["align"], record["scale"], record["landmarks"]) == (0, "rigid", "area", 0)
     assert "which lies nearest to all others" in answer.err
     assert "3 shapes without correspondence" in answer.err
+
+
+def test_prepare_says_what_kind_the_shapes_are(
+    run: Run, eggs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[dict[str, Path]] = []
+    monkeypatch.setattr(kinds, "kinds_of", lambda files, *_: seen.append(files) or dict.fromkeys(files, "hand"))
+    answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1], "--json")
+    assert f"the model hand knows these shapes: to begin with it, `meshmatch fit {eggs} -o fits`" in answer.err
+    assert any("knows these shapes" in note for note in json.loads(answer.out)["notes"])
+    assert list(seen[0]) == json.loads(answer.out)["shapes"]
+    assert all(path.is_file() for path in seen[0].values())
+
+    def refuse(*_: object) -> dict[str, str]:
+        raise ModelError("no model is installed", "see `meshmatch models list`")
+
+    monkeypatch.setattr(kinds, "kinds_of", refuse)
+    answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1])
+    assert answer.status == 0
+    assert "the kinds of these shapes were not read: no model is installed" in answer.err
 
 
 def test_options_reach_the_folder(run: Run, eggs: Path, tmp_path: Path) -> None:

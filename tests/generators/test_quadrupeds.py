@@ -5,10 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 
 from meshmatch import load_model
+from meshmatch.errors import TemplateError
 from meshmatch.generators import quadruped_rig, quadrupeds
-from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig, save_rig
+from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig, rig_file, save_rig
 from meshmatch.generators.quadruped_traits import KINDS, TRAITS, draw_traits
 from meshmatch.generators.quadrupeds import draw_angles, make_animal, plush, resting_animal
 from meshmatch.geometry.triangles import is_watertight, vertex_normals
@@ -39,6 +41,17 @@ def test_a_rig_survives_its_file(rig: AnimalRig, tmp_path: Path) -> None:
     assert again.names == rig.names
     for name in ("verts", "faces", "mirror", "parents", "joints", "weights"):
         assert np.array_equal(getattr(again, name), getattr(rig, name))
+
+
+def test_the_rig_says_whose_it_is_and_a_damaged_one_is_an_error(tmp_path: Path) -> None:
+    with safe_open(str(rig_file()), "numpy") as file:
+        words = file.metadata()
+    assert "dm_control Authors; changed: eyes closed" in words["source"]
+    assert words["licence"] == "Apache-2.0"
+    (tmp_path / "cut.safetensors").write_bytes(rig_file().read_bytes()[:-9])
+    for path in (tmp_path / "cut.safetensors", tmp_path / "none.safetensors"):
+        with pytest.raises(TemplateError, match="is missing or damaged"):
+            load_rig(path)
 
 
 def test_a_stuffed_animal_is_smoother_and_no_thinner(rig: AnimalRig) -> None:

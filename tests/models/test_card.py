@@ -158,11 +158,16 @@ def test_a_wrong_frame_is_refused(frame: dict[str, object], told: str) -> None:
         small_card(frame=frame)
 
 
-@pytest.mark.parametrize(("loss", "known"), [({"correct": 1.0}, True), ({"landmarks": 1.0}, False), ("odd", True)])
+@pytest.mark.parametrize(
+    ("loss", "known"),
+    [({"correct": 1.0}, True), ({"landmarks": 1.0}, False), ({"landmarks": 1.0, "robust": True}, True), ("odd", True)],
+)
 def test_an_older_card_tells_by_its_recipe_what_it_learned_from(loss: object, known: bool) -> None:
     words = json.loads(card_to_json(small_card())) | {"schema": 3, "recipe": {"train": {"loss": loss}}}
     del words["mirror"], words["correspondence"]
     assert card_from_json(json.dumps(words)).correspondence is known
+    words["data"] = "32 shapes of pets, without correspondence"
+    assert not card_from_json(json.dumps(words)).correspondence
 
 
 def test_a_newer_schema_asks_for_an_update_whatever_else_it_holds() -> None:

@@ -180,18 +180,20 @@ def test_extra_keys_in_a_card_are_refused(blob: Path) -> None:
         add_model(blob)
 
 
-@pytest.mark.parametrize("damage", ["cut", "gone", "no header", "long"])
+@pytest.mark.parametrize("damage", ["cut", "gone", "no header", "long", "pipe"])
 def test_weights_that_were_cut_short_are_listed_as_damaged(damage: str) -> None:
     copy = user_folder() / "mine"
     shutil.copytree(locate_model("human"), copy)
     weights = copy / "weights.safetensors"
     content = weights.read_bytes()
     weights.unlink()
-    if damage != "gone":
+    if damage == "pipe":
+        os.mkfifo(weights)
+    elif damage != "gone":
         weights.write_bytes({"cut": content[:-9], "no header": b"\xff" * 64, "long": content + b"more"}[damage])
     entry = {entry.name: entry for entry in list_models()}["mine"]
     assert entry.card is None
-    assert entry.problem == "weights.safetensors is missing or was cut short"
+    assert entry.problem == "weights.safetensors is missing or damaged"
 
 
 def test_a_folder_without_a_card_is_listed_as_damaged_and_can_be_removed(tmp_path: Path) -> None:
