@@ -196,8 +196,7 @@ def tell_kinds(
         kind = best.card.category
         if np.isinf(column[row]):
             return Told(None, best.card)
-        rivals = [reading for model, reading in zip(models, column, strict=True) if model.card.category != kind]
-        known, fit = told(best.load(), shape, column[row], config, min(rivals, default=np.inf), progress)
+        known, fit = told(best.load(), shape, column[row], config, progress)
         return Told(kind if known else None, best.card, fit)
 
     found = beside(tell, shapes, configs, readings.T)

@@ -17,7 +17,7 @@ from meshmatch.fitting.initial_frames import frames_to_try, scan_frame
 from meshmatch.fitting.network_fit import Predictor, best_first
 from meshmatch.fitting.task import without_outliers
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.models.trained import TrainedModel
+from meshmatch.models.trained import TrainedModel, once_per_model
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -30,10 +30,11 @@ FAMILIAR, STRANGE = 0.0465, 0.062
 arms: a fit tells, see `told`."""
 SURE = 0.042
 """Up to this a reading needs no other model's beside it: another kind's were 0.0439 at least (docs/results.md)."""
-# Trust from which on such a fit tells the kind; of a mesh any that is not poor where every other kind's reading is so many
-# times as high. A fair one of heads can be of a heart (1.08 times at most), one of people is of a Rogue (1.10 at least), but
-# also of an aeroplane's cloud (1.14).
-_BELONGS, _ALONE = 0.7, 1.09
+# Trust from which on such a fit tells the kind; of a mesh, and a template with limbs, any that is not poor. A head has none,
+# so that much is like it: a fair fit of it can be of a heart. Clouds of aeroplanes have fair fits of people.
+_BELONGS = 0.7
+# Isoperimetric quotient of a template up to which it has limbs: people have 0.08, hands 0.12, animals 0.15, heads 0.27.
+_LIMBED = 0.2
 _SAMPLES, _THIN = 2048, 768  # how many the reading is of, and how many rank the orientations
 
 
@@ -57,23 +58,25 @@ def read_kind(model: TrainedModel, shape: Shape, samples: OrientedPoints, config
     return predictor.fit(placed, best.pose, draws=1).residual
 
 
+@once_per_model
+def has_limbs(model: TrainedModel) -> bool:
+    """Whether a model's template is far from round: 36 pi V^2 / A^3 is 1 for a ball. Cones to the center close its holes."""
+    shape = model.template.shape
+    volume = np.linalg.det(shape.verts[shape.faces]).sum() / 6
+    return bool(36 * np.pi * volume**2 / shape.area**3 <= _LIMBED)
+
+
 def told(
-    model: TrainedModel,
-    shape: Shape,
-    reading: float,
-    config: FitConfig,
-    rival: float,
-    progress: ProgressCallback | None,
+    model: TrainedModel, shape: Shape, reading: float, config: FitConfig, progress: ProgressCallback | None
 ) -> tuple[bool, Fit | None]:
     """Whether a shape is known to be of a model's kind, and the fit of one that reads strangely, which had to tell.
 
-    ``rival`` is the lowest reading of another kind. The fit is made as ``config`` says, with refined nodes; one of a part
-    tells nothing that the reading does not.
+    The fit is made as ``config`` says, with refined nodes; one of a part tells nothing that the reading does not.
     """
     if not FAMILIAR < reading <= STRANGE:
         return reading <= FAMILIAR, None
     fit = Fitter(model, replace(config, refine="nodes"), progress).fit(shape)
     if fit.partial:
         return reading <= KNOWN, fit
-    alone = rival >= _ALONE * reading and not shape.is_cloud
-    return fit.verdict != "poor" and (fit.trust >= _BELONGS or alone), fit
+    clear = has_limbs(model) and not shape.is_cloud
+    return fit.verdict != "poor" and (fit.trust >= _BELONGS or clear), fit

@@ -87,38 +87,35 @@ def test_a_complete_shape_of_no_kind_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("verdict", "trust", "rival", "of_kind"),
+    ("name", "verdict", "trust", "mesh", "points"),
     [
-        ("fair", 0.75, 0.056, True),
-        ("fair", 0.65, 0.059, False),
-        ("fair", 0.65, 0.061, True),
-        ("poor", 0.95, 0.1, False),
+        ("human", "fair", 0.75, True, True),
+        ("human", "fair", 0.65, True, False),  # a cloud may be an aeroplane's
+        ("quadruped", "fair", 0.55, True, False),
+        ("head", "fair", 0.65, False, False),  # what has no limbs is like much else
+        ("head", "fair", 0.75, True, True),
+        ("human", "poor", 0.95, False, False),
     ],
 )
-def test_a_strange_shape_needs_more_trust_than_a_fair_fit_unless_nothing_else_is_near(
-    monkeypatch: pytest.MonkeyPatch, verdict: str, trust: float, rival: float, of_kind: bool
+def test_a_fair_fit_tells_a_strange_mesh_if_the_template_has_limbs(
+    monkeypatch: pytest.MonkeyPatch, name: str, verdict: str, trust: float, mesh: bool, points: bool
 ) -> None:
     fit = SimpleNamespace(verdict=verdict, trust=trust, partial=False)
     monkeypatch.setattr(kind.Fitter, "fit", lambda *_: fit)
-    assert kind.told(as_model("human"), ball("man"), 0.055, CONFIG, rival, None) == (of_kind, fit)
-    if verdict != "poor":  # a cloud is of no kind just because it is of no other
-        assert kind.told(as_model("human"), cloud("man"), 0.055, CONFIG, rival, None)[0] is (trust > 0.7)
+    for shape, of_kind in ((ball("man"), mesh), (cloud("man"), points)):
+        assert kind.told(as_model(name), shape, 0.055, CONFIG, None) == (of_kind, fit)
+
+
+def test_models_know_whether_they_have_limbs() -> None:
+    found = {name: kind.has_limbs(as_model(name)) for name in ("human", "quadruped", "hand", "head")}
+    assert found == {"human": True, "quadruped": True, "hand": True, "head": False}
 
 
 def test_a_fit_as_a_part_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     fit = SimpleNamespace(verdict="good", trust=1.0, partial=True)
     monkeypatch.setattr(kind.Fitter, "fit", lambda *_: fit)
     for reading, known in ((0.048, True), (0.055, False)):
-        assert kind.told(as_model("human"), ball("half"), reading, CONFIG, 0.1, None) == (known, fit)
-
-
-@pytest.mark.usefixtures("models")
-def test_its_rival_is_the_nearest_reading_of_another_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    rivals: list[float] = []
-    monkeypatch.setattr(kinds, "told", lambda *given: (rivals.append(given[-2]) or True, None))
-    choose(ball("robot 5.5 5.6 7"))
-    choose(ball("robot 5.5 7 5.6"))
-    assert rivals == pytest.approx([0.07, 0.056])
+        assert kind.told(as_model("human"), ball("half"), reading, CONFIG, None) == (known, fit)
 
 
 @pytest.mark.usefixtures("models")
