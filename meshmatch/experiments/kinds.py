@@ -12,7 +12,7 @@ triangles, cut at random, turned anywhere, every other one with a thing beside i
 how many sides were found, and how many pairs of one wrong side were called good. Their errors are in percent of the length
 of the hand (wrist to fingertips) or the head (chin to crown).
 
-Rats are a species that the model has never seen: the share of vertices whose partner is on the same part of the body counts,
+Rats are of a mesh that the model has never seen: the share of vertices whose partner is on the same part of the body counts,
 among rats in random poses and animals that it could have drawn itself (meshmatch/experiments/rats.py).
 
 Characters, and the kind that `--model auto` finds of every shape of every set, are those of
