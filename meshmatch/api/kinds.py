@@ -259,7 +259,7 @@ def kind_notes(kinds: Mapping[str, str | None], folder: Path) -> list[str]:
     if len(several) > 1:
         each = (f"{kind} ({', '.join(own[:3])}{', ...' if len(own) > 3 else ''})" for kind, own in several.items())
         return [
-            f"these seem to be {len(several)} kinds of shapes: {'; '.join(each)}; a model learns one: part the folder"
+            f"these seem to be {len(several)} kinds of shapes: {'; '.join(each)}; a model learns one: split the folder"
         ]
     begin = f"`meshmatch fit {shlex.quote(str(folder))} -o fits` and `meshmatch train --shapes fits -o MODEL`"
     return [f"the model {next(iter(several))} knows these shapes: to begin with it, {begin}"]

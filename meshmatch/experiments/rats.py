@@ -16,7 +16,7 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.experiments.character_designs import Character
 from meshmatch.experiments.mujoco_skin import find_files, read_animal
 from meshmatch.generators.quadruped_rig import AnimalRig, load_rig, skinned
-from meshmatch.generators.quadruped_traits import NONE, TRAITS
+from meshmatch.generators.quadruped_traits import EXTRAS, TRAITS
 from meshmatch.generators.quadrupeds import body_parts, draw_angles, make_animal
 from meshmatch.shapes.shape import Shape
 
@@ -46,7 +46,7 @@ def read_rat() -> AnimalRig:
 def rats_and_dogs(count: int, seed: int) -> list[Character]:
     """So many rats, the first at rest, and as many animals of the dog, turned anywhere, with the part of every vertex."""
     rat, dog = read_rat(), load_rig()
-    plain = {name: float(name not in NONE) for name in TRAITS}
+    plain = {name: float(name not in EXTRAS) for name in TRAITS}
     still = np.tile(np.eye(3), (len(rat.names), 1, 1))
     rng = np.random.default_rng([UNSEEN_SEED, seed])
     poses = [np.zeros((len(rat.names), 3)), *(draw_angles(rat, plain, rng) for _ in range(count - 1))]

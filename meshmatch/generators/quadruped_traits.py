@@ -13,7 +13,8 @@ TRAITS = {
     "tuft": 0.2, "mane": 0.18, "fleece": 0.08, "hoof": 0.12, "straight": 0.25,
     "plush": 0.1,
 }  # fmt: skip
-NONE = {"belly", "hump", "neck_down", "muzzle", "ear_out", "bush", "tuft", "mane", "fleece", "hoof", "straight",
+# What the dog has nothing of.
+EXTRAS = {"belly", "hump", "neck_down", "muzzle", "ear_out", "bush", "tuft", "mane", "fleece", "hoof", "straight",
         "plush"}  # fmt: skip
 KINDS: dict[str, dict[str, float]] = {
     "dog": {"ear": 0.7, "tail": 0.8, "tail_thick": 1.3, "belly": 0.1},
@@ -70,9 +71,9 @@ def draw_traits(rng: np.random.Generator) -> dict[str, float]:
     share = rng.beta(0.45, 0.45)
     found = {}
     for name, spread in TRAITS.items():
-        plain = 1.0 if name not in NONE else 0.0
+        plain = 1.0 if name not in EXTRAS else 0.0
         a, b = (KINDS[kind].get(name, plain) for kind in (first, second))
-        if name in NONE:
+        if name in EXTRAS:
             found[name] = share * a + (1 - share) * b + spread * rng.normal()
         else:
             found[name] = float(np.exp(share * np.log(a) + (1 - share) * np.log(b) + spread * rng.normal()))

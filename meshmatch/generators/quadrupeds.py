@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.generators.generator import Generator, Resting
 from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig, ramp, skinned, smooth_step
-from meshmatch.generators.quadruped_traits import NONE, TRAITS, draw_traits
+from meshmatch.generators.quadruped_traits import EXTRAS, TRAITS, draw_traits
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.progress import Progress
 from meshmatch.shapes.shape import Shape
@@ -226,7 +226,7 @@ def make_animal(rig: AnimalRig, seed: int, number: int) -> Float[Floats, "V 3"]:
 
 def resting_animal(rig: AnimalRig) -> Float[Floats, "V 3"]:
     """The symmetric animal that becomes the template: of middling proportions, its mouth a little open."""
-    traits = {name: float(name not in NONE) for name in TRAITS}
+    traits = {name: float(name not in EXTRAS) for name in TRAITS}
     traits |= {"leg": 0.85, "thick": 1.3, "wide": 1.25, "tall": 1.1, "belly": 0.5, "neck_thick": 1.25, "ear": 0.6,
                "ear_out": 0.3, "tail_thick": 1.6, "neck": 0.85, "straight": 0.3, "shoulder": 1.0}  # fmt: skip
     angles = np.zeros((len(rig.names), 3))

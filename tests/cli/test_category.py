@@ -59,6 +59,9 @@ def test_prepare_says_what_kind_the_shapes_are(
     assert list(seen[0]) == json.loads(answer.out)["shapes"]
     assert all(path.is_file() for path in seen[0].values())
 
+    assert run("prepare", eggs, "-o", tmp_path / "out", *FEW).status == 0
+    assert len(seen) == 1  # nobody listens, nobody asks
+
     def refuse(*_: object) -> dict[str, str]:
         raise ModelError("no model is installed", "see `meshmatch models list`")
 

@@ -11,12 +11,12 @@ import pytest
 from meshmatch.errors import InputError
 from meshmatch.experiments import dog_rig, rats
 from meshmatch.experiments.mujoco_skin import find_files, read_animal
-from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig
+from meshmatch.generators.quadruped_rig import AnimalRig, load_rig
 from meshmatch.generators.quadrupeds import resting_animal
-from meshmatch.geometry.triangles import is_watertight
 from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
+from tests.generators.animal_rigs import check_rig
 
 SKIN, SKELETON = "dog_skin.skn", "dog.xml"
 # Name: parent, place (x forward, y left, z up); those of a side have a partner on the other.
@@ -82,19 +82,6 @@ def assets(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def rig(assets: Path) -> AnimalRig:
     return dog_rig.symmetric_rig(read_animal(assets / SKIN, assets / SKELETON), 1200)
-
-
-def check_rig(rig: AnimalRig) -> None:
-    assert is_watertight(rig.faces)
-    mirrored = rig.verts[rig.mirror] * [-1, 1, 1]
-    assert np.abs(mirrored - rig.verts).max() < 1e-12
-    assert np.abs(rig.weights.sum(1) - 1).max() < 1e-6
-    other = [
-        rig.names.index({"L": n[:-1] + "R", "R": n[:-1] + "L"}.get(n[-1], n) if n[-2] == "_" else n) for n in rig.names
-    ]
-    assert np.abs(rig.weights[rig.mirror][:, other] - rig.weights).max() < 1e-9
-    assert (rig.parents < np.arange(len(rig.names))).all()
-    assert set(map(group_of, rig.names)) <= set(LIMITS)
 
 
 def test_the_rig_is_closed_and_symmetric(rig: AnimalRig) -> None:

@@ -9,6 +9,7 @@ import pytest
 from rich.table import Table
 
 from meshmatch.api.inputs import as_model
+from meshmatch.errors import InputError
 from meshmatch.experiments import kinds
 from meshmatch.experiments.cut_scans import CutScan
 from meshmatch.experiments.sets import Pair
@@ -102,3 +103,27 @@ def test_characters_and_kinds_are_printed_too(monkeypatch: pytest.MonkeyPatch, t
     assert asked == [(kinds.GROUPS, "human", 3)]
     for word in ("of characters", "of auto", "wrong: a chair"):
         assert word in out + err
+
+
+def test_without_the_rat_the_other_sets_are_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def missing(count: int, seed: int) -> None:
+        raise InputError("dm_control is not installed", "install it")
+
+    monkeypatch.setattr(kinds, "rats_and_dogs", missing)
+    monkeypatch.setattr(kinds, "measured_sets", lambda data: ({"rows": 1}, Table(), []))
+    assert kinds.main(["--sets", "rats,auto"]) == 0
+    told = capsys.readouterr()
+    assert "rats are left out: dm_control is not installed; install it" in told.out + told.err
+    assert json.loads(told.out.splitlines()[-1])["auto"] == {"rows": 1}
+    assert kinds.main(["--sets", "rats"]) == 1
+
+
+def test_rats_are_a_row(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    asked: list[tuple[int, int]] = []
+    monkeypatch.setattr(kinds, "rats_and_dogs", lambda count, seed: asked.append((count, seed)) or [])
+    monkeypatch.setattr(kinds, "row_of", lambda name, *_: {"group": name, "bone": 0.5})
+    assert kinds.main(["--sets", "rats", "--rats", "3", "--seed", "7"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["rats"] == {"group": "rats", "bone": 0.5}
+    assert asked == [(3, 7)]

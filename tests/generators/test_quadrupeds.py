@@ -13,7 +13,8 @@ from meshmatch.generators import quadruped_rig, quadrupeds
 from meshmatch.generators.quadruped_rig import LIMITS, AnimalRig, group_of, load_rig, rig_file, save_rig
 from meshmatch.generators.quadruped_traits import KINDS, TRAITS, draw_traits
 from meshmatch.generators.quadrupeds import draw_angles, make_animal, plush, resting_animal
-from meshmatch.geometry.triangles import is_watertight, vertex_normals
+from meshmatch.geometry.triangles import vertex_normals
+from tests.generators.animal_rigs import check_rig
 
 
 @pytest.fixture(scope="module")
@@ -22,16 +23,7 @@ def rig() -> AnimalRig:
 
 
 def test_the_dog_is_closed_and_symmetric(rig: AnimalRig) -> None:
-    assert is_watertight(rig.faces)
-    mirrored = rig.verts[rig.mirror] * [-1, 1, 1]
-    assert np.abs(mirrored - rig.verts).max() < 1e-12
-    assert np.abs(rig.weights.sum(1) - 1).max() < 1e-6
-    other = [
-        rig.names.index({"L": n[:-1] + "R", "R": n[:-1] + "L"}.get(n[-1], n) if n[-2] == "_" else n) for n in rig.names
-    ]
-    assert np.abs(rig.weights[rig.mirror][:, other] - rig.weights).max() < 1e-9
-    assert (rig.parents < np.arange(len(rig.names))).all()
-    assert set(map(group_of, rig.names)) <= set(LIMITS)
+    check_rig(rig)
     assert 4500 < len(rig.verts) < 5200
 
 
@@ -54,6 +46,12 @@ def test_the_rig_says_whose_it_is_and_a_damaged_one_is_an_error(tmp_path: Path) 
             load_rig(path)
 
 
+def edges(rig: AnimalRig, verts: np.ndarray) -> float:
+    """How far normals are from their neighbours' mean."""
+    normals = vertex_normals(verts, rig.faces)
+    return float(np.linalg.norm(normals - rig.smoothed(normals, 1), axis=1).mean())
+
+
 def test_a_stuffed_animal_is_smoother_and_no_thinner(rig: AnimalRig) -> None:
     rest = resting_animal(rig)
     stuffed = plush(rig, rest)
@@ -61,13 +59,22 @@ def test_a_stuffed_animal_is_smoother_and_no_thinner(rig: AnimalRig) -> None:
     def volume(verts: np.ndarray) -> float:
         return float(np.linalg.det(verts[rig.faces]).sum() / 6)
 
-    def edges(verts: np.ndarray) -> float:
-        """How far normals are from their neighbours' mean."""
-        normals = vertex_normals(verts, rig.faces)
-        return float(np.linalg.norm(normals - rig.smoothed(normals, 1), axis=1).mean())
-
-    assert edges(stuffed) < 0.7 * edges(rest)
+    assert edges(rig, stuffed) < 0.7 * edges(rig, rest)
     assert volume(rest) < volume(stuffed) < 1.6 * volume(rest)
+
+
+def test_toys_are_stuffed_and_keep_their_mouths_shut(rig: AnimalRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def animal(plush: float) -> np.ndarray:
+        def traits(rng: np.random.Generator) -> dict[str, float]:
+            return draw_traits(rng) | {"plush": plush}
+
+        monkeypatch.setattr(quadrupeds, "draw_traits", traits)
+        return make_animal(rig, 0, 1)
+
+    assert edges(rig, animal(1.0)) < 0.8 * edges(rig, animal(0.0))
+    jaw, rng = rig.names.index("jaw"), np.random.default_rng(0)
+    gapes = [draw_angles(rig, draw_traits(rng) | {"plush": 1.0}, rng)[jaw, 0] for _ in range(20)]
+    assert max(gapes) < -25  # degrees: closed
 
 
 def test_an_animal_is_a_function_of_seed_and_number(rig: AnimalRig) -> None:
