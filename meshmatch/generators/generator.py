@@ -49,10 +49,14 @@ class Resting:
     def template(self) -> Template:
         """The template of the included model of the kind, if it is of this shape; else one that is made."""
         kind = self.shape.name
-        shipped = bundled_folder() / "models" / kind / "template.safetensors"
-        if shipped.is_file():
-            found = read_template(shipped)
-            if np.array_equal(found.dense.faces, self.shape.faces):
-                return found
+        found = shipped_template(kind)
+        if found is not None and np.array_equal(found.dense.faces, self.shape.faces):
+            return found
         made = make_template(self.shape, kind, self.nodes, labels=self.labels, label_names=self.parts, core=self.core)
         return replace(made, source=self.source, licence=self.licence)
+
+
+def shipped_template(kind: str) -> Template | None:
+    """The template of the included model of a kind, if there is one."""
+    shipped = bundled_folder() / "models" / kind / "template.safetensors"
+    return read_template(shipped) if shipped.is_file() else None

@@ -53,7 +53,7 @@ def two_way_offsets(
     B, A, _ = anchors.shape
     forward = nearest(anchors, points)[1]
     owner, back = nearest(points, anchors)
-    total = torch.zeros(B, A, 4).to(anchors)
+    total = anchors.new_zeros(B, A, 4)
     total.scatter_add_(1, owner[..., None].expand(-1, -1, 4), torch.cat([-back, torch.ones_like(back[..., :1])], -1))
     count = total[..., 3:]
     return torch.cat([forward, total[..., :3] / count.clamp_min(1), torch.log1p(count * (A / points.shape[1]))], -1)

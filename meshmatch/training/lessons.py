@@ -11,9 +11,10 @@ import torch
 from meshmatch.errors import OptionError
 from meshmatch.generators.bodies import Bodies
 from meshmatch.generators.characters import people_source
-from meshmatch.generators.generator import Source
+from meshmatch.generators.generator import Source, shipped_template
 from meshmatch.generators.kinds import Kind
 from meshmatch.models.registry import TEMPLATE
+from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress
 from meshmatch.shapes.normalise import Mirroring
 from meshmatch.templates.prepared_folder import (
@@ -72,6 +73,28 @@ def prepared(shapes: Path, recipe: Recipe) -> Lessons:
     known = f" and {len(samples.template_landmarks)} known points" if len(samples.template_landmarks) else ""
     data = f"{len(samples.points)} shapes of {name}, without correspondence{known}"
     return Lessons(template, samples, "", data, frame, mirror)
+
+
+def template_of(
+    shapes: str | Path | RegisteredShapes | None, kind: Kind | Bodies | None, recipe: Recipe
+) -> Template | None:
+    """The template that `lessons` will have, as far as it is known before shapes are made; `TemplateError` if it is missing
+    or damaged."""
+    if isinstance(shapes, RegisteredShapes):
+        return shapes.template
+    if shapes is not None:
+        return read_template(Path(shapes) / TEMPLATE)
+    if isinstance(kind, Kind):
+        return shipped_template(kind.name)
+    return read_template((kind.template if kind else None) or recipe.template)
+
+
+def check_start(start: TrainedModel, template: Template | None, recipe: Recipe) -> None:
+    """`OptionError` if a training with that template and recipe cannot begin with the weights of a model."""
+    same = template is None or start.template.hash == template.hash
+    if not same or (start.inference.config, start.card.field["kernel"]) != (recipe.network, recipe.kernel):
+        hint = f"fit your shapes with it (`meshmatch fit ... --model {start.card.name}`), and train on the fits"
+        raise OptionError(f"model {start.card.name} has another template, network or kernel", hint)
 
 
 def kind_named(name: str) -> Kind | Bodies:

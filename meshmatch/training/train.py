@@ -39,7 +39,7 @@ from meshmatch.training.aligner import train_aligner
 from meshmatch.training.alone import CHECKPOINT as CHECKPOINT
 from meshmatch.training.alone import alone
 from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattice
-from meshmatch.training.lessons import kind_named, lessons
+from meshmatch.training.lessons import check_start, kind_named, lessons, template_of
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
 from meshmatch.training.recipes import Recipe, going_on, recipe_for
@@ -107,6 +107,8 @@ def train(
         if Path(shapes.model).resolve() == output.resolve():
             raise OptionError(f"{output} is the model that made the fits", "choose another folder")
         facts, recipe = _inherited(facts, start.card), recipe or going_on(start)
+    if start is not None:
+        check_start(start, template_of(shapes, kind, recipe), recipe)  # shapes may take minutes to make
     learned = lessons(shapes, kind, recipe, Progress(progress, "shapes").stage("making shapes (once)"))
     facts = replace(facts, category=facts.category or learned.category or facts.name, data=facts.data or learned.data)
     facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
@@ -159,10 +161,7 @@ def train_model(
         data = build_cloud_dataset(source, config, recipe.scan)
     model = build_deformer(template, data, recipe.network, recipe.scan, kernel, config.seed)
     if isinstance(start := facts.start, TrainedModel):
-        theirs = start.template.hash, start.network.config, start.card.field["kernel"]
-        if theirs != (template.hash, recipe.network, kernel):
-            hint = f"fit your shapes with it (`meshmatch fit ... --model {start.card.name}`), and train on the fits"
-            raise OptionError(f"model {start.card.name} has another template, network or kernel", hint)
+        check_start(start, template, recipe)
         model.load_state_dict(start.network.state_dict())
     if isinstance(source, ShapeSamples):
         data = replace(data, encoder=deepcopy(model.encoder).cpu())

@@ -175,6 +175,26 @@ def test_a_training_may_begin_with_a_models_weights(prepared: Path, tmp_path: Pa
     with pytest.raises(OptionError, match="another template, network or kernel") as caught:
         trained(prepared, tmp_path / "other", replace(SMALL, kernel="cubic"), start=first)
     assert "`meshmatch fit ... --model eggs`" in caught.value.hint
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_model_to_start_from_is_looked_at_before_shapes_are_made(
+    prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = load_model(trained(prepared, tmp_path / "start"))
+    monkeypatch.setattr("meshmatch.training.train.lessons", lambda *_: pytest.fail("shapes were made"))
+    for kind in ("human", "quadruped"):
+        with pytest.raises(OptionError, match="another template, network or kernel"):
+            train(tmp_path / "other", kind=kind, facts=CardFacts(start=start))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["start"]
+
+
+def test_a_refused_training_leaves_what_was_there(prepared: Path, tmp_path: Path) -> None:
+    start = trained(prepared, tmp_path / "start")
+    before = sorted(path.name for path in start.rglob("*"))
+    with pytest.raises(OptionError, match="another template, network or kernel"):
+        train(start, kind="human", facts=CardFacts(start=load_model(start)))
+    assert sorted(path.name for path in start.rglob("*")) == before
 
 
 def test_a_model_goes_on_with_shapes_that_it_has_fitted(prepared: Path, tmp_path: Path) -> None:
