@@ -49,7 +49,6 @@ def _is_list(file: Path) -> bool:
 
 
 def _shape(file: Path) -> Json:
-    from meshmatch.geometry.triangles import face_parts
     from meshmatch.shapes.files import load_shape, mesh_names
     from meshmatch.shapes.normalise import guess_unit, long_axis
     from meshmatch.shapes.repair import repair
@@ -63,7 +62,7 @@ def _shape(file: Path) -> Json:
         border, crowded = shape.edges.counts
         edges = {"watertight": border == crowded == 0, "open_edges": border, "non_manifold_edges": crowded}
         # of the repaired mesh: the seams of texture and the corners of an stl are joined
-        parts = {"parts": int(face_parts(clean.shape.faces, clean.shape.V).max()) + 1}
+        parts = {"parts": int(clean.shape.face_parts.max()) + 1}
     about: Json = {"kind": "point cloud" if shape.is_cloud else "mesh", "vertices": shape.V, "faces": shape.F}
     if names:
         about["meshes"] = [f"{name} ({count:,} vertices)" for name, count in names.items()]

@@ -81,7 +81,6 @@ def fit_whole(task: FitTask, refine: Refine) -> Registration:
             for down in _LOWER
         ]
         candidates = best_first([*candidates, *task.predictor.fit_all(lower, rounds=care, draws=care)])
-        task = replace(task, config=replace(task.config, finalists=2 * task.config.finalists))
         careful *= 4
     orientation(0.7)
     if task.shape.is_cloud:

@@ -21,7 +21,6 @@ from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.signs import empty_share
 from meshmatch.fitting.task import FitTask, Registration
 from meshmatch.fitting.verdict import EVEN_TRUST, FAIR_RESIDUAL, judge_registration
-from meshmatch.geometry.triangles import face_parts
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.repair import Repaired
@@ -160,16 +159,14 @@ def boundary_length(shape: Shape) -> float:
     Those that lie against another connected part of the shape do not count: where an arm ends in a sleeve, nothing is cut.
     """
     ends = shape.verts[shape.edges.open]  # N 2 3
-    part = face_parts(shape.faces, shape.V)
+    part = shape.face_parts
     counts = np.ones(len(ends), bool)
     if len(ends) and part.max() > 0:
-        of_vertex = np.full(shape.V, -1)
-        of_vertex[shape.faces] = part[:, None]
         corners = shape.verts[shape.faces]
         points = np.concatenate(
             [*corners.transpose(1, 0, 2), *(0.5 * (corners[:, k] + corners[:, k - 1]) for k in range(3))]
         )
-        of_point, of_edge = np.tile(part, 6), of_vertex[shape.edges.open[:, 0]]
+        of_point, of_edge = np.tile(part, 6), shape.vertex_parts[shape.edges.open[:, 0]]
         near = _AGAINST * np.sqrt(shape.area)
         for own in np.unique(of_edge):
             mine = of_edge == own

@@ -20,7 +20,6 @@ from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.symmetric import entries_of, logarithm, matrices_of
-from meshmatch.geometry.triangles import face_parts
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -39,9 +38,10 @@ _LEAST_SPREAD = 0.01  # less of it says no more
 _MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
 # Of the logit of a wrong fit, in the order of `Signs.trust`.
 _WEIGHTS, _OFFSET = (0.909, 3.628, 1.163, 2.653, 5.308, 2.133), 9.935
-# Residual (units of sqrt(area)) of even a right fit of a figure built of many solids, which no skin follows; between so many
-# parts of equal area and so many it grows to that. Set by hand, on robots that are not those of docs/results.md.
-_BUILT, _FEW, _MANY = 0.02, 2.0, 8.0
+# Residual (units of sqrt(area)) of even a right fit of a figure built of many solids, which no skin follows: the likeliest
+# one, given right fits and upside-down ones of robots, and fits of solids and kits, that are not those of docs/results.md.
+# Between so many parts of equal area and so many, set by hand, it grows to that.
+_BUILT, _FEW, _MANY = 0.033, 2.0, 8.0
 _AGAINST_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
 
 
@@ -102,14 +102,17 @@ def signs_of(
     parts: Int[Ints, " V"],
     partial: bool = False,
     spread_at: Callable[[Bool[Bools, " V"]], float] | None = None,
+    connected: Int[Ints, " P"] | None = None,
 ) -> Signs:
     """The signs of a fit; ``local`` are samples of the shape in the core frame, ``parts`` the body parts of the template's
-    vertices, ``spread_at`` gives the spread over those that the shape shows (a usual one if there is no network).
+    vertices, ``spread_at`` gives the spread over those that the shape shows (a usual one if there is no network), and
+    ``connected`` numbers the connected part of the shape that each sample is on, where there are several.
     """
     shown = visible_vertices(system, local, vectors)
     surface = system.surface(vectors)
     gap, nearest = cKDTree(surface.points).query(local.points)
     some = local.first(_TEAR_SAMPLES)
+    pairs = neighbours(some, None if connected is None else connected[:_TEAR_SAMPLES])
     gradient = system.deformation_gradient(vectors)
     stretches = matrices_of(0.5 * logarithm(entries_of(gradient.transpose(0, 2, 1) @ gradient), _MIN_SQUARE))
     against = (surface.normals[nearest] * local.normals).sum(1) < 0
@@ -117,7 +120,7 @@ def signs_of(
         residual,
         float(weighted_mean(gap > _REACH, local.weights)),
         0.0 if partial else empty_share(local, surface.points),
-        torn_share(system, neighbours(some), some, vectors, shortened_to(system, gradient)),
+        torn_share(system, pairs, some, vectors, shortened_to(system, gradient)),
         float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
         unevenness(stretches, parts[system.strain_points]),
         float(weighted_mean(against, local.weights)) if local.signed else _AGAINST_IF_UNSIGNED,
@@ -187,9 +190,14 @@ def cloud_allowance(
 
 def built_allowance(shape: Shape) -> float:
     """The part of the residual that even a right fit has on a mesh of several connected parts; squares add up."""
-    area = np.bincount(face_parts(shape.faces, shape.V), shape.face_areas)
+    area = np.bincount(shape.face_parts, shape.face_areas)
     number = area.sum() ** 2 / np.square(area).sum()  # of parts, were they alike
     return _BUILT * float(np.sqrt(np.clip((number - _FEW) / (_MANY - _FEW), 0, 1)))
+
+
+def connected_parts(shape: Shape, points: Float[Floats, "P 3"]) -> Int[Ints, " P"] | None:
+    """Number of the connected part of a mesh that is nearest to each point (file frame); None where it has but one."""
+    return shape.vertex_parts[cKDTree(shape.verts).query(points)[1]] if shape.face_parts.any() else None
 
 
 def visible_vertices(system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> Bool[Bools, " V"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fitting.network_fit import weighted_mean
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints
@@ -12,14 +12,20 @@ from meshmatch.geometry.triangles import is_discontinuous
 
 Pairs = tuple[Ints, Ints]
 """Numbers of samples that are neighbours, normals included: two touching limbs face each other, and are none."""
-_NEIGHBOURS = 6  # of a sample; set by hand
+# Set by hand.
+_NEIGHBOURS = 6  # of a sample
+_IN_PIECES = 0.5  # share of neighbours on the same connected part up to which parts say nothing
 
 
-def neighbours(samples: OrientedPoints) -> Pairs:
-    """Every sample with the few that are nearest to it."""
+def neighbours(samples: OrientedPoints, part: Int[Ints, " P"] | None = None) -> Pairs:
+    """Every sample with the few that are nearest to it; of a shape whose connected ``part`` is known for each sample, only
+    those on the same one, unless the shape is in pieces."""
     count = min(_NEIGHBOURS + 1, len(samples.points))
     index = samples.tree.query(samples.tree.data, count)[1]
-    return np.repeat(np.arange(len(index)), index.shape[1] - 1), index[:, 1:].reshape(-1)
+    start, end = np.repeat(np.arange(len(index)), index.shape[1] - 1), index[:, 1:].reshape(-1)
+    if part is not None and (same := part[start] == part[end]).mean() > _IN_PIECES:
+        return start[same], end[same]
+    return start, end
 
 
 def torn_share(

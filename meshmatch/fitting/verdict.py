@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools
 from meshmatch.fitting.fit import Reason, ReasonCode, Verdict
 from meshmatch.fitting.network_fit import reads_alike
-from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, signs_of, unexplained
+from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, connected_parts, signs_of, unexplained
 from meshmatch.fitting.task import Registration
 
 # Trust from which on a fit is good, and fair: more likely right than wrong; a part is fair at best.
@@ -52,7 +52,21 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
 
     parts = task.model.template.labels
     told = task.model.has_nodes and reads_alike(task.model)
-    return judge(signs_of(task.system, vectors, found.local, residual, parts, partial, spread_at if told else None))
+    connected = connected_parts(task.shape, found.core_frame.undo(found.local.points))
+    known = residual, parts, partial, spread_at if told else None, connected
+    signs = signs_of(task.system, vectors, found.local, *known)
+    return judge(signs) if task.shape.is_cloud else judge_excused(signs, found.candidate.residual)
+
+
+def judge_excused(signs: Signs, residual: float) -> Judgement:
+    """Verdict, reasons and trust of a fit of a mesh that has that ``residual``, some of it excused in ``signs``.
+
+    What is excused makes no fit good: front and back of a figure of solids differ by no more than that.
+    """
+    judged, strict = judge(signs), judge(replace(signs, residual=residual))
+    if judged.verdict != "good":
+        return judged
+    return replace(judged, verdict="fair", reasons=strict.reasons) if strict.verdict == "poor" else strict
 
 
 def judge(signs: Signs) -> Judgement:

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.geometry.triangles import face_parts
 from meshmatch.shapes.sampling import Samples, sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -37,7 +36,7 @@ def without_hidden(shape: Shape) -> Shape:
     """
     if shape.is_cloud or (shape.weights is not None and np.ptp(shape.weights[shape.faces]) > 0):
         return shape
-    part = face_parts(shape.faces, shape.V)
+    part = shape.face_parts
     area = np.bincount(part, shape.face_areas)
     unit = float(np.sqrt(area.sum()))
     if (

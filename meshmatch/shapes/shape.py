@@ -181,6 +181,18 @@ class Shape:
         return triangles.edges_of(self.faces)
 
     @cached_property
+    def face_parts(self) -> Ints:
+        """(F,) number of the connected part that each face is in; faces that share a vertex are connected."""
+        return frozen(triangles.face_parts(self.faces, self.V))
+
+    @cached_property
+    def vertex_parts(self) -> Ints:
+        """(V,) number of the connected part that each vertex is in; -1 without a face."""
+        part = np.full(self.V, -1, np.int64)
+        part[self.faces] = self.face_parts[:, None]
+        return frozen(part)
+
+    @cached_property
     def area(self) -> float:
         """Surface area, squared units of the file; a cloud's is estimated from its density."""
         return float(self.vertex_areas.sum() if self.is_cloud else self.face_areas.sum())

@@ -12,10 +12,10 @@ from meshmatch.api.matching import Matcher
 from meshmatch.arrays import Floats, Ints
 from meshmatch.fitting.fit import Reason
 from meshmatch.fitting.fitter import doubted
-from meshmatch.fitting.signs import Signs, built_allowance, shortened_to, signs_of, unevenness
+from meshmatch.fitting.signs import Signs, built_allowance, connected_parts, shortened_to, signs_of, unevenness
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.tears import neighbours, torn_share
-from meshmatch.fitting.verdict import FAIR_TRUST, GOOD_TRUST, judge
+from meshmatch.fitting.verdict import FAIR_TRUST, GOOD_TRUST, judge, judge_excused
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
@@ -203,4 +203,43 @@ def test_the_residual_of_many_solids_is_allowed_for() -> None:
         return Shape(verts, np.concatenate([egg.faces + len(egg.verts) * k for k in range(count)]))
 
     allowed = [built_allowance(solids(count)) for count in (1, 2, 5, 8, 12)]
-    assert allowed == pytest.approx([0.0, 0.0, 0.02 * np.sqrt(0.5), 0.02, 0.02], abs=1e-6)
+    assert allowed == pytest.approx([0.0, 0.0, 0.033 * np.sqrt(0.5), 0.033, 0.033], abs=1e-6)
+
+
+@pytest.mark.parametrize(("residual", "verdict"), [(0.023, "good"), (0.06, "fair"), (0.1, "fair")])
+def test_what_is_excused_lets_a_fit_be_fair_but_not_good(residual: float, verdict: str) -> None:
+    judged = judge_excused(SOUND, residual)
+    assert judged.verdict == verdict
+    assert bool(judged.reasons) == (verdict == "fair") and judged.trust >= FAIR_TRUST
+    assert judge(replace(SOUND, residual=0.1)).verdict == "poor"  # but for the excuse
+    doubtful = replace(SOUND, residual=0.06)
+    assert judge_excused(doubtful, 0.1) == judge(doubtful)
+
+
+def _two_sheets() -> tuple[Shape, OrientedPoints]:
+    """Two sheets of the same 20 x 20 points, side by side with the rows of one between those of the other."""
+    x, z = (side.ravel() for side in np.meshgrid(np.arange(20.0), np.arange(20.0), indexing="ij"))
+    lower, upper = (np.stack([x, np.full(400, 0.01 * k), z + 0.5 * k], 1) for k in range(2))
+    corner = np.arange(400).reshape(20, 20)
+    a, b, c, d = (corner[i : i + 19, j : j + 19].ravel() for i in range(2) for j in range(2))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+    shape = Shape(np.concatenate([lower, upper]), np.concatenate([faces, faces + 400]))
+    return shape, OrientedPoints(shape.verts, np.tile([0.0, 1.0, 0.0], (800, 1)))
+
+
+def test_neighbours_of_two_parts_are_none() -> None:
+    shape, samples = _two_sheets()
+    part = connected_parts(shape, samples.points)
+    assert part is not None and part.tolist() == [0] * 400 + [1] * 400
+    start, end = neighbours(samples)
+    assert 0.3 < (part[start] != part[end]).mean() < 0.4
+    near, far = neighbours(samples, part)
+    assert (part[near] == part[far]).all() and len(near) == (part[start] == part[end]).sum()
+    pieces = np.arange(800) // 2  # most neighbours are then on two
+    assert len(neighbours(samples, pieces)[0]) == len(start)
+
+
+def test_a_shape_of_one_part_has_no_parts_to_tell() -> None:
+    shape = egg_model().template.shape
+    assert connected_parts(shape, shape.verts) is None
+    assert connected_parts(Shape(shape.verts, np.empty((0, 3), np.int64)), shape.verts) is None
