@@ -61,7 +61,8 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
 def judge_excused(signs: Signs, residual: float) -> Judgement:
     """Verdict, reasons and trust of a fit of a mesh that has that ``residual``, some of it excused in ``signs``.
 
-    What is excused makes no fit good: front and back of a figure of solids differ by no more than that.
+    What is excused makes no fit good, for front and back of a figure of solids differ by no more than that: such a fit is
+    judged without the excuse, and is fair where that would make it poor.
     """
     judged, strict = judge(signs), judge(replace(signs, residual=residual))
     if judged.verdict != "good":
