@@ -13,7 +13,6 @@ from meshmatch.cli.words import Console, print_json
 from meshmatch.errors import OptionError, needs
 from meshmatch.models.card import read_card
 from meshmatch.models.registry import CARD
-from meshmatch.outputs import make_folder
 from meshmatch.threads import set_threads
 
 if TYPE_CHECKING:
@@ -135,8 +134,8 @@ def train(
         from meshmatch.render.charts import check_chart
 
         check_chart(how.picture)
-    make_folder(output)
-    check_writable(how.picture)
+    if how.picture is not None and how.picture.resolve().parent != output.resolve():  # which is not made yet
+        check_writable(how.picture)
     first = os.environ.get("RANK", "0") == "0"  # of several processes on several GPUs one speaks
     console = Console(quiet or not first)
     settings = (

@@ -20,7 +20,7 @@ from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.tears import neighbours, torn_share
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.symmetric import entries_of, logarithm, matrices_of
-from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.sampling import Samples, sample_surface
 from meshmatch.shapes.shape import Shape
 
 # Further from the other surface than this (units of sqrt(area)), a point of shape or template is without counterpart.
@@ -39,7 +39,8 @@ _MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
 # Of the logit of a wrong fit, in the order of `Signs.trust`.
 _WEIGHTS, _OFFSET = (0.909, 3.628, 1.163, 2.653, 5.308, 2.133), 9.935
 # Residual (units of sqrt(area)) of even a right fit of a figure built of many solids, which no skin follows: the likeliest
-# one, given right fits and upside-down ones of robots, and fits of solids and kits, that are not those of docs/results.md.
+# one, given right fits and upside-down ones of robots, and fits of solids and of furniture in pieces, that are not those of
+# docs/results.md.
 # Between so many parts of equal area and so many, set by hand, it grows to that.
 _BUILT, _FEW, _MANY = 0.033, 2.0, 8.0
 _AGAINST_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
@@ -188,16 +189,20 @@ def cloud_allowance(
     return unexplained(expected, clear)
 
 
-def built_allowance(shape: Shape) -> float:
-    """The part of the residual that even a right fit has on a mesh of several connected parts; squares add up."""
-    area = np.bincount(shape.face_parts, shape.face_areas)
+def built_allowance(shape: Shape, shown: Shape | None = None) -> float:
+    """The part of the residual that even a right fit has on a mesh of several connected parts; squares add up.
+
+    Only those count that are ``shown``, the same mesh without the faces that are hidden.
+    """
+    shown = shown or shape
+    area = np.bincount(shape.vertex_parts[shown.faces[:, 0]], shown.face_areas)
     number = area.sum() ** 2 / np.square(area).sum()  # of parts, were they alike
     return _BUILT * float(np.sqrt(np.clip((number - _FEW) / (_MANY - _FEW), 0, 1)))
 
 
-def connected_parts(shape: Shape, points: Float[Floats, "P 3"]) -> Int[Ints, " P"] | None:
-    """Number of the connected part of a mesh that is nearest to each point (file frame); None where it has but one."""
-    return shape.vertex_parts[cKDTree(shape.verts).query(points)[1]] if shape.face_parts.any() else None
+def connected_parts(shape: Shape, samples: OrientedPoints) -> Int[Ints, " P"] | None:
+    """Number of the connected part that each sample of a mesh is on; None where there is but one, and for a cloud."""
+    return shape.vertex_parts[samples.vertex] if isinstance(samples, Samples) and shape.face_parts.any() else None
 
 
 def visible_vertices(system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"]) -> Bool[Bools, " V"]:

@@ -10,7 +10,7 @@ from meshmatch.arrays import Bool, Bools
 from meshmatch.fitting.fit import Reason, ReasonCode, Verdict
 from meshmatch.fitting.network_fit import reads_alike
 from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, connected_parts, signs_of, unexplained
-from meshmatch.fitting.task import Registration
+from meshmatch.fitting.task import Registration, without_inside
 
 # Trust from which on a fit is good, and fair: more likely right than wrong; a part is fair at best.
 GOOD_TRUST, FAIR_TRUST = 0.99, 0.5
@@ -44,7 +44,7 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
     if task.shape.is_cloud:
         allowance = cloud_allowance(task.system, found.local, task.shape.V, vectors, task.config.seed)
     else:
-        allowance = built_allowance(task.shape)
+        allowance = built_allowance(task.shape, without_inside(task.shape, task.system))
     residual = unexplained(found.candidate.residual, allowance)
 
     def spread_at(vertices: Bool[Bools, " V"]) -> float:
@@ -52,7 +52,7 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
 
     parts = task.model.template.labels
     told = task.model.has_nodes and reads_alike(task.model)
-    connected = connected_parts(task.shape, found.core_frame.undo(found.local.points))
+    connected = connected_parts(task.shape, found.local)
     known = residual, parts, partial, spread_at if told else None, connected
     signs = signs_of(task.system, vectors, found.local, *known)
     return judge(signs) if task.shape.is_cloud else judge_excused(signs, found.candidate.residual)
@@ -61,13 +61,12 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
 def judge_excused(signs: Signs, residual: float) -> Judgement:
     """Verdict, reasons and trust of a fit of a mesh that has that ``residual``, some of it excused in ``signs``.
 
-    What is excused makes no fit good, for front and back of a figure of solids differ by no more than that: such a fit is
-    judged without the excuse, and is fair where that would make it poor.
+    What is excused makes no fit good: front and back of a figure of solids differ by no more than that.
     """
-    judged, strict = judge(signs), judge(replace(signs, residual=residual))
-    if judged.verdict != "good":
+    judged = judge(signs)
+    if judged.verdict != "good" or judge(replace(signs, residual=residual)).verdict == "good":
         return judged
-    return replace(judged, verdict="fair", reasons=strict.reasons) if strict.verdict == "poor" else strict
+    return replace(judged, verdict="fair", reasons=(Reason("residual", _gap(residual)),))
 
 
 def judge(signs: Signs) -> Judgement:
@@ -91,14 +90,13 @@ def judge(signs: Signs) -> Judgement:
 
 def _reasons(signs: Signs) -> list[Reason]:
     """Signs that speak against the fit."""
-    gap = f"template and shape stay {100 * signs.residual:.1f} % of sqrt(area) apart on average"
     unreached = f"{100 * signs.missed:.0f} % of the shape is not reached by the template"
     empty = f"{100 * signs.empty:.0f} % of the template lies where the shape has no surface"
     crushed = f"the template is stretched or crushed {np.exp(signs.stretch):.1f} times on average"
     facing = f"{100 * signs.against:.0f} % of the shape faces the other way than the template"
     unsure = f"what the network reads in copies of the shape is {100 * signs.spread:.0f} % of sqrt(area) from the fit"
     told: list[tuple[bool, ReasonCode, str]] = [
-        (signs.residual > 0.0285, "residual", gap),
+        (signs.residual > 0.0285, "residual", _gap(signs.residual)),
         (signs.missed > _GOOD_SHARE, "unreached", unreached),
         (signs.empty > _GOOD_SHARE, "empty", empty),
         (signs.torn > 0.02, "torn", f"{100 * signs.torn:.0f} % of neighbours on the shape belong far apart"),
@@ -107,3 +105,7 @@ def _reasons(signs: Signs) -> list[Reason]:
         (signs.spread > 0.06, "unsure", unsure),
     ]
     return [Reason(code, words) for speaks, code, words in told if speaks]
+
+
+def _gap(residual: float) -> str:
+    return f"template and shape stay {100 * residual:.1f} % of sqrt(area) apart on average"

@@ -76,25 +76,30 @@ def prepared(shapes: Path, recipe: Recipe) -> Lessons:
 
 
 def template_of(
-    shapes: str | Path | RegisteredShapes | None, kind: Kind | Bodies | None, recipe: Recipe
+    shapes: str | Path | RegisteredShapes | None, kind: Kind | Bodies | None, recipe: Recipe, start: TrainedModel
 ) -> Template | None:
-    """The template that `lessons` will have, as far as it is known before shapes are made; `TemplateError` if it is missing
-    or damaged."""
+    """The template that `lessons` will have, where it is known before shapes are made: for a model to start from that is of
+    their kind a `Kind` may make another. `TemplateError` if it is missing or damaged.
+    """
     if isinstance(shapes, RegisteredShapes):
         return shapes.template
     if shapes is not None:
         return read_template(Path(shapes) / TEMPLATE)
     if isinstance(kind, Kind):
-        return shipped_template(kind.name)
+        return None if start.template.name == kind.name else shipped_template(kind.name)
     return read_template((kind.template if kind else None) or recipe.template)
 
 
 def check_start(start: TrainedModel, template: Template | None, recipe: Recipe) -> None:
     """`OptionError` if a training with that template and recipe cannot begin with the weights of a model."""
-    same = template is None or start.template.hash == template.hash
-    if not same or (start.inference.config, start.card.field["kernel"]) != (recipe.network, recipe.kernel):
+    same = {
+        "template": template is None or start.template.hash == template.hash,
+        "network": start.inference.config == recipe.network,
+        "kernel": start.card.field["kernel"] == recipe.kernel,
+    }
+    if other := [name for name, equal in same.items() if not equal]:
         hint = f"fit your shapes with it (`meshmatch fit ... --model {start.card.name}`), and train on the fits"
-        raise OptionError(f"model {start.card.name} has another template, network or kernel", hint)
+        raise OptionError(f"model {start.card.name} has another {' and another '.join(other)}", hint)
 
 
 def kind_named(name: str) -> Kind | Bodies:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import datetime
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,9 @@ from meshmatch.training.aligner import train_aligner
 from meshmatch.training.alone import CHECKPOINT as CHECKPOINT
 from meshmatch.training.alone import alone
 from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattice
-from meshmatch.training.lessons import check_start, kind_named, lessons, template_of
+from meshmatch.training.facts import CardFacts as CardFacts
+from meshmatch.training.facts import inherited
+from meshmatch.training.lessons import Lessons, check_start, kind_named, lessons, template_of
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
 from meshmatch.training.recipes import Recipe, going_on, recipe_for
@@ -49,25 +51,6 @@ VALIDATION_SEED = 999_983
 """Of the batch that no training sees and every training is measured on."""
 
 
-@dataclass(frozen=True)
-class CardFacts:
-    """What a training is told about its model; goes onto the card, see `ModelCard`.
-
-    Empty words are found out. The weights of ``start`` (a model of the same template, network and kernel, its name or
-    folder) begin the training.
-    """
-
-    name: str = ""  # the output folder's
-    category: str = ""  # of a folder of shapes the model's name; "human" for bodies
-    data: str = ""  # a sentence about the shapes
-    licence: str = "unstated"
-    stiffness: float = 1.0  # 0.05 suits what differs more from shape to shape than bodies do, such as organs
-    start: TrainedModel | str | Path | None = None
-    mirror: str = ""  # "auto" for what comes in two sides, or "no"
-    frame: dict[str, str] | None = None  # as the training's shapes and network say
-
-
-@alone
 def train(
     output: str | Path,
     *,
@@ -91,10 +74,10 @@ def train(
 
     `InputError` if the folder is not prepared or has too few shapes; `OptionError` for choices that do not go together, or
     if the extra ``train`` is not installed; `ModelError` for a name that cannot be one, or a checkpoint of another
-    training; `OutputError` if the folder cannot be written, or another training writes to it.
+    training; `TemplateError` for a template that is missing or damaged; `OutputError` if the folder cannot be written, or
+    another training writes to it.
     """
-    output = Path(output)
-    facts = facts or CardFacts()
+    output, facts = Path(output), facts or CardFacts()
     facts = replace(facts, name=check_name(facts.name or output.resolve().name))
     kind = kind_named(kind) if isinstance(kind, str) else kind
     start = facts.start or (shapes.model if isinstance(shapes, RegisteredShapes) else None)
@@ -106,12 +89,9 @@ def train(
         assert start is not None
         if Path(shapes.model).resolve() == output.resolve():
             raise OptionError(f"{output} is the model that made the fits", "choose another folder")
-        facts, recipe = _inherited(facts, start.card), recipe or going_on(start)
+        facts, recipe = inherited(facts, start.card), recipe or going_on(start)
     if start is not None:
-        check_start(start, template_of(shapes, kind, recipe), recipe)  # shapes may take minutes to make
-    learned = lessons(shapes, kind, recipe, Progress(progress, "shapes").stage("making shapes (once)"))
-    facts = replace(facts, category=facts.category or learned.category or facts.name, data=facts.data or learned.data)
-    facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
+        check_start(start, template_of(shapes, kind, recipe, start), recipe)  # shapes may take minutes to make
 
     def both(now: StepReport) -> None:
         if progress is not None:
@@ -119,17 +99,20 @@ def train(
         if report is not None:
             report(now)
 
-    return train_model(learned.template, learned.source, output, recipe, facts, resume, both, learned.unseen)
+    making = Progress(progress, "shapes").stage("making shapes (once)")
+    return _learn(output, facts, recipe, resume, both, lambda: lessons(shapes, kind, recipe, making))
 
 
-def _inherited(facts: CardFacts, card: ModelCard) -> CardFacts:
-    """What is not said of a model is said of the one that it goes on from; `OptionError` if that may not teach."""
-    if not card.correspondence:
-        raise OptionError(f"{card.name} was learned without correspondence", "fit with a model that knows it")
-    plain = CardFacts()
-    names = ("frame", "mirror", "category", "licence", "stiffness")
-    unsaid = {name: getattr(card, name) for name in names if getattr(facts, name) == getattr(plain, name)}
-    return replace(facts, **unsaid)
+@alone
+def _learn(
+    output: str | Path, facts: CardFacts, recipe: Recipe, resume: bool, report: Callable[[StepReport], None],
+    make: Callable[[], Lessons],
+) -> Path:  # fmt: skip
+    """What `train` does once its folder is its own."""
+    learned = make()
+    facts = replace(facts, category=facts.category or learned.category or facts.name, data=facts.data or learned.data)
+    facts = replace(facts, frame=facts.frame or learned.frame, mirror=facts.mirror or learned.mirror)
+    return train_model(learned.template, learned.source, output, recipe, facts, resume, report, learned.unseen)
 
 
 def train_model(

@@ -241,7 +241,8 @@ def test_train_save_load_and_register(
         return
     words = ["--field", "mls" if field != "mls" else "rbf", "--start", str(folder), "--steps", "3"]
     assert main(["train", "--shapes", str(prepared), "-o", str(tmp_path / "other"), *words]) == 1
-    assert "another template, network or kernel" in capsys.readouterr().err
+    assert f"model {load_model(folder).card.name} has another network" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
 
 
 def _short(for_model):

@@ -14,7 +14,9 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.generators import bodies
 from meshmatch.generators import rig as rigs
+from meshmatch.generators.bodies import Bodies
 from meshmatch.generators.generator import Source
+from meshmatch.generators.kinds import Kind
 from meshmatch.implicit.training import train_implicit
 from meshmatch.locks import locked
 from meshmatch.models.registry import load_model, verify_model
@@ -26,6 +28,7 @@ from meshmatch.templates.prepare import PrepareConfig, prepare
 from meshmatch.templates.prepared_folder import RegisteredShapes, read_registered
 from meshmatch.templates.template import Template, read_template, save_template
 from meshmatch.training.datasets import registered_source
+from meshmatch.training.lessons import template_of
 from meshmatch.training.loop import StepReport, TrainConfig
 from meshmatch.training.losses import CorrespondenceLoss
 from meshmatch.training.recipes import Recipe, default, going_on, paper, people, recipe_for
@@ -172,29 +175,38 @@ def test_a_training_may_begin_with_a_models_weights(prepared: Path, tmp_path: Pa
     begun = second.card.recipe["start"]
     assert begun == {"model": "eggs", "weights_sha256": first.card.weights_sha256, "steps": 4}
     assert "start" not in scratch.card.recipe
-    with pytest.raises(OptionError, match="another template, network or kernel") as caught:
+    with pytest.raises(OptionError, match="another kernel") as caught:
         trained(prepared, tmp_path / "other", replace(SMALL, kernel="cubic"), start=first)
     assert "`meshmatch fit ... --model eggs`" in caught.value.hint
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.parametrize(("kind", "start"), [("quadruped", "human"), ("human", "quadruped")])
 def test_a_model_to_start_from_is_looked_at_before_shapes_are_made(
-    prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, start: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    start = load_model(trained(prepared, tmp_path / "start"))
+    """Their networks and kernels are equal, their templates are not."""
     monkeypatch.setattr("meshmatch.training.train.lessons", lambda *_: pytest.fail("shapes were made"))
-    for kind in ("human", "quadruped"):
-        with pytest.raises(OptionError, match="another template, network or kernel"):
-            train(tmp_path / "other", kind=kind, facts=CardFacts(start=start))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["start"]
+    with pytest.raises(OptionError, match=f"model {start} has another template$"):
+        train(tmp_path / "other", kind=kind, facts=CardFacts(start=start))
+    assert not list(tmp_path.iterdir())
 
 
-def test_a_refused_training_leaves_what_was_there(prepared: Path, tmp_path: Path) -> None:
-    start = trained(prepared, tmp_path / "start")
-    before = sorted(path.name for path in start.rglob("*"))
-    with pytest.raises(OptionError, match="another template, network or kernel"):
-        train(start, kind="human", facts=CardFacts(start=load_model(start)))
-    assert sorted(path.name for path in start.rglob("*")) == before
+def test_the_template_of_a_training_is_known_before_its_shapes(prepared: Path) -> None:
+    human, quadruped = load_model("human"), load_model("quadruped")
+    usual = people()
+
+    def known(shapes=None, kind=None, start=human):
+        found = template_of(shapes, kind, usual, start)
+        return None if found is None else found.hash
+
+    assert known() == known(kind=Bodies()) == human.template.hash
+    assert known(kind=Bodies("human-I")) == read_template("human-I").hash != human.template.hash
+    assert known(kind=Kind("quadruped")) == quadruped.template.hash
+    assert known(kind=Kind("quadruped"), start=quadruped) is None  # another one may be made
+    assert known(prepared) == read_template(prepared / "template.safetensors").hash
+    fits = RegisteredShapes(human.template, np.asarray(human.template.shape.verts)[None], "fits", "human")
+    assert known(fits) == human.template.hash
 
 
 def test_a_model_goes_on_with_shapes_that_it_has_fitted(prepared: Path, tmp_path: Path) -> None:
