@@ -119,7 +119,8 @@ def find_parts(
 
 
 def _gaps(verts: Floats, faces: Ints, face_areas: Floats, part: Ints, body: Ints, others: Ints) -> tuple[Floats, float]:
-    """Distance (parts,) of each of the `others` to the parts in `body`, else 0; and the body's diagonal."""
+    """Distance (parts,) of each of the `others` to the parts in `body`, infinite beyond `_FAR`, else 0; and the body's
+    diagonal."""
     from scipy.spatial import cKDTree
 
     gap = np.zeros(int(part.max()) + 1)
@@ -136,7 +137,8 @@ def _gaps(verts: Floats, faces: Ints, face_areas: Floats, part: Ints, body: Ints
         of_vertex = np.zeros(len(verts), np.int64)
         of_vertex[chosen] = part[theirs, None]
         gap[others] = np.inf
-        np.minimum.at(gap, of_vertex[corners], cKDTree(points).query(verts[corners])[0])
+        reach = np.nextafter(_FAR * diagonal, np.inf)
+        np.minimum.at(gap, of_vertex[corners], cKDTree(points).query(verts[corners], distance_upper_bound=reach)[0])
     return gap, diagonal
 
 
