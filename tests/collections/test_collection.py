@@ -311,6 +311,7 @@ def test_a_model_can_learn_from_fits(
 
     def train(output: Path, **given: Any) -> None:
         asked.update(given)
+        output.mkdir()
         shutil.copy(bundled_folder() / "models" / "human" / "card.json", output / "card.json")
 
     monkeypatch.setattr("meshmatch.training.train.train", train)
