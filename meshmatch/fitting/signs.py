@@ -40,8 +40,7 @@ _MIN_SQUARE = 1e-6  # of a stretch: a logarithm must stay finite
 _WEIGHTS, _OFFSET = (0.909, 3.628, 1.163, 2.653, 5.308, 2.133), 9.935
 # Residual (units of sqrt(area)) of even a right fit of a figure built of many solids, which no skin follows: the likeliest
 # one, given right fits and upside-down ones of robots, and fits of solids and of furniture in pieces, that are not those of
-# docs/results.md.
-# Between so many parts of equal area and so many, set by hand, it grows to that.
+# docs/results.md. Between so many parts of equal area and so many, set by hand, it grows to that.
 _BUILT, _FEW, _MANY = 0.033, 2.0, 8.0
 _AGAINST_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
 
@@ -113,7 +112,6 @@ def signs_of(
     surface = system.surface(vectors)
     gap, nearest = cKDTree(surface.points).query(local.points)
     some = local.first(_TEAR_SAMPLES)
-    pairs = neighbours(some, None if connected is None else connected[:_TEAR_SAMPLES])
     gradient = system.deformation_gradient(vectors)
     stretches = matrices_of(0.5 * logarithm(entries_of(gradient.transpose(0, 2, 1) @ gradient), _MIN_SQUARE))
     against = (surface.normals[nearest] * local.normals).sum(1) < 0
@@ -121,7 +119,7 @@ def signs_of(
         residual,
         float(weighted_mean(gap > _REACH, local.weights)),
         0.0 if partial else empty_share(local, surface.points),
-        torn_share(system, pairs, some, vectors, shortened_to(system, gradient)),
+        torn_share(system, neighbours(some, connected), some, vectors, shortened_to(system, gradient)),
         float(np.sqrt(np.square(stretches).sum((1, 2)).mean())),
         unevenness(stretches, parts[system.strain_points]),
         float(weighted_mean(against, local.weights)) if local.signed else _AGAINST_IF_UNSIGNED,
@@ -189,12 +187,11 @@ def cloud_allowance(
     return unexplained(expected, clear)
 
 
-def built_allowance(shape: Shape, shown: Shape | None = None) -> float:
+def built_allowance(shape: Shape, shown: Shape) -> float:
     """The part of the residual that even a right fit has on a mesh of several connected parts; squares add up.
 
     Only those count that are ``shown``, the same mesh without the faces that are hidden.
     """
-    shown = shown or shape
     area = np.bincount(shape.vertex_parts[shown.faces[:, 0]], shown.face_areas)
     number = area.sum() ** 2 / np.square(area).sum()  # of parts, were they alike
     return _BUILT * float(np.sqrt(np.clip((number - _FEW) / (_MANY - _FEW), 0, 1)))
