@@ -68,7 +68,8 @@ def command(run: Callable[..., Report]) -> Callable[..., int]:
     JSON line begins with the circumstances and the options.
     """
     module = sys.modules[run.__module__]
-    name = Path(str(module.__file__)).stem
+    spec = module.__spec__  # a module that is run is called __main__
+    name = str(spec.name if spec else run.__module__).removeprefix("meshmatch.experiments.").removesuffix(".__main__")
 
     @functools.wraps(run)
     def body(**options: Any) -> None:

@@ -17,7 +17,7 @@ from meshmatch.cli import main
 from meshmatch.collections.fit_files import load_fit, load_words, save_fit
 from meshmatch.collections.setting import Record
 from meshmatch.errors import InputError, MeshmatchError, OptionError, OutputError
-from meshmatch.experiments.hostile_learned import write_eggs
+from meshmatch.experiments.hostile.learned import write_eggs
 from meshmatch.fitting.agree import agree_step
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.locks import locked

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from meshmatch.experiments import ablation_setting
+from meshmatch.experiments.paper import ablation_setting
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.experiments.ablation_errors import (
+from meshmatch.experiments.bench.sets import load_set
+from meshmatch.experiments.paper.ablation_errors import (
     LINES,
     METHODS,
     Measure,
@@ -20,9 +21,8 @@ from meshmatch.experiments.ablation_errors import (
     refinement_of,
     subject,
 )
-from meshmatch.experiments.ablation_setting import Setting
-from meshmatch.experiments.ablation_views import BASE, CONSTRAINTS
-from meshmatch.experiments.sets import load_set
+from meshmatch.experiments.paper.ablation_setting import Setting
+from meshmatch.experiments.paper.ablation_views import BASE, CONSTRAINTS
 from meshmatch.fitting.latent import LatentRefineConfig
 from meshmatch.fitting.nodes import NodeRefineConfig
 from meshmatch.fitting.system import node_system

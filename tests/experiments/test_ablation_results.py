@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from meshmatch.experiments.ablation_claims import Sample, claims, order, pairs_interval, seeds_interval
-from meshmatch.experiments.ablation_results import cost_table, draw_views, number, tables
-from meshmatch.experiments.ablation_views import BASE, PAPER_SETS, VIEWS, Known, Run, all_runs, methods_of
+from meshmatch.experiments.paper.ablation_claims import Sample, claims, order, pairs_interval, seeds_interval
+from meshmatch.experiments.paper.ablation_results import cost_table, draw_views, number, tables
+from meshmatch.experiments.paper.ablation_views import BASE, PAPER_SETS, VIEWS, Known, Run, all_runs, methods_of
 from meshmatch.experiments.runner import as_markdown
 
 SETS = ["scape"]

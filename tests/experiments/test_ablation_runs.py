@@ -10,9 +10,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
 from meshmatch.errors import TemplateError
-from meshmatch.experiments import ablation_setting, ablation_training, ablation_transmatch
-from meshmatch.experiments.ablation_setting import SCANS, Setting, pool_of
-from meshmatch.experiments.ablation_training import (
+from meshmatch.experiments.paper import ablation_setting, ablation_training, ablation_transmatch
+from meshmatch.experiments.paper.ablation_setting import SCANS, Setting, pool_of
+from meshmatch.experiments.paper.ablation_training import (
     built,
     fewer,
     is_trained,
@@ -22,8 +22,8 @@ from meshmatch.experiments.ablation_training import (
     timed,
     train_run,
 )
-from meshmatch.experiments.ablation_transmatch import train_transformer
-from meshmatch.experiments.ablation_views import (
+from meshmatch.experiments.paper.ablation_transmatch import train_transformer
+from meshmatch.experiments.paper.ablation_views import (
     BASE,
     CODED,
     CONSTRAINTS,
@@ -35,7 +35,7 @@ from meshmatch.experiments.ablation_views import (
     all_runs,
     methods_of,
 )
-from meshmatch.experiments.learned_baselines import TransConfig
+from meshmatch.experiments.paper.learned_baselines import TransConfig
 from meshmatch.fields.shape_functions import FIELDS, FieldName
 from meshmatch.geometry.frames import kabsch
 from meshmatch.models.registry import load_model

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from meshmatch.experiments import ablation_errors, ablation_training, ablation_transmatch, ablations
-from meshmatch.experiments.ablation_errors import Measure
-from meshmatch.experiments.ablations import main
+from meshmatch.experiments.paper import ablation_errors, ablation_training, ablation_transmatch, ablations
+from meshmatch.experiments.paper.ablation_errors import Measure
+from meshmatch.experiments.paper.ablations import main
 from meshmatch.fitting.fit_config import FitConfig
 from tests.experiments.egg_runs import make_small, prepare_eggs
 from tests.experiments.small_bench import build

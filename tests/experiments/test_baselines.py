@@ -12,12 +12,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import InputError, ModelError, OptionError
-from meshmatch.experiments import baseline_methods, classical_baselines, learned_baselines, orientation
-from meshmatch.experiments.baseline_methods import METHODS, Baseline, Choices, Coded
-from meshmatch.experiments.baselines import main
-from meshmatch.experiments.bench_methods import Method
-from meshmatch.experiments.classical_baselines import Registration, ZoomOut, carried, library, placed
-from meshmatch.experiments.learned_baselines import (
+from meshmatch.experiments.bench import baseline_methods, orientation
+from meshmatch.experiments.bench import classical as classical_baselines
+from meshmatch.experiments.bench.baseline_methods import METHODS, Baseline, Choices, Coded
+from meshmatch.experiments.bench.baselines import main
+from meshmatch.experiments.bench.classical import Registration, ZoomOut, carried, library, placed
+from meshmatch.experiments.bench.methods import Method
+from meshmatch.experiments.paper import learned_baselines
+from meshmatch.experiments.paper.learned_baselines import (
     TransBatch,
     TransMatch,
     coded_recipe,
@@ -25,7 +27,7 @@ from meshmatch.experiments.learned_baselines import (
     load_transmatch,
     train_transmatch,
 )
-from meshmatch.experiments.transformer import TransConfig, Transformer
+from meshmatch.experiments.paper.transformer import TransConfig, Transformer
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from meshmatch.experiments import bench as command
-from meshmatch.experiments import bench_methods, orientation
-from meshmatch.experiments.bench import main, run_set
-from meshmatch.experiments.bench_methods import OurMethod
-from meshmatch.experiments.sets import load_set
+from meshmatch.experiments.bench import accuracy as command
+from meshmatch.experiments.bench import methods as bench_methods
+from meshmatch.experiments.bench import orientation
+from meshmatch.experiments.bench.accuracy import main, run_set
+from meshmatch.experiments.bench.methods import OurMethod
+from meshmatch.experiments.bench.sets import load_set
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from meshmatch.experiments import characters
-from meshmatch.experiments.character_designs import Character, Designer
+from meshmatch.experiments.bench import characters
+from meshmatch.experiments.makers.character_designs import Character, Designer
 from meshmatch.generators.figure import PARTS, SIDED, Figure, joints_of
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape

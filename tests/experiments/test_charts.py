@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from meshmatch.errors import OptionError
-from meshmatch.experiments.charts import Bar, Chart, Line, draw_bars, draw_lines, draw_stack
+from meshmatch.experiments.bench.charts import Bar, Chart, Line, draw_bars, draw_lines, draw_stack
 from tests.render.spots import middle, spots
 
 

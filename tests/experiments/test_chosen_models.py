@@ -8,7 +8,7 @@ import pytest
 
 from meshmatch.api.inputs import as_model, validated
 from meshmatch.api.kinds import Installed
-from meshmatch.experiments import chosen_models
+from meshmatch.experiments.bench import chosen_models
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
 

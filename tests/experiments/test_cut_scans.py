@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.experiments.cut_scans import CutScan, make_scans, scan_errors, with_clutter
+from meshmatch.experiments.makers.cut_scans import CutScan, make_scans, scan_errors, with_clutter
 from meshmatch.generators import rig as rigs
 from meshmatch.maps.vertex_map import VertexMap
 from tests.experiments.small_bench import BODY

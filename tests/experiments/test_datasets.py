@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.experiments.datasets import CHECKS, main
+from meshmatch.experiments.bench.datasets import CHECKS, main
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from tests.experiments.small_bench import BODY, build

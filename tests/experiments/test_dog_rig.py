@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.experiments import dog_rig, rats
-from meshmatch.experiments.mujoco_skin import find_files, read_animal
+from meshmatch.experiments.makers import dog_rig
+from meshmatch.experiments.makers.mujoco_skin import find_files, read_animal
 from meshmatch.generators.quadruped_rig import AnimalRig, load_rig
 from meshmatch.generators.quadrupeds import resting_animal
 from meshmatch.shapes.normalise import sqrt_area_frame
@@ -110,18 +110,6 @@ def test_without_dm_control(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         with pytest.raises(InputError, match=told) as caught:
             find_files("rodent.xml")
         assert "pip install --no-deps dm_control" in caught.value.hint
-
-
-def test_rats_and_animals_share_their_parts(assets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rats, "find_files", lambda *names: [assets / SKIN, assets / SKELETON])
-    cast = rats.rats_and_dogs(2, seed=0)
-    assert [each.shape.name for each in cast] == ["rat 0", "rat 1", "animal 0", "animal 1"]
-    assert all(len(each.bones) == each.shape.V for each in cast)
-    ball, dog = cast[0], cast[2]
-    assert set(ball.bones) < set(dog.bones)  # the ball's parts are among the dog's
-    again = rats.rats_and_dogs(2, seed=0)
-    assert all(np.array_equal(a.shape.verts, b.shape.verts) for a, b in zip(cast, again, strict=True))
-    assert not np.allclose(rats.rats_and_dogs(2, seed=1)[1].shape.verts, cast[1].shape.verts)
 
 
 def test_another_decimation_is_laid_on_the_template(rig: AnimalRig, assets: Path) -> None:

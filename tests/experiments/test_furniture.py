@@ -9,10 +9,10 @@ import pytest
 pytest.importorskip("skimage", reason="scikit-image is of the extra `bench`")
 
 from meshmatch.errors import OptionError
-from meshmatch.experiments import furniture as command
-from meshmatch.experiments.furniture import KINDS, furniture
-from meshmatch.experiments.furniture_pieces import FLAT, inside
-from meshmatch.experiments.furniture_solids import Assembly, Rod, Slab, plane
+from meshmatch.experiments.makers import furniture as command
+from meshmatch.experiments.makers.furniture import KINDS, furniture
+from meshmatch.experiments.makers.furniture_pieces import FLAT, inside
+from meshmatch.experiments.makers.furniture_solids import Assembly, Rod, Slab, plane
 from meshmatch.geometry.triangles import face_parts, is_watertight
 from meshmatch.shapes.files import load_shape
 

@@ -12,11 +12,14 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import ModelError
-from meshmatch.experiments import hostile, hostile_inputs, hostile_kills, hostile_readers
-from meshmatch.experiments.hostile_damage import damaged
-from meshmatch.experiments.hostile_inputs import Sample, make_input, run_batch
-from meshmatch.experiments.hostile_learned import sign
-from meshmatch.experiments.hostile_samples import make_samples
+from meshmatch.experiments.hostile import campaign as hostile
+from meshmatch.experiments.hostile import inputs as hostile_inputs
+from meshmatch.experiments.hostile import kills as hostile_kills
+from meshmatch.experiments.hostile import readers as hostile_readers
+from meshmatch.experiments.hostile.damage import damaged
+from meshmatch.experiments.hostile.inputs import Sample, make_input, run_batch
+from meshmatch.experiments.hostile.learned import sign
+from meshmatch.experiments.hostile.samples import make_samples
 from meshmatch.models.registry import verify_model
 from meshmatch.templates.template import load_template
 

@@ -11,9 +11,10 @@ from PIL import Image
 
 pytest.importorskip("skimage", reason="scikit-image is of the extra `implicit`")
 
+
 from meshmatch.errors import InputError
-from meshmatch.experiments import implicit
-from meshmatch.experiments.implicit import (
+from meshmatch.experiments.paper import implicit
+from meshmatch.experiments.paper.implicit import (
     FRAMES,
     chamfer,
     draw,
@@ -28,9 +29,7 @@ from meshmatch.experiments.implicit import (
     reconstruction,
     volume,
 )
-from meshmatch.experiments.implicit_real import undeformed
-from meshmatch.geometry.frames import Frame
-from meshmatch.implicit.model import ImplicitFit, ImplicitModel
+from meshmatch.implicit.model import ImplicitModel
 from meshmatch.implicit.network import ImplicitConfig, ImplicitNetwork
 from meshmatch.implicit.space import CUBE_RADIUS, cube_nodes
 from meshmatch.models.implicit_card import ImplicitCard
@@ -201,12 +200,6 @@ def test_means_over_trainings_keep_what_they_are_of() -> None:
 def test_pairs_are_of_different_shapes() -> None:
     assert all(a != b for a, b in pairs_of(4, 50, 0))
     assert pairs_of(4, 50, 0) == pairs_of(4, 50, 0)
-
-
-def test_undeformed_shapes_are_matched_in_the_cube() -> None:
-    small, large = box(np.array([0.5, 0.2, 0.3])), box(np.array([5.0, 2.0, 3.0]))
-    fits = [ImplicitFit("box", torch.zeros(1), Frame(size, np.eye(3), np.zeros(3))) for size in (1.0, 10.0)]
-    assert np.array_equal(undeformed(small, large, *fits).index, np.arange(8))
 
 
 @pytest.mark.parametrize(

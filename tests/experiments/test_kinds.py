@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.table import Table
 
 from meshmatch.api.inputs import as_model
-from meshmatch.errors import InputError
-from meshmatch.experiments import kinds
-from meshmatch.experiments.cut_scans import CutScan
-from meshmatch.experiments.sets import Pair
+from meshmatch.experiments.bench import kinds
+from meshmatch.experiments.bench.sets import Pair
+from meshmatch.experiments.makers.cut_scans import CutScan
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from tests.experiments.small_bench import build
@@ -44,7 +42,6 @@ def test_every_pair_counts(agree: str, tmp_path: Path, capsys: pytest.CaptureFix
     )
     means = [row["mean_x100"] for row in record["animals"]]
     assert record["all"]["mean_x100"] == pytest.approx(np.mean(means), abs=1e-3)
-    assert 0 < record["all"]["euclid"] <= record["all"]["mean_x100"]
 
 
 def test_without_data_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -87,43 +84,5 @@ def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caps
     assert sides["wrong_called_good"] == len(pairs)
 
 
-def test_characters_and_kinds_are_printed_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
-    asked = []
-
-    def groups(data: Path, names: tuple[str, ...], matcher: kinds.Matcher, **how: object) -> tuple[list[str], Table]:
-        asked.append((names, matcher.model.card.name, how["seed"]))
-        return ["a row"], Table("of characters")
-
-    monkeypatch.setattr(kinds, "measured_groups", groups)
-    monkeypatch.setattr(kinds, "measured_sets", lambda data: ({"rows": []}, Table("of auto"), ["wrong: a chair"]))
-    assert kinds.main(["--data", str(tmp_path), "--sets", "characters,auto", "--seed", "3"]) == 0
-    out, err = capsys.readouterr()
-    record = json.loads(out.splitlines()[-1])
-    assert (record["characters"], record["auto"]) == (["a row"], {"rows": []})
-    assert asked == [(kinds.GROUPS, "human", 3)]
-    for word in ("of characters", "of auto", "wrong: a chair"):
-        assert word in out + err
-
-
-def test_without_the_rat_the_other_sets_are_measured(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def missing(count: int, seed: int) -> None:
-        raise InputError("dm_control is not installed", "install it")
-
-    monkeypatch.setattr(kinds, "rats_and_dogs", missing)
-    monkeypatch.setattr(kinds, "measured_sets", lambda data: ({"rows": 1}, Table(), []))
-    assert kinds.main(["--sets", "rats,auto"]) == 0
-    told = capsys.readouterr()
-    assert "rats are left out: dm_control is not installed; install it" in told.out + told.err
-    assert json.loads(told.out.splitlines()[-1])["auto"] == {"rows": 1}
-    assert kinds.main(["--sets", "rats"]) == 1
-
-
-def test_rats_are_a_row(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    asked: list[tuple[int, int]] = []
-    monkeypatch.setattr(kinds, "rats_and_dogs", lambda count, seed: asked.append((count, seed)) or [])
-    monkeypatch.setattr(kinds, "row_of", lambda name, *_: {"group": name, "bone": 0.5})
-    assert kinds.main(["--sets", "rats", "--rats", "3", "--seed", "7"]) == 0
-    assert json.loads(capsys.readouterr().out.splitlines()[-1])["rats"] == {"group": "rats", "bone": 0.5}
-    assert asked == [(3, 7)]
+def test_species_by_the_names_of_files() -> None:
+    assert [kinds.species_of(name) for name in ("fox-05", "Davis_cow_00000", "timthumb")] == ["dog", "cow", "other"]

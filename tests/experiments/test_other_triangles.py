@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from meshmatch.experiments.other_triangles import other_triangles
+from meshmatch.experiments.makers.other_triangles import other_triangles
 from meshmatch.geometry.triangles import is_watertight, triangle_areas, vertex_normals
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape

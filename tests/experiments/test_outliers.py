@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from meshmatch.experiments import outliers
-from meshmatch.experiments.outliers import load_clouds, main
+from meshmatch.experiments.bench import outliers
+from meshmatch.experiments.bench.outliers import load_clouds, main
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 

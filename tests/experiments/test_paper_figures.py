@@ -10,12 +10,12 @@ from PIL import Image
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from meshmatch.experiments import figure_fields
-from meshmatch.experiments.ablation_errors import Measure
-from meshmatch.experiments.ablation_setting import Setting
-from meshmatch.experiments.ablation_views import BASE
-from meshmatch.experiments.figure_direct import Direct, direct_fits, fitted, in_template_frame
-from meshmatch.experiments.figure_fields import (
+from meshmatch.experiments.paper import figure_fields
+from meshmatch.experiments.paper.ablation_errors import Measure
+from meshmatch.experiments.paper.ablation_setting import Setting
+from meshmatch.experiments.paper.ablation_views import BASE
+from meshmatch.experiments.paper.figure_direct import Direct, direct_fits, fitted, in_template_frame
+from meshmatch.experiments.paper.figure_fields import (
     OFF,
     PULL,
     REFINED,
@@ -27,8 +27,8 @@ from meshmatch.experiments.figure_fields import (
     refinements,
     volume,
 )
-from meshmatch.experiments.figure_nodes import config_of, refusals, refused, worst_candidate
-from meshmatch.experiments.figures import main, stacked
+from meshmatch.experiments.paper.figure_nodes import config_of, refusals, refused, worst_candidate
+from meshmatch.experiments.paper.figures import main, stacked
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look

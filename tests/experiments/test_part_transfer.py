@@ -9,9 +9,8 @@ import pytest
 
 pytest.importorskip("skimage", reason="scikit-image is of the extra `bench`")
 
-from meshmatch.experiments import part_transfer
-from meshmatch.experiments.furniture import KINDS, furniture
-from meshmatch.experiments.furniture_models import (
+from meshmatch.experiments.makers.furniture import KINDS, furniture
+from meshmatch.experiments.makers.furniture_models import (
     Learned,
     chosen_templates,
     cloud_template,
@@ -19,9 +18,8 @@ from meshmatch.experiments.furniture_models import (
     learned_shapes,
     mesh_template,
 )
-from meshmatch.experiments.part_votes import Electorate, VoteConfig, box_of, boxed, vote
+from meshmatch.experiments.paper import part_transfer
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.network import PAPER
 from meshmatch.templates.template import Template, template_radius
 from meshmatch.training.recipes import Recipe, clouds
@@ -106,41 +104,3 @@ def test_real_shapes_are_turned_like_generated_ones(kind: str) -> None:
     turn = part_transfer.UPRIGHT[kind]
     assert np.linalg.det(turn) == 1 and np.array_equal(turn @ turn.T, np.eye(3))
     assert furniture(kind, 0, 0).kind == kind
-
-
-def test_boxes_become_cubes_and_normals_stay_across() -> None:
-    """A slanted plane is no longer across its old normal when it is stretched."""
-    rng = np.random.default_rng(0)
-    flat = rng.uniform(-1, 1, (50, 2))
-    points = np.column_stack([flat, flat[:, 0]]) * [1, 5, 3] + 7
-    normals = np.tile([-3.0, 0, 1], (50, 1)) / np.sqrt(10)
-    assert np.abs((points - points[0]) @ normals[0]).max() < 1e-9
-    found = boxed(OrientedPoints(points, normals), *box_of(points))
-    assert np.allclose(found.points.min(0), -1) and np.allclose(found.points.max(0), 1)
-    assert np.abs((found.points - found.points[0]) @ found.normals[0]).max() < 1e-9
-    assert np.allclose(np.linalg.norm(found.normals, axis=1), 1)
-
-
-def test_votes_of_fits_that_stay_away_count_less() -> None:
-    points = np.column_stack([np.linspace(-1, 1, 40), np.zeros(40), np.zeros(40)])
-    shape = OrientedPoints(points, np.tile([0.0, 0, 1], (40, 1)))
-    away = OrientedPoints(points + np.array([0, 0.06, 0]), shape.normals)
-    half = (points[:, 0] > 0).astype(int)
-    found = vote([away, shape, away], [1 - half, half, 1 - half], shape, shape, VoteConfig())
-    assert np.array_equal(found, half)
-    found = vote([shape, shape, shape], [1 - half, half, 1 - half], shape, shape, VoteConfig())
-    assert np.array_equal(found, 1 - half)
-    # the back of a thin wall is another part, however near
-    back = OrientedPoints(points + np.array([0, 0, 0.01]), -shape.normals)
-    both = OrientedPoints(np.concatenate([points, back.points]), np.concatenate([shape.normals, back.normals]))
-    sides = np.repeat([0, 1], 40)
-    assert np.array_equal(vote([both], [sides], both, both, VoteConfig()), sides)
-
-
-def test_labelled_shapes_vote(learned: Learned) -> None:
-    """Three planes that are not the fourth, which is twice as long: all must be fitted to be of use."""
-    config = VoteConfig(labelled=3, voters=2, pool=4)
-    electorate = Electorate("plane", 0, learned, config)
-    assert len(set(electorate.numbers)) == 3
-    found = part_transfer.part_overlap(part_transfer.by_votes(electorate, 0), "plane", range(4, 5), 0)
-    assert found["generated_iou"] > 0.6

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from meshmatch.experiments import partial
-from meshmatch.experiments.partial import main, part_of, seen_faces
-from meshmatch.experiments.sets import load_set
+from meshmatch.experiments.bench import partial
+from meshmatch.experiments.bench.partial import main, part_of, seen_faces
+from meshmatch.experiments.bench.sets import load_set
 from meshmatch.geometry.triangles import unit
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape

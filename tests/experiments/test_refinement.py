@@ -10,8 +10,9 @@ import torch
 
 from meshmatch.api.inputs import validated
 from meshmatch.errors import OptionError
-from meshmatch.experiments import human_bodies, refinement
-from meshmatch.experiments.refinement import (
+from meshmatch.experiments.makers import human_bodies
+from meshmatch.experiments.paper import refinement
+from meshmatch.experiments.paper.refinement import (
     METHODS,
     Answer,
     Subject,

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.experiments import rgbd, rgbd_clouds
-from meshmatch.experiments.rgbd_clouds import Body, Camera, Cloud, save_pcd, scan
+from meshmatch.experiments.makers import rgbd_clouds
+from meshmatch.experiments.makers.rgbd_clouds import Body, Camera, Cloud, save_pcd, scan
+from meshmatch.experiments.paper import rgbd
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere

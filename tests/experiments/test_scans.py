@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from meshmatch.api.matching import Matcher
-from meshmatch.experiments.scans import main, scan_panels
-from meshmatch.experiments.simulated_scans import scanned, simulated_scans
+from meshmatch.experiments.bench.scans import main, scan_panels
+from meshmatch.experiments.makers.simulated_scans import scanned, simulated_scans
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.shapes.colors import label_colors
 from meshmatch.shapes.shape import Shape

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError, OptionError, OutputError
-from meshmatch.experiments import scores as room
-from meshmatch.experiments.scores import TruthDistances, area_under_curve, evaluate_set, summary
-from meshmatch.experiments.sets import SET_NAMES, BenchSet, load_folder, load_set
+from meshmatch.experiments.bench import scores as room
+from meshmatch.experiments.bench.scores import TruthDistances, area_under_curve, evaluate_set, summary
+from meshmatch.experiments.bench.sets import SET_NAMES, BenchSet, load_folder, load_set
 from meshmatch.maps.evaluate import CM_PER_UNIT, Errors, map_errors
 from meshmatch.maps.geodesics import GeodesicDistances
 from meshmatch.shapes.files import save_shape

@@ -1,11 +1,9 @@
 """The clock of whole processes: shapes of the sizes that are asked, costs as the system counts them, a record."""
 
-import inspect
 import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,10 +11,8 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import MeshmatchError
-from meshmatch.experiments import roofline, speed, stages
-from meshmatch.experiments.speed import Case, cost_of, keep_to_cores, main, measure, shape_file, sized, split
-from meshmatch.experiments.stages import STAGES, Clock, place_of, watched
-from meshmatch.fitting import refinement
+from meshmatch.experiments.bench import speed
+from meshmatch.experiments.bench.speed import Case, cost_of, keep_to_cores, main, measure, shape_file, sized, split
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
@@ -90,7 +86,7 @@ def test_costs_are_those_of_the_process() -> None:
     code = f"""
 import json, sys
 from dataclasses import asdict
-from meshmatch.experiments.speed import cost_of
+from meshmatch.experiments.bench.speed import cost_of
 costs = [cost_of([sys.executable, "-c", code]) for code in ("pass", {burn!r})]
 print(json.dumps([asdict(cost) for cost in costs]))
 """
@@ -152,99 +148,6 @@ def test_a_case_that_breaks_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     monkeypatch.setattr(speed, "CASES", {"broken": Case(("dance",), 1.0)})
     assert main(["--cases", "broken", "--runs", "1"]) == 1
     assert "ended with 2" in " ".join(capsys.readouterr().err.split())
-
-
-def test_every_stage_is_a_function() -> None:
-    for _, module, name in STAGES:
-        place, last = place_of(module, name)
-        assert inspect.isfunction(vars(place)[last]), f"{module}.{name}"
-
-
-def test_a_stage_does_not_count_what_another_one_does() -> None:
-    clock = Clock()
-
-    def burn(seconds: float) -> None:
-        end = time.process_time() + seconds
-        while time.process_time() < end:
-            pass
-
-    inner = clock.timed("inner", burn)
-
-    def both() -> None:
-        burn(0.02)
-        inner(0.05)
-
-    began = time.process_time()
-    clock.timed("outer", both)()
-    passed = time.process_time() - began
-    assert clock.calls == {"outer": 1, "inner": 1}
-    assert clock.seconds["inner"] == pytest.approx(0.05, abs=0.01)
-    assert clock.seconds["outer"] == pytest.approx(0.02, abs=0.01)
-    assert clock.total - clock.seconds["other"] == pytest.approx(passed, abs=0.005)
-
-
-def test_watched_functions_are_theirs_again() -> None:
-    known = [vars(module) for name, module in sys.modules.items() if name.split(".")[0] == "meshmatch"]
-    before = [dict(names) for names in known]
-    original = [vars(place_of(module, name)[0])[name.split(".")[-1]] for _, module, name in STAGES]
-    with pytest.raises(KeyError), watched():
-        assert refinement.two_way_residual is not before[known.index(vars(refinement))]["two_way_residual"]
-        raise KeyError
-    assert [vars(place_of(module, name)[0])[name.split(".")[-1]] for _, module, name in STAGES] == original
-    assert all(names[key] is value for names, old in zip(known, before, strict=True) for key, value in old.items())
-
-
-def test_the_stages_of_a_match(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    small = Case(("match", "climber@900", "dancer@900", "-o", "@map"), 1.0)
-    monkeypatch.setattr(speed, "CASES", {"pair": small})
-    picture = tmp_path / "stages.svg"
-    assert main(["--profile", "--runs", "1", "--picture", str(picture)]) == 0
-    record = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    rows = {row["stage"]: row for row in record["stages"]}
-    assert list(rows) == ["import", *dict.fromkeys(stage for stage, _, _ in STAGES), "other"]
-    assert sum(row["cpu"] for row in rows.values()) == pytest.approx(record["total"])
-    assert sum(row["share"] for row in rows.values()) == pytest.approx(1)
-    assert record["total"] == pytest.approx(record["runs"][0] + record["imports"][0])
-    assert all(row["cpu"] > 0 and row["calls"] for name, row in rows.items() if name not in ("import", "other"))
-    assert rows["other"]["share"] < 0.25
-    assert "Gauss-Newton, solve" in picture.read_text()
-
-
-def test_a_picture_is_of_stages(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--picture", "stages.png"]) == 1
-    assert main(["--profile", "--picture", "stages.doc"]) == 1
-    told = " ".join(capsys.readouterr().err.split())
-    assert "add --profile" in told
-    assert "stages.doc: unsupported chart format" in told
-
-
-def test_a_match_imports_nothing_else(tmp_path: Path) -> None:
-    """No library is loaded later than in the row ``import``."""
-
-    def packages(code: str) -> set[str]:
-        told = subprocess.run(
-            python(f"{code}\nimport sys; print(*sys.modules)"), capture_output=True, text=True, check=True
-        )
-        names = {name.split(".")[0] for name in told.stdout.splitlines()[-1].split()}
-        return names - set(sys.stdlib_module_names)
-
-    paths = [str(shape_file(word, tmp_path)) for word in ("climber@900", "dancer@900")]
-    words = ["match", *paths, "-o", str(tmp_path / "map.npy"), "--quiet"]
-    run = f"from meshmatch.cli import main\nassert main({words!r}) == 0"
-    assert packages(run) <= packages(stages.IMPORTS)
-
-
-def test_the_machine_and_its_bounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(roofline, "_PRODUCT", 200)
-    monkeypatch.setattr(roofline, "_COPY", 1 << 20)
-    assert main(["--roofline", "--runs", "1"]) == 0
-    record = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    many, one, *rest = record["kernels"]
-    assert many["mflop"] == pytest.approx(24 * one["mflop"])
-    assert many["megabytes"] < 1.1 * one["megabytes"]
-    assert all(row["share"] > 0 and row["limit"] in ("product", "copy") for row in (many, one, *rest))
 
 
 def test_every_bar_of_the_house_is_a_case() -> None:

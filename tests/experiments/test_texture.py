@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.experiments import texture
-from meshmatch.experiments.speed import Cost
-from meshmatch.experiments.texture import colors_at, loss, main, nearest_map
+from meshmatch.experiments.bench import texture
+from meshmatch.experiments.bench.speed import Cost
+from meshmatch.experiments.bench.texture import colors_at, loss, main, nearest_map
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
 from tests.shapes.painted import CORNERS, FACES, UV, quarters

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError
-from meshmatch.experiments import verdicts
-from meshmatch.experiments.verdict_cases import FAMILIES, KEPT, TUNED, Cases
+from meshmatch.experiments.bench import verdicts
+from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, TUNED, Cases
 from meshmatch.shapes.shape import Shape
 
 pytest.importorskip("anny")

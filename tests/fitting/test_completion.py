@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from meshmatch.api.inputs import as_model
-from meshmatch.experiments.partial import part_of
+from meshmatch.experiments.bench.partial import part_of
 from meshmatch.fitting.candidates import completed
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.network_fit import Candidate

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import OptionError
-from meshmatch.experiments.human_bodies import Still, body_parts, human_template, standing_body, still_pose
+from meshmatch.experiments.makers.human_bodies import Still, body_parts, human_template, standing_body, still_pose
 from meshmatch.generators.bodies import draw_identities, sample_bodies, sample_free_pose, sample_pose
 from meshmatch.generators.limbs import FOLDED, Draw, draw_arms, draw_limbs, mirrored, with_legs
 from meshmatch.generators.rig import Rig, build_rig, forward_kinematics, load_rig, penetration, save_rig, skin

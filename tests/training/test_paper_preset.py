@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from meshmatch.cli import main
-from meshmatch.experiments.human_bodies import with_paper_nodes
+from meshmatch.experiments.makers.human_bodies import with_paper_nodes
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit_config import FitConfig

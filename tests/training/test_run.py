@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from meshmatch.errors import InputError, OptionError, OutputError, TemplateError
-from meshmatch.experiments import human_bodies
+from meshmatch.experiments.makers import human_bodies
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter

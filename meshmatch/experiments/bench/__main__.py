@@ -1,0 +1,5 @@
+import sys
+
+from meshmatch.experiments.bench.accuracy import main
+
+sys.exit(main())

@@ -1,0 +1,265 @@
+"""The development benchmark, whole: every shape fitted once, every pair mapped and measured.
+
+A pair that cannot be matched is not left out: it counts as the map that sends every vertex to vertex 0. --limit-pairs
+measures a stated part and says so.
+
+--output FOLDER keeps fits and maps: the same command goes on where it was stopped, and `--maps FOLDER/maps` measures anew.
+
+--oriented-by MODEL asks what --model is worth where the orientation is no question: every shape is first turned into the
+frame of that model's unrefined fit, and up and front are told. Maps are between the same vertices, and measured as ever.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from rich.table import Table
+from typer import Option
+
+from meshmatch.api.inputs import as_model
+from meshmatch.arrays import Int, Ints
+from meshmatch.errors import MeshmatchError, OptionError
+from meshmatch.experiments import runner
+from meshmatch.experiments.bench.methods import Method, OurMethod
+from meshmatch.experiments.bench.scores import SetScores, evaluate_set
+from meshmatch.experiments.bench.sets import ALL_SETS, SET_NAMES, BenchSet, Pair, load_set
+from meshmatch.fitting.fit_config import Refine
+from meshmatch.maps.evaluate import LOST_CM, SKIN_M2
+from meshmatch.maps.files import load_map, save_map
+from meshmatch.maps.geodesics import GEODESIC
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.outputs import make_folder
+from meshmatch.render.charts import draw_curves
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import set_threads
+
+Maps = Mapping[Pair, Int[Ints, " V_src"]]
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What a worker needs: it is sent once, not with every task."""
+
+    bench: BenchSet
+    method: Method
+    threads: int
+    fits: dict[str, Any]
+    kept: Path | None  # folder of maps
+
+    def map_file(self, pair: Pair) -> Path | None:
+        """Where the map of a pair is kept, if at all."""
+        return None if self.kept is None else _map_path(self.kept, self.bench, pair)
+
+
+_work: _Work | None = None
+
+
+def _begin(work: _Work) -> None:
+    global _work
+    set_threads(work.threads)
+    _work = work
+
+
+@lru_cache(maxsize=64)
+def _seen(bench: BenchSet, name: str) -> Shape:
+    return bench.seen(name)
+
+
+def _fit_one(name: str) -> tuple[str, Any, float]:
+    assert _work is not None
+    shape = _seen(_work.bench, name)
+    started = time.perf_counter()
+    try:
+        fit = _work.method.fit(shape)
+    except MeshmatchError as error:
+        fit = error
+    # one that was kept took longer than to read it
+    return name, fit, max(time.perf_counter() - started, getattr(fit, "seconds", 0.0))
+
+
+def _map_one(pair: Pair) -> tuple[Pair, Ints | MeshmatchError, float]:
+    assert _work is not None
+    fits = [_work.fits[name] for name in pair]
+    for fit in fits:
+        if isinstance(fit, MeshmatchError):
+            return pair, fit, 0.0
+    source, target = (_seen(_work.bench, name) for name in pair)
+    file = _work.map_file(pair)
+    if file is not None and file.is_file():
+        return pair, load_map(file, source, target).index, 0.0
+    started = time.perf_counter()
+    try:
+        index = _work.method.map(source, fits[0], target, fits[1]).index
+    except MeshmatchError as error:
+        return pair, error, time.perf_counter() - started
+    seconds = time.perf_counter() - started
+    if file is not None:
+        make_folder(file.parent)
+        save_map(file, VertexMap(*pair, index))
+    return pair, index, seconds
+
+
+def _each(task: Any, items: Sequence[Any], work: _Work, jobs: int) -> Iterator[Any]:
+    if jobs <= 1:
+        _begin(work)
+        yield from map(task, items)
+        return
+    context = multiprocessing.get_context("spawn")  # a fork would inherit torch's and scipy's thread pools
+    with ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=(work,)) as pool:
+        yield from pool.map(task, items, chunksize=1)
+
+
+@dataclass(frozen=True)
+class SetRun:
+    """One set, matched and measured."""
+
+    scores: SetScores
+    fit_seconds: dict[str, float]
+    map_seconds: dict[Pair, float]
+    failed: dict[Pair, str]
+    fits: dict[str, Any]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers, those of each kind of pair, each fit's own judgement, and the times."""
+        record = self.scores.as_dict()
+        record["groups"] = {part.group: part.as_dict() for part in self.scores.groups()}
+        record["failed"] = [[*pair, reason] for pair, reason in self.failed.items()]
+        if self.fit_seconds:
+            record["fit_seconds_mean"] = round(float(np.mean(list(self.fit_seconds.values()))), 3)
+            record["fit_seconds_max"] = round(max(self.fit_seconds.values()), 3)
+        if self.map_seconds:
+            record["map_seconds_mean"] = round(float(np.mean(list(self.map_seconds.values()))), 3)
+        record["fits"] = {name: _judgement(fit) for name, fit in self.fits.items()}
+        return record
+
+
+def _judgement(fit: Any) -> Any:
+    if isinstance(fit, MeshmatchError):
+        return ["failed", fit.message]
+    residual = getattr(fit, "residual", None)
+    return [getattr(fit, "verdict", None), None if residual is None else round(float(residual), 5)]
+
+
+def run_set(
+    bench: BenchSet,
+    method: Method,
+    pairs: Sequence[Pair],
+    *,
+    cache: Path | None = None,
+    jobs: int = 1,
+    threads: int = 1,
+    kept: Path | None = None,
+) -> SetRun:
+    """Fit every shape of ``pairs`` once, map every pair, measure all of them.
+
+    With ``kept``, a folder, maps are written there, and those that are there are not made again.
+    """
+    names = sorted({name for pair in pairs for name in pair}, key=bench.shapes.index)
+    fits: dict[str, Any] = {}
+    fit_seconds: dict[str, float] = {}
+    work = _each(_fit_one, names, _Work(bench, method, threads, {}, kept), jobs)
+    for name, fit, seconds in runner.track(work, f"{bench.name}: fitting", len(names)):
+        fits[name], fit_seconds[name] = fit, seconds
+    maps: dict[Pair, Ints] = {}
+    map_seconds: dict[Pair, float] = {}
+    failed: dict[Pair, str] = {}
+    work = _each(_map_one, pairs, _Work(bench, method, threads, fits, kept), jobs)
+    for pair, index, seconds in runner.track(work, f"{bench.name}: mapping", len(pairs)):
+        if isinstance(index, MeshmatchError):
+            failed[pair] = index.message
+            maps[pair] = np.zeros(bench.shape(pair[0]).V, dtype=np.int64)
+        else:
+            maps[pair] = index
+            if seconds:
+                map_seconds[pair] = seconds
+    return SetRun(evaluate_set(bench, maps, pairs=pairs, cache=cache), fit_seconds, map_seconds, failed, fits)
+
+
+def _map_path(folder: Path, bench: BenchSet, pair: Pair) -> Path:
+    return folder / bench.name / f"{pair[0]}-{pair[1]}.npy"
+
+
+def load_maps(folder: Path, bench: BenchSet, pairs: Iterable[Pair]) -> dict[Pair, Ints]:
+    """Maps that were made elsewhere, checked against their shapes."""
+    shapes = {name: bench.shape(name) for name in sorted({name for pair in pairs for name in pair})}
+    return {pair: load_map(_map_path(folder, bench, pair), shapes[pair[0]], shapes[pair[1]]).index for pair in pairs}
+
+
+def scores_table(sets: Sequence[SetScores], oriented_by: str = "") -> Table:
+    """A row for each set, and one for each kind of pair in it; the title names the model that found the orientation."""
+    rows = []
+    for whole in sets:
+        for scores in (whole, *whole.groups()):
+            row = scores.as_dict()
+            part = "" if row["complete"] else f" of {scores.expected}"
+            name = f"  {scores.group}" if scores.group else scores.bench.name
+            rows.append(row | {"set": name, "pairs": f"{row['pairs']}{part}", "worst": row["worst"][0][2]})
+    columns = {"set": "set", "pairs": "pairs:>", "mean": "mean_cm:.2f", "median": "median_cm:.2f"}
+    columns |= {"median pair": "median_pair_cm:.2f", f"over {LOST_CM:g} cm": "share_over_15cm:.2%"}
+    columns |= {"flips": "flips:.1%", "worst pair": "worst:.2f"}
+    title = f"Geodesic error, cm at {SKIN_M2} m2 of skin ({GEODESIC})"
+    return runner.table(f"{title}, oriented by {oriented_by}" if oriented_by else title, rows, columns)
+
+
+INCOMPLETE = "Not all pairs were measured: these means are not the benchmark's."
+
+
+@runner.command
+def main(
+    data: runner.Data = runner.DATA,
+    sets: Annotated[str, Option(help=f"of {', '.join(ALL_SETS)}")] = ",".join(SET_NAMES),
+    model: runner.Model = "human",
+    oriented_by: Annotated[str, Option(help="model whose fits turn every shape upright first; none by default")] = "",
+    refine: Refine = "nodes",
+    seed: runner.Seed = 0,
+    limit_pairs: runner.LimitPairs = None,
+    jobs: runner.Jobs = 1,
+    threads: runner.Threads = 1,
+    cache: runner.Cache = None,
+    maps: Annotated[Path | None, Option(help="measure DIR/set/source-target.npy instead")] = None,
+    output: Annotated[Path | None, Option(help="keep fits and maps in this folder, and go on with those there")] = None,
+    curve: Annotated[Path | None, Option(help="draw the cumulative curves into this file")] = None,
+) -> runner.Report:
+    benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
+    if oriented_by and maps is not None:
+        raise OptionError("maps that are given cannot be oriented anew", "leave out --oriented-by or --maps")
+    if maps is None:
+        weights = as_model(model).card.weights_sha256  # a wrong name would cost every pair
+        told = as_model(oriented_by).card.weights_sha256 if oriented_by else ""
+        if output is not None:
+            asked = {"weights": weights, "oriented_by": told, "refine": refine, "seed": seed, "threads": threads}
+            runner.once(output / "asked.json", asked, lambda: runner.circumstances(threads, jobs))
+    fits, made = (None, None) if output is None else (output / "fits", output / "maps")
+    method = OurMethod(model, refine, seed, threads=threads, oriented_by=oriented_by, kept=fits)
+    runs: list[SetRun] = []
+    for bench in benches:
+        pairs = runner.spread(bench.pairs, limit_pairs)
+        if maps is not None:
+            given = evaluate_set(bench, load_maps(maps, bench, pairs), pairs=pairs, cache=cache)
+            runs.append(SetRun(given, {}, {}, {}, {}))
+        else:
+            runs.append(run_set(bench, method, pairs, cache=cache, jobs=jobs, threads=threads, kept=made))
+    scores = [each.scores for each in runs]
+    if curve is not None:
+        draw_curves({each.bench.name: each.joined for each in scores}, curve)
+    notes = []
+    for each in scores:
+        worst = ", ".join(f"{a} -> {b} {mean:.1f}" for (a, b), mean in list(each.means_cm.items())[:5])
+        notes.append(f"{each.bench.name}, worst pairs (mean, cm): {worst}")
+    if any(len(each.errors) < each.expected for each in scores):
+        notes.append(INCOMPLETE)
+    record = {"geodesic": GEODESIC, "sets": {each.scores.bench.name: each.as_dict() for each in runs}}
+    return runner.Report(record, [scores_table(scores, oriented_by)], notes)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

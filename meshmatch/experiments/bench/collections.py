@@ -1,0 +1,137 @@
+"""Whole sets as collections: every shape fitted once, all fits agreed, every map looked up; how long it takes, and errors.
+
+The fits are made by one process and by two, each from nothing, and must be the same bit for bit; the ratio of their times
+is what two processes gain. Errors count all pairs, as in `meshmatch.experiments.bench`, where the same maps made pair by
+pair are. Hearts are fitted without a model (`--model none`); their error is that of `meshmatch.experiments.hearts`.
+Bodies are generated ones, enough of them that the start of the processes does not tell; of their maps those from the first
+body are measured, in straight distances.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from itertools import permutations
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from typer import Option
+
+from meshmatch.arrays import Int, Ints
+from meshmatch.collections.collection import Collection
+from meshmatch.errors import InputError
+from meshmatch.experiments import runner
+from meshmatch.experiments.bench.hearts import TRUTH, heart_errors
+from meshmatch.experiments.bench.scores import evaluate_set
+from meshmatch.experiments.bench.sets import load_folder, load_set
+from meshmatch.experiments.makers.human_bodies import write_bodies
+from meshmatch.fitting.viscous import NO_MODEL
+from meshmatch.maps.evaluate import CM_PER_UNIT
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.files import load_shape
+
+HEART, BODIES = "heart", "bodies"
+SETS = ("scape", "faust", HEART, BODIES)
+_BODIES = 100
+COLUMNS = {"set": "set", "shapes": "shapes:d", "maps": "maps:d", "fits, 1 process": "one_s:.1f"}
+COLUMNS |= {
+    "2 processes": "two_s:.1f",
+    "times": "gain:.2f",
+    "same bits": "same",
+    "largest process, GB": "largest_gb:.2f",
+}
+COLUMNS |= {"maps written, s": "maps_s:.1f", "a map, ms": "map_ms:.1f", "error": "error:.3f", "unit": "unit"}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The finished fits of a folder."""
+    fits = folder / "fits"
+    return {path.relative_to(fits).as_posix(): path.read_bytes() for path in sorted(fits.rglob("*.safetensors"))}
+
+
+def timed_fits(shapes: list[Path], folder: Path, model: str, jobs: int) -> float:
+    """Seconds that `meshmatch fit` takes as a whole process, from nothing."""
+    words = [*map(str, shapes), "-o", str(folder), "--model", model, "--jobs", str(jobs), "--quiet", "--json"]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+    began = time.perf_counter()
+    done = subprocess.run([sys.executable, "-m", "meshmatch", "fit", *words], capture_output=True, env=environment)
+    seconds = time.perf_counter() - began
+    if done.returncode or json.loads(done.stdout)["verdicts"]["failed"]:
+        raise InputError(f"meshmatch fit failed: {done.stderr.decode(errors='replace')[-200:]}")
+    return seconds
+
+
+def straight_cm(
+    folder: Path, orders: Mapping[str, Int[Ints, " V"]], source: str, target: str, vertex_map: VertexMap
+) -> float:
+    """Mean straight distance of the partners of generated bodies' vertices from the true ones (cm, the person scaled as
+    usual)."""
+    shape = load_shape(folder / f"{target}.ply")
+    true = np.argsort(orders[target])[orders[source]]
+    off = shape.verts[vertex_map.index] - shape.verts[true]
+    return CM_PER_UNIT / float(np.sqrt(shape.area)) * float(np.linalg.norm(off, axis=1).mean())
+
+
+def measure(name: str, data: Path, work: Path, limit: int | None) -> dict[str, Any]:
+    """One row."""
+    model = NO_MODEL if name == HEART else "human"
+    if name == HEART:
+        shapes, truth = load_folder(data / HEART, TRUTH)
+        paths = [data / HEART / f"{each}.ply" for each in runner.spread(list(shapes), limit)]
+    elif name == BODIES:
+        orders = write_bodies(work / name, limit or _BODIES, seed=0)
+        paths = sorted((work / name).iterdir())
+    else:
+        bench = load_set(name, data)
+        paths = [bench.path(each) for each in runner.spread(list(bench.shapes), limit)]
+    one, two = work / f"{name}-1", work / f"{name}-2"
+    seconds = {folder: timed_fits(paths, folder, model, number) for folder, number in ((one, 1), (two, 2))}
+    largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6  # of all processes so far
+    collection = Collection(two, 2)
+    pairs = [pair for pair in permutations(collection.names, 2) if name != BODIES or pair[0] == collection.names[0]]
+    began = time.perf_counter()
+    collection.save_maps(work / f"{name}-maps", pairs)
+    written = time.perf_counter() - began
+    found: dict[tuple[str, str], Any] = {}
+    began = time.perf_counter()
+    for pair in pairs:
+        found[pair] = collection.map(*pair)
+    each = (time.perf_counter() - began) / len(pairs)
+    if name == HEART:
+        error, unit = heart_errors(shapes, truth, found)["mean_x100"], "x100 of sqrt(area)"
+    elif name == BODIES:
+        error, unit = float(np.mean([straight_cm(paths[0].parent, orders, *pair, found[pair]) for pair in pairs])), "cm"
+    else:
+        scores = evaluate_set(bench, {pair: one.index for pair, one in found.items()}, pairs=pairs, cache=work / "kept")
+        error, unit = float(np.mean(list(scores.means_cm.values()))), "cm"
+    return {
+        **{"set": name, "shapes": len(paths), "maps": len(pairs), "one_s": seconds[one], "two_s": seconds[two]},
+        **{"gain": seconds[one] / seconds[two], "same": contents(one) == contents(two), "largest_gb": largest},
+        **{"maps_s": written, "map_ms": 1000 * each, "error": error, "unit": unit},
+    }
+
+
+@runner.command
+def main(
+    data: runner.Data = runner.DATA,
+    sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
+    limit_shapes: Annotated[int | None, Option(min=2, help="of each set, evenly spread; by default all")] = None,
+    work: Annotated[Path | None, Option(help="keep fits and maps in this new folder")] = None,
+) -> runner.Report:
+    """Fit, agree and map whole sets."""
+    asked = runner.names_of(sets, SETS, "set")
+    with tempfile.TemporaryDirectory() as folder:
+        rows = [measure(name, data, work or Path(folder), limit_shapes) for name in asked]
+    title = f"Collections, {os.cpu_count()} cores, one thread a process"
+    return runner.Report({"rows": rows}, [runner.table(title, rows, COLUMNS)])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,247 @@
+"""From maps to numbers: every pair counts, whoever made the maps.
+
+Errors are geodesic distances on the target between the predicted and the true vertex. A benchmark asks the same
+question again and again (how far is vertex p of this target from landmark k?), so these distances, which depend on the
+target alone, are computed once and kept on disk.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import platformdirs
+from numpy.lib.format import open_memmap
+from numpy.typing import ArrayLike, NDArray
+
+from meshmatch.arrays import Int, Ints
+from meshmatch.errors import InputError, OutputError
+from meshmatch.experiments.bench.sets import BenchSet, Pair
+from meshmatch.maps.evaluate import LOST_CM, Errors
+from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
+from meshmatch.outputs import replace_on_success
+from meshmatch.shapes.shape import Shape
+
+READ_BYTES = 64_000_000
+CACHE_VARIABLE = "MESHMATCH_GEODESICS"
+# Part of every file's name: a change of the graph in maps.geodesics must not meet the distances of the old one.
+_GRAPH_VERSION = "1"
+
+
+def default_folder() -> Path:
+    """Where distances are kept: ``$MESHMATCH_GEODESICS``, or ``geodesics`` in the user's cache folder."""
+    chosen = os.environ.get(CACHE_VARIABLE)
+    return Path(chosen) if chosen else platformdirs.user_cache_path("meshmatch") / "geodesics"
+
+
+class TruthDistances:
+    """Distances on one target between its landmarks and all its vertices, in units of sqrt(area).
+
+    Parameters
+    ----------
+    target
+        The shape on which errors are measured.
+    landmarks
+        Vertex ids ``(N,)`` of its true points.
+    folder
+        Where the matrix is kept (`default_folder` for None): ``(unique landmarks, V)`` float16, named by the hashes of
+        shape and landmarks. float16 rounds a distance by at most one part in 2000.
+    """
+
+    def __init__(self, target: Shape, landmarks: Int[Ints, " N"], folder: Path | None) -> None:
+        self.target = target
+        self.rows, self.row_of_landmark = np.unique(landmarks, return_inverse=True)
+        parts = [target.hash, hashlib.sha256(self.rows.tobytes()).hexdigest(), GEODESIC, _GRAPH_VERSION]
+        name = hashlib.sha256("|".join(parts).encode()).hexdigest()[:16]
+        self.path = Path(folder or default_folder()) / f"{target.hash}-{name}.npy"
+
+    def prepare(self) -> None:
+        """Compute and store the matrix unless it is there (1 to 15 ms a row on one core).
+
+        Raises
+        ------
+        OutputError
+            The folder cannot be made or written.
+        """
+        if self.path.exists():
+            return
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"cannot keep distances in {self.path.parent}: {error.strerror}", "choose a folder with --cache"
+            ) from error
+        geodesics = GeodesicDistances(self.target)
+        with replace_on_success(self.path) as temporary:
+            matrix = open_memmap(temporary, "w+", dtype=np.float16, shape=(len(self.rows), self.target.V))
+            for first, rows in geodesics.chunks(self.rows):
+                matrix[first : first + len(rows)] = rows
+            matrix.flush()
+            del matrix
+
+    def of(self, landmarks: Int[NDArray[np.integer], N]) -> NDArray[np.float16]:
+        """Distances (N, V) from some landmarks, given by their numbers, to all vertices."""
+        self.prepare()
+        matrix = np.load(self.path, mmap_mode="r", allow_pickle=False)
+        return np.array(matrix[self.row_of_landmark[landmarks]])
+
+    def errors(self, predictions: Sequence[NDArray[np.integer]]) -> list[NDArray[np.float32]]:
+        """Errors ``(N,)`` of each prediction ``(N,)``: the distance from landmark k to vertex ``prediction[k]``.
+
+        The matrix is read once, in order, however many predictions there are: give all those of a target together.
+        """
+        self.prepare()
+        matrix = np.load(self.path, mmap_mode="r", allow_pickle=False)
+        order = np.argsort(self.row_of_landmark, kind="stable")
+        bounds = np.searchsorted(self.row_of_landmark[order], np.arange(len(self.rows) + 1))
+        results = [np.empty(len(self.row_of_landmark), dtype=np.float32) for _ in predictions]
+        step = max(1, READ_BYTES // (2 * self.target.V))
+        for first in range(0, len(self.rows), step):
+            block = np.array(matrix[first : first + step])
+            mine = order[bounds[first] : bounds[first + len(block)]]
+            rows = self.row_of_landmark[mine] - first
+            for prediction, result in zip(predictions, results, strict=True):
+                result[mine] = block[rows, prediction[mine]]
+        return results
+
+
+def joined_errors(several: Iterable[Errors]) -> Errors:
+    """All points of several maps together."""
+    return Errors(np.concatenate([errors.values for errors in several]))
+
+
+def summary(errors: Sequence[Errors]) -> dict[str, float]:
+    """Errors of pairs in centimeters, unrounded: means and medians over points and over pairs, lost points, flips."""
+    joined, means = joined_errors(errors), [each.mean_cm for each in errors]
+    return {
+        "mean_cm": joined.mean_cm,
+        "median_cm": joined.median_cm,
+        "median_pair_cm": float(np.median(means)),
+        "share_over_15cm": joined.share_over(LOST_CM),
+        "flips": float(np.mean([mean > LOST_CM for mean in means])),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class SetScores:
+    """Errors of all pairs of a set, or of a stated part of it.
+
+    Parameters
+    ----------
+    errors : dict of pair to Errors
+        Errors at all landmarks, for each evaluated pair.
+    group : str
+        Which pairs these are, if not all kinds of the set ("same subject").
+    """
+
+    bench: BenchSet
+    errors: Mapping[Pair, Errors]
+    group: str = ""
+
+    @property
+    def expected(self) -> int:
+        """Number of pairs that the protocol asks for."""
+        return sum(1 for pair in self.bench.pairs if self.group in ("", self.bench.group(pair)))
+
+    @property
+    def means_cm(self) -> dict[Pair, float]:
+        """Mean error of each pair, centimeters, the largest first."""
+        means = {pair: errors.mean_cm for pair, errors in self.errors.items()}
+        return dict(sorted(means.items(), key=lambda item: -item[1]))
+
+    @property
+    def flips(self) -> float:
+        """Share (0..1) of the pairs whose mean error exceeds 15 cm."""
+        return float(np.mean([mean > LOST_CM for mean in self.means_cm.values()]))
+
+    @property
+    def joined(self) -> Errors:
+        """All points of all pairs."""
+        return joined_errors(self.errors.values())
+
+    def groups(self) -> list[SetScores]:
+        """The same for each kind of pair, where a set has several."""
+        parts: dict[str, dict[Pair, Errors]] = defaultdict(dict)
+        for pair, errors in self.errors.items():
+            parts[self.bench.group(pair)][pair] = errors
+        return [SetScores(self.bench, part, name) for name, part in sorted(parts.items()) if name]
+
+    def as_dict(self, worst: int = 10) -> dict[str, Any]:
+        """Plain numbers. The mean over points is the mean over pairs, for every pair has as many points."""
+        digits = {"share_over_15cm": 5, "flips": 5}
+        rounded = {
+            name: round(value, digits.get(name, 4)) for name, value in summary(list(self.errors.values())).items()
+        }
+        return {
+            "pairs": len(self.errors),
+            "complete": len(self.errors) == self.expected,
+            "points_per_pair": len(next(iter(self.errors.values())).values),
+            **rounded,
+            "mean_x100": round(100 * self.joined.mean, 4),
+            "worst": [[*pair, round(mean, 2)] for pair, mean in list(self.means_cm.items())[:worst]],
+        }
+
+
+def evaluate_set(
+    bench: BenchSet, maps: Mapping[Pair, ArrayLike], *, pairs: Sequence[Pair] | None = None, cache: Path | None = None
+) -> SetScores:
+    """Errors of maps on a set, at the source's landmarks, as geodesic distance on the target.
+
+    Parameters
+    ----------
+    maps
+        For each pair ``(source, target)`` the index ``(V_src,)``: target vertex of each source vertex.
+    pairs
+        Evaluate these only. All pairs of the set, if none are given: a mean that leaves one out is not a mean.
+    cache
+        Folder of the kept distances; the first run fills it.
+
+    Raises
+    ------
+    InputError
+        A map is missing, or does not fit its pair: wrong length, or an index outside the target.
+    """
+    wanted = list(bench.pairs if pairs is None else pairs)
+    if not wanted:
+        raise InputError(f"{bench.name}: there is nothing to evaluate")
+    if strangers := sorted(set(wanted) - set(bench.pairs)):
+        raise InputError(f"{bench.name} has no pair {' -> '.join(strangers[0])}")
+    if missing := [pair for pair in wanted if pair not in maps]:
+        raise InputError(f"{bench.name}: {len(missing)} maps are missing, the first {' -> '.join(missing[0])}")
+    sources: dict[str, list[str]] = defaultdict(list)
+    for source, target in wanted:
+        sources[target].append(source)
+    found: dict[Pair, Errors] = {}
+    sizes = {name: bench.shape(name).V for name in sorted({source for source, _ in wanted})}
+    for target, names in sources.items():
+        shape = bench.shape(target)
+        predictions = []
+        for source in names:
+            index = np.asarray(maps[source, target])
+            if index.shape != (sizes[source],) or index.dtype.kind not in "iu":
+                wrong = f"a map of {sizes[source]} indices is needed, not {index.dtype} {index.shape}"
+                raise InputError(f"{bench.name} {source} -> {target}: {wrong}")
+            if index.min() < 0 or index.max() >= shape.V:
+                raise InputError(f"{bench.name} {source} -> {target}: an index is outside the target")
+            predictions.append(index[bench.landmarks(source)])
+        truth = TruthDistances(shape, bench.landmarks(target), cache)
+        for source, values in zip(names, truth.errors(predictions), strict=True):
+            found[source, target] = Errors(values)
+    return SetScores(bench, {pair: found[pair] for pair in wanted})
+
+
+def area_under_curve(score: ArrayLike, right: ArrayLike) -> float:
+    """Chance that a right answer has a higher score than a wrong one (ties count half); nan if one kind lacks."""
+    from scipy.stats import rankdata
+
+    values, truth = np.asarray(score, float), np.asarray(right, bool)
+    good, bad = int(truth.sum()), int((~truth).sum())
+    if not good or not bad:
+        return float("nan")
+    return float((rankdata(values)[truth].sum() - good * (good + 1) / 2) / (good * bad))

@@ -1,0 +1,312 @@
+"""Shapes with known truth on which a verdict must be honest: sound and damaged ones, and what is of no kind at all.
+
+Every family is drawn from people, animals and poses that no training drew, a function of the seed and a number alone. The
+truth of a vertex is its vertex of the template (low resolution), or -1 where it has no counterpart; a shape of another
+kind has none anywhere. `TUNED` families may set thresholds, by seeds other than those that measure them; `KEPT` never.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
+from meshmatch.experiments.bench import verdict_shapes as craft
+from meshmatch.experiments.makers.character_designs import Designer
+from meshmatch.experiments.makers.furniture import KINDS, furniture
+from meshmatch.experiments.makers.human_bodies import unseen_bodies
+from meshmatch.experiments.makers.simulated_scans import scanned
+from meshmatch.generators.generator import Generator
+from meshmatch.generators.kinds import GENERATORS, Kind
+from meshmatch.generators.proportions import CHILD, PLAIN, TOON
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.sampling import sample_surface
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.template import Template, read_template
+
+_DRAWN = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A shape, and of every vertex the template's vertex that it belongs to, or -1."""
+
+    family: str
+    shape: Shape
+    truth: Int[Ints, " V"]
+
+
+@dataclass(frozen=True, eq=False)
+class Cases:
+    """Draws cases of a kind of which there are generated shapes."""
+
+    kind: str = "human"
+    seed: int = 0
+
+    @cached_property
+    def template(self) -> Template:
+        """What the truth is about."""
+        return read_template("human-T") if self.kind == "human" else self._others[self.kind].template
+
+    @cached_property
+    def bodies(self) -> Float[Floats, "N V 3"]:
+        """People, animals, hands or heads in poses, about as large as a person."""
+        if self.kind == "human":
+            return unseen_bodies(self.template, _DRAWN, seed=1000 + self.seed)
+        return self._drawn(self.kind)
+
+    @cached_property
+    def _others(self) -> dict[str, Generator]:
+        return {name: Kind(name, 64).generator(7100 + self.seed) for name in GENERATORS}
+
+    def _drawn(self, kind: str) -> Float[Floats, "N V 3"]:
+        if kind not in self._kept:
+            generator = torch.Generator().manual_seed(7100 + self.seed)
+            verts = self._others[kind].draw(_DRAWN, generator).double().numpy()
+            self._kept[kind] = verts * (craft.METRES / np.ptp(verts, axis=1).max(1)[:, None, None])
+        return self._kept[kind]
+
+    @cached_property
+    def _kept(self) -> dict[str, Floats]:
+        return {}
+
+    @cached_property
+    def _opposite(self) -> Int[Ints, " V"]:
+        """The template's vertex across the plane of its symmetry."""
+        verts = self.template.shape.verts
+        return np.asarray(cKDTree(verts).query(verts * [-1, 1, 1])[1], dtype=np.int64)
+
+    def draw(self, family: str, number: int) -> Case:
+        """A case of a family, turned anywhere, in any unit."""
+        rng = np.random.default_rng([self.seed, number, *family.encode()])
+        shape, truth = FAMILIES[family](self, number, rng)
+        turn, unit = Rotation.random(random_state=rng).as_matrix(), 10.0 ** rng.uniform(-2, 3)
+        verts = unit * (np.asarray(shape.verts) @ turn.T + rng.normal(size=3))
+        return Case(family, Shape(verts, shape.faces, f"{family} {number}"), truth)
+
+    def body(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """A sound shape, by turns with the template's triangles and with others."""
+        verts = self.bodies[int(rng.integers(len(self.bodies)))]
+        shape = Shape(verts, self.template.shape.faces)
+        if number % 2:
+            return shape, np.arange(shape.V)
+        fine = trimesh.Trimesh(verts, shape.faces, process=False).subdivide()
+        other = decimate(Shape(fine.vertices, fine.faces), int(rng.integers(5_000, 16_000)))
+        return other, np.asarray(cKDTree(verts).query(other.verts)[1], dtype=np.int64)
+
+    # Right as a rule.
+
+    def _rough(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        noise = rng.uniform(0.002, 0.04) * rng.standard_normal(shape.verts.shape)
+        return Shape(shape.verts + noise, shape.faces), truth
+
+    def _cloud(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        points = sample_surface(shape, int(rng.integers(1_500, 12_000)), rng).points
+        near = cKDTree(shape.verts).query(points)[1]
+        noise = rng.uniform(0, 0.025) * rng.standard_normal(points.shape)
+        return Shape(points + noise, np.empty((0, 3), np.int64)), truth[near]
+
+    def _holes(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        centers = shape.verts[shape.faces].mean(1)
+        kept: Bools = np.ones(shape.F, bool)
+        for _ in range(int(rng.integers(1, 9))):
+            at = centers[rng.integers(shape.F)]
+            kept &= np.linalg.norm(centers - at, axis=1) > rng.uniform(0.04, 0.2)
+        return craft.faces_kept(shape, truth, kept)
+
+    def _scan(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        scan = scanned(shape, int(rng.integers(2**31)))
+        distance, near = cKDTree(shape.verts).query(scan.verts)
+        return scan, np.where(distance < 0.05, truth[near], -1)
+
+    def _dressed(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        return self._character(number, PLAIN)
+
+    def _stylised(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        return self._character(number, (TOON, CHILD)[number % 2])
+
+    def _character(self, number: int, kind: int) -> tuple[Shape, Ints]:
+        drawn = self._casts.setdefault(kind, [])
+        while len(drawn) <= number:
+            made = Designer.unseen(self.template, 100 + self.seed + len(drawn)).people(10, (kind,), "")
+            drawn += [(each.shape, np.asarray(each.places)) for each in made]
+        return drawn[number]
+
+    @cached_property
+    def _casts(self) -> dict[int, list[tuple[Shape, Ints]]]:
+        return {}
+
+    def _swollen(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        return Shape(shape.verts + rng.uniform(0.01, 0.06) * shape.vertex_normals, shape.faces), truth
+
+    def _inside_out(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        return Shape(shape.verts, shape.faces[:, ::-1]), truth
+
+    # Damaged.
+
+    def _squashed(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        return self._scaled(number, rng, rng.uniform(0.2, 0.8))
+
+    def _flattened(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        return self._scaled(number, rng, rng.choice([0.0, rng.uniform(0, 0.15)]))
+
+    def _pulled(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        return self._scaled(number, rng, rng.uniform(1.25, 4.0))
+
+    def _scaled(self, number: int, rng: np.random.Generator, factor: float) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        axis = np.eye(3)[rng.integers(3)] if number % 3 else craft.direction(rng)
+        along = shape.verts @ axis
+        return Shape(shape.verts + np.outer(along * (factor - 1), axis), shape.faces), truth
+
+    def _mirrored(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        return Shape(shape.verts * [-1, 1, 1], shape.faces[:, ::-1]), self._opposite[truth]
+
+    def _limb(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        kept = self._in_limb(truth, rng)[shape.faces].all(1)
+        return craft.faces_kept(shape, truth, np.asarray(kept))
+
+    def _in_limb(self, truth: Ints, rng: np.random.Generator, most: int = len(craft.LIMBS)) -> Bool[Bools, " V"]:
+        """Whether vertices are of some limb, one of the first so many: of people a named one, else a few parts."""
+        names, labels = self.template.label_names or (), np.asarray(self.template.labels)
+        if self.kind == "human":
+            asked = [names.index(name) for name in craft.LIMBS[int(rng.integers(most))]]
+        else:
+            first = int(rng.integers(len(names)))
+            asked = list(range(first, min(first + int(rng.integers(1, 4)), len(names))))
+        return np.asarray(np.isin(labels[truth], asked))
+
+    def _cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        return craft.between(shape, truth, craft.direction(rng), rng.uniform(0.1, 0.75), 1.0)
+
+    def _merged(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        (one, first), (other, second) = self.body(number, rng), self.body(number + 1, rng)
+        apart = rng.uniform(0.0, 0.8) * craft.direction(rng)
+        return craft.joined(one, other, other.verts + apart), np.concatenate([first, second])
+
+    def _floor(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        whole = craft.on_floor(shape, rng.uniform(0.8, 6.0))
+        return whole, np.append(truth, np.full(whole.V - shape.V, -1))
+
+    def _melted(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        mesh = trimesh.Trimesh(shape.verts, shape.faces, process=False)
+        trimesh.smoothing.filter_laplacian(mesh, iterations=int(rng.integers(20, 400)))
+        return Shape(np.asarray(mesh.vertices), shape.faces), truth
+
+    # No bodies.
+
+    def _animal(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """An animal, a hand or a head."""
+        kind = [name for name in GENERATORS if name != self.kind][number % 2 if self.kind != "human" else number % 3]
+        verts = self._drawn(kind)
+        return craft.no_body(verts[int(rng.integers(len(verts)))], np.asarray(self._others[kind].template.shape.faces))
+
+    def _furniture(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        mesh = furniture(sorted(KINDS)[number % 3], 50 + self.seed, number).mesh(48)
+        return craft.no_body(np.asarray(mesh.verts), np.asarray(mesh.faces))
+
+    def _solid(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        whole = craft.solids(rng)
+        return craft.no_body(whole.verts, whole.faces)
+
+    def _kit(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Furniture of boxes that run into each other."""
+        made = furniture(sorted(KINDS)[number % 3], 70 + self.seed, number)
+        kit = craft.boxes([solid.box for _, solid in made.solids], 0.2)
+        return craft.no_body(kit.verts, kit.faces)
+
+    # Kept: nothing is tuned on these.
+
+    def _twisted(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        middle = shape.verts.mean(0)
+        local = shape.verts - middle
+        turns = Rotation.from_rotvec(np.outer(local[:, 1] * rng.uniform(0.3, 4.0), [0, 1, 0]))
+        return Shape(turns.apply(local) + middle, shape.faces), truth
+
+    def _amputated(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        lost = self._in_limb(truth, rng, 8)[shape.faces].all(1)
+        return craft.faces_kept(shape, truth, np.asarray(~lost))
+
+    def _beside(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Boxes and balls on or in the body."""
+        shape, truth = self.body(number, rng)
+        for _ in range(int(rng.integers(1, 4))):
+            size = rng.uniform(0.05, 0.8, 3)
+            thing = craft.boxes([np.stack([-0.5 * size, 0.5 * size])], 0.08)
+            at = shape.verts[rng.integers(shape.V)] + rng.normal(size=3) * 0.1
+            shape = craft.joined(shape, thing, thing.verts + at)
+            truth = np.append(truth, np.full(thing.V, -1))
+        return shape, truth
+
+    def _sheared(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        shape, truth = self.body(number, rng)
+        axis = rng.permutation(3)
+        verts = np.array(shape.verts)
+        verts[:, axis[0]] += rng.uniform(0.2, 1.5) * verts[:, axis[1]]
+        return Shape(verts, shape.faces), truth
+
+    def _lumpy(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """The body bent by a smooth random field."""
+        shape, truth = self.body(number, rng)
+        verts = np.array(shape.verts)
+        for _ in range(12):
+            wave = craft.direction(rng) * rng.uniform(2, 9)
+            phase = rng.uniform(0, 2 * np.pi)
+            verts += np.outer(np.sin(shape.verts @ wave + phase), craft.direction(rng)) * rng.uniform(0.0, 0.05)
+        return Shape(verts, shape.faces), truth
+
+    def _two_cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Two cuts: what lies between two parallel planes."""
+        shape, truth = self.body(number, rng)
+        axis, low = craft.direction(rng), rng.uniform(0, 0.5)
+        return craft.between(shape, truth, axis, low, low + rng.uniform(0.3, 0.5))
+
+    def _dense(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """The same surface in two million triangles."""
+        shape, truth = self.body(number, rng)
+        fine = craft.refined(shape, 2_000_000)
+        return fine, truth[cKDTree(shape.verts).query(fine.verts)[1]]
+
+    def _not_manifold(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """With triangles twice, turned round, and across the body."""
+        shape, truth = self.body(number, rng)
+        some = rng.permutation(shape.F)
+        twice, turned, across = (shape.faces[some[k::3]][: int(0.04 * shape.F)] for k in range(3))
+        across = np.column_stack([across[:20, :2], rng.integers(shape.V, size=20)])
+        return Shape(shape.verts, np.concatenate([shape.faces, twice, turned[:, ::-1], across])), truth
+
+
+Family = Callable[[Cases, int, np.random.Generator], tuple[Shape, Ints]]
+TUNED: dict[str, Family] = {
+    "sound": Cases.body, "rough": Cases._rough, "cloud": Cases._cloud, "holes": Cases._holes, "scan": Cases._scan,
+    "dressed": Cases._dressed, "stylised": Cases._stylised, "swollen": Cases._swollen, "inside out": Cases._inside_out,
+    "squashed": Cases._squashed, "flattened": Cases._flattened, "pulled": Cases._pulled, "mirrored": Cases._mirrored,
+    "limb": Cases._limb, "cut": Cases._cut, "merged": Cases._merged, "floor": Cases._floor, "melted": Cases._melted,
+    "animal": Cases._animal, "furniture": Cases._furniture, "solid": Cases._solid,
+}  # fmt: skip
+KEPT: dict[str, Family] = {
+    "twisted": Cases._twisted, "amputated": Cases._amputated, "things beside": Cases._beside, "sheared": Cases._sheared,
+    "lumpy": Cases._lumpy, "cut twice": Cases._two_cut, "two million": Cases._dense, "not manifold": Cases._not_manifold,
+    "kit": Cases._kit,
+}  # fmt: skip
+FAMILIES = TUNED | KEPT

@@ -1,0 +1,270 @@
+"""How honest verdicts and confidences are: shapes of which some can be matched and some cannot, and what is said of them.
+
+Each case (`meshmatch.experiments.verdict_cases`) is matched onto a shape that another person, or animal, made in
+another pose, one of two dozen, every fourth of which is cut. The error of a vertex is the straight distance on the
+target between its partner and the true one, in centimetres of a person of 1.9 m2; a map's error is the mean over the
+vertices that have a partner, and that of a shape of another kind is infinite. A map is right below 5 cm and wrong
+above 8. Confidence is compared, at every vertex, with how often the error is within 5 cm; a vertex without a partner
+never is. All maps weigh the same, however many vertices they have. The longest fit is in CPU seconds.
+
+``--fit`` prints the weights that tell right from wrong best, of the cases of this run: those in
+`meshmatch.fitting.signs` are of nine cases of seeds 0 and 1 and the families that may tune, of as many limbs, cuts and holes
+of seed 2, of twelve stylised and pulled ones of seeds 2, 3 and 4, and of 32 people of `experiments.characters`, seed 5.
+Measure with another seed.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import beta
+from typer import Option
+
+from meshmatch.api.matching import Matcher
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
+from meshmatch.errors import InputError, MeshmatchError
+from meshmatch.experiments import runner
+from meshmatch.experiments.bench.charts import Chart, Line, draw_lines
+from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, Case, Cases
+from meshmatch.experiments.bench.verdict_shapes import between, direction
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.generators.kinds import GENERATORS
+from meshmatch.maps.evaluate import CM_PER_UNIT
+from meshmatch.outputs import make_folder
+from meshmatch.shapes.shape import Shape
+
+RIGHT_CM, WRONG_CM = 5.0, 8.0
+VERDICTS = ("good", "fair", "poor")
+REFUSED = "refused"
+_TARGETS, _FINE, _COARSE = 24, 100, 10
+_OFTEN = 200  # vertices of a step of confidence, at least, of which a share is told
+_COLUMNS = {"maps": "maps:d", "good": "good:d", "fair": "fair:d", "poor": "poor:d", "refused": "refused:d"}
+_COLUMNS |= {"under 5 cm": "right:d", "over 8 cm": "wrong:d", "mean cm": "mean_cm:.1f", "worst": "worst_cm:.1f"}
+_COLUMNS |= {"longest": "seconds:.1f"}
+_STEPS = {"confidence": "of", "vertices": "vertices:d", "mean": "confidence:.3f", "within 5 cm": "near:.3f"}
+_RIDGE = 0.002
+GROUPS = {"tuned": [name for name in FAMILIES if name not in KEPT], "kept": list(KEPT), "all": list(FAMILIES)}
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A shape to match onto: its fit, where all of the template's vertices belong, and which of them it has."""
+
+    shape: Shape
+    fit: Fit
+    places: Float[Floats, "T 3"]
+    has: Bool[Bools, " T"]
+
+
+def target_of(others: Cases, matcher: Matcher, number: int) -> Target:
+    """A sound shape of another person than the cases; every fourth is cut, again where a cut leaves parts far apart."""
+    rng, cut = np.random.default_rng([others.seed, number]), number % 4 == 3
+    places, faces = others.bodies[number], others.template.shape.faces
+    whole, every = Shape(places, faces, f"target {number}"), np.arange(len(places))
+    while True:
+        shape, kept = between(whole, every, direction(rng), rng.uniform(0.15, 0.5), 1.0) if cut else (whole, every)
+        with suppress(InputError) if cut else nullcontext():
+            has = np.zeros(len(places), bool)
+            has[kept] = True
+            return Target(shape, matcher.fit(shape), places, has)
+
+
+def measured(case: Case, target: Target, matcher: Matcher) -> dict[str, Any]:
+    """What is said of a case and its map, and how far it is off."""
+    began = time.process_time()
+    row: dict[str, Any] = {"family": case.family, "verdict": REFUSED, "error": float("inf")}
+    try:
+        fit = matcher.fit(case.shape)
+    except MeshmatchError as error:
+        return row | {"reasons": error.message}
+    row["seconds"] = time.process_time() - began
+    vertex_map = matcher.map(fit, target.fit)
+    known = np.flatnonzero(case.truth >= 0)
+    has = known[target.has[case.truth[known]]]
+    off = target.shape.verts[vertex_map.index[has]] - target.places[case.truth[has]]
+    cm = np.full(len(case.truth), np.inf)
+    cm[has] = _cm_of(target) * np.linalg.norm(off, axis=1)
+    row |= {"verdict": vertex_map.verdict, "fit": fit.verdict, "trust": fit.trust, "reasons": "; ".join(fit.reasons)}
+    row |= {"error": float(cm[has].mean()) if len(has) else float("inf"), "partial": fit.partial}
+    assert fit.signs is not None
+    return row | {"signs": list(fit.signs.values()), "bins": fine_bins(vertex_map.confidence, cm <= RIGHT_CM)}
+
+
+def _cm_of(target: Target) -> float:
+    """Centimetres in a unit of the target's file, were it a person."""
+    return CM_PER_UNIT / float(np.sqrt(Shape(target.places, np.asarray(target.fit.faces)).area))
+
+
+def fine_bins(confidence: Float[Floats32, " V"], near: Bool[Bools, " V"]) -> dict[str, list[float]]:
+    """By steps of confidence: how many vertices, the sum of their confidences, and how many are near."""
+    which = np.minimum((confidence * _FINE).astype(int), _FINE - 1)
+    columns: dict[str, np.ndarray] = {"count": np.ones(len(near)), "sum": confidence, "near": near}
+    return {name: np.bincount(which, values, _FINE).tolist() for name, values in columns.items()}
+
+
+def calibration(found: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], float]:
+    """A row for every tenth of confidence: vertices, mean confidence, share near. And how well confidence separates.
+
+    All maps weigh the same.
+    """
+    vertices = np.sum([each["bins"]["count"] for each in found], axis=0)
+    total = {
+        name: np.sum([np.divide(each["bins"][name], sum(each["bins"]["count"])) for each in found], axis=0)
+        for name in ("count", "sum", "near")
+    }
+    rows = []
+    for number in range(_COARSE):
+        part = slice(number * _FINE // _COARSE, (number + 1) * _FINE // _COARSE)
+        count, expected, near = (float(total[name][part].sum()) for name in ("count", "sum", "near"))
+        many = int(vertices[part].sum())
+        row: dict[str, Any] = {"of": f"{number / _COARSE:.1f} to {(number + 1) / _COARSE:.1f}", "vertices": many}
+        rows.append(row | ({"confidence": expected / count, "near": near / count} if many >= _OFTEN else {}))
+    near, far = total["near"], total["count"] - total["near"]
+    below = np.cumsum(far) - 0.5 * far
+    return rows, float((near * below).sum() / max(near.sum() * far.sum(), 1e-12))
+
+
+def rows_of(found: Sequence[Mapping[str, Any]], group: str, names: Sequence[str]) -> list[dict[str, Any]]:
+    """A row for every value of a column: how many maps, of which verdict, and how many of each are right, or wrong."""
+    rows = []
+    for name in names:
+        some = [each for each in found if each[group] == name]
+        row: dict[str, Any] = {"of": name, "maps": len(some)}
+        row |= {verdict: sum(each["verdict"] == verdict for each in some) for verdict in (*VERDICTS, REFUSED)}
+        mapped = [each for each in some if each["verdict"] != REFUSED]
+        finite = [each["error"] for each in mapped if np.isfinite(each["error"])]
+        row |= {"right": sum(each["error"] < RIGHT_CM for each in mapped)}
+        row |= {"wrong": sum(each["error"] > WRONG_CM for each in mapped)}
+        row |= {"mean_cm": float(np.mean(finite)), "worst_cm": max(finite)} if finite else {}
+        row |= {"seconds": max(each["seconds"] for each in mapped)} if mapped else {}
+        rows.append(row)
+    return rows
+
+
+def bars_of(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The numbers by which verdicts are judged; a refused shape is no map.
+
+    ``at_most``: the upper end of the 95 % interval of the share of wrong maps among good ones.
+    """
+    good = [each for each in found if each["verdict"] == "good"]
+    right = [each for each in found if each["verdict"] != REFUSED and each["error"] < RIGHT_CM]
+    wrong = sum(each["error"] > WRONG_CM for each in good)
+    believed = sum(each["verdict"] != "poor" for each in right)
+    most = float(beta.ppf(0.975, wrong + 1, max(len(good) - wrong, 1e-9)))  # Clopper and Pearson 1934
+    return {
+        "good": len(good),
+        "good_and_wrong": wrong,
+        "at_most": most,
+        "right": len(right),
+        "right_and_believed": believed,
+    }
+
+
+def fitted_weights(found: Sequence[Mapping[str, Any]]) -> tuple[Float[Floats, " N"], float]:
+    """Weights of the signs and an offset: the logistic regression of being wrong, with a little ridge; no sign speaks for
+    a fit.
+    """
+    known = [each for each in found if each["verdict"] != REFUSED]
+    X, error = np.array([each["signs"] for each in known]), np.array([each["error"] for each in known])
+    sign = np.where(error > WRONG_CM, 1.0, -1.0)
+    weight = np.where((error > RIGHT_CM) & (error < 1.5 * WRONG_CM), 0.5, 1.0)  # neither quite right nor quite wrong
+    deviation = X.std(0) + 1e-9
+    Z = X / deviation
+
+    def loss(p: Floats) -> float:
+        costs = np.logaddexp(0.0, -sign * (Z @ p[1:] + p[0]))
+        return float((weight * costs).sum() / weight.sum() + _RIDGE * np.square(p[1:]).sum())
+
+    bounds = [(None, None), *[(0.0, None)] * X.shape[1]]
+    p = minimize(loss, np.zeros(X.shape[1] + 1), method="L-BFGS-B", bounds=bounds).x
+    return p[1:] / deviation, float(p[0])
+
+
+@dataclass(frozen=True)
+class Request:
+    """How many cases of each family, of which seed; and where they are kept."""
+
+    count: int
+    seed: int
+    threads: int
+    folder: Path
+
+
+def of_seed(kind: str, names: Sequence[str], asked: Request) -> Iterator[dict[str, Any]]:
+    """All cases of one seed, measured where they are not kept already."""
+    cases, matcher = Cases(kind, asked.seed), Matcher(kind, FitConfig(seed=asked.seed), asked.threads)
+    onto = cache(partial(target_of, Cases(kind, 900 + asked.seed), matcher))
+
+    def family(name: str) -> dict[str, Any]:
+        first = list(FAMILIES).index(name) * asked.count
+        numbers = runner.track(range(asked.count), f"{name}, seed {asked.seed}", asked.count)
+        return {"found": [measured(cases.draw(name, k), onto((first + k) % _TARGETS), matcher) for k in numbers]}
+
+    for name in names:
+        which = {"kind": kind, "family": name, "count": asked.count, "seed": asked.seed, "targets": _TARGETS}
+        path = asked.folder / f"{kind}-{name.replace(' ', '-')}-{asked.seed}.json"
+        kept = runner.once(path, which, partial(family, name))["found"]
+        # null is what JSON makes of infinity
+        found = [each | {"error": np.inf if each["error"] is None else each["error"]} for each in kept]
+        (row,) = rows_of(found, "family", [name])
+        runner.tell(f"{name}, seed {asked.seed}: " + ", ".join(f"{row[word]} {word}" for word in (*VERDICTS, REFUSED)))
+        yield from found
+
+
+@runner.command
+def main(
+    kind: Annotated[str, Option(help=f"human, {', '.join(GENERATORS)}")] = "human",
+    families: Annotated[str, Option(help=f"names, or one of {', '.join(GROUPS)}")] = "all",
+    count: Annotated[int, Option(min=1, help="cases of each family")] = 10,
+    output: Annotated[Path, Option(help="folder of what was measured, and of the picture")] = Path("verdicts"),
+    fit: Annotated[bool, Option("--fit", help="also find the weights of the signs")] = False,
+    threads: runner.Threads = 1,
+    seed: runner.Seed = 1,
+    seeds: Annotated[int, Option(min=1, help="so many seeds from that one on, all of which count together")] = 1,
+) -> runner.Report:
+    names = GROUPS.get(families) or runner.names_of(families, FAMILIES, "family")
+    found: list[dict[str, Any]] = []
+    for number in range(seed, seed + seeds):
+        found += of_seed(kind, names, Request(count, number, threads, output))
+    mapped = [each for each in found if each["verdict"] != REFUSED]
+    steps, auc = calibration(mapped)
+    bars, by_family, by_verdict = bars_of(found), rows_of(found, "family", names), rows_of(found, "verdict", VERDICTS)
+    furthest = max(abs(row["near"] - row["confidence"]) for row in steps if "near" in row)
+    chart = Line([row["confidence"] for row in steps if "near" in row], [row["near"] for row in steps if "near" in row])
+    ideal = Line([0.0, 1.0], [0.0, 1.0])
+    make_folder(output)
+    draw_lines(
+        [Chart("confidence", {"measured": chart, "ideal": ideal})], output / f"{kind}.png", f"within {RIGHT_CM:g} cm"
+    )
+    tables = [
+        runner.table(
+            f"{kind}: verdicts by family, {seeds} seeds from {seed} on", by_family, {"family": "of", **_COLUMNS}
+        ),
+        runner.table("By verdict", by_verdict, {"verdict": "of", **_COLUMNS}),
+        runner.table("Confidence of vertices", steps, _STEPS),
+    ]
+    notes = [
+        f"good: {bars['good']}, of which over {WRONG_CM:g} cm: {bars['good_and_wrong']}, at most {bars['at_most']:.1%}",
+        f"under {RIGHT_CM:g} cm: {bars['right']}, of which good or fair: {bars['right_and_believed']}",
+        f"confidence: AUC {auc:.3f}, furthest from the truth {furthest:.3f}",
+    ]
+    record: dict[str, Any] = {"families": by_family, "verdicts": by_verdict, "confidence": steps, "auc": auc, **bars}
+    if fit:
+        weights, offset = fitted_weights([each for each in found if each["family"] not in KEPT])
+        record["weights"] = [round(float(value), 3) for value in weights] + [round(offset, 3)]
+        notes.append(f"weights {record['weights'][:-1]}, offset {record['weights'][-1]}")
+    return runner.Report(record, tables, notes)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,5 @@
+import sys
+
+from meshmatch.experiments.hostile.campaign import main
+
+sys.exit(main())

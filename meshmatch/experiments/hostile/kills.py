@@ -1,0 +1,294 @@
+"""Commands that are killed at random moments, or find the disk full: afterwards the old or the new is there, whole, and
+nothing else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import resource
+import shutil
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from meshmatch.cli import main as command
+from meshmatch.collections.stores import LOCK
+from meshmatch.errors import MeshmatchError
+from meshmatch.experiments.hostile.learned import write_eggs
+from meshmatch.experiments.hostile.samples import small_shape, write_small_model
+from meshmatch.maps.files import save_map
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.implicit_card import IMPLICIT
+from meshmatch.models.registry import HOME_VARIABLE
+from meshmatch.shapes.files import save_shape
+from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import save_textured
+from meshmatch.templates.location import bundled_folder
+
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command in a folder of its own.
+
+    Before each kill `reset` brings back the old. `outputs` are the files that are looked at afterwards, and `states` what
+    they may be: the old and the new; `apart` if each file appears by itself. Then a command follows, `after`, which goes on
+    with what was begun or clears up what was left. `seconds` is what a run takes.
+    """
+
+    name: str
+    folder: Path
+    words: tuple[str, ...]
+    reset: Callable[[], None]
+    outputs: Callable[[], dict[str, str]]
+    after: tuple[str, ...] = ()
+    states: list[dict[str, str]] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    apart: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """fine, missed (it ended before) or broken."""
+
+    outcome: str
+    what: str = ""
+
+
+def make_cases(folder: Path, training: bool) -> list[Case]:
+    """Cheap commands come more often in a turn. Each is run once to its end, to know what the new is."""
+    shape = small_shape()
+
+    def case(
+        name: str,
+        words: str,
+        files: Callable[[Path], None],
+        outputs: Callable[[Path], list[Path]],
+        after: str = "",
+        apart: bool = False,
+    ) -> Case:
+        place = folder / name.replace(" ", "-")
+        place.mkdir(parents=True)
+        files(place)
+        kept = folder / f"{place.name}-kept"
+        shutil.copytree(place, kept)
+
+        def reset() -> None:
+            shutil.rmtree(place)
+            shutil.copytree(kept, place)
+
+        def found() -> dict[str, str]:
+            held = {str(path.relative_to(place)): path for path in outputs(place) if path.is_file()}
+            return {name: digest(path) for name, path in held.items() if "/." not in f"/{name}"}
+
+        one = Case(name, place, tuple(words.split()), reset, found, tuple(after.split()), apart=apart)
+        one.states.append(found())
+        for _ in range(2):  # the second run is as quick as those that are killed
+            reset()
+            began = time.monotonic()
+            status = os.waitstatus_to_exitcode(os.waitpid(_start(one), 0)[1])
+            one.seconds.insert(0, time.monotonic() - began)
+            if status:
+                raise MeshmatchError(f"{name} ended with {status} in {place}")
+        one.states.append(found())
+        return one
+
+    def pair(place: Path) -> None:
+        source, target = (bundled_folder() / "samples" / f"{name}.ply" for name in ("climber", "dancer"))
+        shutil.copyfile(source, place / "a.ply")
+        shutil.copyfile(target, place / "b.ply")
+        (place / "m.npz").write_bytes(b"the old")
+
+    def texture(place: Path) -> None:
+        paint = np.random.default_rng(0).integers(0, 256, (64, 64, 4)).astype(np.uint8)
+        uv = np.random.default_rng(1).random((shape.F, 3, 2))
+        save_textured(place / "a.obj", Textured(shape.verts, shape.faces, uv), paint)
+        save_shape(place / "b.ply", shape)
+        save_map(place / "m.npz", VertexMap.identity(shape))
+        for name in ("o.obj", "o.mtl", "o.png"):
+            (place / name).write_bytes(b"the old")
+
+    def model(place: Path) -> None:
+        write_small_model(place / "new" / "blob")
+        write_small_model(place / "home" / "models" / "blob")
+        card = place / "home" / "models" / "blob" / "card.json"
+        card.write_text(card.read_text().replace('"seed": ', '"seed": 7'))
+
+    def collection(place: Path) -> None:
+        (place / "in").mkdir()
+        for k in range(3):
+            turned = shape.verts @ (np.eye(3) + 0.05 * np.random.default_rng(k).normal(size=(3, 3)))
+            save_shape(place / "in" / f"s{k}.ply", Shape(turned, shape.faces))
+
+    def all_of(*parts: str) -> Callable[[Path], list[Path]]:
+        return lambda place: sorted(path for part in parts for path in (place / part).rglob("*") if path.is_file())
+
+    def trained(place: Path) -> list[Path]:
+        made = place / "m"
+        return [made / "weights.safetensors", made / "template.safetensors"] if (made / "card.json").exists() else []
+
+    def prepared(place: Path) -> list[Path]:
+        """Without the picture, which is drawn last, for people."""
+        return [path for path in all_of("out")(place) if path.name != "nodes.png"]
+
+    def ready(place: Path) -> None:
+        collection(place)
+        shutil.copytree(prepare.folder / "out", place / "out")
+
+    def fitted(place: Path) -> None:
+        shutil.copytree(fit.folder / "fits", place / "fits")
+
+    def learned(place: Path) -> list[Path]:
+        return [place / "m" / "weights.safetensors"] if (place / "m" / IMPLICIT).exists() else []
+
+    add = case(
+        "models add", "models add new/blob --replace", model, all_of("home/models"), "models add new/blob"
+    )  # fmt: skip
+    obj = case(
+        "transfer-texture", "transfer-texture a.obj b.ply --map m.npz -o o.obj --size 64 -q", texture,
+        lambda place: [place / name for name in ("o.obj", "o.mtl", "o.png")], apart=True,
+    )  # fmt: skip
+    prepare = case("prepare", "prepare in -o out --nodes 40 --radius 0.4 --strategy uniform -q", collection, prepared)
+    match = case("match", "match a.ply b.ply -o m.npz -q", pair, lambda place: [place / "m.npz"])
+    fits = "fit in -o fits --model none --jobs 1 -q"
+    fit = case("fit", fits, lambda place: write_eggs(place / "in"), all_of("fits/fits"), fits, True)
+    maps = "map fits -o maps --all --jobs 1 -q"
+    mapping = case("map", maps, fitted, all_of("maps"), maps, True)
+    atlas = case("atlas", "atlas fits -o out --no-measures --modes 2 -q", fitted, all_of("out"))
+    long = [prepare, match, fit, atlas]
+    if training:
+        learn = "train --shapes out -o m --steps 3 --workers 0 -q"
+        long.append(case("train", learn, ready, trained, learn))
+        implicit = "train --implicit --shapes in -o m --steps 3 -q"
+        long.append(case("train --implicit", implicit, lambda place: write_eggs(place / "in"), learned, implicit))
+    return [one for last in long for one in (*[add, obj, mapping, add, mapping, add] * 2, last)]
+
+
+def kill(case: Case, seed: int, number: int) -> Outcome:
+    """Start a command and end it at a random moment; what is found then must be the old or the new."""
+    rng = np.random.default_rng([seed, 1, number])
+    case.reset()
+    child = _start(case)
+    time.sleep(float(rng.uniform(0.0, 1.0)) * case.seconds[0])
+    sign = SIGNALS[int(rng.integers(len(SIGNALS)))]
+    os.kill(child, sign)
+    began = time.monotonic()
+    while not (ended := os.waitpid(child, os.WNOHANG))[0]:
+        if time.monotonic() - began > 30:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            return Outcome("broken", f"{case.name} did not end within 30 s after {sign.name}")
+        time.sleep(0.002)
+    status = os.waitstatus_to_exitcode(ended[1])
+    allowed = {0, -sign, 128 + sign}
+    hidden = [] if sign == signal.SIGKILL else _hidden(case)
+    _quietly(case.folder, ("models", "list"))  # what any next command does
+    found = case.outputs()
+    what = f"{case.name} after {sign.name}: status {status}, hidden {hidden}, found {found}, not {case.states}"
+    what += f"\n{_said(case).read_text(errors='replace')}"
+    case.seconds[0] *= 0.85 if status == 0 else 1.03  # most should be hit
+    if status not in allowed or (hidden and not case.after) or not _old_or_new(case, found):
+        return Outcome("broken", what)
+    if case.after:
+        _quietly(case.folder, case.after)
+        hidden = _hidden(case)
+        then = case.outputs()
+        if hidden or then != (case.states[1] if case.after == case.words else found):
+            return Outcome("broken", f"{what}; then {' '.join(case.after)} left hidden {hidden}, found {then}")
+    return Outcome("missed" if status == 0 else "fine")
+
+
+def fill(case: Case, seed: int, number: int) -> Outcome:
+    """Run a command where no file may be larger than a random size, as on a full disk; it must say so in words."""
+    rng = np.random.default_rng([seed, 2, number])
+    case.reset()
+    largest = max(path.stat().st_size for path in case.folder.rglob("*") if path.is_file())
+    limit = int(rng.integers(1000, max(2000, largest)))
+    status = os.waitstatus_to_exitcode(os.waitpid(_start(case, limit), 0)[1])
+    said, found = _said(case).read_text(errors="replace"), case.outputs()
+    what = f"{case.name} with {limit} bytes a file: status {status}, hidden {_hidden(case)}, found {found}\n{said}"
+    told = said.startswith("error: cannot write") and said.count("\n") <= 2
+    if not (status == 0 or (status == 1 and told)) or _hidden(case) or not _old_or_new(case, found):
+        return Outcome("broken", what)
+    return Outcome("missed" if status == 0 else "fine")
+
+
+def _hidden(case: Case) -> list[str]:
+    """What is left half-written; a lock is not."""
+    return [path.name for path in case.folder.rglob(".*") if path.name != LOCK]
+
+
+def _old_or_new(case: Case, found: dict[str, str]) -> bool:
+    """Each file the old or the new; where the name of a folder is taken, all of it the same."""
+    if found in case.states:
+        return True
+    old, new = case.states
+    return case.apart and all(found.get(name) in (old.get(name), new.get(name)) for name in {*old, *new, *found})
+
+
+def _start(case: Case, limit: int | None = None) -> int:
+    """The command in a process forked from this one, where all is imported; maybe with a limit on the size of files."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS[1:])  # none may unwind the copy of what called this
+    child = os.fork()
+    if child:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS[1:])
+        return child
+    status = 99
+    try:
+        with open(_said(case), "wb") as said:
+            os.dup2(said.fileno(), 1)
+            os.dup2(said.fileno(), 2)
+        for sign in SIGNALS[1:]:
+            signal.signal(sign, signal.default_int_handler if sign == signal.SIGINT else signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS[1:])
+        if limit is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        status = _run(case.folder, case.words)
+    except KeyboardInterrupt:
+        status = 130  # before the command begins
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(status)
+
+
+def _said(case: Case) -> Path:
+    return case.folder.with_suffix(".said")
+
+
+def _quietly(place: Path, words: tuple[str, ...]) -> None:
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        _run(place, words)
+
+
+def _run(place: Path, words: tuple[str, ...]) -> int:
+    """A command in a folder, with a registry and a cache of its own."""
+    os.environ |= {HOME_VARIABLE: str(place / "home"), "XDG_CACHE_HOME": str(place / "cache")}
+    before = os.getcwd()
+    os.chdir(place)
+    try:
+        return command(words)
+    finally:
+        os.chdir(before)
+        sys.stdout.flush()
+
+
+def digest(path: Path) -> str:
+    """Of what a file says."""
+    data = path.read_bytes()
+    if path.suffix == ".safetensors":  # its writer shuffles the words in the header
+        size = 8 + int.from_bytes(data[:8], "little")
+        data = json.dumps(json.loads(data[8:size]), sort_keys=True).encode() + data[size:]
+    return hashlib.sha256(data).hexdigest()[:16]

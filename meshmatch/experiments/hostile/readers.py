@@ -1,0 +1,134 @@
+"""What reads a file of each family of `experiments.hostile`, and what it may say."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from meshmatch.cli.info import info
+from meshmatch.collections.atlas import Atlas
+from meshmatch.collections.collection import Collection
+from meshmatch.collections.fit_files import load_fit
+from meshmatch.collections.map_all import load_pairs as load_names
+from meshmatch.collections.registered import Registered, read_group
+from meshmatch.errors import MeshmatchError, visible
+from meshmatch.experiments.hostile.learned import trainers
+from meshmatch.generators.pose_files import load_poses
+from meshmatch.implicit.model import load_implicit
+from meshmatch.implicit.samples import samples_of
+from meshmatch.maps.files import load_map
+from meshmatch.maps.table_files import load_pairs, load_points
+from meshmatch.models.card import read_card
+from meshmatch.models.checkpoint import load_weights as load_network
+from meshmatch.models.implicit_card import IMPLICIT, read_implicit_card
+from meshmatch.models.registry import TEMPLATE, verify_model
+from meshmatch.shapes.appearance import ImageReader
+from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.repair import repair
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import find_appearance, load_coordinates
+from meshmatch.templates.prepared_folder import (
+    frame_of,
+    has_sides,
+    is_registered,
+    read_landmarks,
+    read_registered,
+    read_samples,
+)
+from meshmatch.templates.template import load_template
+from meshmatch.training.datasets import registered_source
+from meshmatch.transfer.label_files import load_labels
+from meshmatch.transfer.landmarks import load_landmarks
+from meshmatch.transfer.vertex_files import load_values, load_weights
+
+_EGGS = Registered(
+    np.empty((0, 0, 3)), np.empty((0, 3), np.int64), ("egg0", "egg1", "egg 2", "egg3"), None, {"egg4": "poor"}
+)
+
+
+def readers(family: str, path: Path, shape: Shape) -> Iterator[Callable[[], object]]:
+    """All that the product does with a file of a family while it is read."""
+    if family == "shapes":
+        yield lambda: _look_at(path)
+        if path.suffix in (".glb", ".gltf"):
+            yield lambda: load_weights(path, load_shape(path))
+    simple: dict[str, tuple[Callable[[], object], ...]] = {
+        "maps": (lambda: load_map(path), lambda: load_map(path, shape, shape)),
+        "tables": (lambda: load_values(path, shape),),
+        "lists": (lambda: load_pairs(path), lambda: load_points(path)),
+        "known points": (lambda: read_landmarks(path, repair(shape)),),
+        "names": (lambda: read_group(path, _EGGS) if path.stem == "group" else load_names(path),),
+        "poses": (lambda: load_poses(path),),
+        "samples": (lambda: samples_of(path, 64, np.random.default_rng(0)),),
+        "fits": (lambda: Collection(path.parents[1], 1).atlas(poor=True), lambda: _map_all(path)),
+        "atlases": (lambda: _look_at_atlas(path),),
+        "prepared": tuple(partial(read, path.parent) for read in (_learn_from, is_registered, frame_of, has_sides)),
+        "checkpoints": (lambda: trainers()[path.stem == "chair"].load(path),),
+        "models": (lambda: verify_model(path.parent),),
+        "implicit models": (lambda: verify_model(path.parent), lambda: load_implicit(path.parent)),
+        "labels": (lambda: load_labels(path, shape, "vertices"), lambda: load_labels(path, shape)),
+        "weights": (lambda: load_weights(path, shape),),
+        "landmarks": (lambda: load_landmarks(path, shape),),
+        "images": (lambda: ImageReader().decode(path.read_bytes(), path.name),),
+        "safetensors": (lambda: load_network(path, {"a.weight": (4, 70), "a.bias": (4,)}),),
+        "templates": (lambda: load_template(path),),
+        "cards": (lambda: read_implicit_card(path.parent) if path.name == IMPLICIT else read_card(path),),
+    }
+    yield from simple.get(family, ())
+    if family in ("shapes", "maps", "templates"):
+        yield lambda: _info(path)
+
+
+def _look_at(path: Path) -> None:
+    shape = load_shape(path)
+    found = []
+    for look in (find_appearance, load_coordinates):
+        try:
+            found.append(look(path, shape))
+        except MeshmatchError as error:
+            check(error.message, error.hint)
+
+
+def _map_all(path: Path) -> None:
+    fits = path.parents[1]
+    if path.parent.name == "alone":
+        load_fit(path, load_template(fits / TEMPLATE))
+    Collection(fits, 1).save_maps(fits / "maps")
+
+
+def _look_at_atlas(path: Path) -> None:
+    atlas = Atlas.load(path)
+    atlas.sample(1)
+    atlas.project(atlas.mean)
+    check(*atlas.names)
+
+
+def _learn_from(folder: Path) -> None:
+    """Draw shapes of a prepared folder, as a training does."""
+    template = load_template(folder / TEMPLATE)
+    read_samples(folder, template)
+    registered_source(torch.from_numpy(read_registered(folder, template)))(2, torch.Generator().manual_seed(0))
+
+
+def _info(path: Path) -> None:
+    """What the verb says is judged, and kept from where failures are looked for."""
+    out = io.StringIO()
+    with redirect_stdout(out):
+        info(path, False)
+    check(*out.getvalue().splitlines())
+
+
+class BadMessage(Exception):
+    """Words that are too long, or that could command a terminal."""
+
+
+def check(*lines: str) -> None:
+    for line in lines:
+        if visible(line) != line or "\n" in line:
+            raise BadMessage(line)

@@ -1,0 +1,252 @@
+"""One good file of every kind that the product reads, for `experiments.hostile` to damage."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.sparse import csr_array
+
+from meshmatch.experiments.hostile.learned import learned_samples
+from meshmatch.maps import MAP_SUFFIXES
+from meshmatch.maps.files import save_map
+from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.models.checkpoint import save_weights as save_network
+from meshmatch.models.implicit_card import ImplicitCard, write_implicit_card
+from meshmatch.models.registry import load_model
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.textured_files import save_textured
+from meshmatch.templates.location import bundled_folder
+from meshmatch.templates.template import load_template
+from meshmatch.transfer.label_files import Labels, save_labels
+from meshmatch.transfer.landmarks import at_vertices, save_landmarks
+from meshmatch.transfer.vertex_files import SkinWeights, Values, save_colors, save_values, save_weights
+
+LABEL_SUFFIXES = (".npy", ".txt", ".csv", ".json")
+IMAGES = {"png": "PNG", "jpg": "JPEG", "webp": "WEBP", "bmp": "BMP", "tga": "TGA", "tif": "TIFF"}
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A folder with a file of a family, maybe among others and in folders of its own; the first of its files is the one
+    that is read, all may be damaged.
+    """
+
+    family: str
+    folder: Path
+    files: tuple[str, ...]
+
+
+def small_shape() -> Shape:
+    """A body of some hundred vertices, in colors."""
+    body = decimate(load_shape(bundled_folder() / "samples" / "climber.ply"), 200)
+    colors = np.random.default_rng(0).random((body.V, 4))
+    return Shape(body.verts, body.faces, "small.ply", colors)
+
+
+def make_samples(folder: Path) -> list[Sample]:
+    """Write all samples, each into a folder of its own; the order is always the same."""
+    found: list[Sample] = []
+    shape = small_shape()
+    colors = np.random.default_rng(7).random((shape.V, 4))
+    cloud = Shape(shape.verts, np.empty((0, 3), np.int64), "cloud")
+
+    def add(family: str, name: str, write: Callable[..., Any], *more: Any) -> None:
+        place = folder / f"{len(found):03d}-{family}"
+        place.mkdir(parents=True)
+        write(place / name, *more)
+        others = sorted(set(os.listdir(place)) - {name})
+        found.append(Sample(family, place, (name, *others)))
+
+    for suffix in (".ply", ".obj", ".off", ".stl", ".glb"):
+        add("shapes", f"a{suffix}", lambda path: save_shape(path, shape))
+    for suffix in (".xyz", ".npy", ".ply"):
+        add("shapes", f"a{suffix}", lambda path: save_shape(path, cloud))
+    for name, data in _plys().items():
+        add("shapes", f"{name}.ply", Path.write_bytes, data)
+    add("shapes", "a.pcd", lambda path: path.write_bytes(_pcd()))
+    add("shapes", "skin.gltf", lambda path: path.write_text(json.dumps(_skinned())))
+    add("shapes", "apart.gltf", _write_apart)
+    paint = np.random.default_rng(0).integers(0, 256, (16, 16, 4)).astype(np.uint8)
+    uv = np.random.default_rng(1).random((shape.F, 3, 2))
+    for suffix in (".obj", ".glb"):
+        add("shapes", f"a{suffix}", lambda path: save_textured(path, Textured(shape.verts, shape.faces, uv), paint))
+    index = np.arange(shape.V)[::-1].copy()
+    trust = np.linspace(0, 1, shape.V)
+    about: dict[str, Any] = {"confidence": trust, "verdict": "fair", "reasons": ("it lies far",)}
+    for suffix in MAP_SUFFIXES:
+        add("maps", f"m{suffix}", lambda path: save_map(path, VertexMap.between(shape, shape, index, **about)))
+    values = Values(np.random.default_rng(2).random((shape.V, 3)), ("a", "b", "c"))
+    for suffix in (".npy", ".csv"):
+        add("tables", f"v{suffix}", lambda path: save_values(path, values, shape))
+    add("tables", "c.csv", lambda path: save_colors(path, shape, colors))
+    add("lists", "p.txt", lambda path: path.write_text("# pairs\n" + "".join(f"{k} {k + 1}\n" for k in range(40))))
+    add("lists", "p.npy", lambda path: np.save(path, np.arange(60).reshape(-1, 2)))
+    add("known points", "k.npy", lambda path: np.save(path, shape.verts[:9]))
+    add("known points", "k.txt", lambda path: np.savetxt(path, shape.verts[:9]))
+    add("names", "pairs.txt", Path.write_text, "# source, target\negg 1,egg 2\negg0\tegg3\negg4 egg5\n")
+    for suffix in (".txt", ".csv"):
+        add("names", f"group{suffix}", Path.write_text, "egg0\negg1.ply\negg 2\n")
+    for suffix in (".npz", ".json", ".csv"):
+        add("poses", f"p{suffix}", _write_poses)
+    for known in ("distances", "normals"):
+        add("samples", "s.npz", _write_distances, known)
+    for words in (False, True):
+        names = ("arm", "leg", "head") if words else (3, 5, 9)
+        labels = Labels(np.arange(shape.V) % 3, names, "vertices")
+        for suffix in LABEL_SUFFIXES:
+            add("labels", f"l{suffix}", save_labels, labels, shape)
+    matrix = csr_array(np.random.default_rng(3).dirichlet(np.ones(4), shape.V))
+    for suffix in (".npz", ".json"):
+        add("weights", f"w{suffix}", lambda path: save_weights(path, SkinWeights(matrix, tuple("abcd"))))
+    for suffix in (".csv", ".json", ".pp"):
+        marks = at_vertices(shape, np.arange(5), ("nose", "knee", "l", "r", "x"))
+        add("landmarks", f"k{suffix}", save_landmarks, marks)
+    for suffix, kind in IMAGES.items():
+        add("images", f"i.{suffix}", Path.write_bytes, _image(paint, kind))
+    built_in = bundled_folder() / "models" / "human"
+    add("cards", "card.json", lambda path: shutil.copyfile(built_in / "card.json", path))
+    add("cards", "implicit.json", lambda path: write_implicit_card(_implicit(), path.parent))
+    for storage in ("int8", "float16", "float32"):
+        add("safetensors", "w.safetensors", _save_network, storage)
+    add("templates", "t.safetensors", lambda path: _small_template(path, built_in / "template.safetensors"))
+    for family, place, name in learned_samples(folder / "learned"):
+        held = sorted(str(path.relative_to(place)) for path in place.rglob("*") if path.is_file())
+        found.append(Sample(family, place, (name, *(other for other in held if other != name))))
+    return found
+
+
+def write_small_model(folder: Path) -> None:
+    """A copy of a model that ships."""
+    built_in = bundled_folder() / "models" / "hand"
+    folder.mkdir(parents=True)
+    for name in ("template.safetensors", "weights.safetensors"):
+        shutil.copyfile(built_in / name, folder / name)
+    card = json.loads((built_in / "card.json").read_text(encoding="utf-8")) | {"name": folder.name}
+    (folder / "card.json").write_text(json.dumps(card), encoding="utf-8")
+    load_model(folder)
+
+
+def _save_network(path: Path, storage: str) -> None:
+    state = {"a.weight": np.random.default_rng(4).random((4, 70)), "a.bias": np.zeros(4)}
+    save_network(state, path, storage=storage)
+
+
+def _small_template(path: Path, source: Path) -> None:
+    load_template(source)
+    shutil.copyfile(source, path)
+
+
+def _image(paint: np.ndarray, kind: str) -> bytes:
+    out = BytesIO()
+    options = {"compression": "tiff_lzw"} if kind == "TIFF" else {}
+    Image.fromarray(paint[..., :3]).save(out, kind, **options)
+    return out.getvalue()
+
+
+def _implicit() -> ImplicitCard:
+    return ImplicitCard(
+        "chair", "chairs", {"field": "mls"}, ["a", "b"], [[1.0, 0, 0, 0], [2.0, 0, 0, 1.0]], "two chairs", "CC0-1.0", {},
+        0, 1, 0.5, "ab" * 32, "2026-01-31",
+    )  # fmt: skip
+
+
+def _plys() -> dict[str, bytes]:
+    """Text, big-endian, strips and polygons of several sizes: what our writer does not write."""
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    places = np.random.default_rng(5).random((9, 3))
+    rows = "".join(" ".join(f"{x:.4f}" for x in row) + "\n" for row in places)
+    head = "ply\nformat {} 1.0\ncomment made by hand\nelement vertex 9\n" + axes
+    faces = "element face 3\nproperty list uchar int vertex_indices\n"
+    mixed = "3 0 1 2\n4 2 3 4 5\n5 4 5 6 7 8\n"
+    strips = "element tristrips 1\nproperty list int int vertex_indices\n"
+    big = b"".join(bytes([3]) + np.array([k, k + 1, k + 2], ">i4").tobytes() for k in range(3))
+    return {
+        "text": (head.format("ascii") + faces + "end_header\n" + rows + mixed).encode(),
+        "strips": (head.format("ascii") + strips + "end_header\n" + rows + "8 0 1 2 3 -1 4 5 6\n").encode(),
+        "big": (head.format("binary_big_endian") + faces + "end_header\n").encode()
+        + places.astype(">f4").tobytes() + big,
+    }  # fmt: skip
+
+
+def _write_poses(path: Path) -> None:
+    joints, vectors = ["root", "head"], np.random.default_rng(9).uniform(-1, 1, (3, 2, 3))
+    if path.suffix == ".npz":
+        np.savez(path, joints=np.array(joints), rotations=vectors)
+    elif path.suffix == ".json":
+        path.write_text(json.dumps({"joints": joints, "rotations": vectors.tolist()}))
+    else:
+        rows = [[p, joint, *vectors[p, j]] for p in range(3) for j, joint in enumerate(joints)]
+        path.write_text("pose,joint,x,y,z\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
+
+
+def _write_distances(path: Path, known: str) -> None:
+    """Points in and around a ball, or on it."""
+    points = np.random.default_rng(10).standard_normal((200, 3))
+    length = np.linalg.norm(points, axis=1)
+    if known == "distances":
+        np.savez(path, points=points, distances=length - 1)
+    else:
+        ball = points / length[:, None]
+        np.savez(path, points=ball, normals=ball)
+
+
+def _write_apart(path: Path) -> None:
+    """A gltf whose buffer and image are files beside it."""
+    words = _skinned()
+    for part, name in ((words["buffers"][0], "apart.bin"), (words["images"][0], "apart.png")):
+        path.with_name(name).write_bytes(base64.b64decode(part["uri"].partition("base64,")[2]))
+        part["uri"] = name
+    path.write_text(json.dumps(words))
+
+
+def _pcd() -> bytes:
+    head = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 8\nHEIGHT 1\nPOINTS 8\nDATA {}\n"
+    return head.format("binary").encode() + np.random.default_rng(6).random((8, 4)).astype("<f4").tobytes()
+
+
+def _skinned() -> dict[str, Any]:
+    """A square with two joints, a texture, and a mesh that stands twice."""
+    parts = [
+        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "<f4"), np.array([0, 1, 2, 1, 3, 2], "<u2"),
+        np.array([[0, 1, 0, 0]] * 4, "<u2"), np.array([[0.75, 0.25, 0, 0]] * 4, "<f4"), np.ones((4, 3), "<f4"),
+        np.array([[0, 0], [1, 0], [0, 1], [1, 1]], "<f4"), np.tile(np.eye(4, dtype="<f4").reshape(1, 16), (2, 1)),
+    ]  # fmt: skip
+    kinds, widths = {"float32": 5126, "uint16": 5123}, {2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+    accessors, views, data = [], [], b""
+    for k, array in enumerate(parts):
+        kind = "SCALAR" if array.ndim == 1 else widths[array.shape[1]]
+        accessors.append({"bufferView": k, "count": len(array), "componentType": kinds[array.dtype.name], "type": kind})
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
+        data += array.tobytes() + b"\0" * (-array.nbytes % 4)
+    image = base64.b64encode(_image(np.zeros((2, 2, 4), np.uint8), "PNG")).decode()
+    texture = {"index": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2], "rotation": 1}}}
+    attributes = {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3, "COLOR_0": 4, "TEXCOORD_0": 5}
+    return {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 2, 3]}],
+        "nodes": [
+            {"name": "hip", "children": [1], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}, {"name": "knee"},
+            {"name": "body", "mesh": 0, "skin": 0}, {"name": "stone", "mesh": 1, "translation": [5, 0, 0]},
+        ],
+        "meshes": [
+            {"name": "skin", "primitives": [{"attributes": attributes, "indices": 1, "material": 0}]},
+            {"primitives": [{"attributes": {"POSITION": 0}, "mode": 5}]},
+        ],
+        "materials": [{"name": "m", "pbrMetallicRoughness": {"baseColorTexture": texture}, "alphaMode": "BLEND"}],
+        "textures": [{"source": 0, "sampler": 0}], "samplers": [{"wrapS": 33071}],
+        "images": [{"uri": f"data:image/png;base64,{image}"}],
+        "skins": [{"joints": [1, 0], "inverseBindMatrices": 6}], "accessors": accessors, "bufferViews": views,
+        "buffers": [{"byteLength": len(data), "uri": f"data:;base64,{base64.b64encode(data).decode()}"}],
+    }  # fmt: skip

@@ -1,0 +1,1 @@
+"""What makes templates, rigs, and generated shapes with known correspondence."""
