@@ -40,7 +40,7 @@ def test_a_command_prints_tables_notes_and_one_line_last(capsys: pytest.CaptureF
     record = json.loads(lines[-1])
     assert lines[-2] == "done"
     assert any("scape" in line and "1.23" in line and "25 %" in line for line in lines)
-    assert (record["experiment"], record["options"]) == ("test_runner", {"count": 2, "seed": 3})
+    assert (record["experiment"], record["options"]) == ("tests.experiments.test_runner", {"count": 2, "seed": 3})
     assert {"date", "commit", "machine", "python", "threads", "jobs", "seconds"} < record.keys()
     assert record["rows"][1]["mean"] is None  # JSON has no nan
     assert (record["path"], record["array"]) == ("x", [0, 1])
