@@ -13,6 +13,7 @@ from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, numbers, w
 from meshmatch.shapes.input_files import check_text, read_npy
 from meshmatch.shapes.shape import Shape
 
+_MOST_HEADERS = 30
 _WORDS = re.compile(rb"\s*(\d+[ \t]*\n\s*)?(?![+-]?(?:nan|inf))(/*[ \t]*[a-z_][^\n]{,2000})(?=\n|\Z)", re.IGNORECASE)
 _AXES = ((b"x", b"y", b"z"), (b"points:0", b"points:1", b"points:2"))
 _DECIMAL_COMMA = re.compile(rb"(?<!\S)[+-]?\d*,\d+(?:[eE][+-]?\d+)?(?!\S)")
@@ -108,7 +109,10 @@ def read_xyz(path: Path, data: bytes) -> Raw:
 def _without_header(text: bytes) -> tuple[bytes, list[bytes]]:
     """The text behind its first lines of words, and the last of these: a name for each column."""
     labels: list[bytes] = []
-    while found := _WORDS.match(text):
+    for _ in range(_MOST_HEADERS):
+        found = _WORDS.match(text)
+        if found is None:
+            break
         line, text = found[2], (found[1] or b"") + text[found.end() :]
         split = next((mark for mark in (b";", b",", b"\t") if mark in line), None)
         labels = [cell.strip(b" \t/").lower() for cell in line.strip(b"/ ").split(split)]
