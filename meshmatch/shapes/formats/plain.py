@@ -151,8 +151,10 @@ def write_xyz(path: Path, shape: Shape) -> None:
 
 
 def read_points(path: Path, data: bytes) -> Raw:
-    """An npy array (N, 3) of points, or (N, 6) with normals, which are ignored."""
+    """An npy array (N, 3) of points, or (N, 6) with normals, which are ignored; or rows with fields x, y and z."""
     array = read_npy(path)
+    if array.ndim == 1 and {"x", "y", "z"} <= set(array.dtype.names or ()):
+        array = np.stack([array[axis] for axis in "xyz"], axis=1)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{path.name} does not hold an array of numbers", "save points as an (N, 3) array")
     if array.ndim != 2 or array.shape[1] not in (3, 6):

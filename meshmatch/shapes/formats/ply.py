@@ -136,19 +136,28 @@ def read_pcd(path: Path, data: bytes) -> Raw:
     name, start, colors = path.name, _DATA.search(data), None
     if not start:
         raise InputError(f"{name} is not a pcd file of text or plain binary points", "write it uncompressed, or as ply")
-    lines = data[: start.start()].decode("latin-1").splitlines()
+    lines = data[: start.start()].removeprefix(b"\xef\xbb\xbf").decode("latin-1").splitlines()
     head = {line.split()[0]: line.split()[1:] for line in lines if line.strip()}
     try:
-        points = Element("vertex", int(head["POINTS"][0]))
         counts = head.get("COUNT", ["1"] * len(head["FIELDS"]))
+        points = Element("vertex", 0)
         for label, kind, size, count in zip(head["FIELDS"], head["TYPE"], head["SIZE"], counts, strict=True):
             known = TYPES[{"F": "float", "I": "int", "U": "uint"}[kind] + str(8 * int(size))]
-            points.properties += [Property(label, known)] * min(int(count), len(data))
+            points.properties += [Property(label.lower(), known)] * min(int(count), len(data))
+        size = int(head["WIDTH"][0]) * int(head["HEIGHT"][0]) if "WIDTH" in head and "HEIGHT" in head else 0
+        promised = int(head["POINTS"][0]) if "POINTS" in head else size
+        body = Body(name, data, start.end(), None if start[1] == b"ascii" else "<")
+        held = body.rows_left(points)
+        points.count = held if held and (promised <= 0 or promised > held or size == held) else promised
         check_places(name, len(data), points.count)
-        table = Body(name, data, start.end(), None if start[1] == b"ascii" else "<").element(points)
+        table = body.element(points)
         verts = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     except (KeyError, ValueError, IndexError) as error:
         raise damaged(name, "its header makes no sense, or names no x, y and z") from error
+    if points.count != promised:
+        warn(f"{name} promises {promised} points, but holds {points.count}: these are read")
+    elif held > points.count:
+        warn(f"{name} holds more than its {points.count} points, which is not read")
     for p in points.properties:
         if p.name in ("rgb", "rgba"):  # of a float its bits count, not its value
             packed = table[p.name].astype(p.kind[0] + "4").view(np.uint32)[:, None]

@@ -58,6 +58,11 @@ class Body:
         table = self._equal_rows(element) if element.count else None
         return table if table is not None else self._walk(element)
 
+    def rows_left(self, element: Element) -> int:
+        """How many whole rows of an element without lists there may be from here on."""
+        row = sum(self._dtype(p.kind).itemsize for p in element.properties)
+        return (len(self.data) - self.at) // row if row else 0
+
     def _check(self, element: Element, end: int) -> None:
         if element.count < 0 or end > len(self.data):
             raise damaged(self.name, f"fewer {element.name} rows than the {element.count} that its header promises")
