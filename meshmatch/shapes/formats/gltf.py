@@ -12,7 +12,7 @@ import binascii
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
-from urllib.parse import unquote
+from urllib.parse import unquote_to_bytes
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,9 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_srgb
+from meshmatch.shapes.companions import beside
 from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, check_places, damaged
-from meshmatch.shapes.input_files import beside, check_text, json_of, read_bytes
+from meshmatch.shapes.input_files import check_text, json_of, read_bytes
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -259,21 +260,38 @@ class Document:
         if number not in self.buffers:
             uri = self.json["buffers"][number].get("uri")
             self.buffers[number] = self.body if uri is None else self.resource(uri)
-            self.size += 0 if uri is None or uri.startswith("data:") else len(self.buffers[number])
+            self.size += 0 if uri is None or embedded(uri) else len(self.buffers[number])
         return self.buffers[number]
 
     def resource(self, uri: str) -> bytes:
         """What a URI names: data within it, or a file in the folder of this one."""
-        if uri.startswith("data:"):
+        if embedded(uri):
             try:
-                return base64.b64decode(uri.split(",", 1)[1], validate=True)
-            except (binascii.Error, IndexError) as error:
+                return _data_of(uri)
+            except (binascii.Error, ValueError) as error:
                 raise damaged(self.name, "its embedded data is not base64") from error
-        file = beside(self.path.parent, unquote(uri))
+        file = beside(self.path.parent, uri, uri=True)
         if file is None:
             missing = f"{self.name} needs the file {uri[:200]}, which is not in its folder"
             raise InputError(missing, "copy it beside the gltf")
         return read_bytes(file)
+
+
+def embedded(uri: str) -> bool:
+    """Whether a URI holds its data itself."""
+    return uri[:5].lower() == "data:"
+
+
+def _data_of(uri: str) -> bytes:
+    """The data of a URI: base64, also without padding and in the alphabet of URLs, or else plain bytes."""
+    kind, comma, text = uri[5:].partition(",")
+    if not comma:
+        raise ValueError("it has no comma")
+    data = unquote_to_bytes(text)
+    if not kind.lower().rstrip().endswith("base64"):
+        return data
+    data = b"".join(data.translate(bytes.maketrans(b"-_", b"+/")).split()).rstrip(b"=")
+    return base64.b64decode(data + b"=" * (-len(data) % 4), validate=True)
 
 
 def joined_colors(colors: list[Float[Floats, "_ 4"] | None], counts: list[int]) -> Float[Floats, "V 4"] | None:

@@ -20,7 +20,7 @@ from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap, no_coordinates
 from meshmatch.shapes.formats import damaged
-from meshmatch.shapes.formats.gltf import Document, joined_colors, understood
+from meshmatch.shapes.formats.gltf import Document, embedded, joined_colors, understood
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _ALPHAS: dict[str, Alpha] = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
@@ -122,7 +122,7 @@ class _Look:
             entry = self.json["images"][number]
             uri = entry.get("uri")
             data = self.document.view_bytes(entry["bufferView"]) if uri is None else self.document.resource(uri)
-            inside = uri is None or uri.startswith("data:")
+            inside = uri is None or embedded(uri)
             self.images[number] = self.reader.decode(data, f"image {number} of {self.document.name}" if inside else uri)
         return self.images[number]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 
@@ -16,9 +16,10 @@ from meshmatch.errors import InputError
 from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap
 from meshmatch.shapes.colors import to_linear
+from meshmatch.shapes.companions import beside
 from meshmatch.shapes.formats import columns, damaged, fan, lines_of, numbers, words_per_line
 from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines
-from meshmatch.shapes.input_files import beside, read_bytes
+from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 _LARGEST_MTL = 10_000_000  # bytes
@@ -123,8 +124,7 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
     """The materials of all mtl files that are named. A shape with vertex colors may miss them."""
     entries: dict[str, _Entry] = {}
     for name in names:
-        whole = _beside(path.parent, name)
-        for file in [whole] if whole is not None else [_beside(path.parent, word) for word in name.split()]:
+        for file in _named(path.parent, name):
             if file is not None:
                 entries |= _parse(file)
             elif shape.colors is None:
@@ -133,10 +133,13 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
     return entries
 
 
-def _beside(folder: Path, name: str) -> Path | None:
-    """A file that is named relative to a folder, within it; else one of the same name in it; else None."""
-    windows = PureWindowsPath(name.strip().strip('"'))  # takes both kinds of slash
-    return beside(folder, windows.as_posix()) or beside(folder, windows.name)
+def _named(folder: Path, names: str) -> list[Path | None]:
+    """The files of a line that names one, maybe with spaces, or several; None for one that is not there."""
+    several = [beside(folder, word) for word in names.split()]
+    if len(several) > 1 and not all(file is not None and file.suffix.lower() == ".mtl" for file in several):
+        whole = beside(folder, names)
+        return several if whole is None else [whole]
+    return several
 
 
 def _parse(file: Path) -> dict[str, _Entry]:
@@ -198,7 +201,7 @@ def _image(path: Path, name: str, entry: _Entry, reader: ImageReader, laid: bool
     """The image of a material; if it is `laid` on, with the alpha of map_d: of that its own, else how bright it is."""
 
     def decode(wanted: _Map) -> Pixels:
-        file = _beside(entry.folder, wanted.file)
+        file = beside(entry.folder, wanted.file) or beside(path.parent, wanted.file)
         if file is None:
             what = f"{path.name} needs the image {wanted.file[:200]} of its material {name}, which is not there"
             raise InputError(what, f"copy it to {entry.folder}, or name another with --image")
