@@ -1,20 +1,24 @@
-"""The plain formats: Geomview OFF (text), STL, and points as xyz text or NumPy arrays."""
+"""The plain formats: Geomview OFF (text), and points as xyz text or NumPy arrays."""
 
 from __future__ import annotations
 
-import logging
 import re
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, warn
 from meshmatch.shapes import formats
 from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, numbers, words_per_line
 from meshmatch.shapes.input_files import check_text, read_npy
 from meshmatch.shapes.shape import Shape
 
+_WORDS = re.compile(rb"\s*(\d+[ \t]*\n\s*)?(?![+-]?(?:nan|inf))(/*[ \t]*[a-z_][^\n]{,2000})(?=\n|\Z)", re.IGNORECASE)
+_AXES = ((b"x", b"y", b"z"), (b"points:0", b"points:1", b"points:2"))
+_DECIMAL_COMMA = re.compile(rb"(?<!\S)[+-]?\d*,\d+(?:[eE][+-]?\d+)?(?!\S)")
+_UNCLEAR_COMMA = re.compile(rb"[+-]?[\d.]*,\d+(?:[eE][+-]?\d+)?|[+-]?\d{1,3},\d{3}\.\d*")
+_PAIRS = re.compile(rb"(?:\s*+[+-]?\d++,\d++(?:,[+-]?\d++,\d++){2,}+[ \t]*+)++\s*+")
+_FRACTION = re.compile(rb",0\d|,\d{5}")  # no whole number begins with 0, and few columns have five digits
 _HEADER = re.compile(rb"\s*((?:ST)?C?N?)OFF\b|\s*((?:ST)?C?N?)OFF(?=\d)")
 
 
@@ -72,50 +76,69 @@ def write_off(path: Path, shape: Shape) -> None:
     path.write_text("\n".join([*lines, ""]))
 
 
-def read_stl(path: Path, data: bytes) -> Raw:
-    """Every corner of a triangle is a vertex of its own, in the file's order; several solids one after the other."""
-    from trimesh.exchange.stl import load_stl  # 0.7 s to import: only where it is needed
-
-    if data[:5].lower() == b"solid":  # text, unless the size is just that of a binary file
-        check_text(path.name, data)
-        formats.check_places(path.name, len(data), data.count(b"vertex") * 4 // 3, text=True)
-    else:
-        formats.check_places(path.name, len(data), 0, len(data) // 50 * 4)
-    logging.getLogger("trimesh").addHandler(logging.NullHandler())  # or it prints tracebacks of damaged files
-    try:
-        found = load_stl(BytesIO(data))
-        solids = found["geometry"].values() if "geometry" in found else [found]
-        verts = np.concatenate([np.asarray(one["vertices"], np.float64)[one["faces"]] for one in solids])
-    except Exception as error:  # of whatever kind: trimesh has no class for damaged files
-        raise damaged(path.name, "its triangles cannot be read, or it is not an stl file") from error
-    verts = verts.reshape(-1, 3)
-    return Raw(verts, np.arange(len(verts)).reshape(-1, 3))
-
-
-def write_stl(path: Path, shape: Shape) -> None:
-    """Binary, 32-bit floats."""
-    from trimesh.exchange.stl import export_stl
-
-    path.write_bytes(export_stl(shape.to_trimesh()))
-
-
 def read_xyz(path: Path, data: bytes) -> Raw:
-    """x y z at the start of each line, split by space, comma or semicolon; further columns are ignored."""
+    """x y z at the start of each line, or where a header says; split by space, comma or semicolon."""
     name = path.name
     if b"\0" in data[:4096]:
         raise InputError(f"{name} is not a text file of points", formats.WRONG_SUFFIX)
     check_text(name, data)
-    text = formats.without_comments(data.translate(bytes.maketrans(b",;\r", b"  \n")))
+    text = formats.without_comments(data.translate(bytes.maketrans(b"\r\"'", b"\n  ")))
+    text, labels = _without_header(text)
+    text = _split_by_spaces(name, text)
     counts = words_per_line(text)
     formats.check_places(name, len(data), len(counts), text=True)
-    if len(counts) > 1 and counts[0] == 1 and text.split(None, 1)[0] == str(len(counts) - 1).encode():
-        text, counts = text.split(None, 1)[1], counts[1:]  # a first line with the number of points
+    if len(counts) > 1 and counts[0] == 1 and counts[1:].min() >= 3 and text.split(None, 1)[0].isdigit():
+        promised, text = text.split(None, 1)  # a first line with the number of points
+        counts = counts[1:]
+        if promised.lstrip(b"0") != str(len(counts)).encode():
+            warn(f"{name} promises {promised[:20].decode()} points, but holds {len(counts)}: these are read")
     if len(counts) == 0:
         raise InputError(f"{name} holds no points", "each line should be: x y z")
-    if counts.min() < 3:
-        short = int(np.flatnonzero(counts < 3)[0])
-        raise damaged(name, f"point {short} has only {int(counts[short])} of 3 coordinates")
-    return Raw(columns(numbers(name, text), counts, 0, 3), NO_FACES)
+    places = [0, 1, 2]
+    for axes in _AXES if len(labels) == counts[0] else ():
+        if all(labels.count(axis) == 1 for axis in axes):
+            places = [labels.index(axis) for axis in axes]
+    least = max(places) + 1
+    if counts.min() < least:
+        short = int(np.flatnonzero(counts < least)[0])
+        raise damaged(name, f"point {short} has only {int(counts[short])} of {least} coordinates")
+    return Raw(columns(numbers(name, text), counts, 0, least)[:, places], NO_FACES)
+
+
+def _without_header(text: bytes) -> tuple[bytes, list[bytes]]:
+    """The text behind its first lines of words, and the last of these: a name for each column."""
+    labels: list[bytes] = []
+    while found := _WORDS.match(text):
+        line, text = found[2], (found[1] or b"") + text[found.end() :]
+        split = next((mark for mark in (b";", b",", b"\t") if mark in line), None)
+        labels = [cell.strip(b" \t/").lower() for cell in line.strip(b"/ ").split(split)]
+    return text, labels
+
+
+def _split_by_spaces(name: str, text: bytes) -> bytes:
+    """A table of numbers with spaces between its cells, nan in those that are empty, and decimal points.
+
+    A comma inside a word is a decimal comma where something else splits the lines into three words and more, no word has
+    two commas, and no number has a point. `InputError` where it may be one, but that cannot be told.
+    """
+    if b"," not in text and b";" not in text:
+        return text
+    text = re.sub(rb"([,;])[ \t]*(?=[,;])", rb"\1 nan ", text)
+    text = re.sub(rb"^[ \t]*(?=[,;])", b"nan ", text, flags=re.MULTILINE).replace(b";", b" ")
+    words, spaced = re.subn(rb",(?!\S)|(?<!\S),", b" ", text)
+    counts = words_per_line(words)
+    several = counts[1:] if len(counts) > 1 and counts[0] == 1 else counts  # behind a first line with their number
+    unclear = False
+    if b"," in words and len(several) and several.min() >= 3:
+        if not spaced and b"." not in words and words.count(b",") == len(_DECIMAL_COMMA.findall(words)):
+            return words.replace(b",", b".")
+        start = 1 if len(several) < len(counts) else 0
+        unclear = any(_UNCLEAR_COMMA.fullmatch(word) for word in words.split(None, start + 3)[start : start + 3])
+    elif b"," in words and b"." not in words:  # nothing but commas: 0,46183,1,04,-2,5
+        unclear = bool(_FRACTION.search(words)) and _PAIRS.fullmatch(words) is not None
+    if unclear:
+        raise InputError(f"{name}: its commas may be decimal commas, separators, or both", formats.DECIMAL_COMMA)
+    return words.replace(b",", b" ")
 
 
 def write_xyz(path: Path, shape: Shape) -> None:
