@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import NO_FACES, NO_MESH, WRONG_SUFFIX, Raw, check_places, damaged, fan
+from meshmatch.shapes.formats import NO_FACES, NO_MESH, WRONG_SUFFIX, Raw, check_places, damaged
 from meshmatch.shapes.formats.ply_rows import TYPES, Body, Element, Property
+from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.shape import Shape
 
 _MOST_LINES = 4096  # of a header that declare something
@@ -39,7 +40,7 @@ def read(path: Path, data: bytes) -> Raw:
     if promised < len(data):  # else it is told as damage, below
         check_places(name, len(data), promised, text=order is None)
     body = Body(name, data, start, order)
-    places, faces, colors = [], NO_FACES, None
+    places, faces, polygons, colors = [], NO_FACES, None, None
     for element in elements[: max(wanted) + 1]:
         if not element.properties:
             continue  # rows of nothing, however many
@@ -51,13 +52,15 @@ def read(path: Path, data: bytes) -> Raw:
             if len(places) < 3:
                 break
         elif element.name == "face":
-            lists = next((table[key] for key in _FACE_LISTS if key in table), None)
-            faces = faces if lists is None else fan(*lists)
+            polygons = next((table[key] for key in _FACE_LISTS if key in table), polygons)
         elif element.name == "tristrips":
             faces = _strips(table[element.properties[0].name][0])
     if len(places) < 3:
         raise InputError(f"{name}: the vertices have no x, y and z", NO_MESH)
-    return Raw(np.stack(places, axis=1), faces, colors)
+    verts = np.stack(places, axis=1)
+    if polygons is not None:
+        faces = polygons[0][triangles_of(name, verts, *polygons)]
+    return Raw(verts, faces, colors)
 
 
 def read_pcd(path: Path, data: bytes) -> Raw:
