@@ -68,9 +68,13 @@ def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] |
     `shape` is what `load_shape` made of the same file; `InputError` if that is damaged.
     """
     path = Path(path)
-    readers = {".glb": gltf_attributes, ".gltf": gltf_attributes, ".obj": obj_look, ".ply": ply_look}
-    reader = readers.get(path.suffix.lower())
-    found = None if reader is None else reader.read_coordinates(path, read_bytes(path))
+    suffix, found = path.suffix.lower(), None
+    if suffix in (".glb", ".gltf"):
+        found = gltf_attributes.read_coordinates(path, read_bytes(path))
+    elif suffix == ".obj":
+        found = obj_look.read_coordinates(path, read_bytes(path), shape)
+    elif suffix == ".ply":
+        found = ply_look.read_coordinates(path, read_bytes(path), shape)
     if found is not None and len(found) != shape.F:
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
     return found if shape.F else None

@@ -200,7 +200,7 @@ def test_obj_colors(tmp_path: Path) -> None:
     "head", ["OFF\n5 2 0\n", "OFF 5 2 0\n", "OFF5 2 0\n", "# by\nOFF # x\n\n5 2\n", "OFF\r\n5 2 0\r\n"]
 )
 def test_off(tmp_path: Path, head: str) -> None:
-    rows = "0 0 0\n1 0 0\n1 1 0 # corner\n\n0 1 0\n.5 .5 1\n4 0 1 2 3 255 0 0\n3 0 1 4\n"
+    rows = "0 0 0\n1 0 0\n1 1 0 # corner\n\n0 1 0\n.5 .5 1\n4 0 1 2 3 7\n3 0 1 4\n"
     check(load(tmp_path, "a.off", head + rows))
 
 

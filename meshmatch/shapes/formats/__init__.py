@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
+from meshmatch.shapes.colors import light, seen
 
 NO_FACES = np.empty((0, 3), np.int64)
 NO_MESH = "is it a mesh or a point cloud at all?"
@@ -109,12 +110,25 @@ def indices(name: str, values: NDArray[Any]) -> Ints:
     return values.astype(np.int64)
 
 
-def painted(channels: Float[Floats, "V C"]) -> Float[Floats, "V 4"]:
-    """Colors of 3 or 4 channels, which count to 255 if one is above 1, else to 1."""
+def painted(channels: Float[Floats, "N C"]) -> Float[Floats, "N 4"]:
+    """Colors of 3 or 4 channels, which count to 255 if one is above 1, else to 1; of alpha this is told apart."""
     channels = np.nan_to_num(channels)
     colors = np.ones((len(channels), 4))
-    colors[:, : channels.shape[1]] = np.clip(channels / (255.0 if (channels > 1).any() else 1.0), 0.0, 1.0)
+    for some in (slice(0, 3), slice(3, channels.shape[1])):
+        largest = 255.0 if (channels[:, some] > 1).any() else 1.0
+        colors[:, some] = np.clip(channels[:, some] / largest, 0.0, 1.0)
     return colors
+
+
+def colors_of_faces(count: int, faces: Int[Ints, "F 3"], colors: Float[Floats, "F 4"]) -> Float[Floats, "count 4"]:
+    """Colors of vertices where a file has them for faces: the mean light of those around; white where there are none."""
+    total, many = np.zeros((count, 4)), np.zeros(count)
+    own = light(colors)
+    for k in range(3):
+        many += np.bincount(faces[:, k], minlength=count)[:count]
+        for channel in range(4):
+            total[:, channel] += np.bincount(faces[:, k], own[:, channel], minlength=count)[:count]
+    return np.where(many[:, None] > 0, seen(total / np.maximum(many, 1)[:, None]), 1.0)
 
 
 def without_comments(text: bytes) -> bytes:

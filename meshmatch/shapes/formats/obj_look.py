@@ -17,8 +17,9 @@ from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap
 from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.companions import beside
-from meshmatch.shapes.formats import columns, damaged, fan, lines_of, numbers, words_per_line
-from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines
+from meshmatch.shapes.formats import columns, damaged, lines_of, numbers, words_per_line
+from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines, vertices_of_corners
+from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
@@ -56,7 +57,7 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     """Materials and texture coordinates, face by face in the order of `obj.read`; `picture` replaces all images."""
     data = joined_lines(data)
     named, libraries = (_words(*found) for found in lines_of(data, b"usemtl", b"mtllib"))
-    corners, laid, lines = _coordinates(path.name, data)
+    corners, laid, lines = _coordinates(path.name, data, shape)
     used = np.searchsorted([line for _, line in named], lines, side="right") - 1  # -1: none named yet
     entries = {} if picture is not None else _libraries(path, [name for name, _ in libraries], shape)
     # Only what faces use is read; a material counts twice where some of its faces have no coordinates.
@@ -81,9 +82,9 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     return Appearance(tuple(materials), kind, corners)
 
 
-def read_coordinates(path: Path, data: bytes) -> Float[Floats, "F 3 2"] | None:
-    """Texture coordinates of all faces, v down; None where a face has none."""
-    uv, laid, _ = _coordinates(path.name, joined_lines(data))
+def read_coordinates(path: Path, data: bytes, shape: Shape) -> Float[Floats, "F 3 2"] | None:
+    """Texture coordinates of all faces, v down; None where a face has none. `shape` is of the same file."""
+    uv, laid, _ = _coordinates(path.name, joined_lines(data), shape)
     uv[:, :, 1] = 1.0 - uv[:, :, 1]
     return uv if laid.all() else None
 
@@ -99,7 +100,7 @@ def _words(text: bytes, lines: Ints) -> list[tuple[str, int]]:
     return list(zip(names, lines.tolist(), strict=False))
 
 
-def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
+def _coordinates(name: str, data: bytes, shape: Shape) -> tuple[Floats, Bools, Ints]:
     """(F, 3, 2) coordinates with v up, (F,) whether all three corners have them, and (F,) the line of each face."""
     text, vt_lines, faces, sizes, face_lines = entries_and_faces(name, data, b"vt")
     counts = words_per_line(text)
@@ -113,7 +114,11 @@ def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
     if b"/" in faces:
         values = numbers(name, second_index(faces))
         index = from_one(name, "texture coordinate", values, vt_lines, np.repeat(face_lines, sizes))
-    triangles = fan(index, sizes)
+    vertices = index
+    if (sizes > 3).any():  # how polygons are split, depends on where their vertices are
+        [(_, v_lines)] = lines_of(data, b"v")
+        vertices = vertices_of_corners(name, faces, sizes, v_lines, face_lines)
+    triangles = index[triangles_of(name, shape.verts_or_nan, vertices, sizes)]
     laid = np.asarray((triangles > 0).all(axis=1))
     uv = np.zeros((len(triangles), 3, 2))
     uv[laid] = pairs[triangles[laid] - 1]

@@ -1,4 +1,4 @@
-"""The plain formats: Geomview OFF (text), and points as xyz text or NumPy arrays."""
+"""Points: xyz text, and NumPy arrays."""
 
 from __future__ import annotations
 
@@ -20,61 +20,6 @@ _DECIMAL_COMMA = re.compile(rb"(?<!\S)[+-]?\d*,\d+(?:[eE][+-]?\d+)?(?!\S)")
 _UNCLEAR_COMMA = re.compile(rb"[+-]?[\d.]*,\d+(?:[eE][+-]?\d+)?|[+-]?\d{1,3},\d{3}\.\d*")
 _PAIRS = re.compile(rb"(?:\s*+[+-]?\d++,\d++(?:,[+-]?\d++,\d++){2,}+[ \t]*+)++\s*+")
 _FRACTION = re.compile(rb",0\d|,\d{5}")  # no whole number begins with 0, and few columns have five digits
-_HEADER = re.compile(rb"\s*((?:ST)?C?N?)OFF\b|\s*((?:ST)?C?N?)OFF(?=\d)")
-
-
-def read_off(path: Path, data: bytes) -> Raw:
-    """With or without colors and normals."""
-    name = path.name
-    check_text(name, data)
-    text = formats.without_comments(data).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    header = _HEADER.match(text)
-    if not header:
-        raise InputError(f"{name} is not an off file: it does not begin with 'OFF'", formats.WRONG_SUFFIX)
-    kind = header.group(1) or header.group(2) or b""
-    body = text[header.end() :]
-    if body.lstrip()[:6] == b"BINARY":
-        raise InputError(f"{name} is a binary off file", "convert it to ply")
-    head = re.match(rb"\s*(\d{1,15})\s+(\d{1,15})(?!\d)(?:[ \t]+\d+)?", body)
-    if not head:
-        raise damaged(name, "the header does not say how many vertices and faces there are")
-    V, F = int(head.group(1)), int(head.group(2))
-    promise = f"it promises {V} vertices and {F} faces, but"
-    body = body[head.end() :]
-    if len(body) < V + F:  # a row takes two bytes and more
-        raise damaged(name, f"{promise} is only {len(data)} bytes long")
-    formats.check_places(name, len(data), V, F, text=True)
-    counts = words_per_line(body)
-    if len(counts) < V + F:
-        raise damaged(name, f"{promise} has only {len(counts)} lines of them")
-    widths, sizes = counts[:V], counts[V : V + F]
-    if V and widths.min() < 3:
-        raise damaged(name, "a vertex has fewer than 3 coordinates")
-    rows, faces = np.split(numbers(name, body), [widths.sum()])
-    at = 6 if b"N" in kind else 3
-    colors = None
-    if b"C" in kind and V and widths.min() >= at + 3:
-        colors = formats.painted(columns(rows, widths, at, min(at + 4, int(widths.min()))))
-    verts = columns(rows, widths, 0, 3) if V else np.empty((0, 3))
-    if F == 0:
-        return Raw(verts, NO_FACES, colors)
-    starts = np.cumsum(sizes) - sizes
-    corners = faces[starts]
-    if not ((corners >= 0) & (corners < sizes)).all():
-        raise damaged(name, "a face has fewer corners than it says")
-    many = corners.astype(np.int64)
-    formats.check_places(name, len(data), V, max(int(many.sum()) - 2 * F, 0), text=True)
-    return Raw(verts, formats.fan(formats.indices(name, faces[formats.runs(starts + 1, many)]), many), colors)
-
-
-def write_off(path: Path, shape: Shape) -> None:
-    """Positions with every digit that they have; colors as COFF."""
-    verts = shape.verts_or_nan
-    rows = verts if shape.colors is None else np.hstack([verts, shape.colors])
-    lines = ["OFF" if shape.colors is None else "COFF", f"{shape.V} {shape.F} 0"]
-    lines += [" ".join(map(repr, row)) for row in rows.tolist()]
-    lines += [f"3 {a} {b} {c}" for a, b, c in shape.faces.tolist()]
-    path.write_text("\n".join([*lines, ""]))
 
 
 def read_xyz(path: Path, data: bytes) -> Raw:

@@ -12,11 +12,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Floats, Int, Ints
+from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes.colors import to_linear, to_srgb
-from meshmatch.shapes.formats import NO_FACES, NO_MESH, WRONG_SUFFIX, Raw, check_places, damaged, fan, indices
+from meshmatch.shapes.formats import NO_FACES, NO_MESH, WRONG_SUFFIX, Raw, check_places, damaged, indices
 from meshmatch.shapes.formats.ply_rows import TYPES, Body, Element, Property
+from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.shape import Shape
 
 _MOST_LINES = 4096  # of a header that declare something
@@ -55,7 +56,7 @@ def read(path: Path, data: bytes) -> Raw:
     verts = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     colors = _colors(element, table)
     lists = [corners_of(name, *each) for each in content.faces]
-    faces = [corners[triangles_of(corners, sizes)] for corners, sizes in lists]
+    faces = [corners[triangles_of(name, verts, corners, sizes)] for corners, sizes in lists]
     faces += [faces_of(*corners_of(name, *each)) for each in content.strips]
     joined = np.concatenate([NO_FACES, *faces])
     listed = sum(element.count for element, _ in [*content.faces, *content.strips])
@@ -124,11 +125,6 @@ def corners_of(name: str, element: Element, table: Table) -> tuple[Ints, Ints]:
         raise InputError(f"{name}: {which} that of the vertices of each {element.name}", _FACE_HINT)
     items, sizes = table[chosen[0].name]
     return indices(name, items), sizes
-
-
-def triangles_of(corners: Ints, sizes: Ints) -> Int[Ints, "F 3"]:
-    """Which of the corners, counted over all polygons, each triangle has."""
-    return fan(np.arange(len(corners)), sizes)
 
 
 def read_pcd(path: Path, data: bytes) -> Raw:

@@ -18,8 +18,9 @@ from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Appearance, ImageReader, Material, Pixels
 from meshmatch.shapes.companions import beside
 from meshmatch.shapes.formats import damaged
-from meshmatch.shapes.formats.ply import Content, Table, corners_of, faces_of, parsed, triangles_of
+from meshmatch.shapes.formats.ply import Content, Table, corners_of, faces_of, parsed
 from meshmatch.shapes.formats.ply_rows import Element
+from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
@@ -47,7 +48,7 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     Without either, the vertex colors.
     """
     content = parsed(path.name, data)
-    uv, laid, number = _coordinates(path.name, content)
+    uv, laid, number = _coordinates(path.name, content, shape)
     names = [found[1].strip() for comment in content.comments if (found := _TEXTURE.match(comment))]
     if picture is not None:
         if not laid.any():
@@ -68,9 +69,9 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     return Appearance(tuple(materials), kind.reshape(-1).astype(np.int64), uv)
 
 
-def read_coordinates(path: Path, data: bytes) -> Float[Floats, "F 3 2"] | None:
-    """Texture coordinates of all faces, v down; None where a face has none."""
-    uv, laid, _ = _coordinates(path.name, parsed(path.name, data))
+def read_coordinates(path: Path, data: bytes, shape: Shape) -> Float[Floats, "F 3 2"] | None:
+    """Texture coordinates of all faces, v down; None where a face has none. `shape` is of the same file."""
+    uv, laid, _ = _coordinates(path.name, parsed(path.name, data), shape)
     return uv if laid.all() else None
 
 
@@ -86,14 +87,14 @@ def _image(path: Path, name: str, reader: ImageReader, shape: Shape) -> Pixels |
     return None
 
 
-def _coordinates(name: str, content: Content) -> tuple[Floats, Bools, Ints]:
+def _coordinates(name: str, content: Content, shape: Shape) -> tuple[Floats, Bools, Ints]:
     """(F, 3, 2) coordinates with v down, (F,) whether a face has them, and (F,) the number of its image."""
     element, table = content.vertices
     own = _of_vertices(element, table)
     uvs, laid, numbers = [np.empty((0, 3, 2))], [np.empty(0, bool)], [np.empty(0, np.int64)]
     for face, rows in content.faces:
         corners, sizes = corners_of(name, face, rows)
-        triangles = triangles_of(corners, sizes)
+        triangles = triangles_of(name, shape.verts_or_nan, corners, sizes)
         of_corners = _of_corners(name, face, rows, sizes)
         polygon = np.repeat(np.arange(len(sizes)), sizes)[triangles[:, 0]]
         if of_corners is not None:
