@@ -140,11 +140,11 @@ def read_pcd(path: Path, data: bytes) -> Raw:
         for label, kind, size, count in zip(head["FIELDS"], head["TYPE"], head["SIZE"], counts, strict=True):
             known = TYPES[{"F": "float", "I": "int", "U": "uint"}[kind] + str(8 * int(size))]
             points.properties += [Property(label.lower(), known)] * min(int(count), len(data))
-        size = int(head["WIDTH"][0]) * int(head["HEIGHT"][0]) if "WIDTH" in head and "HEIGHT" in head else 0
-        promised = int(head["POINTS"][0]) if "POINTS" in head else size
+        grid = int(head["WIDTH"][0]) * int(head["HEIGHT"][0]) if "WIDTH" in head and "HEIGHT" in head else 0
+        promised = int(head["POINTS"][0]) if "POINTS" in head else grid
         body = Body(name, data, start.end(), None if start[1] == b"ascii" else "<")
         held = body.rows_left(points)
-        points.count = held if held and (promised <= 0 or promised > held or size == held) else promised
+        points.count = held if held and (promised <= 0 or promised > held or grid == held) else promised
         check_places(name, len(data), points.count)
         table = body.element(points)
         verts = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
