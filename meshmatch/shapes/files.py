@@ -19,15 +19,15 @@ from numpy.typing import ArrayLike, NDArray
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import as_path, plain_text, replace_on_success
-from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, plain, ply
+from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, off, plain, ply, stl
 from meshmatch.shapes.input_files import existing, read_bytes
 from meshmatch.shapes.shape import Shape
 
 _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], None] | None]] = {
     ".ply": (ply.read, ply.write),
     ".obj": (obj.read, obj.write),
-    ".off": (plain.read_off, plain.write_off),
-    ".stl": (plain.read_stl, plain.write_stl),
+    ".off": (off.read, off.write),
+    ".stl": (stl.read, stl.write),
     ".glb": (gltf.read, gltf_out.write),
     ".gltf": (gltf.read, None),
     ".xyz": (plain.read_xyz, plain.write_xyz),

@@ -121,15 +121,6 @@ def check_memory(name: str, size: int, need: int) -> None:
         raise InputError(large, "make it smaller, or save it uncompressed in a binary format")
 
 
-def beside(folder: Path, name: str) -> Path | None:
-    """The file of that name in a folder or below it; None if it is not there, or elsewhere."""
-    try:
-        file = (folder / name).resolve()
-        return file if file.is_relative_to(folder.resolve()) and file.is_file() else None
-    except (OSError, RuntimeError, ValueError):  # a name too long, a circle of links, a NUL in the name
-        return None
-
-
 def read_npy(path: Path) -> NDArray[Any]:
     """The array of an npy file; `InputError` if it is damaged or holds objects."""
     try:

@@ -20,7 +20,7 @@ from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap, no_coordinates
 from meshmatch.shapes.formats import damaged
-from meshmatch.shapes.formats.gltf import Document, joined_colors, understood
+from meshmatch.shapes.formats.gltf import Document, embedded, joined_colors, understood
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _ALPHAS: dict[str, Alpha] = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
@@ -48,7 +48,7 @@ def read_skin(path: Path, data: bytes) -> tuple[csr_array, tuple[str, ...]]:
 
 def _coordinates(document: Document) -> Floats | None:
     parts = [np.empty((0, 3, 2))]
-    for _, primitive in document.primitives():
+    for _, primitive, _ in document.primitives():
         attributes = primitive["attributes"]
         faces = document.triangles(primitive)
         if len(faces) and "TEXCOORD_0" not in attributes:
@@ -69,7 +69,7 @@ class _Look:
         kinds: list[Ints] = [np.empty(0, np.int64)]
         colors: list[Floats | None] = []
         counts: list[int] = []
-        for _, primitive in self.document.primitives():
+        for _, primitive, _ in self.document.primitives():
             counts.append(self.document.count(primitive["attributes"]["POSITION"]))
             colors.append(self.document.colors(primitive))
             faces = self.document.triangles(primitive)
@@ -122,7 +122,7 @@ class _Look:
             entry = self.json["images"][number]
             uri = entry.get("uri")
             data = self.document.view_bytes(entry["bufferView"]) if uri is None else self.document.resource(uri)
-            inside = uri is None or uri.startswith("data:")
+            inside = uri is None or embedded(uri)
             self.images[number] = self.reader.decode(data, f"image {number} of {self.document.name}" if inside else uri)
         return self.images[number]
 
@@ -157,7 +157,7 @@ def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
     parent = {int(c): k for k, node in enumerate(document.nodes) for c in node.get("children", [])}
     found: list[tuple[Ints, Ints, Floats]] = []  # vertices, joints, weights
     seen = 0
-    for number, primitive in document.primitives():
+    for number, primitive, _ in document.primitives():
         attributes = primitive["attributes"]
         V, node = document.count(attributes["POSITION"]), document.nodes[number]
         if "skin" in node and "JOINTS_0" in attributes:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 
@@ -16,9 +16,11 @@ from meshmatch.errors import InputError
 from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap
 from meshmatch.shapes.colors import to_linear
-from meshmatch.shapes.formats import columns, damaged, fan, lines_of, numbers, words_per_line
-from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines
-from meshmatch.shapes.input_files import beside, read_bytes
+from meshmatch.shapes.companions import beside
+from meshmatch.shapes.formats import columns, damaged, lines_of, numbers, words_per_line
+from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines, vertices_of_corners
+from meshmatch.shapes.formats.polygons import triangles_of
+from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 _LARGEST_MTL = 10_000_000  # bytes
@@ -55,7 +57,7 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     """Materials and texture coordinates, face by face in the order of `obj.read`; `picture` replaces all images."""
     data = joined_lines(data)
     named, libraries = (_words(*found) for found in lines_of(data, b"usemtl", b"mtllib"))
-    corners, laid, lines = _coordinates(path.name, data)
+    corners, laid, lines = _coordinates(path.name, data, shape)
     used = np.searchsorted([line for _, line in named], lines, side="right") - 1  # -1: none named yet
     entries = {} if picture is not None else _libraries(path, [name for name, _ in libraries], shape)
     # Only what faces use is read; a material counts twice where some of its faces have no coordinates.
@@ -80,9 +82,9 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     return Appearance(tuple(materials), kind, corners)
 
 
-def read_coordinates(path: Path, data: bytes) -> Float[Floats, "F 3 2"] | None:
-    """Texture coordinates of all faces, v down; None where a face has none."""
-    uv, laid, _ = _coordinates(path.name, joined_lines(data))
+def read_coordinates(path: Path, data: bytes, shape: Shape) -> Float[Floats, "F 3 2"] | None:
+    """Texture coordinates of all faces, v down; None where a face has none. `shape` is of the same file."""
+    uv, laid, _ = _coordinates(path.name, joined_lines(data), shape)
     uv[:, :, 1] = 1.0 - uv[:, :, 1]
     return uv if laid.all() else None
 
@@ -98,7 +100,7 @@ def _words(text: bytes, lines: Ints) -> list[tuple[str, int]]:
     return list(zip(names, lines.tolist(), strict=False))
 
 
-def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
+def _coordinates(name: str, data: bytes, shape: Shape) -> tuple[Floats, Bools, Ints]:
     """(F, 3, 2) coordinates with v up, (F,) whether all three corners have them, and (F,) the line of each face."""
     text, vt_lines, faces, sizes, face_lines = entries_and_faces(name, data, b"vt")
     counts = words_per_line(text)
@@ -112,7 +114,11 @@ def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
     if b"/" in faces:
         values = numbers(name, second_index(faces))
         index = from_one(name, "texture coordinate", values, vt_lines, np.repeat(face_lines, sizes))
-    triangles = fan(index, sizes)
+    vertices = index
+    if (sizes > 3).any():  # how polygons are split, depends on where their vertices are
+        [(_, v_lines)] = lines_of(data, b"v")
+        vertices = vertices_of_corners(name, faces, sizes, v_lines, face_lines)
+    triangles = index[triangles_of(name, shape.verts_or_nan, vertices, sizes)]
     laid = np.asarray((triangles > 0).all(axis=1))
     uv = np.zeros((len(triangles), 3, 2))
     uv[laid] = pairs[triangles[laid] - 1]
@@ -123,8 +129,7 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
     """The materials of all mtl files that are named. A shape with vertex colors may miss them."""
     entries: dict[str, _Entry] = {}
     for name in names:
-        whole = _beside(path.parent, name)
-        for file in [whole] if whole is not None else [_beside(path.parent, word) for word in name.split()]:
+        for file in _named(path.parent, name):
             if file is not None:
                 entries |= _parse(file)
             elif shape.colors is None:
@@ -133,10 +138,13 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
     return entries
 
 
-def _beside(folder: Path, name: str) -> Path | None:
-    """A file that is named relative to a folder, within it; else one of the same name in it; else None."""
-    windows = PureWindowsPath(name.strip().strip('"'))  # takes both kinds of slash
-    return beside(folder, windows.as_posix()) or beside(folder, windows.name)
+def _named(folder: Path, names: str) -> list[Path | None]:
+    """The files of a line that names one, maybe with spaces, or several; None for one that is not there."""
+    several = [beside(folder, word) for word in names.split()]
+    if len(several) > 1 and not all(file is not None and file.suffix.lower() == ".mtl" for file in several):
+        whole = beside(folder, names)
+        return several if whole is None else [whole]
+    return several
 
 
 def _parse(file: Path) -> dict[str, _Entry]:
@@ -198,7 +206,7 @@ def _image(path: Path, name: str, entry: _Entry, reader: ImageReader, laid: bool
     """The image of a material; if it is `laid` on, with the alpha of map_d: of that its own, else how bright it is."""
 
     def decode(wanted: _Map) -> Pixels:
-        file = _beside(entry.folder, wanted.file)
+        file = beside(entry.folder, wanted.file) or beside(path.parent, wanted.file)
         if file is None:
             what = f"{path.name} needs the image {wanted.file[:200]} of its material {name}, which is not there"
             raise InputError(what, f"copy it to {entry.folder}, or name another with --image")
