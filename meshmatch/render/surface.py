@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.geometry.triangles import same_rows, vertex_normals
 from meshmatch.shapes.appearance import Appearance, Material
+from meshmatch.shapes.colors import INVISIBLE
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.texels import pyramids_of
 
@@ -28,7 +29,6 @@ Paint = Callable[[Rows, Weights, float], Float[AnyFloats, "N C"]]
 which a fourth below a half is a hole. The last argument is the size of a pixel in view coordinates: finer detail is
 averaged.
 """
-_INVISIBLE = 0.05  # an alpha below this is meant to be invisible
 
 
 def corners_of(faces: Int[Ints, "F 3"]) -> Rows:
@@ -102,7 +102,7 @@ def _solid(material: Material, image: Float[Floats32, " N"], factor: Float[Float
         return np.ones(len(image), bool)
     if material.alpha == "mask":
         return np.asarray(image * factor >= material.cutoff)
-    return np.asarray((image >= 0.5) & (factor >= _INVISIBLE))
+    return np.asarray((image >= 0.5) & (factor >= INVISIBLE))
 
 
 @dataclass(frozen=True, eq=False)
