@@ -48,7 +48,7 @@ def read_skin(path: Path, data: bytes) -> tuple[csr_array, tuple[str, ...]]:
 
 def _coordinates(document: Document) -> Floats | None:
     parts = [np.empty((0, 3, 2))]
-    for _, primitive in document.primitives():
+    for _, primitive, _ in document.primitives():
         attributes = primitive["attributes"]
         faces = document.triangles(primitive)
         if len(faces) and "TEXCOORD_0" not in attributes:
@@ -69,7 +69,7 @@ class _Look:
         kinds: list[Ints] = [np.empty(0, np.int64)]
         colors: list[Floats | None] = []
         counts: list[int] = []
-        for _, primitive in self.document.primitives():
+        for _, primitive, _ in self.document.primitives():
             counts.append(self.document.count(primitive["attributes"]["POSITION"]))
             colors.append(self.document.colors(primitive))
             faces = self.document.triangles(primitive)
@@ -157,7 +157,7 @@ def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
     parent = {int(c): k for k, node in enumerate(document.nodes) for c in node.get("children", [])}
     found: list[tuple[Ints, Ints, Floats]] = []  # vertices, joints, weights
     seen = 0
-    for number, primitive in document.primitives():
+    for number, primitive, _ in document.primitives():
         attributes = primitive["attributes"]
         V, node = document.count(attributes["POSITION"]), document.nodes[number]
         if "skin" in node and "JOINTS_0" in attributes:

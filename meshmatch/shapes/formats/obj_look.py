@@ -25,6 +25,7 @@ from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 _LARGEST_MTL = 10_000_000  # bytes
+_MOST_LIBRARIES = 100  # names in one line
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
 _ONE, _ZERO = (1.0, 1.0), (0.0, 0.0)
 _OPTION = re.compile(
@@ -162,7 +163,7 @@ def _materials_meant(file: str, wanted: set[str], known: Collection[str]) -> dic
 def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
     """The materials of all mtl files that are named. A shape with vertex colors may miss them."""
     entries: dict[str, _Entry] = {}
-    for name in names:
+    for name in dict.fromkeys(names):
         for file in _named(path.parent, name):
             if file is not None:
                 entries |= _parse(file)
@@ -174,7 +175,7 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
 
 def _named(folder: Path, names: str) -> list[Path | None]:
     """The files of a line that names one, maybe with spaces, or several; None for one that is not there."""
-    several = [beside(folder, word) for word in names.split()]
+    several = [beside(folder, word) for word in names.split(None, _MOST_LIBRARIES)[:_MOST_LIBRARIES]]
     if len(several) > 1 and not all(file is not None and file.suffix.lower() == ".mtl" for file in several):
         whole = beside(folder, names)
         return several if whole is None else [whole]

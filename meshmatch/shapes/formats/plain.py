@@ -13,6 +13,7 @@ from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, numbers, w
 from meshmatch.shapes.input_files import check_text, read_npy
 from meshmatch.shapes.shape import Shape
 
+_MOST_HEADERS = 30
 _WORDS = re.compile(rb"\s*(\d+[ \t]*\n\s*)?(?![+-]?(?:nan|inf))(/*[ \t]*[a-z_][^\n]{,2000})(?=\n|\Z)", re.IGNORECASE)
 _AXES = ((b"x", b"y", b"z"), (b"points:0", b"points:1", b"points:2"))
 _DECIMAL_COMMA = re.compile(rb"(?<!\S)[+-]?\d*,\d+(?:[eE][+-]?\d+)?(?!\S)")
@@ -53,7 +54,10 @@ def read_xyz(path: Path, data: bytes) -> Raw:
 def _without_header(text: bytes) -> tuple[bytes, list[bytes]]:
     """The text behind its first lines of words, and the last of these: a name for each column."""
     labels: list[bytes] = []
-    while found := _WORDS.match(text):
+    for _ in range(_MOST_HEADERS):
+        found = _WORDS.match(text)
+        if found is None:
+            break
         line, text = found[2], (found[1] or b"") + text[found.end() :]
         split = next((mark for mark in (b";", b",", b"\t") if mark in line), None)
         labels = [cell.strip(b" \t/").lower() for cell in line.strip(b"/ ").split(split)]
@@ -92,8 +96,10 @@ def write_xyz(path: Path, shape: Shape) -> None:
 
 
 def read_points(path: Path, data: bytes) -> Raw:
-    """An npy array (N, 3) of points, or (N, 6) with normals, which are ignored."""
+    """An npy array (N, 3) of points, or (N, 6) with normals, which are ignored; or rows with fields x, y and z."""
     array = read_npy(path)
+    if array.ndim == 1 and {"x", "y", "z"} <= set(array.dtype.names or ()):
+        array = np.stack([array[axis] for axis in "xyz"], axis=1)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{path.name} does not hold an array of numbers", "save points as an (N, 3) array")
     if array.ndim != 2 or array.shape[1] not in (3, 6):

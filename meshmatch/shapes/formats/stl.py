@@ -20,8 +20,12 @@ from meshmatch.shapes.shape import Shape
 
 _HEADER, _ROW = 84, 50  # bytes
 _ROWS = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_NAMES = re.compile(rb"^[ \t]*(?:end)?solid\b[^\n]*", re.MULTILINE)
+_NAMES = re.compile(rb"^[ \t]*((?:end)?solid)\b[^\n]*", re.MULTILINE)
+_WORDS = re.compile(rb"\b(?=(?:vertex|facet|endloop|endfacet|endsolid)\b)")
+_END = re.compile(rb"^[ \t]*endsolid\b", re.MULTILINE)
 _SMALLEST, _LARGEST = 1e-30, 1e30
+_REACH = 100.0
+"""How far from the triangles that are counted, in their size, others may be that are not."""
 _VISIBLE = 1e-5
 """Share of the size by which 32-bit floats may move a vertex without a word."""
 
@@ -54,7 +58,7 @@ def _binary(name: str, data: bytes) -> Float[Floats, "V 3"]:
         count = promised
         low, high = (edge(corners[:count], axis=(0, 1)) for edge in (np.nanmin, np.nanmax))
         middle, reach = (low + high) / 2, float((high - low).max())
-        alike = _likely(corners[count:]) & (np.abs(corners[count:] - middle).max(axis=(1, 2)) <= reach)
+        alike = _likely(corners[count:]) & (np.abs(corners[count:] - middle).max(axis=(1, 2)) <= _REACH * reach)
         count += len(alike) if alike.all() else int(np.argmin(alike))  # a count that was too low
     elif _likely(corners).mean() < 0.9:
         raise damaged(name, f"its triangles are not the {promised} that it promises, or it is not an stl file")
@@ -78,18 +82,17 @@ def _likely(corners: Float[Floats, "F 3 3"]) -> Bools:
 
 def _text(name: str, data: bytes) -> Float[Floats, "V 3"]:
     check_text(name, data)
-    text = _NAMES.sub(b"", data.replace(b"\r", b"\n").lower())
+    text = _NAMES.sub(rb"\1", data.replace(b"\r", b"\n").lower())
     check_places(name, len(data), text.count(b"vertex") * 4 // 3, text=True)
     if b"vertex" not in text:
         raise InputError(f"{name} holds no triangles, or it is not an stl file", WRONG_SUFFIX)
+    if text.count(b"vertex") != len(lines_of(text, b"vertex")[0][1]):  # several on a line
+        text = _WORDS.sub(b"\n", text)
+    ended = bool(_END.search(text))
+    if not ended:  # the last number may be cut short
+        text = text[: text.rfind(b"\n") + 1]
     (vertices, where), (_, begins) = lines_of(text, b"vertex", b"facet")
-    if len(where) != text.count(b"vertex"):  # several on a line
-        lines = re.sub(rb"\b(?=vertex\b|facet\b)", b"\n", text)
-        (vertices, where), (_, begins) = lines_of(lines, b"vertex", b"facet")
     counts = words_per_line(vertices)
-    if len(counts) and counts[-1] < 3 and len(counts) == len(where):  # cut short within a line
-        vertices, where = vertices[: vertices.rstrip(b"\n").rfind(b"\n") + 1], where[:-1]
-        counts = counts[:-1]
     if len(counts) != len(where) or (counts != 3).any():
         raise damaged(name, "its triangles cannot be read: a vertex has other than 3 coordinates")
     sizes = np.bincount(np.searchsorted(begins, where), minlength=len(begins) + 1)
@@ -100,7 +103,7 @@ def _text(name: str, data: bytes) -> Float[Floats, "V 3"]:
         raise damaged(name, "its triangles cannot be read: one of them has fewer than 3 vertices")
     if len(sizes) == 0:
         raise damaged(name, "none of its triangles is whole")
-    if not re.search(rb"^[ \t]*endsolid\b", data.replace(b"\r", b"\n").lower(), re.MULTILINE):
+    if not ended:
         warn(f"{name} has no end: it may be cut short; {len(sizes)} whole triangles are read")
     verts = numbers(name, vertices).reshape(-1, 3)
     return np.asarray(verts[fan(np.arange(int(sizes.sum())), sizes)]).reshape(-1, 3)
