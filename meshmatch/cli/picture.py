@@ -11,7 +11,7 @@ import meshmatch
 from meshmatch.cli import options, words
 from meshmatch.cli.transfer_options import Transfer, ViewMapOptions
 from meshmatch.cli.words import Console, print_json
-from meshmatch.errors import ModelError, OptionError
+from meshmatch.errors import InputError, ModelError, OptionError, warn
 from meshmatch.models.registry import TEMPLATE, locate_model
 
 if TYPE_CHECKING:
@@ -165,13 +165,22 @@ def picture(
 
 def _load_subject(path: Path, shown: PictureOptions) -> Subject:
     """Read a shape, or a template by its file or name, or that of a model."""
+    from meshmatch.shapes.appearance import vertex_colors_alone
     from meshmatch.shapes.textured_files import find_appearance
 
     if (template := _template(path)) is not None:
         return template, None
     shape = meshmatch.load_shape(path)
     textured = not (shown.plain or shown.map or shown.values or shown.labels or shown.fit)
-    return shape, find_appearance(path, shape, shown.image) if textured else None
+    if not textured:
+        return shape, None
+    try:
+        return shape, find_appearance(path, shape, shown.image)
+    except InputError as error:
+        if shown.image is not None:
+            raise
+        warn(f"{shape.name} is drawn without its texture: {error.message}")
+        return shape, None if shape.colors is None else vertex_colors_alone(shape)
 
 
 def _template(path: Path) -> "Template | None":

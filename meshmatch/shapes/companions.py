@@ -107,7 +107,7 @@ def _entries_like(folder: Path, name: str) -> list[str]:
         # What changed a moment ago may change again without a later time on it.
         fresh = abs(time.time_ns() - state.st_mtime_ns) < _MOMENT
         listed = (_entries.__wrapped__ if fresh else _entries)(folder, (state.st_dev, state.st_ino, state.st_mtime_ns))
-        entries = listed.get(_folded(name), [])
+        entries = listed.get(folded(name), [])
     except (OSError, ValueError):
         return []
     composed = unicodedata.normalize("NFC", name)
@@ -119,11 +119,12 @@ def _entries(folder: Path, state: tuple[int, int, int]) -> dict[str, list[str]]:
     """The names in a folder, by what is the same in all that are alike; `state` says whether it is still the same one."""
     entries: dict[str, list[str]] = {}
     for entry in os.listdir(folder):
-        entries.setdefault(_folded(entry), []).append(entry)
+        entries.setdefault(folded(entry), []).append(entry)
     return entries
 
 
-def _folded(name: str) -> str:
+def folded(name: str) -> str:
+    """What is the same in two names that differ only in case, in how accents are composed, or in their encoding."""
     data = name.encode("utf-8", "surrogateescape")
     try:
         text = data.decode("utf-8")

@@ -1,7 +1,7 @@
 """Shapes from what users hold (files, arrays, meshes of other libraries), and to files; the format by suffix.
 
 Every vertex that a file lists stays, in the file's order, because a map has to answer for each of them: nothing is
-merged, split or dropped here (see `meshmatch.shapes.repair` for that). Polygons become fans of triangles.
+merged, split or dropped here (see `meshmatch.shapes.repair` for that). Polygons become triangles.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from meshmatch.arrays import Float, Floats
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, plain_text, replace_on_success
+from meshmatch.shapes.colors import INVISIBLE
 from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, off, plain, ply, stl
 from meshmatch.shapes.input_files import existing, read_bytes
 from meshmatch.shapes.shape import Shape
@@ -89,7 +90,16 @@ def _read(path: str | Path) -> tuple[Shape, Raw]:
     data = read_bytes(path)
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and huge numbers are judged below
         raw = _FORMATS[suffix][0](path, data)
-    return Shape.with_invalid(raw.verts, raw.faces, plain_text(path.name), raw.colors), raw
+    name = plain_text(path.name)
+    return Shape.with_invalid(raw.verts, raw.faces, name, _visible(name, raw.colors)), raw
+
+
+def _visible(name: str, colors: Floats | None) -> Floats | None:
+    """Colors of vertices; opaque where they are all transparent, which is never meant."""
+    if colors is None or len(colors) == 0 or colors[:, 3].max() >= INVISIBLE:
+        return colors
+    warn(f"the colors of {name} are transparent at every vertex; they are read as opaque")
+    return np.insert(colors[:, :3], 3, 1.0, axis=1)
 
 
 def mesh_names(path: str | Path) -> dict[str, int]:

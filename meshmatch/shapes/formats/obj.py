@@ -25,7 +25,7 @@ _ENDS_IN_BACKSLASH = re.compile(rb"\\[ \t]*(?:\n|\Z)")
 _LINE_THAT_GOES_ON = re.compile(rb"^[^\n]*\\[ \t]*$", re.MULTILINE)
 _GOES_ON = re.compile(rb"\\[ \t]*\n(?![ \t]*(?:" + _ENTRIES + rb")[ \t])", re.IGNORECASE)
 _COMMENT = re.compile(rb"(?:^|[ \t])#")
-_SLASH_APART = re.compile(rb"(?<![ \t])[ \t]++/[ \t]*+")
+_SLASH_APART = re.compile(rb"(?<![ \t])[ \t]++(//?)[ \t]*+")
 _MIXED_CORNERS = re.compile(rb"/[ \t]++[^\s/]++(?!/)")
 _POLYPAINT = re.compile(rb"(?:[0-9a-fA-F]{8})+")
 
@@ -133,7 +133,7 @@ def entries_and_faces(name: str, data: bytes, word: bytes) -> tuple[bytes, Ints,
     if len(old_lines):
         faces, lines = faces + b"\n" + old, np.concatenate([lines, old_lines])
     if b" /" in faces or b"\t/" in faces:  # 1 / 2 is the corner 1/2
-        faces = _SLASH_APART.sub(b"/", faces)
+        faces = _SLASH_APART.sub(rb"\1", faces)
     if (b"/ " in faces or b"/\t" in faces) and _MIXED_CORNERS.search(faces):
         raise damaged(name, "a face has a slash at the end of one corner, and none at the next: where do they end?")
     sizes = words_per_line(faces)

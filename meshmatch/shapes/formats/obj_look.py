@@ -6,17 +6,18 @@ An image is taken as it is: Kd counts for faces without one (many programs write
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from meshmatch.arrays import Bools, Float, Floats, Ints
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, warn
 from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap
 from meshmatch.shapes.colors import to_linear
-from meshmatch.shapes.companions import beside
+from meshmatch.shapes.companions import beside, folded
 from meshmatch.shapes.formats import columns, damaged, lines_of, numbers, words_per_line
 from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines, vertices_of_corners
 from meshmatch.shapes.formats.polygons import triangles_of
@@ -24,7 +25,9 @@ from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 _LARGEST_MTL = 10_000_000  # bytes
+_MOST_LIBRARIES = 100  # names in one line
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
+_ONE, _ZERO = (1.0, 1.0), (0.0, 0.0)
 _OPTION = re.compile(
     rf"(?:(-o|-s|-t)((?:\s+{_NUMBER}(?!\S)){{0,3}})|-mm\s+\S+\s+\S+|(-clamp)\s+(\S+)|"
     r"-(?:blendu|blendv|cc|bm|boost|texres|imfchan|type)\s+\S+)(?:\s+|\Z)",
@@ -47,10 +50,16 @@ class _Entry:
     """A material as the mtl has it."""
 
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    opacity: float = 1.0
+    dissolve: float | None = None
+    transparency: float = 0.0
     image: _Map | None = None
     alpha: _Map | None = None
     folder: Path = field(default_factory=Path)
+
+    @property
+    def opacity(self) -> float:
+        """In 0..1. What is given as such (d) counts more than its opposite (Tr), which some programs write for it."""
+        return float(np.clip(1.0 - self.transparency if self.dissolve is None else self.dissolve, 0.0, 1.0))
 
 
 def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
@@ -58,18 +67,24 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     data = joined_lines(data)
     named, libraries = (_words(*found) for found in lines_of(data, b"usemtl", b"mtllib"))
     corners, laid, lines = _coordinates(path.name, data, shape)
-    used = np.searchsorted([line for _, line in named], lines, side="right") - 1  # -1: none named yet
+    names = list(dict.fromkeys(name for name, _ in named))
+    place = {name: k for k, name in enumerate(names)}
+    used = np.searchsorted([line for _, line in named], lines, side="right") - 1
+    used = np.array([*(place[name] for name, _ in named), -1])[used]  # -1: none named yet
+    names.append("")
     entries = {} if picture is not None else _libraries(path, [name for name, _ in libraries], shape)
+    wanted = {names[k] for k in np.unique(used).tolist()}
+    meant = _materials_meant(path.name, wanted, entries.keys()) if entries else {name: name for name in wanted}
     # Only what faces use is read; a material counts twice where some of its faces have no coordinates.
     _, which, kind = np.unique(2 * used + laid, return_index=True, return_inverse=True)
     kind = kind.reshape(-1).astype(np.int64)
     materials: list[Material] = []
     for number, face in enumerate(which.tolist()):
-        name = named[used[face]][0] if used[face] >= 0 else ""
+        name = meant[names[used[face]]]
         entry = entries.get(name, _Entry())
         image = picture if picture is not None else _image(path, name, entry, reader, bool(laid[face]))
         materials.append(_material(name, entry, image if laid[face] else None))
-        if laid[face] and entry.image is not None:
+        if laid[face] and entry.image is not None and (entry.image.scale, entry.image.offset) != (_ONE, _ZERO):
             rows = kind == number
             corners[rows] = corners[rows] * entry.image.scale + entry.image.offset
     corners[laid, :, 1] = 1.0 - corners[laid, :, 1]
@@ -125,10 +140,30 @@ def _coordinates(name: str, data: bytes, shape: Shape) -> tuple[Floats, Bools, I
     return uv, laid, np.repeat(face_lines, np.maximum(sizes - 2, 0))
 
 
+def _materials_meant(file: str, wanted: set[str], known: Collection[str]) -> dict[str, str]:
+    """For each name that faces use ("" for none at all) that of a material: the same, or one that differs in nothing but
+    case; where there is but one material, that one for faces without a name. Names without a material are said.
+    """
+    alike: dict[str, str] = {}
+    for name in known:
+        alike.setdefault(folded(name), name)
+    meant = {name: name if name in known else alike.get(folded(name), name) for name in wanted}
+    if "" in wanted and len(known) == 1:
+        [meant[""]] = known
+    elif wanted == {""}:
+        warn(f"{file} does not say which of the {len(known)} materials of its mtl it wears: its faces have no image")
+    missing = sorted(name for name in wanted if name and meant[name] not in known)
+    if missing:
+        some = ", ".join(name[:60] for name in missing[:5]) + (", ..." if len(missing) > 5 else "")
+        what = f"a material {some}" if len(missing) == 1 else f"{len(missing)} materials ({some})"
+        warn(f"{file} names {what} that its mtl does not have: those faces have no image")
+    return meant
+
+
 def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
     """The materials of all mtl files that are named. A shape with vertex colors may miss them."""
     entries: dict[str, _Entry] = {}
-    for name in names:
+    for name in dict.fromkeys(names):
         for file in _named(path.parent, name):
             if file is not None:
                 entries |= _parse(file)
@@ -140,7 +175,7 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
 
 def _named(folder: Path, names: str) -> list[Path | None]:
     """The files of a line that names one, maybe with spaces, or several; None for one that is not there."""
-    several = [beside(folder, word) for word in names.split()]
+    several = [beside(folder, word) for word in names.split(None, _MOST_LIBRARIES)[:_MOST_LIBRARIES]]
     if len(several) > 1 and not all(file is not None and file.suffix.lower() == ".mtl" for file in several):
         whole = beside(folder, names)
         return several if whole is None else [whole]
@@ -151,7 +186,7 @@ def _parse(file: Path) -> dict[str, _Entry]:
     entries: dict[str, _Entry] = {}
     entry = _Entry()
     data = joined_lines(read_bytes(file, largest=_LARGEST_MTL))
-    for line in data.decode("utf-8", "surrogateescape").splitlines():
+    for line in data.decode("utf-8", "surrogateescape").split("\n"):
         word, rest = (*line.split(None, 1), "", "")[:2]
         word, rest = word.lower(), rest.strip()
         try:
@@ -161,9 +196,9 @@ def _parse(file: Path) -> dict[str, _Entry]:
                 values = [float(number) for number in rest.split()[:3]]
                 entry.color = (values[0], values[1], values[2]) if len(values) == 3 else (values[0],) * 3
             elif word == "d":
-                entry.opacity = float(rest.split()[-1])  # d -halo 0.5
+                entry.dissolve = float(rest.split()[-1])  # d -halo 0.5
             elif word == "tr":
-                entry.opacity = 1.0 - float(rest.split()[-1])
+                entry.transparency = float(rest.split()[-1])
             elif word == "map_kd":
                 entry.image = _map(rest)
             elif word == "map_d":
@@ -194,7 +229,7 @@ def _map(text: str) -> _Map:
 
 def _material(name: str, entry: _Entry, image: Pixels | None) -> Material:
     red, green, blue = to_linear(np.clip(entry.color, 0.0, 1.0)).tolist()
-    opacity = float(np.clip(entry.opacity, 0.0, 1.0))
+    opacity = entry.opacity
     alpha: Alpha = "opaque" if opacity == 1.0 and (image is None or (image[..., 3] == 255).all()) else "blend"
     if image is None:
         return Material(name, None, (red, green, blue, opacity), alpha=alpha)

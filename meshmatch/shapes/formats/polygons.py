@@ -22,6 +22,7 @@ MOST_TESTS = 300_000_000
 _BENT = 1e-3  # radians that a polygon's corners may turn back, in all, and still count as convex
 _TOGETHER = 1 << 18  # corners
 _FLAT = 1e-12  # of the square of a polygon's extent: a doubled area that is rounding
+_NARROW = 64  # corners, of which all are looked at
 _ON = 1e-9  # the same for a corner on the edge of an ear
 
 
@@ -110,17 +111,28 @@ def _alike(polygons: Ints, sizes: Ints) -> Iterator[Ints]:
 
 def _other_diagonal(quads: Float[Floats, "Q 4 3"]) -> Bools:
     """(Q,) True for a quad that is concave at its second or fourth corner, and there alone."""
-    edges = np.roll(quads, -1, axis=1) - quads
-    normal = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
-    turns = _sines(edges, np.roll(edges, 1, axis=1), normal[:, None])
-    back = turns < -_BENT
-    return np.asarray((back.sum(axis=1) == 1) & (back[:, 1] | back[:, 3]))
+    normal = _cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+    edges = [quads[:, (k + 1) % 4] - quads[:, k] for k in range(4)]
+    turns = [np.einsum("qi,qi->q", _cross(edges[k - 1], edges[k]), normal) for k in range(4)]
+    out = np.zeros(len(quads), bool)
+    some = np.flatnonzero(np.minimum(np.minimum(turns[0], turns[1]), np.minimum(turns[2], turns[3])) < 0)
+    back = np.stack([_sines(edges[k][some], edges[k - 1][some], normal[some]) for k in range(4)], axis=1) < -_BENT
+    out[some] = (back.sum(axis=1) == 1) & (back[:, 1] | back[:, 3])
+    return out
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """Cross products of rows; `np.cross` takes several times as long."""
+    out = np.empty_like(a)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
+    return out
 
 
 def _sines(edges: Floats, before: Floats, normal: Floats) -> Floats:
-    """Sine of the turn at each corner, seen along a normal; 0 at an edge of no length."""
-    turn = np.einsum("...i,...i->...", np.cross(before, edges), normal)
-    lengths = [np.einsum("...i,...i->...", each, each) for each in (before, edges, normal)]
+    """(N,) sine of the turn at each corner, seen along a normal; 0 at an edge of no length."""
+    turn = np.einsum("ni,ni->n", _cross(before, edges), normal)
+    lengths = [np.einsum("ni,ni->n", each, each) for each in (before, edges, normal)]
     size = np.sqrt(lengths[0]) * np.sqrt(lengths[1]) * np.sqrt(lengths[2])
     return np.asarray(np.divide(turn, size, out=np.zeros_like(turn), where=size > 0))
 
@@ -140,7 +152,7 @@ def _normals(places: Floats, sizes: Ints) -> Floats:
     after = _neighbours(sizes)[1]
     begins = np.cumsum(sizes) - sizes
     own = places - np.repeat(places[begins], sizes, axis=0)
-    return np.add.reduceat(np.cross(own, own[after]), begins, axis=0)
+    return np.add.reduceat(_cross(own, own[after]), begins, axis=0)
 
 
 def _turns_back(places: Floats, sizes: Ints) -> Bools:
@@ -165,6 +177,9 @@ def _flattened(places: Floats, sizes: Ints) -> Floats:
     up = np.cross(normal, right)
     own = places - np.repeat(places[begins], sizes, axis=0)
     flat = np.stack([np.einsum("ni,ni->n", own, np.repeat(each, sizes, axis=0)) for each in (right, up)], axis=1)
+    low, high = (each.reduceat(flat, begins, axis=0) for each in (np.minimum, np.maximum))
+    tall = np.repeat((high - low)[:, 1] > (high - low)[:, 0], sizes)
+    flat[tall] = np.stack([flat[tall, 1], -flat[tall, 0]], axis=1)  # lying: ears are looked for by the first coordinate
     extent = np.maximum.reduceat(np.abs(flat).max(axis=1), begins)
     out = np.full((len(sizes), int(sizes.max()), 2), np.nan)
     out[np.arange(out.shape[1]) < sizes[:, None]] = flat / np.repeat(extent, sizes)[:, None]
@@ -183,14 +198,18 @@ def _ears(flat: Floats, sizes: Ints) -> tuple[Ints, Bools]:
     out = np.zeros((many, max(width - 2, 1), 3), np.int64)
     whole = np.zeros(many, bool)
     number, alive = np.arange(many), np.ones(many, bool)
-    after = np.tile(np.arange(1, width + 1), (many, 1))
-    before = np.tile(np.arange(-1, width - 1), (many, 1))
-    after[number, sizes - 1], before[:, 0] = 0, sizes - 1
-    there = np.arange(width) < sizes[:, None]
+    order = np.argsort(flat[..., 0], axis=1, kind="stable")  # within, corners are numbered from left to right
+    rank = np.argsort(order, axis=1)
+    after, before = np.empty_like(rank), np.empty_like(rank)
+    for step, neighbour in ((1, after), (-1, before)):
+        own = np.arange(width) + step
+        np.put_along_axis(neighbour, rank, np.take_along_axis(rank, own[None] % sizes[:, None], axis=1), axis=1)
+    there = np.take_along_axis(np.arange(width) < sizes[:, None], order, axis=1)
     queue = np.zeros((many, 6 * width), np.int32)
-    queue[:, :width] = np.arange(width)
+    queue[:, :width] = rank
     head, tail, left, patience = np.zeros(many, np.int64), sizes.copy(), sizes.copy(), np.zeros(many, np.int64)
-    x, y = np.ascontiguousarray(flat[..., 0]), np.ascontiguousarray(flat[..., 1])
+    x, y = (np.take_along_axis(flat[..., k], order, axis=1) for k in range(2))
+    keys = _keys(x)
     while len(number):
         row = np.arange(len(number))
         at = queue[row, head].astype(np.int64)
@@ -203,9 +222,17 @@ def _ears(flat: Floats, sizes: Ints) -> tuple[Ints, Bools]:
         if len(look):
             triangle = [each[look, None] for each in (px, py, qx, qy, rx, ry)]
             on = np.where(patience[look] > 0, _ON, -_ON)[:, None]
-            ear[look] = ~_any_inside((x[look], y[look]), there[look], triangle, on)
+            if width > _NARROW:
+                seen = _window(
+                    keys, look, np.minimum(np.minimum(px, qx), rx)[look], np.maximum(np.maximum(px, qx), rx)[look]
+                )
+                points = x.reshape(-1)[seen], y.reshape(-1)[seen], there.reshape(-1)[seen]
+            else:
+                points = x[look], y[look], there[look]
+            ear[look] = ~_any_inside(points, triangle, on)
         cut = np.flatnonzero(ear)
-        out[number[cut], sizes[cut] - left[cut]] = np.stack([p[cut], at[cut], r[cut]], axis=1)
+        corners = [order[number[cut], each[cut]] for each in (p, at, r)]
+        out[number[cut], sizes[cut] - left[cut]] = np.stack(corners, axis=1)
         after[cut, p[cut]], before[cut, r[cut]] = r[cut], p[cut]
         there[cut, at[cut]] = False
         left[cut] -= 1
@@ -224,16 +251,29 @@ def _ears(flat: Floats, sizes: Ints) -> tuple[Ints, Bools]:
             number, sizes, after, before, there, queue, head, tail, left, patience, x, y = (
                 each[alive] for each in (number, sizes, after, before, there, queue, head, tail, left, patience, x, y)
             )
-            alive = np.ones(len(number), bool)
+            alive, keys = np.ones(len(number), bool), _keys(x)
     return out, whole
 
 
-def _any_inside(points: tuple[Floats, Floats], there: Bools, triangle: list[Floats], on: Floats) -> Bools:
-    """(P,) whether one of the points (P, n) that are `there` lies in a triangle, given by the columns of its corners.
+def _keys(x: Floats) -> Floats:
+    """First coordinates (P, n) within -1..1, sorted, as one list that is sorted: those of each polygon lie 3 further on."""
+    return (np.nan_to_num(x, nan=1.5) + 3.0 * np.arange(len(x))[:, None]).reshape(-1)
 
-    A point counts if it is further inside than `on` from all edges, in doubled areas; not one at the place of a corner.
+
+def _window(keys: Floats, polygons: Ints, low: Floats, high: Floats) -> Ints:
+    """(K, widest) where in `_keys` the corners of some polygons lie between two coordinates; the last again for the rest."""
+    first = np.searchsorted(keys, low + 3.0 * polygons - 1e-6)
+    last = np.searchsorted(keys, high + 3.0 * polygons + 1e-6)
+    return np.minimum(first[:, None] + np.arange((last - first).max()), last[:, None] - 1)
+
+
+def _any_inside(points: tuple[Floats, Floats, Bools], triangle: list[Floats], on: Floats) -> Bools:
+    """(P,) whether one of the points (P, n) lies in a triangle, given by the columns of its corners.
+
+    Of each point the coordinates, and whether it counts at all. One counts if it is further inside than `on` from all
+    edges, in doubled areas; not one at the place of a corner.
     """
-    x, y = points
+    x, y, there = points
     px, py, qx, qy, rx, ry = triangle
     inside = there & ((qx - px) * (y - py) - (qy - py) * (x - px) > on)
     inside &= (rx - qx) * (y - qy) - (ry - qy) * (x - qx) > on
