@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,6 +44,10 @@ class Matcher:
     more if they are asked for, which may change the last bits. Afterwards they have their threads back. ``progress`` is
     called with the stage, the name of the shape and the share of the stage that is done (0..1).
 
+    A Matcher can be pickled, for `multiprocessing`, joblib, or the workers of a data loader. Its model is loaded again by
+    its name or folder where the pickle is opened (`ModelError` if it is missing there, or has other weights); ``progress``
+    stays behind.
+
     >>> matcher = meshmatch.Matcher("human")
     >>> fits = [matcher.fit(path) for path in paths]
     >>> maps = {(a, b): matcher.map(fits[a], fits[b]) for a, b in pairs}
@@ -65,6 +70,15 @@ class Matcher:
         self.threads = checked_threads(threads)
         self._asked_threads = threads or 1
         self.progress = progress
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_choosing"} | {"progress": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _choosing=threading.Lock())
+
+    def __repr__(self) -> str:
+        return f"Matcher({self._model.card.name if self._model else AUTO!r})"
 
     @property
     def model(self) -> TrainedModel:

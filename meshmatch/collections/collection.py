@@ -51,6 +51,8 @@ class Collection:
     Fits are read when they are asked for, and some are kept in memory. Of a folder without fits, all but `fit` is an
     `InputError`.
 
+    A Collection can be pickled: the pickle holds the folder and ``workers``, not the fits, and not ``progress``.
+
     >>> collection = meshmatch.Collection("fits")
     >>> collection.fit("scans")
     >>> collection.map("anna", "ben").index
@@ -63,6 +65,16 @@ class Collection:
         self.workers = workers
         self.progress = progress
         self._read = lru_cache(maxsize=_KEPT)(self._load)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"store": self.store, "workers": self.workers, "progress": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._read = lru_cache(maxsize=_KEPT)(self._load)
+
+    def __repr__(self) -> str:
+        return f"Collection({self.store.location!r})"
 
     def fit(
         self,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints, Pickled
 from meshmatch.errors import OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.quick_scipy import cKDTree
@@ -46,7 +46,7 @@ class Reason(str):
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(Pickled):
     """A template moved onto one shape.
 
     Attributes
@@ -90,6 +90,12 @@ class Fit:
     model: str = ""
     trust: float = 1.0
     signs: Signs | None = None
+
+    def __repr__(self) -> str:
+        name = f"{self.repaired.original.name!r}, " if self.repaired else ""
+        part = ", part" if self.partial else ""
+        way = f"up {self.up}, front {self.front}"
+        return f"Fit({name}model {self.model!r}, {self.verdict}, trust {self.trust:.2f}, {way}{part})"
 
     @cached_property
     def vertex_distance(self) -> Floats:

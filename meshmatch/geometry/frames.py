@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Float, Floats, read_only
+from meshmatch.arrays import Brief, Float, Floats, Pickled, read_only
 from meshmatch.errors import InputError
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
+@dataclass(frozen=True, eq=False, repr=False)
+class Frame(Brief, Pickled):
     """A similarity: the way from a file's own coordinates into a model's, and back; for a shape that is known by its
     mirror image, a reflection too."""
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Float, Floats, Floats32, frozen
+from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, frozen
 from meshmatch.errors import InputError
 from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
 from meshmatch.maps.vertex_map import VertexMap
@@ -22,8 +22,8 @@ LOST_CM = 15.0
 """An error above this is a point on the wrong limb; a pair whose mean lies above it is a left-right flip."""
 
 
-@dataclass(frozen=True, eq=False)
-class Errors:
+@dataclass(frozen=True, eq=False, repr=False)
+class Errors(Brief, Pickled):
     """Errors of a map, one for each point whose truth is known: distance between predicted and true point along the
     target's surface, over the square root of its area; as "cm", with the target scaled to 1.9 m2 of skin.
     """

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, as_numbers, frozen
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Pickled, as_numbers, frozen
 from meshmatch.errors import InputError
 from meshmatch.geometry.quick_scipy import csr_array
 from meshmatch.geometry.triangles import interpolate
@@ -26,7 +26,7 @@ _READ_WITH_SHAPES = "read it with load_map(path, source, target)"
 
 
 @dataclass(frozen=True, eq=False)
-class VertexMap:
+class VertexMap(Pickled):
     """A map from every vertex of a source to a target: *index[i] is the vertex of the target matched to
     vertex i of the source.*
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, frozen, read_only
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Pickled, frozen, read_only
 from meshmatch.errors import InputError
 from meshmatch.geometry import triangles
 from meshmatch.geometry.triangles import average_normals, share_areas, squared_lengths, triangle_vectors
@@ -24,7 +24,7 @@ LARGEST = 1e60
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class Shape(Pickled):
     """A triangle mesh, or a point cloud if it has no faces. Valid once built; its arrays are read-only.
 
     `verts` are positions in the file's own frame and unit, always finite; `faces` the corners of each triangle, (0, 3)
