@@ -11,11 +11,12 @@ import os
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from meshmatch.errors import InputError, MeshmatchError, OptionError, needs
 from meshmatch.threads import set_threads
@@ -91,9 +92,10 @@ def _pool(count: int) -> ProcessPoolExecutor:
 
 
 def _begin(parent: int) -> None:
-    """A worker leaves Ctrl-C to its parent, uses one thread, and does not outlive its parent."""
+    """A worker leaves Ctrl-C to its parent, uses one thread, warns in a line, and does not outlive its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     set_threads(1)
+    warnings.formatwarning = _in_a_line
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -101,6 +103,11 @@ def _begin(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def _in_a_line(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> str:
+    """A warning as the command line shows it, without the place in the code."""
+    return f"warning: {message}\n"
 
 
 class Cluster:
