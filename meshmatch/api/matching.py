@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from meshmatch.api.inputs import as_model, check_config, checked_threads, validated
 from meshmatch.api.results import MatchResult, map_of_fits, shape_of
+from meshmatch.arrays import off_torch
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
@@ -163,7 +164,7 @@ class Matcher:
             fits = self._fit_all(clean, configs, begun)
             known = None
             if landmarks is not None:
-                pairs = np.asarray(landmarks[0]), np.asarray(landmarks[1])
+                pairs = np.asarray(off_torch(landmarks[0])), np.asarray(off_torch(landmarks[1]))
                 pulled, known = fits_with_landmarks(self.model, clean, fits, pairs, configs)
                 fits = [self._finished(*each) for each in zip(pulled, clean, configs, strict=True)]
             before = fits[0], fits[1]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Brief, Float, Floats, Pickled, read_only
+from meshmatch.arrays import Brief, Float, Floats, Pickled, off_torch, read_only
 from meshmatch.errors import InputError
 
 
@@ -50,11 +50,11 @@ class Frame(Brief, Pickled):
 
     def apply(self, points: ArrayLike) -> Float[Floats, "... 3"]:
         """Points (..., 3) of the file, in the model's frame: ``((points - center) @ rotation.T) / scale``."""
-        return ((np.asarray(points, np.float64) - self.center) @ self.rotation.T) / self.scale
+        return ((np.asarray(off_torch(points), np.float64) - self.center) @ self.rotation.T) / self.scale
 
     def undo(self, points: ArrayLike) -> Float[Floats, "... 3"]:
         """Points (..., 3) of the model's frame, back in the file's."""
-        return (np.asarray(points, np.float64) * self.scale) @ self.rotation + self.center
+        return (np.asarray(off_torch(points), np.float64) * self.scale) @ self.rotation + self.center
 
     def compose(self, outer: Frame) -> Frame:
         """This frame first, then `outer`: ``self.compose(outer).apply(x) = outer.apply(self.apply(x))``."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, frozen
+from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, frozen, off_torch
 from meshmatch.errors import InputError
 from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
 from meshmatch.maps.vertex_map import VertexMap
@@ -85,7 +85,7 @@ def map_errors(
     `index` (V_source,) is the map; both kinds of points (N,) are vertices, `geodesics` those of the target.
     `InputError` if the lists are no integers, differ in length, or name a vertex that is not there.
     """
-    index, a, b = (np.asarray(ids) for ids in (index, source_points, target_points))
+    index, a, b = (np.asarray(off_torch(ids)) for ids in (index, source_points, target_points))
     for ids in (a, b):
         if ids.dtype.kind not in "iu":
             raise InputError(f"the truth must be numbers of vertices, not {ids.dtype}", "integers, counted from 0")

@@ -54,7 +54,8 @@ class Shape(Pickled):
         if verts.ndim != 2 or verts.shape[1] != 3:
             raise InputError(f"{label}: vertices must be an array of (V, 3), not {verts.shape}")
         if faces.ndim != 2 or faces.shape[1] != 3:
-            raise InputError(f"{label}: faces must be an array of (F, 3), not {faces.shape}")
+            hint = "each names three vertices, from 0"
+            raise InputError(f"{label}: faces must be an array of (F, 3), not {faces.shape}", hint)
         V = len(verts)
         if V == 0:
             raise InputError(f"{label} has no vertices")
