@@ -99,9 +99,11 @@ class Collection:
         are fitted; the fits are those of a run that nobody stopped, bit for bit. ``tell`` is called with the record of
         each shape, as they come in.
 
-        A shape that cannot be read or fitted is a record, and stops nobody. `MeshmatchError`: there is no shape, two have
-        the same name, none could be fitted, or the folder holds fits of another model or made in another way, or is
-        written to by somebody else.
+        A shape that cannot be read or fitted becomes a record, and the others go on. Where no processes can be started, this
+        one does the work, and warns.
+
+        `MeshmatchError`: there is no shape, two have the same name, none could be fitted, or the folder holds fits of
+        another model or made in another way, or is written to by somebody else.
         """
         sources = find_sources(shapes, self.store)
         wish = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without), sequence)

@@ -26,9 +26,9 @@ ReasonCode = Literal[
     "residual", "unreached", "empty", "torn", "crushed", "facing", "unsure", "doubt", "part", "side", "unsupervised"
 ]
 """Template and shape stay apart; some of the shape is not reached; template lies where the shape has no surface;
-neighbours belong far apart; the template is stretched or crushed; the shape faces the other way; the network reads copies
-of the shape differently; no sign alone, but all together; it was taken for a part; its mirror image fits as well; the
-model was learned without correspondence."""
+neighbours belong far apart; the template is stretched or compressed; the shape faces the other way; the network predicts
+other points for tilted and mirrored copies of the shape; no sign alone, but all together; it was taken for a part; its mirror
+image fits as well; the model was learned without correspondence."""
 
 
 class Reason(str):

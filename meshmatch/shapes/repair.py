@@ -19,7 +19,7 @@ from meshmatch.shapes.faces import duplicate_faces, find_parts, flat_faces, seam
 from meshmatch.shapes.noise import without_noise
 from meshmatch.shapes.shape import Shape
 
-_NOT_TRUSTED = "of weight 0 left out"
+_NOT_TRUSTED = "left out, as was asked for (weight 0)"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
