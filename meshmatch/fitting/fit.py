@@ -27,8 +27,8 @@ ReasonCode = Literal[
 ]
 """Template and shape stay apart; some of the shape is not reached; template lies where the shape has no surface;
 neighbours belong far apart; the template is stretched or compressed; the shape faces the other way; the network predicts
-other points for tilted and mirrored copies of the shape; no sign alone, but all together; it was taken for a part; its mirror
-image fits as well; the model was learned without correspondence."""
+other points for tilted and mirrored copies of the shape; no sign alone, but all together; it was taken for a part; its
+mirror image fits as well; the model was learned without correspondence."""
 
 
 class Reason(str):
