@@ -129,9 +129,9 @@ class Matcher:
     def map(self, source: Fit, target: Fit, *, agree: bool = True) -> VertexMap:
         """The map from the shape of one fit to the shape of another, both of the same model.
 
-        With ``agree`` both fits first agree on how the template stretches, as `match` does: the more accurate map, and
-        a confidence that knows where they disagreed. Without it they are only composed: a tenth of a second instead of
-        some seconds. `OptionError` for a fit of another template, or one that does not know its shape.
+        With ``agree`` both fits are first refined together, so that the template stretches alike, as `match` does: the more
+        accurate map, and a confidence that knows where they disagreed. Without it they are only composed, in a tenth of the
+        time. `OptionError` for a fit of another template, or one that does not know its shape.
         """
         with thread_limit(1):
             for fit in (source, target):

@@ -133,7 +133,7 @@ def register(
     dense: bool = Option(False, "--dense", help="Write the template in its full resolution."),
     picture: Path | None = optional("PNG", "Draw the template over the shape, colored by distance."),
 ) -> None:
-    """Fit the model's template to one shape.
+    """Fit the model's template to one shape (a non-rigid registration; the shape itself is not moved).
 
     Results for all shapes have the same vertices and triangles in the same order. More than one of --threads may change
     the last bits.
