@@ -75,12 +75,12 @@ class Processes:
                         result = done.result()
                         yield in_flight.pop(done), result
             except BrokenProcessPool:
-                if self._pool is not None and self._pool.has_worked:
+                self.close()
+                if _processes_work(_needs_main(task, items)):
                     suspects += in_flight.values()
                 else:
                     waiting += in_flight.values()
                     self._work_here("processes that were started ended at once")
-                self.close()
             except CannotStart as error:
                 waiting += in_flight.values()
                 self._work_here(str(error))
@@ -125,20 +125,23 @@ class _Pool:
         with _starting():
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(count, context, _begin, (os.getpid(),))
-        self._first = self.submit(os.getpid)
 
     def submit(self, task: Callable[..., Result], *items: Any) -> Future[Result]:
         """A future of the task's result for an item. The processes are started here, whenever one is missing."""
         with _starting(), nullcontext() if self._needs_main else _hidden_main():
             return self._pool.submit(task, *items)
 
-    @property
-    def has_worked(self) -> bool:
-        """Whether a process has done anything."""
-        return self._first.done() and not self._first.cancelled() and self._first.exception() is None
-
     def close(self) -> None:
         self._pool.shutdown(cancel_futures=True)
+
+
+def _processes_work(needs_main: bool) -> bool:
+    """Whether a process that is given next to nothing to do can do it."""
+    try:
+        with closing(_Pool(1, needs_main)) as pool:
+            return pool.submit(os.getpid).result() > 0
+    except (BrokenProcessPool, CannotStart):
+        return False
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Pickled, frozen, read_only
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Pickled, frozen, off_torch, read_only
 from meshmatch.errors import InputError
 from meshmatch.geometry import triangles
 from meshmatch.geometry.triangles import average_normals, share_areas, squared_lengths, triangle_vectors
@@ -47,7 +47,8 @@ class Shape(Pickled):
     def __post_init__(self) -> None:
         label = self.name or "the shape"
         verts = read_only(self.verts, np.float64, label)
-        faces = np.empty((0, 3), np.int64) if self.faces is None or np.size(self.faces) == 0 else self.faces
+        faces = off_torch(self.faces)
+        faces = np.empty((0, 3), np.int64) if faces is None or np.size(faces) == 0 else faces
         if np.asarray(faces).dtype.kind not in "iu":
             raise InputError(f"{label}: faces must be integers, not {np.asarray(faces).dtype}")
         faces = read_only(faces, np.int64, label)
