@@ -133,10 +133,10 @@ def register(
     dense: bool = Option(False, "--dense", help="Write the template in its full resolution."),
     picture: Path | None = optional("PNG", "Draw the template over the shape, colored by distance."),
 ) -> None:
-    """Fit the model's template to one shape (a non-rigid registration; the shape itself is not moved).
+    """Fit the model's template to one shape.
 
-    Results for all shapes have the same vertices and triangles in the same order. More than one of --threads may change
-    the last bits.
+    This is a non-rigid registration: the template is deformed, and the shape stays where it is. Results for all
+    shapes have the same vertices and triangles in the same order. More than one of --threads may change the last bits.
     """
     from meshmatch.shapes.files import check_suffix
 
