@@ -169,7 +169,7 @@ def _hidden_main() -> Iterator[None]:
     """Inside, a process that is spawned finds no program to run again."""
     main = vars(sys.modules["__main__"])
     with _hiding:
-        kept = {name: main[name] for name in ("__spec__", "__file__") if name in main}
+        kept: dict[str, Any] = {name: main[name] for name in ("__spec__", "__file__") if name in main}
         main.pop("__file__", None)
         main["__spec__"] = None
         try:

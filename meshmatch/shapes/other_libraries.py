@@ -171,7 +171,7 @@ def _faces(source: Any, label: str) -> Any:
             hint = "pass its .triangulate()" if name == "strips" else _SURFACE
             raise InputError(f"{label} connects its points by .{name}, which is not read", hint)
     vtk = type(getattr(source, "dataset", None)).__name__  # of vedo
-    if (faces is None and getattr(source, "n_cells", 0)) or vtk not in ("NoneType", "vtkPolyData"):
+    if (faces is None and getattr(source, "n_cells", None)) or vtk not in ("NoneType", "vtkPolyData"):
         raise InputError(f"{label} is a grid, not a surface", "pass its surface, such as .extract_surface()")
     return None
 
