@@ -29,9 +29,9 @@ from meshmatch.threads import beside
 _PEOPLE = "human"
 _NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before the others; how many models at a time
 _MOST_READ = 40  # files of a folder whose kind is found out
-_NAME_IT = "name the model with --model (model=...) if that is wrong"
+_NAME_IT = "name the model (--model NAME, in Python model=NAME) if that is wrong"
 _LEAVE_OUT = "--without leaves out what is no part of it"
-_NONE = f"if it is of one of them, name its model with --model (model=...); {_LEAVE_OUT}"
+_NONE = f"if it is one of these all the same, name the model (--model NAME, in Python model=NAME); {_LEAVE_OUT}"
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ def tell_kinds(
     for shape, config, each in zip(shapes, configs, found, strict=True):
         if each.kind is None and not shape.is_cloud and not may_show_part(shape, config):
             names = ", ".join(sorted({model.card.category for model in models}))
-            problem = f"{shape.name} is of no kind that the installed models know: {names}"
+            problem = f"{shape.name} does not look like anything that the installed models know: {names}"
             raise InputError(problem, _NONE)
     return found
 
@@ -241,7 +241,7 @@ def kinds_of(
         best = int(readings.argmin())
         found[name] = models[best].card.category if readings[best] <= FAMILIAR else None
         if progress is not None:
-            progress("kinds read", "shapes", (number + 1) / len(read))
+            progress("looking for known kinds", "shapes", (number + 1) / len(read))
     return found
 
 

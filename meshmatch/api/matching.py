@@ -8,12 +8,14 @@ from collections.abc import Sequence
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch.api.inputs import as_model, check_config, checked_threads, validated
 from meshmatch.api.results import MatchResult, map_of_fits, shape_of
+from meshmatch.arrays import off_torch
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
@@ -43,6 +45,10 @@ class Matcher:
     more if they are asked for, which may change the last bits. Afterwards they have their threads back. ``progress`` is
     called with the stage, the name of the shape and the share of the stage that is done (0..1).
 
+    A Matcher can be pickled, for `multiprocessing`, joblib, or the workers of a data loader. Its model is loaded again by
+    its name or folder where the pickle is opened (`ModelError` if it is missing there, or has other weights); ``progress``
+    stays behind.
+
     >>> matcher = meshmatch.Matcher("human")
     >>> fits = [matcher.fit(path) for path in paths]
     >>> maps = {(a, b): matcher.map(fits[a], fits[b]) for a, b in pairs}
@@ -65,6 +71,15 @@ class Matcher:
         self.threads = checked_threads(threads)
         self._asked_threads = threads or 1
         self.progress = progress
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_choosing"} | {"progress": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _choosing=threading.Lock())
+
+    def __repr__(self) -> str:
+        return f"Matcher({self._model.card.name if self._model else AUTO!r})"
 
     @property
     def model(self) -> TrainedModel:
@@ -114,9 +129,9 @@ class Matcher:
     def map(self, source: Fit, target: Fit, *, agree: bool = True) -> VertexMap:
         """The map from the shape of one fit to the shape of another, both of the same model.
 
-        With ``agree`` both fits first agree on how the template stretches, as `match` does: the more accurate map, and
-        a confidence that knows where they disagreed. Without it they are only composed: a tenth of a second instead of
-        some seconds. `OptionError` for a fit of another template, or one that does not know its shape.
+        With ``agree`` both fits are first refined together, so that the template stretches alike, as `match` does: the more
+        accurate map, and a confidence that knows where they disagreed. Without it they are only composed, in a tenth of the
+        time. `OptionError` for a fit of another template, or one that does not know its shape.
         """
         with thread_limit(1):
             for fit in (source, target):
@@ -149,7 +164,7 @@ class Matcher:
             fits = self._fit_all(clean, configs, begun)
             known = None
             if landmarks is not None:
-                pairs = np.asarray(landmarks[0]), np.asarray(landmarks[1])
+                pairs = np.asarray(off_torch(landmarks[0])), np.asarray(off_torch(landmarks[1]))
                 pulled, known = fits_with_landmarks(self.model, clean, fits, pairs, configs)
                 fits = [self._finished(*each) for each in zip(pulled, clean, configs, strict=True)]
             before = fits[0], fits[1]

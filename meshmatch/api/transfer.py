@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from meshmatch.api.results import ConfidenceRule, MapPair, MatchResult, Transferred
-from meshmatch.arrays import Floats, as_numbers
+from meshmatch.arrays import Floats, as_numbers, off_torch
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
@@ -252,7 +252,12 @@ def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape) -> 
         return landmarks
     if isinstance(landmarks, str | Path):
         return load_landmarks(landmarks, source)[0]
-    places = np.asarray(landmarks)
+    try:
+        places = np.asarray(off_torch(landmarks))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"landmarks are no array of numbers ({error})", "give vertices (N,) or positions (N, 3)"
+        ) from error
     if places.ndim == 1 and places.dtype.kind in "iu":
         return at_vertices(source, places)
     if places.ndim == 2 and places.shape[1] == 3 and places.dtype.kind in "iuf":

@@ -14,7 +14,7 @@ def info(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A shape, a map or a template bundle.")],
     json: options.Json = False,
 ) -> None:
-    """Say what is in a file.
+    """Describe a file: a shape, a map or a template.
 
     Of a shape also what repair would do. Nothing is written.
     """

@@ -40,7 +40,7 @@ Truth = Annotated[
     Path | None,
     Option(
         metavar="FILE",
-        help="True pairs, a source vertex and a target vertex a line (.txt .csv .npy); or one column: the "
+        help="True pairs, a source vertex and a target vertex a line (.txt, .csv or .npy); or one column: the "
         "target vertex of every source vertex.",
     ),
 ]

@@ -32,16 +32,18 @@ class PictureOptions:
     confidence: bool = Option(False, "--confidence", help="With --map: its confidence, as a color map.")
     truth: options.Truth = None
     points: options.Points = None
-    unit: options.ErrorUnit = Option("cm", help="Of errors: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100.")
+    unit: options.ErrorUnit = Option(
+        "cm", help="Of errors: cm on a person (1.9 m2 of skin), or 1/100 of sqrt(area) of the target."
+    )
     values: list[Path] | None = options.optional(
-        "FILE", "A number per vertex, as a color map (.npy .csv); or three, as a color. Once for each shape."
+        "FILE", "A number per vertex, as a color map (.npy or .csv); or three, as a color. Once for each shape."
     )
     title: str | None = options.optional("TEXT", "What the numbers of --values are, with their unit.")
     range: tuple[float, float] | None = options.optional(
         "LOW HIGH", "Ends of the scale of a heat; chosen if not given."
     )
     labels: list[Path] | None = options.optional(
-        "FILE", "A label for each vertex or face (.npy .csv .txt .json). Once for each shape."
+        "FILE", "A label for each vertex or face (.npy, .csv, .txt or .json). Once for each shape."
     )
     on: Literal["vertices", "faces"] | None = Option(
         None, help="What the labels belong to; told by their count if not given."

@@ -20,13 +20,14 @@ def transfer_color(
     source: Source,
     target: Target,
     output: Path = output_option(
-        "FILE", "TGT with colors: .ply .glb .obj .off, or the colors alone: .npy .csv. With --values: .npy .csv .ply."
+        "FILE",
+        "TGT with colors (.ply, .glb, .obj or .off), or colors alone (.npy or .csv). With --values: .npy, .csv or .ply.",
     ),
     maps: MapOptions,
     rules: RuleOptions,
     run: RunOptions,
     values: Path | None = optional(
-        "FILE", "Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colors."
+        "FILE", "Transfer these numbers, a row per vertex of SRC (.npy or .csv), not its colors."
     ),
     directions: bool = Option(
         False,
@@ -81,9 +82,9 @@ def transfer_labels(
     *,
     source: Source,
     target: Target,
-    output: Path = output_option("FILE", "Labels: .npy .csv .txt .json, or TGT as .ply."),
+    output: Path = output_option("FILE", "Labels: .npy, .csv, .txt or .json, or TGT as .ply."),
     labels: Path = Option(
-        ..., metavar="FILE", help="A whole number or a word per vertex or face of SRC: .npy .csv .txt .json."
+        ..., metavar="FILE", help="A whole number or a word per vertex or face of SRC: .npy, .csv, .txt or .json."
     ),
     maps: MapOptions,
     rules: RuleOptions,
@@ -131,10 +132,10 @@ def transfer_weights(
     *,
     source: Source,
     target: Target,
-    output: Path = output_option("FILE", "Skin weights of TGT: .npz .json."),
+    output: Path = output_option("FILE", "Skin weights of TGT: .npz or .json."),
     maps: MapOptions,
     run: RunOptions,
-    weights: Path | None = optional("FILE", "Skin weights of SRC: .npz .json .glb. Default: the skin in SRC."),
+    weights: Path | None = optional("FILE", "Skin weights of SRC: .npz, .json or .glb. Default: the skin in SRC."),
     influences: int = Option(4, min=1, help="Maximum number of joints per vertex."),
     fill: bool = Option(False, "--fill", help="Replace weights of low confidence by those of their neighbours."),
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for weights to be trusted."),
@@ -180,12 +181,12 @@ def transfer_landmarks(
     *,
     source: Source,
     target: Target,
-    output: Path = output_option("FILE", "Landmarks of TGT: .csv .json .pp."),
+    output: Path = output_option("FILE", "Landmarks of TGT: .csv, .json or .pp."),
     landmarks: Path = Option(
         ...,
         "--landmarks",
         metavar="FILE",
-        help="Landmarks of SRC, as vertices or positions: .csv .json, MeshLab's .pp, or .txt .npy of vertices.",
+        help="Landmarks of SRC, as vertices or positions: .csv or .json, MeshLab's .pp, or .txt or .npy of vertices.",
     ),
     maps: MapOptionsWithPairs,
     run: RunOptions,

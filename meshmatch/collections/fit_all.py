@@ -113,7 +113,7 @@ class _Run:
             before = [self._last(chain[:turn], found) for chain in chains if turn < len(chain)]
             places = zip(numbers, before, strict=True)
             tasks = [FitTask(self.setting, self.sources[number], last, folder) for number, last in places]
-            for at, result in self._each(fit_alone, tasks, "fitting" if folder == ALONE else "fitting one to all"):
+            for at, result in self._each(fit_alone, tasks, "fitting" if folder == ALONE else "choosing the template"):
                 source = self.sources[numbers[at]]
                 if isinstance(result, Died):
                     result = Record(source.name, source.path, reasons=result.message)

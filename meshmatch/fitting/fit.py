@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints, Pickled
 from meshmatch.errors import OptionError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.quick_scipy import cKDTree
@@ -26,9 +26,9 @@ ReasonCode = Literal[
     "residual", "unreached", "empty", "torn", "crushed", "facing", "unsure", "doubt", "part", "side", "unsupervised"
 ]
 """Template and shape stay apart; some of the shape is not reached; template lies where the shape has no surface;
-neighbours belong far apart; the template is stretched or crushed; the shape faces the other way; the network reads copies
-of the shape differently; no sign alone, but all together; it was taken for a part; its mirror image fits as well; the
-model was learned without correspondence."""
+neighbours belong far apart; the template is stretched or compressed; the shape faces the other way; the network predicts
+other points for tilted and mirrored copies of the shape; no sign alone, but all together; it was taken for a part; its
+mirror image fits as well; the model was learned without correspondence."""
 
 
 class Reason(str):
@@ -46,7 +46,7 @@ class Reason(str):
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(Pickled):
     """A template moved onto one shape.
 
     Attributes
@@ -90,6 +90,12 @@ class Fit:
     model: str = ""
     trust: float = 1.0
     signs: Signs | None = None
+
+    def __repr__(self) -> str:
+        name = f"{self.repaired.original.name!r}, " if self.repaired else ""
+        part = ", part" if self.partial else ""
+        way = f"up {self.up}, front {self.front}"
+        return f"Fit({name}model {self.model!r}, {self.verdict}, trust {self.trust:.2f}, {way}{part})"
 
     @cached_property
     def vertex_distance(self) -> Floats:

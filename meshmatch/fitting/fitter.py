@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints, off_torch
 from meshmatch.errors import OptionError
 from meshmatch.fitting.candidates import fit_part, fit_whole
 from meshmatch.fitting.fit import Fit, Reason, Verdict, axis_name
@@ -208,7 +208,7 @@ def landmark_places(clean: Sequence[Repaired], landmarks: Sequence[ArrayLike]) -
         raise OptionError(f"landmarks must be two lists of vertices, not {len(landmarks)}", _HINT)
     places = []
     for part, vertices in zip(clean, landmarks, strict=True):
-        chosen, V = np.asarray(vertices), len(part.original_to_repaired)
+        chosen, V = np.asarray(off_torch(vertices)), len(part.original_to_repaired)
         if chosen.ndim != 1 or len(chosen) == 0 or chosen.dtype.kind not in "iu" or chosen.min() < 0:
             raise OptionError("landmarks must be lists of vertex numbers", _HINT)
         if chosen.max() >= V:

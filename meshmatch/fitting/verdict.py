@@ -20,6 +20,7 @@ _GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
 _HIDDEN = 0.6  # share of the template: of a part that shows less than the rest, such as a leg, too little can be told
 # A stretch of the template from which on no fit is good, and from which on it is poor. Set by hand.
 _CRUSHED, _FLAT = 1.0, 2.0
+_SKIN = 1.9  # square metres of an adult's skin
 # A residual (units of sqrt(area)) from which on a fit may be one of a part, and the search for parts goes on. Set by hand.
 FAIR_RESIDUAL = 0.031
 
@@ -92,9 +93,9 @@ def _reasons(signs: Signs) -> list[Reason]:
     """Signs that speak against the fit."""
     unreached = f"{100 * signs.missed:.0f} % of the shape is not reached by the template"
     empty = f"{100 * signs.empty:.0f} % of the template lies where the shape has no surface"
-    crushed = f"the template is stretched or crushed {np.exp(signs.stretch):.1f} times on average"
+    crushed = f"the template had to be stretched or compressed {np.exp(signs.stretch):.1f}-fold on average"
     facing = f"{100 * signs.against:.0f} % of the shape faces the other way than the template"
-    unsure = f"what the network reads in copies of the shape is {100 * signs.spread:.0f} % of sqrt(area) from the fit"
+    unsure = f"what the network predicts for tilted and mirrored copies is {100 * signs.spread:.0f} % of sqrt(area) off"
     told: list[tuple[bool, ReasonCode, str]] = [
         (signs.residual > 0.0285, "residual", _gap(signs.residual)),
         (signs.missed > _GOOD_SHARE, "unreached", unreached),
@@ -108,4 +109,5 @@ def _reasons(signs: Signs) -> list[Reason]:
 
 
 def _gap(residual: float) -> str:
-    return f"template and shape stay {100 * residual:.1f} % of sqrt(area) apart on average"
+    on_a_person = 100 * np.sqrt(_SKIN) * residual
+    return f"template and shape are {100 * residual:.1f} % of sqrt(area) apart on average ({on_a_person:.1f} cm on a person)"

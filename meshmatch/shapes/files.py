@@ -16,12 +16,13 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Float, Floats, off_torch
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, plain_text, replace_on_success
 from meshmatch.shapes.colors import INVISIBLE
 from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, off, plain, ply, stl
 from meshmatch.shapes.input_files import existing, read_bytes
+from meshmatch.shapes.other_libraries import HINT, arrays_of, as_faces
 from meshmatch.shapes.shape import Shape
 
 _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], None] | None]] = {
@@ -38,7 +39,6 @@ _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], 
 _WRITERS = {suffix: write for suffix, (_, write) in _FORMATS.items() if write is not None}
 SUFFIXES = tuple(_FORMATS)
 """The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf and .pcd."""
-_HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
 
 
 def load_shape(path: str | Path, *, only: str | Sequence[str] = (), without: str | Sequence[str] = ()) -> Shape:
@@ -171,56 +171,84 @@ class HasVertices(Protocol):
     def vertices(self) -> ArrayLike: ...
 
 
-ShapeLike: TypeAlias = Shape | str | Path | NDArray[np.generic] | tuple[ArrayLike, ArrayLike] | HasVertices
-"""A shape; its file; points (N, 3); vertices and faces, ((V, 3), (F, 3)); or an object with ``vertices``."""
+@runtime_checkable
+class HasPoints(Protocol):
+    """A mesh or a point cloud of a library that calls its vertices ``points``."""
+
+    @property
+    def points(self) -> ArrayLike: ...
+
+
+ShapeLike: TypeAlias = Shape | str | Path | NDArray[np.generic] | tuple[ArrayLike, ArrayLike] | HasVertices | HasPoints
+"""A shape; its file; points (N, 3); vertices and faces, ((V, 3), (F, 3)); or an object of another library."""
 
 
 def as_shape(source: ShapeLike, name: str = "") -> Shape:
     """The shape that is meant: a `Shape` as it is, a file read, everything else copied.
 
-    Of an object, ``vertices`` are taken and, unless it is a cloud, ``faces`` (trimesh) or ``triangles`` (Open3D); and
-    vertex colors of a `trimesh.Trimesh`. `name` is for messages, where the source has none of its own.
+    Read are meshes and clouds of trimesh (its scenes as one shape, each mesh where its node puts it), Open3D, vedo, PyVista,
+    meshio, PyMeshLab and PyTorch3D (one at a time), and other objects with ``vertices`` or ``points`` and ``faces`` or
+    ``triangles``; with vertex colors of trimesh and Open3D. Polygons become fans of triangles. Tensors of torch are copied
+    from whatever device they are on, without their gradient; masked values are invalid positions. Faces may be floats if
+    they are whole numbers. What connects its points in another way (volumes, lines, strips) is refused, and never taken
+    for a cloud. `name` is for messages, where the source has none of its own.
+
     `InputError`: the file cannot be read, or the source is none of these.
     """
     if isinstance(source, Shape):
         return source
     if isinstance(source, str | os.PathLike):
         return load_shape(os.fspath(source))
-    if isinstance(source, HasVertices):
-        faces = getattr(source, "faces", getattr(source, "triangles", None))
-        visual: Any = getattr(source, "visual", None)
-        painted = getattr(visual, "kind", None) == "vertex" and len(visual.vertex_colors)  # none: a cloud of trimesh's
-        colors = np.asarray(visual.vertex_colors, np.float64) / 255.0 if painted else None
-        return _from_arrays(source.vertices, faces, name, colors)
+    found = None if isinstance(source, np.ndarray | tuple | list) else arrays_of(source, name)
+    if found is not None:
+        return _from_arrays(found.verts, found.faces, name, found.colors)
     if isinstance(source, tuple | list) and len(source) == 2 and _is_table(source[0]):
-        return _from_arrays(source[0], source[1], name)
+        return _from_arrays(source[0], as_faces(source[1], name or "the shape"), name)
     if hasattr(source, "__array__") or isinstance(source, tuple | list):
         return _from_arrays(source, None, name)
-    raise InputError(f"cannot make a shape of {type(source).__name__}", _HINT)
+    raise InputError(f"cannot make a shape of {type(source).__name__}", HINT)
 
 
 def as_shapes(sources: Sequence[ShapeLike]) -> list[Shape]:
     """The shapes that are meant, see `as_shape`; `InputError` also for a single shape instead of a list."""
-    if isinstance(sources, str | os.PathLike | Shape | HasVertices) or not isinstance(sources, Iterable):
+    single = isinstance(sources, str | os.PathLike | Shape | HasVertices | HasPoints)
+    if single or not isinstance(sources, Iterable):
         raise InputError(f"expected a list of shapes, not {type(sources).__name__}", "write [shape]")
-    if isinstance(sources, tuple) and len(sources) == 2 and np.asarray(sources[1]).dtype.kind in "iu":
+    if isinstance(sources, tuple) and len(sources) == 2 and _are_whole(sources[1]):
         raise InputError("expected a list of shapes, not one mesh", "write [(vertices, faces)]")
     return [as_shape(source) for source in sources]
 
 
 def _is_table(values: Any) -> bool:
     try:
-        return np.ndim(values) == 2
-    except ValueError:  # rows of different lengths
+        return np.ndim(off_torch(values)) == 2
+    except (TypeError, ValueError):  # rows of different lengths
+        return False
+
+
+def _are_whole(values: Any) -> bool:
+    try:
+        return np.asarray(off_torch(values)).dtype.kind in "iu"
+    except (TypeError, ValueError):
         return False
 
 
 def _from_arrays(verts: Any, faces: Any, name: str, colors: Any = None) -> Shape:
+    label = name or "the shape"
     try:
-        verts = np.array(verts, np.float64)
-        faces = NO_FACES if faces is None else np.asarray(faces)
+        verts = np.ma.asanyarray(verts) if isinstance(verts, np.ma.MaskedArray) else np.asarray(off_torch(verts))
+        if verts.dtype.kind == "c":
+            raise TypeError("complex ones have two parts")
+        verts = verts.astype(np.float64)  # a copy
+        if isinstance(verts, np.ma.MaskedArray):
+            verts = verts.filled(np.nan)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name or 'the shape'}: not an array of numbers ({error})", _HINT) from error
+        raise InputError(f"{label}: not an array of numbers ({error})", HINT) from error
+    if verts.ndim == 3 and verts.shape[2] == 3:
+        raise InputError(f"{label}: vertices are a batch of {verts.shape}, not (V, 3)", "pass one of them: vertices[0]")
     if verts.ndim != 2 or verts.shape[1] != 3:
-        raise InputError(f"{name or 'the shape'}: vertices must be an array of (V, 3), not {verts.shape}", _HINT)
-    return Shape.with_invalid(verts, faces, name, colors)
+        raise InputError(f"{label}: vertices must be an array of (V, 3), not {verts.shape}", HINT)
+    faces = NO_FACES if faces is None else faces
+    if len(faces) and np.min(faces) == 1 and np.max(faces) == len(verts):
+        raise InputError(f"{label}: faces count vertices from 1 to {len(verts)}", "subtract 1: the first vertex is 0")
+    return Shape.with_invalid(np.array(verts), faces, name, colors)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Bools, Float, Floats, Int, Ints
+from meshmatch.arrays import Bools, Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
@@ -19,11 +19,11 @@ from meshmatch.shapes.faces import duplicate_faces, find_parts, flat_faces, seam
 from meshmatch.shapes.noise import without_noise
 from meshmatch.shapes.shape import Shape
 
-_NOT_TRUSTED = "of weight 0 left out"
+_NOT_TRUSTED = "left out, as was asked for (weight 0)"
 
 
-@dataclass(frozen=True, eq=False)
-class Repaired:
+@dataclass(frozen=True, eq=False, repr=False)
+class Repaired(Brief):
     """A shape that is fit for work, and how it relates to the one that it came from.
 
     All vertices of `shape` are valid and, in a mesh, used by a face; they are where they were, unless noise was smoothed.

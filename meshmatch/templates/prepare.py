@@ -87,7 +87,7 @@ def prepare(
             raise OptionError("labels are of one shape, not of a folder", "name the shape itself")
         if output.is_dir() and output.samefile(shapes):
             raise OptionError(f"cannot prepare {shapes} into itself", "choose another folder with -o")
-        return _prepare_folder(shapes, output, config, Progress(progress, shapes.name).stage("checked"))
+        return _prepare_folder(shapes, output, config, Progress(progress, shapes.name).stage("checking and aligning"))
     for name in ("template", "align", "landmarks"):
         if getattr(config, name) is not None:
             raise OptionError(f"{name} goes with a folder of shapes", "one shape is its own template")

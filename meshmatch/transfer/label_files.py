@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.arrays import Int, Ints
+from meshmatch.arrays import Brief, Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
@@ -30,8 +30,8 @@ check_labels_suffix = partial(table_files.check_suffix, suffixes=LABEL_SUFFIXES,
 _HINT = "one label for each vertex or triangle of the source, in the order of its file; polygons are fans of triangles"
 
 
-@dataclass(frozen=True, eq=False)
-class Labels:
+@dataclass(frozen=True, eq=False, repr=False)
+class Labels(Brief):
     """Which label each vertex or face has."""
 
     codes: Int[Ints, " N"]  # a place in `names`; -1 for none

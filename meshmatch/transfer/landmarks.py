@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps import table_files
@@ -35,8 +35,8 @@ _Record = dict[str, Any]
 _HINT = "a row each: name,vertex or name,x,y,z; or MeshLab's .pp, or .json"
 
 
-@dataclass(frozen=True, eq=False)
-class Landmarks:
+@dataclass(frozen=True, eq=False, repr=False)
+class Landmarks(Brief):
     """Named points on a shape, in its own frame and unit."""
 
     names: tuple[str, ...]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array, issparse
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Brief, Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
@@ -169,8 +169,8 @@ def save_colors(path: Path, shape: Shape, colors: Float[Floats, "V 4"]) -> None:
         save_shape(path, Shape(shape.verts, shape.faces, shape.name, colors, shape.invalid))
 
 
-@dataclass(frozen=True, eq=False)
-class SkinWeights:
+@dataclass(frozen=True, eq=False, repr=False)
+class SkinWeights(Brief):
     """How much each joint moves each vertex."""
 
     matrix: csr_array  # (V, J), not negative; rows sum to 1, or to 0 for a vertex that nothing moves

@@ -82,7 +82,7 @@ def test_later_shapes_are_of_the_kind_before(models: list[TrainedModel]) -> None
 
 @pytest.mark.usefixtures("models")
 def test_a_complete_shape_of_no_kind_is_refused() -> None:
-    with pytest.raises(InputError, match=r"chair 7 7 6 is of no kind .*: human, quadruped"):
+    with pytest.raises(InputError, match=r"chair 7 7 6 does not look like .*: human, quadruped"):
         choose(ball("man 3 4 6"), ball("chair 7 7 6"))
 
 
@@ -129,9 +129,9 @@ def test_what_reads_strangely_is_of_the_kind_that_fits_it(monkeypatch: pytest.Mo
     fit = Matcher().fit(strange)
     assert fit.verdict == "good" and fit.repaired is not None
     for words in ("robot 7 7.1 7.2", "robot 7 7.1 5.5"):  # too strange; and no animal
-        with pytest.raises(InputError, match="is of no kind"):
+        with pytest.raises(InputError, match="does not look like"):
             choose(Shape(dancer.verts, dancer.faces, words))
-    with pytest.raises(InputError, match="is of no kind"):  # read like a body, or nearly, but nothing fits it
+    with pytest.raises(InputError, match="does not look like"):  # read like a body, or nearly, but nothing fits it
         choose(ball("aeroplane 4.7 4.8 7"))
 
 
@@ -215,7 +215,7 @@ def test_hands_and_heads_are_told_apart() -> None:
 
 def test_a_ring_is_of_no_kind() -> None:
     ring = trimesh.creation.torus(1.0, 0.3)
-    with pytest.raises(InputError, match="ring is of no kind"):
+    with pytest.raises(InputError, match="ring does not look like"):
         meshmatch.register(Shape(ring.vertices, ring.faces, "ring"))
 
 
