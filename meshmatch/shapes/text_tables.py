@@ -27,9 +27,27 @@ from meshmatch.shapes.input_files import check_memory, read_text
 
 DECIMAL_COMMA = "for a decimal comma: put semicolons or tabs between the cells (0,5;1,25), or write points (0.5)"
 _MISSING = frozenset(
-    ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "#n/a", "#num!", "#div/0!", "#value!", "#ref!", "#name?")
-    + ("1.#qnan", "1.#ind", "-1.#ind", "1.#snan", "nan(ind)", "-nan(ind)")
-)
+    [
+        "na",
+        "n/a",
+        "nan",
+        "-nan",
+        "+nan",
+        "null",
+        "none",
+        "#n/a",
+        "#num!",
+        "#div/0!",
+        "#value!",
+        "#ref!",
+        "#name?",
+        "1.#qnan",
+        "1.#ind",
+        "-1.#ind",
+        "nan(ind)",
+        "-nan(ind)",
+    ]
+) | {""}
 _SIGN = "[+\N{MINUS SIGN}-]?"  # some locales write the mathematical sign
 _EXPONENT = "(?:[eE][+-]?[0-9]+)?"
 _NUMBER = re.compile(rf"{_SIGN}(?:[0-9]+\.?[0-9]*|[0-9]+,[0-9]+|[.,][0-9]+){_EXPONENT}")
@@ -126,9 +144,9 @@ class Table:
         if not rows:
             return []
         first, others = len(rows[0]), {len(row) for row in rows[1:]} or {len(rows[0])}
-        if len(others) == 1 and (width := others.pop()) > 1:
-            if not any(row[-1] for row in rows[1:]) and (first < width or not rows[0][-1]):
-                rows = [row[: width - 1] for row in rows]
+        is_even = len(others) == 1 and (width := others.pop()) > 1
+        if is_even and not any(row[-1] for row in rows[1:]) and (first < width or not rows[0][-1]):
+            rows = [row[: width - 1] for row in rows]
         self._check_widths(rows)
         return rows
 
