@@ -2,8 +2,8 @@
 mark is a point or a comma, which cells are missing.
 
 A decimal comma is read where something else separates the cells (``0,5;1,25``, also a tab or spaces), where it is in
-quotes, and in a single column whose digits are no second column of whole numbers. Where both could be meant, readers refuse the
-table and say so.
+quotes, and in a single column whose digits are no second column of whole numbers. Where both could be meant, readers
+refuse the table and say so.
 """
 
 from __future__ import annotations
@@ -26,28 +26,10 @@ from meshmatch.errors import InputError
 from meshmatch.shapes.input_files import check_memory, read_text
 
 DECIMAL_COMMA = "for a decimal comma: put semicolons or tabs between the cells (0,5;1,25), or write points (0.5)"
-_MISSING = frozenset(
-    [
-        "na",
-        "n/a",
-        "nan",
-        "-nan",
-        "+nan",
-        "null",
-        "none",
-        "#n/a",
-        "#num!",
-        "#div/0!",
-        "#value!",
-        "#ref!",
-        "#name?",
-        "1.#qnan",
-        "1.#ind",
-        "-1.#ind",
-        "nan(ind)",
-        "-nan(ind)",
-    ]
-) | {""}
+_WORDS = (
+    "na n/a nan -nan +nan null none #n/a #num! #div/0! #value! #ref! #name? 1.#qnan 1.#ind -1.#ind nan(ind) -nan(ind)"
+)
+_MISSING = frozenset((*_WORDS.split(), ""))
 _SIGN = "[+\N{MINUS SIGN}-]?"  # some locales write the mathematical sign
 _EXPONENT = "(?:[eE][+-]?[0-9]+)?"
 _NUMBER = re.compile(rf"{_SIGN}(?:[0-9]+\.?[0-9]*|[0-9]+,[0-9]+|[.,][0-9]+){_EXPONENT}")
