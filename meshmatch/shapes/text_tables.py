@@ -42,6 +42,7 @@ _TO_THE_END = re.compile(rf"{_COMMENT}.*$", re.MULTILINE)
 # Lines of a single column with decimal commas: is there another line; and signs for and against such a column.
 _OTHER_LINE = re.compile(rf"^(?![ \t]*{_SIGN}[0-9]+(?:,[0-9]+)?{_EXPONENT}[ \t]*$)[^\n]*[^\s][^\n]*$", re.MULTILINE)
 _FRACTION = re.compile(r"^[ \t]*[\N{MINUS SIGN}-]0+,|,0[0-9]|,[0-9]+[eE]", re.MULTILINE)
+_WHOLE_NUMBERS, _PADDED = re.compile(r"[0-9,+\s-]+"), re.compile(r",0[0-9]")
 _SECOND = re.compile(r",([0-9]+)")
 _SAMPLE = 2000  # lines that tell what separates the cells
 _ROW, _CELL = 280, 120  # bytes of memory that a row and a cell of text take
@@ -200,7 +201,9 @@ class Table:
         """`InputError` if lines may be one column with decimal commas or two of whole numbers."""
         if self.is_doubtful:
             line = next(line for line in _lines(self.text) if line.strip()).strip()
-            problem = f"is {line} one number with a decimal comma, or are these two columns?"
+            problem = f"is {line[:40]} one number with a decimal comma, or are these columns?"
+            if line.count(",") > 1:
+                problem = f"are in {line[:40]} numbers with a decimal comma, or is each a column?"
             hint = "write 0.5 for a decimal comma; put semicolons or tabs between columns, or names above them"
             raise InputError(problem, hint)
 
@@ -349,7 +352,10 @@ def _one_column(text: str, whole: bool) -> bool | None:
     head = next((line for line in _lines(text) if line.strip()), "")
     header = head if not all(map(is_number, next(_split([head], ",")))) else ""
     body = text.partition(header)[2] if header else text
-    if _OTHER_LINE.search(body) or _is_numbered(body):
+    if _OTHER_LINE.search(body):
+        broken = not header and head.count(",") % 2 and _WHOLE_NUMBERS.fullmatch(body) and _PADDED.search(body)
+        return None if broken else False  # 0,05,1,25: pairs of them may be numbers
+    if _is_numbered(body):
         return False
     if "," in header:  # names of two columns, or a comma in the name of one
         return None if _FRACTION.search(body) else False
