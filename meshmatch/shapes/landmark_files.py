@@ -94,7 +94,6 @@ def read_landmark_file(path: Path, shape: str = "") -> LandmarkFile:
     """
     reader = LANDMARK_READERS[path.suffix.lower()]
     records, space = reader(path, Path(shape).stem) if reader is _read_tps else reader(path)
-    check_memory(path.name, path.stat().st_size, _RECORD * len(records))
     if not records:
         raise InputError(f"{path.name} holds no landmark")
     named = [not is_missing(str(record.get("name") or "")) for record in records]
@@ -161,6 +160,7 @@ def _read_table(path: Path) -> tuple[list[Record], Space]:
     rows = table.rows()
     if not rows:
         return _bare([])
+    check_memory(path.name, path.stat().st_size, _RECORD * len(rows))
     head = _columns(rows[0])
     said = _columns(next(csv.reader([table.comment.replace(";", ",").replace("\t", ",")]), []))
     if head:
@@ -209,9 +209,11 @@ def _usual_columns(row: Sequence[str]) -> list[str]:
 def _read_json(path: Path) -> tuple[list[Record], Space]:
     found = read_json(path)
     if isinstance(found, dict) and isinstance(found.get("markups"), list):
-        return _markups(found["markups"])
+        return _markups(path, found["markups"])
     if isinstance(found, dict) and isinstance(found.get("landmarks"), list | dict):
         found = found["landmarks"]
+    if isinstance(found, dict | list):
+        check_memory(path.name, path.stat().st_size, _RECORD * len(found))
     if isinstance(found, dict):
         return _bare([{"name": name, **_record(value)} for name, value in found.items()])
     if isinstance(found, list):
@@ -229,7 +231,7 @@ def _record(value: Any) -> Record:
     return {"vertex" if isinstance(value, int) else "position": value}
 
 
-def _markups(lists: list[Any]) -> tuple[list[Record], Space]:
+def _markups(path: Path, lists: list[Any]) -> tuple[list[Record], Space]:
     """The control points of 3D Slicer's markups."""
     records: list[Record] = []
     spaces = set()
@@ -237,6 +239,7 @@ def _markups(lists: list[Any]) -> tuple[list[Record], Space]:
         points = markup.get("controlPoints") if isinstance(markup, dict) else None
         if not isinstance(points, list) or not all(isinstance(point, dict) for point in points):
             raise InputError("its markups hold no list of control points")
+        check_memory(path.name, path.stat().st_size, _RECORD * (len(records) + len(points)))
         if points:
             spaces.add(_SPACES.get(str(markup.get("coordinateSystem", "")).upper(), ""))
         for point in points:
@@ -249,7 +252,7 @@ def _markups(lists: list[Any]) -> tuple[list[Record], Space]:
 
 def _read_fcsv(path: Path) -> tuple[list[Record], Space]:
     """3D Slicer's fiducials: comments say the frame and the columns."""
-    text = read_text(path, 280, 120)
+    text = read_text(path, _RECORD)
     space = re.search(r"^#\s*CoordinateSystem\s*=\s*(\w+)", text, re.MULTILINE)
     if space and space[1].upper() not in _SPACES:
         raise InputError(f"its coordinate system is {space[1][:20]}, not LPS or RAS")
@@ -268,7 +271,7 @@ def _read_fcsv(path: Path) -> tuple[list[Record], Space]:
 def _read_pts(path: Path) -> tuple[list[Record], Space]:
     """Points a line, with or without a name before the three coordinates, among lines that count them."""
     records = []
-    for line in read_text(path, 280, 120).splitlines():
+    for line in read_text(path, _RECORD).splitlines():
         words = line.replace("\t", " ").split()
         counts = len(words) == 1 and (words[0].isdigit() or words[0] in "{}")
         declares = words and re.fullmatch(r"(version|n_points|points|dim|landmarks)\b.*", line.strip(), re.IGNORECASE)
@@ -288,7 +291,7 @@ def _read_pts(path: Path) -> tuple[list[Record], Space]:
 def _read_tps(path: Path, shape: str) -> tuple[list[Record], Space]:
     """Landmarks of one specimen (LM3=), then the points of its curves; of several, those of the shape's name."""
     specimens: list[tuple[list[list[float]], dict[str, str]]] = []
-    for line in read_text(path, 280, 120).splitlines():
+    for line in read_text(path, _RECORD).splitlines():
         key, has_value, value = (part.strip() for part in line.partition("="))
         key = key.upper()
         if key == "LM" or key == "LM3":
