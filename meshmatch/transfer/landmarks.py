@@ -173,7 +173,7 @@ def _on_shape(found: LandmarkFile, shape: Shape, space: Space) -> tuple[Landmark
     places = found.in_space(space).places
     missing = [f"landmark {place.name}{place.where}" for place in places if place.kind == "missing"]
     if len(missing) == len(places):
-        raise InputError(missing[0] + (f", nor do {len(missing) - 1} more" if len(missing) > 1 else ""))
+        raise InputError(missing[0] + (f", and {len(missing) - 1} more are missing" if len(missing) > 1 else ""))
     if missing:
         notes.append(
             missing[0] + (f", and {len(missing) - 1} more are missing" if len(missing) > 1 else "") + ": left out"

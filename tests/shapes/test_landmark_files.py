@@ -131,7 +131,7 @@ def test_what_slicer_gets_states_its_frame(tmp_path: Path, suffix: str, space: s
         ("a.json", '{"markups": [{"controlPoints": 7}]}', "no list of control points"),
         ("a.json", '{"nose": [0,46, 1,2, 3,4]}', "three numbers are needed"),
         ("a.csv", "name,x,y,z\nnose,0,46,1,2,3,4\n", "line 2 has 7 cells, the first 4"),
-        ("a.csv", "name,x,y,z\na,nan,0,0\nb,0,nan,0\n", "landmark a has no position, nor do 1 more"),
+        ("a.csv", "name,x,y,z\na,nan,0,0\nb,0,nan,0\n", "landmark a has no position, and 1 more are missing"),
     ],
 )
 def test_what_is_refused_in_words(tmp_path: Path, name: str, content: str, told: str) -> None:
