@@ -22,6 +22,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.colors import light, seen
 from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.landmark_files import Space, mesh_space
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import pull_directions, pull_face_labels, pull_labels, pull_values, pull_weights
@@ -238,8 +239,9 @@ def transfer_landmarks(
 
     `MeshmatchError`: landmarks that are not on the source; or as `find_maps`.
     """
+    space = mesh_space(source) if isinstance(source, str | Path) else ""
     source = as_shape(source, "source")
-    given = _landmarks(landmarks, source)
+    given = _landmarks(landmarks, source, space)
     maps = find_maps(source, target, match)
     with thread_limit(1):
         found = push_landmarks(maps.forward, maps.source, maps.target, given)
@@ -247,11 +249,11 @@ def transfer_landmarks(
     return Transferred(found, found.confidence, LowConfidence(len(found.names), low), maps)
 
 
-def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape) -> Landmarks:
+def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape, space: Space) -> Landmarks:
     if isinstance(landmarks, Landmarks):
         return landmarks
     if isinstance(landmarks, str | Path):
-        return load_landmarks(landmarks, source)[0]
+        return load_landmarks(landmarks, source, space)[0]
     try:
         places = np.asarray(off_torch(landmarks))
     except (TypeError, ValueError) as error:

@@ -181,12 +181,13 @@ def transfer_landmarks(
     *,
     source: Source,
     target: Target,
-    output: Path = output_option("FILE", "Landmarks of TGT: .csv, .json or .pp."),
+    output: Path = output_option("FILE", "Landmarks of TGT: .csv, .json, .pp, .fcsv or .mrk.json."),
     landmarks: Path = Option(
         ...,
         "--landmarks",
         metavar="FILE",
-        help="Landmarks of SRC, as vertices or positions: .csv or .json, MeshLab's .pp, or .txt or .npy of vertices.",
+        help="Landmarks of SRC, as vertices or positions: .csv, .txt, .npy or .json, MeshLab's .pp, 3D Slicer's .fcsv and "
+        ".mrk.json, .pts or .tps.",
     ),
     maps: MapOptionsWithPairs,
     run: RunOptions,
@@ -196,10 +197,11 @@ def transfer_landmarks(
     """Transfer landmarks to exact points on the surface of another shape.
 
     The output has for each: its vertex, its position, its face with barycentric weights, and its confidence (.csv,
-    .json); or name and position (.pp). A position in FILE stands for the nearest point of SRC.
+    .json); or name and position (.pp, .fcsv, .mrk.json). A position in FILE stands for the nearest point of SRC.
     """
     import numpy as np
 
+    from meshmatch.shapes.landmark_files import mesh_space
     from meshmatch.transfer.landmarks import check_landmarks_suffix, load_landmarks, save_landmarks
 
     transfer = Transfer(source, target, output, maps, run, picture)
@@ -207,7 +209,9 @@ def transfer_landmarks(
     check_landmarks_suffix(output)
     with transfer.outputs(landmarks) as (temporary,):
         a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
-        given, furthest = load_landmarks(landmarks, a)
+        given, furthest = load_landmarks(landmarks, a, mesh_space(source))
+        for note in given.notes:
+            console.warn(note)
         if furthest > _FAR * a.diagonal:
             console.warn(
                 f"a landmark lies {furthest:.4g} from {a.name}, {100 * furthest / a.diagonal:.0f} % of its size: the "
@@ -215,7 +219,7 @@ def transfer_landmarks(
             )
         result = meshmatch.transfer_landmarks(a, b, given, transfer, rule=meshmatch.ConfidenceRule(min_confidence))
         found = result.data
-        save_landmarks(temporary, found)
+        save_landmarks(temporary, found, mesh_space(target) or "LPS", output.name)
     low = np.flatnonzero(found.confidence < min_confidence)
     for k in low[:10].tolist():
         console.warn(f"landmark {found.names[k]} is uncertain: its confidence is {found.confidence[k]:.2f}")

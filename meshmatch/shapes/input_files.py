@@ -7,6 +7,7 @@ from __future__ import annotations
 import codecs
 import json
 import math
+import re
 import warnings
 import zipfile
 from collections.abc import Iterable
@@ -31,6 +32,7 @@ ROOM = 800_000_000
 _MAYBE_TEXT = (".ply", ".obj", ".mtl", ".off", ".stl", ".gltf", ".xyz", ".pcd")  # tables are read by `read_text`
 _COPIES = 24  # bytes for each number of an array: it becomes one of 64 bits, and is compared and copied
 _LAST_CHARACTER = 0x10FFFF
+_NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1f\x7f]")  # what no editor puts into a text
 _LINE_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e\x85"  # where `str.splitlines` splits
 
 
@@ -97,12 +99,22 @@ def _unmarked(name: str, data: bytes) -> bytes:
 
 
 def read_text(path: Path, line: int, cell: int = 0) -> str:
-    """A file's text in UTF-8, where a line takes so many bytes of memory, and each further cell; `InputError` if that
+    """A file's text, where a line takes so many bytes of memory, and each further cell; `InputError` if that
     would be too much (`check_memory`), or the file is too large.
     """
     data = read_bytes(path, largest=LARGEST_TEXT // 2)
     check_memory(path.name, len(data), line * sum(map(data.count, _LINE_ENDS)) + cell * sum(map(data.count, b",;")))
-    return data.decode("utf-8-sig")
+    return _decoded(data)
+
+
+def _decoded(data: bytes) -> str:
+    """Text in UTF-8, UTF-16 with a byte order mark, or else in Windows' Latin letters; `ValueError` for what is no text."""
+    try:
+        return data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
+    except UnicodeDecodeError:
+        if _NO_TEXT.search(data):
+            raise
+        return data.decode("cp1252")
 
 
 def check_text(name: str, data: bytes) -> None:
