@@ -87,6 +87,7 @@ class Collection:
         are fitted; the fits are those of a run that nobody stopped, bit for bit. ``tell`` is called with the record of
         each shape, as they come in.
 
+        Parts of a file that are no part of what is fitted, such as a floor, are left out as by `match`; records say which.
         A shape that cannot be read or fitted is a record, and stops nobody. `MeshmatchError`: there is no shape, two have
         the same name, none could be fitted, or the folder holds fits of another model or made in another way, or is
         written to by somebody else.
