@@ -297,11 +297,10 @@ def match(
 
     ``source`` and ``target`` are meshes or point clouds of the model's category, in any unit, orientation and resolution:
     a path, a Shape, an (N, 3) array, (vertices, faces), or an object with .vertices and .faces. ``config`` says how
-    shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes. Where a file
-    holds a floor or furniture beside the body, which keep a fit of the whole from being right, its parts are tried apart, and
-    ``notes`` say which were left out. ``landmarks`` are known pairs, (source vertices (N,), target vertices (N,)), which
-    pull both fits; the map says which of them it misses, and is then not good. Only with ``refine="nodes"``. See `Matcher`
-    for the rest.
+    shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes. Where the
+    whole of a file cannot be fitted, such as a body on a floor, its parts are tried apart, and ``notes`` say which were left
+    out. ``landmarks`` are known pairs, (source vertices (N,), target vertices (N,)), which pull both fits; the map says
+    which of them it misses, and is then not good. Only with ``refine="nodes"``. See `Matcher` for the rest.
 
     `MeshmatchError`: a shape that cannot be read or fitted, an unknown model, or choices that contradict each other.
     """
