@@ -42,6 +42,21 @@ def validated(shape: Shape) -> Repaired:
     """Repair a shape and refuse what cannot be fitted (`InputError`): too few faces or points, no extent, or large parts
     far apart.
     """
+    clean = usable(shape)
+    refuse_far_parts(clean)
+    return clean
+
+
+def refuse_far_parts(clean: Repaired) -> None:
+    """Refuse a shape with large parts far apart (`InputError`)."""
+    if clean.far_parts:
+        many = f"{clean.shape.name or 'the shape'} contains {clean.far_parts + 1} large parts far apart"
+        choose = "save each object in a file of its own, or choose parts with --only (see `meshmatch info`)"
+        raise InputError(many, choose)
+
+
+def usable(shape: Shape) -> Repaired:
+    """As `validated`, for shapes whose parts may be tried apart: large parts may be far apart."""
     clean = repair(shape)
     fixed = clean.shape
     name = shape.name or "the shape"
@@ -54,9 +69,6 @@ def validated(shape: Shape) -> Repaired:
         raise InputError(f"{name} has no surface: all its points lie on a line", "is it a point cloud?")
     if not fixed.area > 0:
         raise InputError(f"{name} has no surface area", "are all its points the same, or on a line?")
-    if clean.far_parts:
-        many = f"{name} contains {clean.far_parts + 1} large parts far apart"
-        raise InputError(many, "save each object in a file of its own")
     return clean
 
 

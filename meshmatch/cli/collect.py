@@ -96,6 +96,8 @@ def _table(console: Console) -> Callable[["Record"], None]:
         console.say(_ROW.format(record.name, record.verdict, *(measured if record.fitted else [""] * 6)).rstrip())
         if not record.fitted or record.verdict == "poor":
             console.warn(f"{record.name}: {'' if record.fitted else 'not fitted: '}{record.reasons}")
+        if record.notes:
+            console.say(f"{record.name}: {record.notes}")
 
     return tell
 

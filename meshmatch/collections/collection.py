@@ -99,6 +99,7 @@ class Collection:
         are fitted; the fits are those of a run that nobody stopped, bit for bit. ``tell`` is called with the record of
         each shape, as they come in.
 
+        Parts of a file that are no part of what is fitted, such as a floor, are left out as by `match`; records say which.
         A shape that cannot be read or fitted becomes a record, and the others go on. Where no processes can be started, this
         one does the work, and warns.
 

@@ -33,7 +33,7 @@ from meshmatch.maps.vertex_map import VERDICTS
 from meshmatch.progress import ProgressCallback
 
 TABLE = "fits.csv"
-COLUMNS = ("name", "file", "verdict", "trust", "reasons", "residual", "up", "front", "vertices", "seconds")
+COLUMNS = ("name", "file", "verdict", "trust", "reasons", "residual", "up", "front", "vertices", "seconds", "notes")
 _GROUP = 4  # fits that one task of the agreement takes a step with: fixed, for sums must not depend on the workers
 
 

@@ -62,6 +62,7 @@ def save_fit(
     arrays |= {"rotation": fit.frame.rotation, "center": fit.frame.center}
     about: Words = {name: getattr(fit, name) for name in _FIT_WORDS}
     about |= {"reasons": [[reason.code, str(reason)] for reason in fit.reasons], "scale": fit.frame.scale}
+    about |= {"left_out": list(fit.left_out)} if fit.left_out else {}
     if places is not None:
         arrays |= {name: getattr(places, name) for name in _PLACES}
         arrays |= {name: kept for name in _OPTIONAL if (kept := getattr(places, name)) is not None}
@@ -117,6 +118,7 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
             verts=np.empty((0, 3)),
             reasons=tuple(Reason(code, str(sentence)) for code, sentence in about["reasons"]),
             seconds=0.0,
+            left_out=_numbers(about.get("left_out", [])),
             **{name: about[name] for name in _FIT_WORDS},
         )
         if not (1 / LARGEST < fit.frame.scale < LARGEST and (np.abs(fit.frame.center) < LARGEST).all()):
@@ -124,6 +126,13 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
         return StoredFit(fit, _places(arrays, about, fit), _samples(arrays, about), more)
     except (SafetensorError, KeyError, TypeError, ValueError, OverflowError, OSError) as error:
         raise InputError(f"{path.name} is damaged: {error}", _HINT) from error
+
+
+def _numbers(values: Any) -> tuple[int, ...]:
+    """Numbers of parts; `ValueError` for anything else."""
+    if not isinstance(values, list) or not all(type(each) is int and each > 0 for each in values):
+        raise ValueError("its parts cannot be")
+    return tuple(values)
 
 
 def load_finished(path: str | Path, template: Template) -> tuple[Fit, Places]:

@@ -83,6 +83,7 @@ class Record:
     vertices: int = 0
     seconds: float = 0.0
     digest: str = ""
+    notes: str = ""  # which parts were left out, if any
 
     @property
     def fitted(self) -> bool:

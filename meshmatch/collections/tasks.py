@@ -26,6 +26,7 @@ from meshmatch.fitting.viscous import NO_MODEL
 from meshmatch.maps.places import Places
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.input_files import read_npy
+from meshmatch.shapes.parts import leave_out
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ def fit_alone(task: FitTask) -> Record:
             vertices=fit.repaired.original.V,
             seconds=round(time.monotonic() - began, 3),
             digest=digest,
+            notes=fit.repaired.notes[0] if fit.left_out else "",
         )
         words = {"record": asdict(record), "roughness": fit.repaired.shape.roughness}
         with setting.store.writing(file) as path:
@@ -206,7 +208,8 @@ def finish(task: FinishTask) -> str:
         if is_finished(setting.store, task):
             return ""
         alone = setting.read(ALONE, name)
-        part = validated(task.source.load(setting.only, setting.without))
+        whole = task.source.load(setting.only, setting.without)
+        part = validated(leave_out(whole, alone.fit.left_out))
         before = replace(alone.fit, repaired=part, verts=part.shape.verts)
         fit = before
         if task.group is not None:

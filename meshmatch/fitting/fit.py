@@ -68,6 +68,7 @@ class Fit(Pickled):
     repaired : the shape itself, with the way back to the vertices of its file
     notes : what was changed in the shape before fitting, and which choices were replaced
     model : name of the model
+    left_out : numbers of the shape's parts that were left out, where a fit of the whole failed; see `meshmatch info`
     """
 
     template_hash: str
@@ -90,6 +91,7 @@ class Fit(Pickled):
     model: str = ""
     trust: float = 1.0
     signs: Signs | None = None
+    left_out: tuple[int, ...] = ()
 
     def __repr__(self) -> str:
         name = f"{self.repaired.original.name!r}, " if self.repaired else ""

@@ -8,21 +8,23 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.arrays import Float, Floats, off_torch
+from meshmatch.arrays import Bool, Bools, Floats, off_torch
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, plain_text, replace_on_success
 from meshmatch.shapes.colors import INVISIBLE
 from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, obj, off, plain, ply, stl
 from meshmatch.shapes.input_files import existing, read_bytes
 from meshmatch.shapes.other_libraries import HINT, arrays_of, as_faces
+from meshmatch.shapes.parts import Parts
 from meshmatch.shapes.shape import Shape
 
 _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], None] | None]] = {
@@ -41,44 +43,89 @@ SUFFIXES = tuple(_FORMATS)
 """The suffixes that `load_shape` knows; `save_shape` writes all of them but .gltf and .pcd."""
 
 
-def load_shape(path: str | Path, *, only: str | Sequence[str] = (), without: str | Sequence[str] = ()) -> Shape:
+Choice: TypeAlias = str | int | Sequence[str | int]
+"""Meshes of a scene by name, or parts of a mesh by number: one or several."""
+
+
+def load_shape(path: str | Path, *, only: Choice = (), without: Choice = ()) -> Shape:
     """Read a mesh or a point cloud as it is: all vertices, in file order, in the file's frame and unit.
 
     A vertex whose position is not a number is kept in its place and marked in `Shape.invalid`; its `verts` row is then
     the centroid of the others. The scene of a glb or gltf is one shape: its meshes one after the other, each where the
     scene puts it. An stl has no shared vertices: every corner of every triangle is a vertex, 3 F of them.
 
-    Of a scene's meshes ``only`` those of these names, or all ``without`` those, are to be trusted: the vertices of the
-    others have weight 0, so that no fit looks at them, and keep their places. A name is that of a mesh or its node, and may
-    hold ``*`` and ``?``; upper and lower case count the same.
+    ``only`` these meshes of a scene or parts of a mesh, or all ``without`` those, are to be trusted: the vertices of the
+    others have weight 0, so that no fit looks at them, and keep their places. Meshes are chosen by their own name or their
+    node's, which may hold ``*`` and ``?``; upper and lower case count the same. Connected parts are chosen by number, from
+    1, the largest area first, as `meshmatch info` lists them; a mesh that is called "2" goes before part 2.
 
-    `InputError`: the file is missing, empty, cut short, of an unknown kind, or holds no usable vertex; or no mesh of it has
-    a name that is given.
+    `InputError`: the file is missing, empty, cut short, of an unknown kind, or holds no usable vertex; or nothing in it has
+    a name or number that is given.
     """
     return load_shapes([path], only=only, without=without)[0]
 
 
-def load_shapes(
-    paths: Sequence[str | Path], *, only: str | Sequence[str] = (), without: str | Sequence[str] = ()
-) -> list[Shape]:
-    """Read shapes as `load_shape` does. A shape whose scene lacks a name is not asked for it, but one must have it.
+def load_shapes(paths: Sequence[str | Path], *, only: Choice = (), without: Choice = ()) -> list[Shape]:
+    """Read shapes as `load_shape` does. A shape that lacks a name or number is not asked for it, but one must have it.
 
     Errors are those of `load_shape`.
     """
-    chosen, left_out = ([names] if isinstance(names, str) else list(names) for names in (only, without))
+    names = [[each] if isinstance(each, str | int) else list(each) for each in (only, without)]
+    chosen, left_out = ([str(name) for name in each] for each in names)
     found = [_read(path) for path in paths]
+    if not (chosen or left_out):
+        return [shape for shape, _ in found]
+    known = [_Named(shape, raw.meshes) for shape, raw in found]
     for pattern in (*chosen, *left_out):
-        if not any(_has(raw, pattern) for _, raw in found):
-            files = " or ".join(shape.name for shape, _ in found)
-            known = ", ".join(dict.fromkeys(names[0] for _, raw in found for names, _ in raw.meshes if names))
-            if not any(raw.meshes for _, raw in found):
-                raise InputError(f"{files} names no meshes to choose from", "meshes of .glb and .gltf files have names")
-            raise InputError(f"no mesh of {files} is called {pattern[:80]!r}", f"there are: {known[:200] or 'none'}")
-    shapes = []
-    for shape, raw in found:
-        own = [[pattern for pattern in names if _has(raw, pattern)] for names in (chosen, left_out)]
-        shapes.append(replace(shape, weights=_chosen(shape.name, raw, *own)) if any(own) else shape)
-    return shapes
+        if all(each.of(pattern) is None for each in known):
+            raise _nothing_called(pattern, known)
+    return [each.weighted(chosen, left_out) for each in known]
+
+
+@dataclass(frozen=True, eq=False)
+class _Named:
+    """A shape, and the names of its scene's meshes."""
+
+    shape: Shape
+    meshes: tuple[tuple[tuple[str, ...], int], ...]
+
+    @cached_property
+    def parts(self) -> Parts:
+        return Parts.of(self.shape)
+
+    def of(self, pattern: str) -> Bool[Bools, " V"] | None:
+        """The vertices of the meshes of a name, or of the part of a number; None if there is none."""
+        called = [any(fnmatchcase(each.lower(), pattern.lower()) for each in names) for names, _ in self.meshes]
+        if any(called):
+            return np.repeat(np.array(called), [count for _, count in self.meshes])
+        if pattern.isdecimal() and len(pattern) < 10 and 0 < int(pattern) <= len(self.parts):
+            return np.asarray(self.parts.number == int(pattern))
+        return None
+
+    def weighted(self, only: Sequence[str], without: Sequence[str]) -> Shape:
+        """The shape with weight 1 at the vertices that are to be trusted, and 0 at all others."""
+        asked, refused = ([own for each in names if (own := self.of(each)) is not None] for names in (only, without))
+        if not asked and not refused:
+            return self.shape
+        kept = np.any(asked, axis=0) if asked else np.ones(self.shape.V, bool)
+        if refused:
+            kept = kept & ~np.any(refused, axis=0)
+        if not (kept if self.shape.is_cloud else kept[self.shape.faces]).any():
+            what, more = ("mesh", "meshes") if self.meshes else ("part", "parts")
+            raise InputError(f"no {what} of {self.shape.name} is left", f"choose fewer {more} to leave out")
+        return replace(self.shape, weights=kept.astype(float))
+
+
+def _nothing_called(pattern: str, known: Sequence[_Named]) -> InputError:
+    files = " or ".join(each.shape.name for each in known)
+    if pattern.isdecimal():
+        last = ", ".join(f"{each.shape.name}: {len(each.parts)}" for each in known)
+        return InputError(f"{files} has no part {pattern[:20]}", f"number of parts: {last}; see `meshmatch info`")
+    names = ", ".join(dict.fromkeys(names[0] for each in known for names, _ in each.meshes if names))
+    if not any(each.meshes for each in known):
+        hint = "meshes of .glb and .gltf files have names; of others choose parts by number, see `meshmatch info`"
+        return InputError(f"{files} names no meshes to choose from", hint)
+    return InputError(f"no mesh of {files} is called {pattern[:80]!r}", f"there are: {names[:200] or 'none'}")
 
 
 def _read(path: str | Path) -> tuple[Shape, Raw]:
@@ -106,33 +153,24 @@ def mesh_names(path: str | Path) -> dict[str, int]:
     """Names of a scene's meshes, as ``only`` and ``without`` of `load_shape` know them, and how many vertices each has; none
     for formats without names. Errors are those of `load_shape`.
     """
-    path = existing(as_path(path), suffixes=SUFFIXES)
-    if path.suffix.lower() not in (".glb", ".gltf"):
-        return {}
+    return summed(mesh_list(path))
+
+
+def summed(meshes: Sequence[tuple[str, int]]) -> dict[str, int]:
+    """Vertices of all meshes of a name together."""
     found: dict[str, int] = {}
-    for names, count in gltf.read(path, read_bytes(path)).meshes:
-        label = names[0] if names else "(no name)"
+    for label, count in meshes:
         found[label] = found.get(label, 0) + count
     return found
 
 
-def _has(raw: Raw, pattern: str) -> bool:
-    return any(_called(names, pattern) for names, _ in raw.meshes)
-
-
-def _called(names: tuple[str, ...], pattern: str) -> bool:
-    return any(fnmatchcase(each.lower(), pattern.lower()) for each in names)
-
-
-def _chosen(name: str, raw: Raw, only: Sequence[str], without: Sequence[str]) -> Float[Floats, " V"]:
-    """1 for the vertices of the meshes that are to be trusted, 0 for all others."""
-    kept = [
-        (not only or any(_called(names, each) for each in only)) and not any(_called(names, each) for each in without)
-        for names, _ in raw.meshes
-    ]
-    if not any(kept):
-        raise InputError(f"no mesh of {name} is left", "choose fewer meshes to leave out")
-    return np.repeat(np.array(kept, float), [count for _, count in raw.meshes])
+def mesh_list(path: str | Path) -> list[tuple[str, int]]:
+    """As `mesh_names`, in the order of the vertices; meshes of one name one by one."""
+    path = existing(as_path(path), suffixes=SUFFIXES)
+    if path.suffix.lower() not in (".glb", ".gltf"):
+        return []
+    meshes = gltf.read(path, read_bytes(path)).meshes
+    return [(names[0] if names else "(no name)", count) for names, count in meshes]
 
 
 def check_suffix(path: Path) -> str:
