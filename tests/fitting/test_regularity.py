@@ -64,14 +64,14 @@ def test_the_nearest_stretch_that_is_open_has_the_same_axes() -> None:
 
 
 def test_folds_open_and_the_rest_stays(system: NodeSystem, model: TrainedModel) -> None:
-    folded = pushed_in(model, 1.6)
+    folded = pushed_in(model, 2.0)
     before = system.regularity(folded)
     assert before.inverted > 0
     opened_up = system.unfolded(folded)
     assert system.regularity(opened_up).inverted < 0.2 * before.inverted
     low = system.verts[:, 1] < 0
     moved = np.linalg.norm(system.moved(opened_up) - system.moved(folded), axis=1)
-    assert moved[low].max() < 0.1 * moved.max()
+    assert moved[low].max() < 0.25 * moved.max()
     slightly = pushed_in(model, 0.3)
     assert system.unfolded(slightly) is slightly
 
@@ -89,9 +89,9 @@ def test_a_folded_fit_is_not_good_and_says_why(system: NodeSystem, model: Traine
 
 
 def test_what_all_fits_have_in_common_hardly_drifts(system: NodeSystem, model: TrainedModel) -> None:
-    """Two fits of a smaller egg would both shrink along the surface; less so the more the common stretch is held."""
+    """Two fits that slid in the same way slide on together; less so the more the common stretch is held."""
     scan, nodes = scan_of(model.template.shape, 1500), model.template.nodes
-    start = 0.05 * nodes * [0.0, 1.0, 0.0]
+    start = 0.1 * nodes * [1.0, -1.0, 1.0]
 
     def drifted(drift: float) -> float:
         members = [Member(scan, start, AgreeConfig(steps=8, strain=0.01, drift=drift))] * 2
