@@ -62,14 +62,15 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     _, which, kind = np.unique(2 * used + laid, return_index=True, return_inverse=True)
     kind = kind.reshape(-1).astype(np.int64)
     materials: list[Material] = []
+    scale, offset = np.ones((len(which), 2)), np.zeros((len(which), 2))
     for number, face in enumerate(which.tolist()):
         name = named[used[face]][0] if used[face] >= 0 else ""
         entry = entries.get(name, _Entry())
         image = picture if picture is not None else _image(path, name, entry, reader, bool(laid[face]))
         materials.append(_material(name, entry, image if laid[face] else None))
         if laid[face] and entry.image is not None:
-            rows = kind == number
-            corners[rows] = corners[rows] * entry.image.scale + entry.image.offset
+            scale[number], offset[number] = entry.image.scale, entry.image.offset
+    corners[laid] = corners[laid] * scale[kind[laid], None] + offset[kind[laid], None]
     corners[laid, :, 1] = 1.0 - corners[laid, :, 1]
     if not materials or (picture is None and all(material.image is None for material in materials)):
         bare = appearance.vertex_colors_alone(shape)
