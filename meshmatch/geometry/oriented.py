@@ -147,6 +147,6 @@ def nearest(points: Float[Floats32, "P 3"], queries: Float[Floats32, "Q 3"]) -> 
         found[low : low + rows], margin[low : low + rows] = which, compared[: len(some)].min(1) - first
     close = np.flatnonzero(margin <= rounding)
     for low in range(0, len(close), rows):
-        some = close[low : low + rows]
-        found[some] = (lifted[some] @ against).argmin(1)
+        again = close[low : low + rows]
+        found[again] = (lifted[again] @ against).argmin(1)
     return found
