@@ -230,6 +230,8 @@ def _told(
         kind = best.card.category
         if np.isinf(column[row]):
             return Told(None, best.card)
+        if _is_part(shape, config):  # whose fit would tell nothing that the reading does not
+            return Told(kind if column[row] <= KNOWN else None, best.card)
         known, fit = told(best.load(), shape, column[row], config, progress)
         return Told(kind if known else None, best.card, fit)
 

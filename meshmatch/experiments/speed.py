@@ -6,6 +6,8 @@ seconds of CPU (both cores together), and the largest memory that a run ever hel
 processes are kept on two where the system allows that. The shapes are the two samples, split and decimated to the sizes
 that the cases ask for.
 
+``--against`` puts an earlier run beside this one: a file that ends with its JSON line, such as docs/results/speed.json.
+
 ``--profile`` shows instead where a match spends its CPU, with one thread; the row ``import`` is a process of its own that
 imports what the command does, and ends. ``--roofline`` shows how near its dearest stages come to what the machine can do.
 ``--living`` shows what one more fit and map take in a process that has matched before, in seconds of CPU; ``--shared`` what
@@ -14,6 +16,7 @@ workers that share a model take of memory.
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import statistics
@@ -29,7 +32,7 @@ from typing import Annotated, Any
 import numpy as np
 from typer import Option
 
-from meshmatch.errors import MeshmatchError, OptionError
+from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.experiments import living as lives
 from meshmatch.experiments import roofline as roofs
 from meshmatch.experiments import runner, stages
@@ -198,6 +201,30 @@ COLUMNS = {
 }
 
 
+AGAINST = {"s before": "wall_before:.2f", "CPU s before": "cpu_before:.2f", "GB before": "gigabytes_before:.2f"}
+RATIOS = {"s, ratio": "wall_ratio:.2f", "CPU, ratio": "cpu_ratio:.2f", "GB, ratio": "gigabytes_ratio:.2f"}
+
+
+def earlier(path: Path) -> dict[str, dict[str, Any]]:
+    """The rows of an earlier run by the name of their case; `InputError` if the file does not hold one."""
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8").strip().splitlines()[-1])["cases"]
+        return {row["case"]: {name: float(row[name]) for name in ("wall", "cpu", "gigabytes")} for row in rows}
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(
+            f"{path} holds no run of this experiment", "give a file that ends with its JSON line"
+        ) from error
+
+
+def compared(row: dict[str, Any], before: dict[str, float]) -> dict[str, Any]:
+    """A row with the numbers of an earlier one, and how many times as much it takes."""
+    return (
+        row
+        | {f"{name}_before": value for name, value in before.items()}
+        | {f"{name}_ratio": round(row[name] / value, 3) for name, value in before.items() if value > 0}
+    )
+
+
 STAGE_COLUMNS = {"stage": "stage", "CPU s": "cpu:.3f", "share": "share:.1%", "calls": "calls:d"}
 
 
@@ -229,12 +256,14 @@ def main(
     picture: Annotated[Path | None, Option(help="draw the stages as .png or .svg, with --profile")] = None,
     roofline: Annotated[bool, Option("--roofline", help="the dearest stages against the machine instead")] = False,
     living: Annotated[bool, Option("--living", help="stages of a process that stays alive instead")] = False,
+    against: Annotated[Path | None, Option(help="JSON line of an earlier run, to be compared with")] = None,
     shared: Annotated[bool, Option("--shared", help="memory of workers that share a model instead")] = False,
 ) -> runner.Report:
     if picture is not None:
         if not profile:
             raise OptionError("--picture draws the stages of --profile", "add --profile")
         check_chart(picture)
+    before = {} if against is None else earlier(against)
     kept = keep_to_cores(cores)
     if roofline:
         return roofs.report(runs)
@@ -246,11 +275,12 @@ def main(
         if living:
             return lives.living(pair_files(Path(folder)), runs)
         rows = [
-            record_of(name, CASES[name], measure(CASES[name], runs, Path(folder)))
+            compared(record_of(name, CASES[name], measure(CASES[name], runs, Path(folder))), before.get(name, {}))
             for name in runner.track(runner.names_of(cases, CASES, "case"), "running")
         ]
     title = f"Whole processes on {kept} cores, median of {runs} runs"
-    return runner.Report({"kept_to_cores": kept, "cases": rows}, [runner.table(title, rows, COLUMNS)])
+    columns = COLUMNS if against is None else {**COLUMNS, **AGAINST, **RATIOS}
+    return runner.Report({"kept_to_cores": kept, "cases": rows}, [runner.table(title, rows, columns)])
 
 
 if __name__ == "__main__":

@@ -119,6 +119,15 @@ def test_a_fit_as_a_part_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("models")
+def test_a_shape_that_is_said_to_be_a_part_is_not_fitted_to_tell_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kind, "Fitter", None)
+    part, config = validated(ball("half 7 7 5.5", opened=True)), FitConfig(partial="yes")
+    choice = kinds.choose_model([part, validated(ball("man 3 4 6"))], [config] * 2)
+    assert choice.model.card.name == "human" and "may be a part" in choice.words[0]
+    assert kinds.choose_model([part], [config]).model.card.name == "quadruped"  # alone, what reads it best
+
+
+@pytest.mark.usefixtures("models")
 def test_what_reads_strangely_is_of_the_kind_that_fits_it(monkeypatch: pytest.MonkeyPatch) -> None:
     dancer = load_shape(SAMPLES / "dancer.ply")
     strange = Shape(dancer.verts, dancer.faces, "robot 5.5 5.6 7")

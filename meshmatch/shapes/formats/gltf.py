@@ -87,6 +87,8 @@ class Document:
         self.buffers: dict[int, bytes] = {}
         self.world: dict[int, Floats] = {}
         self.hidden: set[int] = set()
+        self._bones: dict[int, Floats] = {}  # a thousand meshes may hang from one skin of a thousand joints
+        self._bound: int | None = None
 
     def _compressed(self, extension: str) -> InputError:
         return InputError(f"{self.name} is compressed ({extension})", "export it without mesh compression")
@@ -209,11 +211,7 @@ class Document:
         hanging = np.asarray(own @ place.T)[:, :3]
         if "skin" not in node or "JOINTS_0" not in attributes:
             return hanging
-        skin = self.json["skins"][node["skin"]]
-        bones = np.stack([self.world[joint] for joint in skin["joints"]])
-        if "inverseBindMatrices" in skin:
-            inverse = self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
-            bones = bones @ inverse[: len(bones)]
+        bones = self._skin(node["skin"])
         moved, total = np.zeros((len(own), 4)), np.zeros((len(own), 1))
         for joints, weights in self.influences(primitive):
             for column in range(4):
@@ -221,6 +219,17 @@ class Document:
                 moved += weight * np.einsum("vij,vj->vi", bones[joints[:, column].astype(np.int64)], own)
                 total += weight
         return np.where(total > 0, moved[:, :3] / np.where(total > 0, total, 1.0), hanging)
+
+    def _skin(self, number: int) -> Floats:
+        """(J, 4, 4) where the joints of a skin put what hangs from each."""
+        if number not in self._bones:
+            skin = self.json["skins"][number]
+            bones = np.stack([self.world[joint] for joint in skin["joints"]])
+            if "inverseBindMatrices" in skin:
+                inverse = self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+                bones = bones @ inverse[: len(bones)]
+            self._bones[number] = bones
+        return self._bones[number]
 
     def influences(self, primitive: dict[str, Any]) -> Iterator[tuple[Float[Floats, "V 4"], Float[Floats, "V 4"]]]:
         """Numbers of joints and their weights for each vertex, four at a time."""
@@ -273,9 +282,10 @@ class Document:
         if "bufferView" in accessor:
             values = self._view(accessor, count, width, kind)
         else:  # zeros, then filled sparsely
-            held = [k for k in range(len(self.json.get("buffers", []))) if self._held(k)]
-            bound = sum(len(self._buffer(k)) for k in held)
-            if not 0 <= count <= max(bound, 1):
+            if self._bound is None:
+                held = [k for k in range(len(self.json.get("buffers", []))) if self._held(k)]
+                self._bound = sum(len(self._buffer(k)) for k in held)
+            if not 0 <= count <= max(self._bound, 1):
                 raise damaged(self.name, f"it promises {count} values that it does not hold")
             values = np.zeros((count, width), kind)
         if "sparse" in accessor:

@@ -27,7 +27,6 @@ from meshmatch.shapes.shape import Shape
 _LARGEST_MTL = 10_000_000  # bytes
 _MOST_LIBRARIES = 100  # names in one line
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
-_ONE, _ZERO = (1.0, 1.0), (0.0, 0.0)
 _OPTION = re.compile(
     rf"(?:(-o|-s|-t)((?:\s+{_NUMBER}(?!\S)){{0,3}})|-mm\s+\S+\s+\S+|(-clamp)\s+(\S+)|"
     r"-(?:blendu|blendv|cc|bm|boost|texres|imfchan|type)\s+\S+)(?:\s+|\Z)",
@@ -79,14 +78,15 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     _, which, kind = np.unique(2 * used + laid, return_index=True, return_inverse=True)
     kind = kind.reshape(-1).astype(np.int64)
     materials: list[Material] = []
+    scale, offset = np.ones((len(which), 2)), np.zeros((len(which), 2))
     for number, face in enumerate(which.tolist()):
         name = meant[names[used[face]]]
         entry = entries.get(name, _Entry())
         image = picture if picture is not None else _image(path, name, entry, reader, bool(laid[face]))
         materials.append(_material(name, entry, image if laid[face] else None))
-        if laid[face] and entry.image is not None and (entry.image.scale, entry.image.offset) != (_ONE, _ZERO):
-            rows = kind == number
-            corners[rows] = corners[rows] * entry.image.scale + entry.image.offset
+        if laid[face] and entry.image is not None:
+            scale[number], offset[number] = entry.image.scale, entry.image.offset
+    corners[laid] = corners[laid] * scale[kind[laid], None] + offset[kind[laid], None]
     corners[laid, :, 1] = 1.0 - corners[laid, :, 1]
     if not materials or (picture is None and all(material.image is None for material in materials)):
         bare = appearance.vertex_colors_alone(shape)
