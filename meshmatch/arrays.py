@@ -8,6 +8,7 @@ jaxtyping is not loaded for them either, unless it was before, as tests do.
 from __future__ import annotations
 
 import sys
+from dataclasses import Field, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,6 +47,7 @@ def read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
     if own and values.flags.c_contiguous and not values.flags.writeable:
         return values
     try:
+        values = off_torch(values)
         if np.iscomplexobj(values):
             raise TypeError("complex ones have two parts")
         array: NDArray[Any] = np.array(values, dtype=dtype, order="C")
@@ -60,10 +62,63 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
     return array
 
 
+class Pickled:
+    """A frozen dataclass that pickles its fields: what was derived of them stays behind, and arrays that were read-only
+    are so again.
+    """
+
+    def __getstate__(self) -> tuple[dict[str, Any], tuple[str, ...]]:
+        state = {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
+        arrays = [name for name, value in state.items() if isinstance(value, np.ndarray)]
+        return state, tuple(name for name in arrays if not state[name].flags.writeable)
+
+    def __setstate__(self, state: tuple[dict[str, Any], tuple[str, ...]]) -> None:
+        self.__dict__.update(state[0])
+        for name in state[1]:
+            frozen(state[0][name])
+
+
+class Brief:
+    """A dataclass (``repr=False``) that shows its arrays by their sizes: one line, whatever it holds."""
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(map(self._shown, fields(self)))})"  # type: ignore[arg-type]
+
+    def _shown(self, field: Field[Any]) -> str:
+        value = getattr(self, field.name)
+        if isinstance(value, np.ndarray):
+            return f"{field.name}: {' x '.join(map(str, value.shape))}"
+        if isinstance(value, tuple | list | dict) and len(value) > 3:
+            return f"{field.name}: {len(value)} items"
+        return f"{field.name}={value!r}"
+
+
+def off_torch(values: Any) -> Any:
+    """A tensor of torch, or a list of them, as NumPy has it: without its gradient, in the memory of the CPU. Anything else
+    as it is. `TypeError` for a tensor that holds no plain numbers, such as a sparse one.
+    """
+    if isinstance(values, list | tuple):
+        some = len(values) > 0 and _is_tensor(values[0])
+        return [off_torch(each) for each in values] if some else values
+    if not _is_tensor(values):
+        return values
+    try:
+        try:
+            return values.numpy(force=True)
+        except TypeError:  # a type that NumPy does not have, such as bfloat16
+            return values.float().numpy(force=True)
+    except (RuntimeError, NotImplementedError) as error:
+        raise TypeError(str(error).splitlines()[0]) from error
+
+
+def _is_tensor(values: Any) -> bool:
+    return callable(getattr(values, "detach", None)) and callable(getattr(values, "numpy", None))
+
+
 def as_numbers(values: ArrayLike, name: str, finite: bool = False) -> Floats:
     """An array of numbers; `InputError` where they are something else, such as words or rows of different lengths."""
     try:
-        found = np.asarray(values)
+        found = np.asarray(off_torch(values))
         if found.dtype.kind == "c":
             raise TypeError("complex ones have two parts")
         found = found.astype(np.float64, copy=False)

@@ -1,9 +1,10 @@
 """The one error family: what is wrong in a line, and a hint what to do about it.
 
 Everything that the user's data or choices can cause is a `MeshmatchError`; anything else is a bug and keeps
-its traceback.
+its traceback. What is worth a word but stops nothing is a `MeshmatchWarning`.
 """
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -22,6 +23,15 @@ class MeshmatchError(Exception):
 
     def __reduce__(self) -> tuple[type["MeshmatchError"], tuple[str, str]]:
         return type(self), (self.message, self.hint)  # the hint survives a process pool
+
+
+class MeshmatchWarning(UserWarning):
+    """Something about a file that the user should know: what was left out, or taken in another way than it is written."""
+
+
+def warn(text: str) -> None:
+    """Warn in one line (`MeshmatchWarning`). The command line shows each line once; in Python it is a usual warning."""
+    warnings.warn(_line(text), MeshmatchWarning, stacklevel=2)
 
 
 class InputError(MeshmatchError):

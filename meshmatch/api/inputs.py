@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import threading
-from functools import lru_cache
 from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,8 +21,6 @@ MINIMUM_POINTS = 100
 THREADS = 2
 """Unless said otherwise: the two shapes of a match are fitted beside each other, each on one thread."""
 
-_loading = threading.Lock()
-
 
 def as_model(model: TrainedModel | str | Path) -> TrainedModel:
     """A model, loaded once if it is given by its name or folder (and again if its files have changed since).
@@ -38,28 +33,30 @@ def as_model(model: TrainedModel | str | Path) -> TrainedModel:
             hint = "give its name, its folder, or what load_model returned"
             raise ModelError(f"a model cannot be made of {type(model).__name__}", hint)
         return model
-    from meshmatch.models.registry import WEIGHTS, locate_model
+    from meshmatch.models.registry import load_once
 
-    folder = locate_model(model)
-    try:
-        changed = os.stat(folder / WEIGHTS).st_mtime_ns
-    except OSError:
-        changed = 0  # the reader says what is missing
-    with _loading:
-        return _loaded(folder.resolve(), changed)
-
-
-@lru_cache(maxsize=8)
-def _loaded(folder: Path, changed: int) -> TrainedModel:
-    from meshmatch.models.registry import load_model
-
-    return load_model(folder)
+    return load_once(model)
 
 
 def validated(shape: Shape) -> Repaired:
     """Repair a shape and refuse what cannot be fitted (`InputError`): too few faces or points, no extent, or large parts
     far apart.
     """
+    clean = usable(shape)
+    refuse_far_parts(clean)
+    return clean
+
+
+def refuse_far_parts(clean: Repaired) -> None:
+    """Refuse a shape with large parts far apart (`InputError`)."""
+    if clean.far_parts:
+        many = f"{clean.shape.name or 'the shape'} contains {clean.far_parts + 1} large parts far apart"
+        choose = "save each object in a file of its own, or choose parts with --only (see `meshmatch info`)"
+        raise InputError(many, choose)
+
+
+def usable(shape: Shape) -> Repaired:
+    """As `validated`, for shapes whose parts may be tried apart: large parts may be far apart."""
     clean = repair(shape)
     fixed = clean.shape
     name = shape.name or "the shape"
@@ -72,9 +69,6 @@ def validated(shape: Shape) -> Repaired:
         raise InputError(f"{name} has no surface: all its points lie on a line", "is it a point cloud?")
     if not fixed.area > 0:
         raise InputError(f"{name} has no surface area", "are all its points the same, or on a line?")
-    if clean.far_parts:
-        many = f"{name} contains {clean.far_parts + 1} large parts far apart"
-        raise InputError(many, "save each object in a file of its own")
     return clean
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from meshmatch.api.matching import Matcher
 from meshmatch.api.results import shape_of
+from meshmatch.arrays import Brief
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import WAYS, Blend, Deviation, Way
@@ -82,8 +83,8 @@ class Step:
         return {"time": round(self.time, 9)} | {key: round(value, 6) for key, value in asdict(self.deviation).items()}
 
 
-@dataclass(frozen=True, eq=False)
-class Interpolation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Interpolation(Brief):
     """A sequence of shapes with the same vertices and faces.
 
     ``fits`` are of the source, of the shapes on the way, of the target, and ``times`` are when each of these is met.

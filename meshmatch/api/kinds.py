@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.api.inputs import as_model
+from meshmatch.api.apart import find_alone
+from meshmatch.api.inputs import as_model, refuse_far_parts
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, MeshmatchError, ModelError, OptionError
 from meshmatch.fitting.fit import Fit
@@ -29,9 +30,9 @@ from meshmatch.threads import beside
 _PEOPLE = "human"
 _NEXT, _TOGETHER = ("quadruped",), 2  # asked after people, before the others; how many models at a time
 _MOST_READ = 40  # files of a folder whose kind is found out
-_NAME_IT = "name the model with --model (model=...) if that is wrong"
-_LEAVE_OUT = "--without leaves out what is no part of it"
-_NONE = f"if it is of one of them, name its model with --model (model=...); {_LEAVE_OUT}"
+_NAME_IT = "name the model (--model NAME, in Python model=NAME) if that is wrong"
+_LEAVE_OUT = "--without leaves out what is no part of it (`meshmatch info` lists parts)"
+_NONE = f"if it is one of these all the same, name the model (--model NAME, in Python model=NAME); {_LEAVE_OUT}"
 
 
 @dataclass(frozen=True)
@@ -91,12 +92,10 @@ def read_kinds(
 
     parts = [_is_part(shape, config) for shape, config in zip(shapes, configs, strict=True)]
     first, *others = sorted(range(len(shapes)), key=lambda number: shapes[number].is_cloud or parts[number])
-    likely = [row for row, model in enumerate(models) if model.card.category == _PEOPLE or not model.built_in]
-    ask(likely, [first])
-    rest = sorted(set(range(len(models))) - set(likely), key=lambda row: models[row].card.category not in _NEXT)
-    while rest and found[:, first].min() > sure:
-        ask(rest[:_TOGETHER], [first])
-        del rest[:_TOGETHER]
+    for rows in _order(models):
+        ask(rows, [first])
+        if found[:, first].min() <= sure:
+            break
     known = found[:, first].min() <= KNOWN
     kind = models[int(found[:, first].argmin())].card.category
     same = [row for row, model in enumerate(models) if model.card.category == kind and known]
@@ -104,6 +103,13 @@ def read_kinds(
     unknown = [number for number in others if found[:, number].min() > KNOWN and not (known and parts[number])]
     ask([row for row in range(len(models)) if row not in same], unknown)
     return found
+
+
+def _order(models: Sequence[Installed]) -> list[list[int]]:
+    """Which models (rows) are asked together, one group after the other."""
+    likely = [row for row, model in enumerate(models) if model.card.category == _PEOPLE or not model.built_in]
+    rest = sorted(set(range(len(models))) - set(likely), key=lambda row: models[row].card.category not in _NEXT)
+    return [likely, *(rest[first : first + _TOGETHER] for first in range(0, len(rest), _TOGETHER))]
 
 
 def _is_part(shape: Shape, config: FitConfig) -> bool:
@@ -124,11 +130,15 @@ class Told:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The model that knows all of some shapes; for each a few words, and a fit by it that telling its kind took, if any."""
+    """The model that knows all of some shapes. For each shape what is fitted of it: all, or some parts; a few words; a fit
+    by the model that telling its kind took, if any; and whether its parts were tried apart.
+    """
 
     model: TrainedModel
+    clean: list[Repaired]
     words: list[str]
     fits: list[Fit | None]
+    tried: list[bool]
 
 
 def choose_model(
@@ -139,7 +149,8 @@ def choose_model(
 ) -> Choice:
     """The installed model that knows the kind of all the shapes; or ``settled``, if it does.
 
-    A cloud, or a shape that may be a part of something, is of the other shapes' kind where its own cannot be told.
+    A cloud, or a shape that may be a part of something, is of the other shapes' kind where its own cannot be told. Of a
+    mesh of no kind, or of parts far apart, those parts are chosen that are of a kind (`meshmatch.api.apart`).
     `InputError` if two shapes are of different kinds, or one of none; `ModelError` if no model is installed.
     """
     models = installed_models()
@@ -149,7 +160,19 @@ def choose_model(
     readings = read_kinds(models, shapes, configs)
     if np.isinf(readings).all():
         raise _no_model()
-    found = tell_kinds(models, readings, shapes, configs, progress)
+    found = _told(models, readings, shapes, configs, progress)
+    clean = list(clean)
+    tried = [told.kind is None or each.far_parts > 0 for told, each in zip(found, clean, strict=True)]
+    for number in np.flatnonzero(tried):
+        config = configs[number]
+        loaders, whole = [model.load for model in models], clean[number].original
+        if (alone := find_alone(loaders, whole, config, _order(models), progress)) is not None:
+            card = models[alone.row].card
+            clean[number], readings[:, number] = alone.clean, alone.readings
+            found[number] = Told(card.category, card, alone.fit)
+        refuse_far_parts(clean[number])
+    shapes = [each.shape for each in clean]
+    _refuse_unknown(models, found, shapes, configs)
     names: dict[str, str] = {} if settled is None else {settled.card.category: "the shapes before"}
     for shape, kind in zip(shapes, [each.kind for each in found], strict=True):
         if kind is not None and kind not in names and names:
@@ -170,7 +193,7 @@ def choose_model(
         each.fit if each.card == chosen.card and config.refine == "nodes" else None
         for each, config in zip(found, configs, strict=True)
     ]
-    return Choice(chosen, words, usable)
+    return Choice(chosen, clean, words, usable, tried)
 
 
 def _unsure(shape: Shape, taken: str) -> str:
@@ -190,22 +213,39 @@ def tell_kinds(
 
     `InputError` for a complete mesh that is not of the kind that reads it best.
     """
+    found = _told(models, readings, shapes, configs, progress)
+    _refuse_unknown(models, found, shapes, configs)
+    return found
 
+
+def _told(
+    models: Sequence[Installed],
+    readings: Float[Floats, "M S"],
+    shapes: Sequence[Shape],
+    configs: Sequence[FitConfig],
+    progress: ProgressCallback | None,
+) -> list[Told]:
     def tell(shape: Shape, config: FitConfig, column: Float[Floats, " M"]) -> Told:
         best = models[row := int(column.argmin())]
         kind = best.card.category
         if np.isinf(column[row]):
             return Told(None, best.card)
+        if _is_part(shape, config):  # whose fit would tell nothing that the reading does not
+            return Told(kind if column[row] <= KNOWN else None, best.card)
         known, fit = told(best.load(), shape, column[row], config, progress)
         return Told(kind if known else None, best.card, fit)
 
-    found = beside(tell, shapes, configs, readings.T)
+    return beside(tell, shapes, configs, readings.T)
+
+
+def _refuse_unknown(
+    models: Sequence[Installed], found: Sequence[Told], shapes: Sequence[Shape], configs: Sequence[FitConfig]
+) -> None:
     for shape, config, each in zip(shapes, configs, found, strict=True):
         if each.kind is None and not shape.is_cloud and not may_show_part(shape, config):
             names = ", ".join(sorted({model.card.category for model in models}))
-            problem = f"{shape.name} is of no kind that the installed models know: {names}"
+            problem = f"{shape.name} does not look like anything that the installed models know: {names}"
             raise InputError(problem, _NONE)
-    return found
 
 
 def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | None:
@@ -241,7 +281,7 @@ def kinds_of(
         best = int(readings.argmin())
         found[name] = models[best].card.category if readings[best] <= FAMILIAR else None
         if progress is not None:
-            progress("kinds read", "shapes", (number + 1) / len(read))
+            progress("looking for known kinds", "shapes", (number + 1) / len(read))
     return found
 
 

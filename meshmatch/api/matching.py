@@ -6,14 +6,16 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.api.inputs import as_model, check_config, checked_threads, validated
+from meshmatch.api.inputs import as_model, check_config, checked_threads, refuse_far_parts, usable, validated
 from meshmatch.api.results import MatchResult, map_of_fits, shape_of
+from meshmatch.arrays import off_torch
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit
@@ -29,8 +31,19 @@ from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import one_of, thread_limit
 
+if TYPE_CHECKING:
+    from meshmatch.api.apart import Alone
+
 LandmarkPairs = tuple[ArrayLike, ArrayLike]
 """Corresponding points: vertices of the source (N,), vertices of the target (N,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """What choosing the model has done for a shape: a fit, if it took one, and whether parts were tried apart."""
+
+    fit: Fit | None = None
+    tried: bool = False
 
 
 class Matcher:
@@ -42,6 +55,10 @@ class Matcher:
     helps the others' fits, whose results it does not change. The libraries have one thread for one shape alone too, and
     more if they are asked for, which may change the last bits. Afterwards they have their threads back. ``progress`` is
     called with the stage, the name of the shape and the share of the stage that is done (0..1).
+
+    A Matcher can be pickled, for `multiprocessing`, joblib, or the workers of a data loader. Its model is loaded again by
+    its name or folder where the pickle is opened (`ModelError` if it is missing there, or has other weights); ``progress``
+    stays behind.
 
     >>> matcher = meshmatch.Matcher("human")
     >>> fits = [matcher.fit(path) for path in paths]
@@ -66,6 +83,15 @@ class Matcher:
         self._asked_threads = threads or 1
         self.progress = progress
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_choosing"} | {"progress": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _choosing=threading.Lock())
+
+    def __repr__(self) -> str:
+        return f"Matcher({self._model.card.name if self._model else AUTO!r})"
+
     @property
     def model(self) -> TrainedModel:
         """The model; `OptionError` before the first shapes have decided."""
@@ -85,9 +111,9 @@ class Matcher:
 
         There is one config for all shapes, or one for each. Errors as `fit`.
         """
-        clean = [validated(shape) for shape in as_shapes(shapes)]
+        clean = [usable(shape) for shape in as_shapes(shapes)]
         configs = self._configs(config, len(clean))
-        kinds, begun = self._choose(clean, configs)
+        clean, kinds, begun = self._choose(clean, configs)
         fits = self._fit_all(clean, configs, begun)
         return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kinds, fits, strict=True)]
 
@@ -102,7 +128,8 @@ class Matcher:
         last.check_template(self.model.template.hash)
         clean = validated(as_shape(shape))
         with thread_limit(1):
-            return self._finished(follow(Fitter(self.model, self.config), clean.shape, last), clean, self.config)
+            found = follow(Fitter(self.model, self.config), clean.shape, last)
+            return self._finished(*self._best(found, clean, self.config), self.config)
 
     def dense(self, fit: Fit) -> Shape:
         """The template in its full resolution on the shape of a fit, in the frame and unit of its file."""
@@ -114,9 +141,9 @@ class Matcher:
     def map(self, source: Fit, target: Fit, *, agree: bool = True) -> VertexMap:
         """The map from the shape of one fit to the shape of another, both of the same model.
 
-        With ``agree`` both fits first agree on how the template stretches, as `match` does: the more accurate map, and
-        a confidence that knows where they disagreed. Without it they are only composed: a tenth of a second instead of
-        some seconds. `OptionError` for a fit of another template, or one that does not know its shape.
+        With ``agree`` both fits are first refined together, so that the template stretches alike, as `match` does: the more
+        accurate map, and a confidence that knows where they disagreed. Without it they are only composed, in a tenth of the
+        time. `OptionError` for a fit of another template, or one that does not know its shape.
         """
         with thread_limit(1):
             for fit in (source, target):
@@ -135,9 +162,9 @@ class Matcher:
     ) -> MatchResult:
         """Fit both shapes and map one to the other; see `match` for the parameters."""
         began = time.monotonic()
-        clean = [validated(as_shape(source, "source")), validated(as_shape(target, "target"))]
+        clean = [usable(as_shape(source, "source")), usable(as_shape(target, "target"))]
         configs = self._configs(config, 2)
-        kinds, begun = self._choose(clean, configs)
+        clean, kinds, begun = self._choose(clean, configs)
         if landmarks is not None:
             for each in configs:
                 if not each.moves_nodes:
@@ -149,7 +176,8 @@ class Matcher:
             fits = self._fit_all(clean, configs, begun)
             known = None
             if landmarks is not None:
-                pairs = np.asarray(landmarks[0]), np.asarray(landmarks[1])
+                clean = [shape_of(fit) for fit in fits]
+                pairs = np.asarray(off_torch(landmarks[0])), np.asarray(off_torch(landmarks[1]))
                 pulled, known = fits_with_landmarks(self.model, clean, fits, pairs, configs)
                 fits = [self._finished(*each) for each in zip(pulled, clean, configs, strict=True)]
             before = fits[0], fits[1]
@@ -162,16 +190,44 @@ class Matcher:
 
     def _choose(
         self, clean: Sequence[Repaired], configs: Sequence[FitConfig]
-    ) -> tuple[list[tuple[str, ...]], list[Fit | None]]:
-        """Let the shapes decide on the model, if nobody did; what is to be said of each, and its fit if that took one."""
+    ) -> tuple[list[Repaired], list[tuple[str, ...]], list[_Begun]]:
+        """Let the shapes decide on the model, if nobody did. Gives what is fitted of each shape, what is to be said of it,
+        and what was done of its fit.
+        """
         if not self._auto:
-            return [()] * len(clean), [None] * len(clean)
+            with thread_limit(1):
+                found = [self._near(*each) for each in zip(clean, configs, strict=True)]
+            return [each for each, _ in found], [()] * len(clean), [begun for _, begun in found]
         from meshmatch.api.kinds import choose_model
 
         with self._choosing, thread_limit(1), one_of(threading.Semaphore(self.threads)):
             choice = choose_model(clean, configs, self._model, self.progress)
             self._model = choice.model
-        return [(each,) for each in choice.words], choice.fits
+        begun = [_Begun(*each) for each in zip(choice.fits, choice.tried, strict=True)]
+        return choice.clean, [(each,) for each in choice.words], begun
+
+    def _near(self, clean: Repaired, config: FitConfig) -> tuple[Repaired, _Begun]:
+        """A shape; of one with parts far apart those that the model knows, with a fit if that took one, or `InputError`."""
+        if clean.far_parts and (alone := self._alone(clean, config, self.progress)) is not None:
+            return alone.clean, _Begun(alone.usable_fit(config), True)
+        refuse_far_parts(clean)
+        return clean, _Begun()
+
+    def _alone(self, clean: Repaired, config: FitConfig, progress: ProgressCallback | None) -> Alone | None:
+        from meshmatch.api.apart import find_alone
+
+        return find_alone([lambda: self.model], clean.original, config, progress=progress)
+
+    def _best(
+        self, whole: Fit, clean: Repaired, config: FitConfig, progress: ProgressCallback | None = None
+    ) -> tuple[Fit, Repaired]:
+        """The fit of a shape, or where that is poor the better one of some of its parts; and what it is a fit of."""
+        if whole.verdict != "poor":
+            return whole, clean
+        if (alone := self._alone(clean, config, progress)) is None:
+            return whole, clean
+        fit = alone.usable_fit(config) or Fitter(self.model, config, progress).fit(alone.clean.shape)
+        return (whole, clean) if fit.verdict == "poor" else (fit, alone.clean)
 
     def _configs(self, config: FitConfig | Sequence[FitConfig] | None, count: int) -> list[FitConfig]:
         config = self.config if config is None else config
@@ -182,9 +238,7 @@ class Matcher:
             check_config(each)
         return configs
 
-    def _fit_all(
-        self, clean: Sequence[Repaired], configs: Sequence[FitConfig], begun: Sequence[Fit | None]
-    ) -> list[Fit]:
+    def _fit_all(self, clean: Sequence[Repaired], configs: Sequence[FitConfig], begun: Sequence[_Begun]) -> list[Fit]:
         stop, threads = threading.Event(), threading.Semaphore(self.threads)
         names = [part.shape.name for part in clean]
         labels = [f"{name} ({number + 1})" if names.count(name) > 1 else name for number, name in enumerate(names)]
@@ -198,11 +252,13 @@ class Matcher:
 
             try:
                 with one_of(threads):
-                    found = begun[number] or Fitter(self.model, configs[number], report).fit(clean[number].shape)
+                    here, config = clean[number], configs[number]
+                    found = begun[number].fit or Fitter(self.model, config, report).fit(here.shape)
+                    best = (found, here) if begun[number].tried else self._best(found, here, config, report)
             except BaseException:
                 stop.set()
                 raise
-            return self._finished(found, clean[number], configs[number])
+            return self._finished(*best, configs[number])
 
         # one fit alone may have all threads that were asked for; several have one each
         inner = self._asked_threads if len(clean) == 1 else 1
@@ -223,7 +279,7 @@ class Matcher:
         notes = [f"{clean.shape.name}: {note}" for note in clean.notes]
         if config.for_model(self.model).refine != config.refine:
             notes.append(f"model {self.model.card.name} is pointwise and has no nodes: its code was refined instead")
-        return replace(fit, repaired=clean, notes=(*notes, *fit.notes))
+        return replace(fit, repaired=clean, left_out=clean.left_out, notes=(*notes, *fit.notes))
 
     def _agreed(
         self,
@@ -255,8 +311,9 @@ def match(
 
     ``source`` and ``target`` are meshes or point clouds of the model's category, in any unit, orientation and resolution:
     a path, a Shape, an (N, 3) array, (vertices, faces), or an object with .vertices and .faces. ``config`` says how
-    shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes.
-    ``landmarks`` are known pairs, (source vertices (N,), target vertices (N,)), which pull both fits; the map says
+    shapes are fitted; a pair holds one for the source and one for the target, which may differ in their axes. Where the
+    whole of a file cannot be fitted, such as a body on a floor, its parts are tried apart, and ``notes`` say which were left
+    out. ``landmarks`` are known pairs, (source vertices (N,), target vertices (N,)), which pull both fits; the map says
     which of them it misses, and is then not good. Only with ``refine="nodes"``. See `Matcher` for the rest.
 
     `MeshmatchError`: a shape that cannot be read or fitted, an unknown model, or choices that contradict each other.

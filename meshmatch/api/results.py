@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Brief, Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
@@ -48,6 +48,9 @@ class MatchResult:
     before_agreement: tuple[Fit, Fit]
     threads: int = 1
 
+    def __repr__(self) -> str:
+        return f"MatchResult({self.map!r}, {self.seconds:.1f} s, {len(self.notes)} notes)"
+
     @property
     def rotations(self) -> tuple[Floats, Floats]:
         """(3, 3) of source and target: from their files into the orientation of the template, for pictures."""
@@ -60,8 +63,8 @@ class MatchResult:
             return map_of_fits((self.target_fit, self.source_fit), (target, source), self.threads)
 
 
-@dataclass(frozen=True, eq=False)
-class MapPair:
+@dataclass(frozen=True, eq=False, repr=False)
+class MapPair(Brief):
     """The maps between two shapes in both directions.
 
     ``forward`` is from source to target. Without a ``match`` of the shapes the backward map is the inverse of it,
@@ -125,8 +128,8 @@ class ConfidenceRule:
             raise OptionError(f"a confidence lies in 0..1, not {self.minimum!r}")
 
 
-@dataclass(frozen=True, eq=False)
-class Transferred(Generic[T]):
+@dataclass(frozen=True, eq=False, repr=False)
+class Transferred(Brief, Generic[T]):
     """What arrived on the target: ``data`` is an array, Labels, SkinWeights or Landmarks.
 
     ``confidence`` (N,) float64 is that of each vertex, face or landmark, 0 (a guess) to 1 (sure); ``low`` says how many

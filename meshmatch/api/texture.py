@@ -9,6 +9,7 @@ from typing import get_args
 
 from meshmatch.api.results import MapPair
 from meshmatch.api.transfer import MapLike, find_maps
+from meshmatch.arrays import Brief
 from meshmatch.errors import InputError, OptionError
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.appearance import Appearance, vertex_colors_alone
@@ -21,8 +22,8 @@ from meshmatch.transfer.bake import Baked, BakeOptions
 from meshmatch.transfer.unwrap import Atlas, Keep, atlas_of
 
 
-@dataclass(frozen=True, eq=False)
-class TexturedResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class TexturedResult(Brief):
     """The target with its new texture: the ``mesh`` with its texture coordinates, what was ``baked`` (``image`` (size,
     size, 4) uint8, and shares of the surface that are not trusted or discontinuous), the ``atlas`` (and why the target's
     own coordinates were not used), the ``maps`` that were followed, and the ``seconds`` of unwrapping and baking.

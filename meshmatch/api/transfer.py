@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from meshmatch.api.results import ConfidenceRule, MapPair, MatchResult, Transferred
-from meshmatch.arrays import Floats, as_numbers
+from meshmatch.arrays import Floats, as_numbers, off_torch
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.colors import light, seen
 from meshmatch.shapes.files import ShapeLike, as_shape
+from meshmatch.shapes.landmark_files import Space, mesh_space
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import pull_directions, pull_face_labels, pull_labels, pull_values, pull_weights
@@ -238,8 +239,9 @@ def transfer_landmarks(
 
     `MeshmatchError`: landmarks that are not on the source; or as `find_maps`.
     """
+    space = mesh_space(source) if isinstance(source, str | Path) else ""
     source = as_shape(source, "source")
-    given = _landmarks(landmarks, source)
+    given = _landmarks(landmarks, source, space)
     maps = find_maps(source, target, match)
     with thread_limit(1):
         found = push_landmarks(maps.forward, maps.source, maps.target, given)
@@ -247,12 +249,17 @@ def transfer_landmarks(
     return Transferred(found, found.confidence, LowConfidence(len(found.names), low), maps)
 
 
-def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape) -> Landmarks:
+def _landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape, space: Space) -> Landmarks:
     if isinstance(landmarks, Landmarks):
         return landmarks
     if isinstance(landmarks, str | Path):
-        return load_landmarks(landmarks, source)[0]
-    places = np.asarray(landmarks)
+        return load_landmarks(landmarks, source, space)[0]
+    try:
+        places = np.asarray(off_torch(landmarks))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"landmarks are no array of numbers ({error})", "give vertices (N,) or positions (N, 3)"
+        ) from error
     if places.ndim == 1 and places.dtype.kind in "iu":
         return at_vertices(source, places)
     if places.ndim == 2 and places.shape[1] == 3 and places.dtype.kind in "iuf":

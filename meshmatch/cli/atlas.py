@@ -36,7 +36,7 @@ class AtlasOptions:
         "normal",
         help="Compare displacements along the normal of the mean, or in all directions (Hotelling's T squared).",
     )
-    permutations: int = Option(10_000, min=1, metavar="N", help="Number of labellings in the comparison, at most.")
+    permutations: int = Option(10_000, min=1, metavar="N", help="Number of permutations of the group labels, at most.")
     samples: int = Option(0, min=0, max=10_000, metavar="N", help="Number of random shapes to write.")
     measures: bool = Option(
         True,
@@ -147,8 +147,9 @@ def _tell(console: Console, about: dict[str, Any]) -> None:
         first, second = found["names"]
         console.say(
             f"{first} and {second} ({found['counts'][0]} and {found['counts'][1]} shapes): p = {found['p_overall']:.4g} "
-            f"overall; {found['vertices_corrected']} of {about['vertices']} vertices differ at {found['level']:g}, "
-            f"{found['vertices_fdr']} by the false discovery rate"
+            f"overall; {found['vertices_corrected']} of {about['vertices']} vertices differ at "
+            f"a family-wise error of {found['level']:g}, "
+            f"{found['vertices_fdr']} at a false discovery rate of {found['level']:g}"
         )
 
 

@@ -1,4 +1,4 @@
-"""The only place where an error becomes words and an exit status.
+"""The only place where an error becomes words and an exit status, and a warning words.
 
 0 done, 1 the user's data or choice (or too little memory for it), 2 usage, 130 interrupted, 143 killed by SIGTERM, 129 by
 SIGHUP. Anything that is not a `MeshmatchError` is a bug and keeps its traceback; with MESHMATCH_DEBUG=1 so does
@@ -10,12 +10,13 @@ import os
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
 from meshmatch.cli.words import Console, stdout_refused
-from meshmatch.errors import MeshmatchError
+from meshmatch.errors import MeshmatchError, MeshmatchWarning
 
 DEBUG_VARIABLE = "MESHMATCH_DEBUG"
 INTERRUPTED = 130
@@ -105,8 +106,9 @@ def _run(arguments: Sequence[str] | None) -> int:
 
     set_threads(1)  # before NumPy reads it: whoever needs more asks for them
     try:
-        # not app(...): that would replace sys.excepthook, and a bug keeps Python's own traceback
-        get_command(app)(args=arguments, prog_name="meshmatch")
+        with _warnings_as_words():
+            # not app(...): that would replace sys.excepthook, and a bug keeps Python's own traceback
+            get_command(app)(args=arguments, prog_name="meshmatch")
     except OSError as error:
         if error.errno != errno.ENOSPC or error.filename is not None:
             raise
@@ -114,3 +116,22 @@ def _run(arguments: Sequence[str] | None) -> int:
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     return 0
+
+
+@contextmanager
+def _warnings_as_words() -> Iterator[None]:
+    """Inside, each of our warnings is shown once, in a line, whatever Python was told to do with warnings."""
+    shown: set[str] = set()
+    others = warnings.showwarning
+
+    def show(message: Any, category: type[Warning], *where: Any, **more: Any) -> None:
+        if not issubclass(category, MeshmatchWarning):
+            others(message, category, *where, **more)
+        elif str(message) not in shown:  # a file may be read twice
+            shown.add(str(message))
+            Console().warn(str(message))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", MeshmatchWarning)
+        warnings.showwarning = show
+        yield

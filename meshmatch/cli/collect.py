@@ -39,7 +39,7 @@ def fit(
     output: str = output_option("FITS", "The folder of the fits, or its URL; if it is there, the work goes on."),
     how: FitOptions,
     agree: bool = Option(
-        True, "--agree/--alone", help="Let all fits agree on how the template stretches, or keep them alone."
+        True, "--agree/--alone", help="Refine all fits together, towards the mean stretch of the template, or not."
     ),
     sequence: bool = Option(
         False, "--sequence", help="The shapes of a folder are frames: each fit starts where the last one ended."
@@ -52,9 +52,10 @@ def fit(
 ) -> None:
     """Fit every shape of a collection once, for maps between any two of them and for atlases.
 
-    Each shape is a row of a table as it comes in; one that cannot be fitted stops nobody. What a run that was stopped had
-    finished is kept, and shapes that were added since are fitted when it is run again. With --model none the template is
-    made of the shapes themselves, which must be complete. FITS/fits.csv says what became of each shape.
+    Each shape is a row of a table as it comes in; one that cannot be fitted is reported, and the others go on. What a run
+    that was stopped had finished is kept, and shapes that were added since are fitted when it is run again. With --model
+    none the template is made of the shapes themselves, which must be complete. FITS/fits.csv says what became of each
+    shape.
     """
     from meshmatch.collections.setting import FAILED
     from meshmatch.fitting.viscous import NO_MODEL
@@ -95,6 +96,8 @@ def _table(console: Console) -> Callable[["Record"], None]:
         console.say(_ROW.format(record.name, record.verdict, *(measured if record.fitted else [""] * 6)).rstrip())
         if not record.fitted or record.verdict == "poor":
             console.warn(f"{record.name}: {'' if record.fitted else 'not fitted: '}{record.reasons}")
+        if record.notes:
+            console.say(f"{record.name}: {record.notes}")
 
     return tell
 
@@ -106,7 +109,7 @@ def map(
     to: str | None = optional("NAME", "Or map every shape to this one."),
     all_pairs: bool = Option(False, "--all", help="Or map every shape to every other."),
     suffix: str = Option(
-        ".npz", "--format", metavar="SUFFIX", help="How maps are written: .npy .npz .csv .txt .mat .json."
+        ".npz", "--format", metavar="SUFFIX", help="How maps are written: .npy, .npz, .csv, .txt, .mat or .json."
     ),
     jobs: Jobs = None,
     scheduler: Scheduler = None,

@@ -1,7 +1,9 @@
 """``meshmatch info``: what is in a file."""
 
+from bisect import bisect_right
+from itertools import accumulate
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -9,12 +11,17 @@ from meshmatch.cli import options
 from meshmatch.cli.words import Json, print_json, print_rows
 from meshmatch.errors import InputError
 
+if TYPE_CHECKING:
+    from meshmatch.shapes.parts import Parts
+
+_SHOWN_PARTS, _MOST_PARTS = 20, 1000  # of a mesh: in words, and with --json
+
 
 def info(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A shape, a map or a template bundle.")],
     json: options.Json = False,
 ) -> None:
-    """Say what is in a file.
+    """Describe a file: a shape, a map or a template.
 
     Of a shape also what repair would do. Nothing is written.
     """
@@ -33,6 +40,7 @@ def info(
     rows = []
     for key, value in record.items():
         values = value if key in ("repair", "reasons", "meshes") else [value]  # a line each
+        values = _part_lines(value, record["parts"]) if key == "largest_parts" else values
         shown = [_shown(item) for item in values] or ["nothing to do" if key == "repair" else "none"]
         rows += [(key.replace("_", " ") if n == 0 else "", text) for n, text in enumerate(shown)]
     print_rows(rows)
@@ -49,27 +57,54 @@ def _is_list(file: Path) -> bool:
 
 
 def _shape(file: Path) -> Json:
-    from meshmatch.shapes.files import load_shape, mesh_names
+    from meshmatch.shapes.files import load_shape, mesh_list, summed
     from meshmatch.shapes.normalise import guess_unit, long_axis
+    from meshmatch.shapes.parts import Parts
     from meshmatch.shapes.repair import repair
 
-    names = mesh_names(file)  # first: what it reads is gone before the shape itself needs memory
+    meshes = mesh_list(file)  # first: what it reads is gone before the shape itself needs memory
     shape = load_shape(file)
     size = [float(length) for length in shape.bounds[1] - shape.bounds[0]]
     clean = repair(shape)
-    edges, parts = {}, {}
+    edges: Json = {}
+    parts: Json = {}
     if not shape.is_cloud:
         border, crowded = shape.edges.counts
         edges = {"watertight": border == crowded == 0, "open_edges": border, "non_manifold_edges": crowded}
-        # of the repaired mesh: the seams of texture and the corners of an stl are joined
-        parts = {"parts": int(clean.shape.face_parts.max()) + 1}
+        found = Parts.of(shape)
+        parts = {"parts": len(found)} | ({"largest_parts": _parts(found, meshes)} if len(found) > 1 else {})
     about: Json = {"kind": "point cloud" if shape.is_cloud else "mesh", "vertices": shape.V, "faces": shape.F}
-    if names:
-        about["meshes"] = [f"{name} ({count:,} vertices)" for name, count in names.items()]
+    if meshes:
+        about["meshes"] = [f"{name} ({count:,} vertices)" for name, count in summed(meshes).items()]
     about |= {"size": size, "area": shape.area, "colors": shape.colors is not None}
     usual = {"longest_along": long_axis(clean.shape), "unit_if_a_person": guess_unit(clean.shape)}
     repaired = {"repaired_vertices": clean.shape.V, "repaired_faces": clean.shape.F}
     return about | edges | parts | usual | {"repair": list(clean.notes)} | repaired | {"hash": shape.hash}
+
+
+def _parts(parts: "Parts", meshes: list[tuple[str, int]]) -> list[Json]:
+    """The largest parts of a mesh, and in which mesh of a scene each begins."""
+    ends = list(accumulate(count for _, count in meshes))
+    found: list[Json] = []
+    for k in range(min(len(parts), _MOST_PARTS)):
+        low, high = parts.bounds[k]
+        about = {"part": k + 1, "vertices": int(parts.counts[k]), "share_of_area": float(parts.shares[k])}
+        about["size"] = [float(length) for length in high - low]
+        if meshes:
+            about["mesh"] = meshes[bisect_right(ends, int(parts.first_vertices[k]))][0]
+        found.append(about)
+    return found
+
+
+def _part_lines(found: list[Json], count: int) -> list[str]:
+    """A line for each of the largest parts, as many as a reader takes in."""
+    lines = []
+    for each in found[:_SHOWN_PARTS]:
+        size = " x ".join(f"{length:.3g}" for length in each["size"])
+        name = f", {each['mesh']}" if "mesh" in each else ""
+        share = f"{100 * each['share_of_area']:.3g} % of the area"
+        lines.append(f"{each['part']}: {share}, {each['vertices']:,} vertices, {size}{name}")
+    return lines + ([f"and {count - _SHOWN_PARTS:,} more"] if count > _SHOWN_PARTS else [])
 
 
 def _map(file: Path) -> Json:

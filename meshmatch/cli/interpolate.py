@@ -55,7 +55,7 @@ def interpolate(
     how: FitOptions,
     run: RunOptions,
 ) -> None:
-    """Make the shapes between two shapes.
+    """Blend one shape into another: a sequence of the shapes in between.
 
     The model's template is fitted to each, and its poses are blended; A's own mesh moves along. Time 0 is A as it is in
     its file, and at time 1 A's mesh lies on B. Shapes given with --through are passed at even times in between.

@@ -32,7 +32,9 @@ def match(
     *,
     source: options.Source,
     target: options.Target,
-    output: Path = output_option("MAP", "The map; its suffix chooses the format: .npy .npz .csv .txt .mat .json."),
+    output: Path = output_option(
+        "MAP", "The map; its suffix chooses the format: .npy, .npz, .csv, .txt, .mat or .json."
+    ),
     how: PairOptions,
     run: RunOptions,
     picture: Path | None = optional("PNG", "Draw both shapes, corresponding points in one color."),
@@ -124,7 +126,7 @@ def register(
     *,
     shape: Path = Argument(..., metavar="SHAPE", help="The shape to fit the template to."),
     output: Path = output_option(
-        "MESH", "The fitted template, in the frame and unit of SHAPE: .ply .obj .off .stl .glb."
+        "MESH", "The fitted template, in the frame and unit of SHAPE: .ply, .obj, .off, .stl or .glb."
     ),
     how: FitOptions,
     run: RunOptions,
@@ -133,8 +135,8 @@ def register(
 ) -> None:
     """Fit the model's template to one shape.
 
-    Results for all shapes have the same vertices and triangles in the same order. More than one of --threads may change
-    the last bits.
+    This is a non-rigid registration: the template is deformed, and the shape stays where it is. Results for all
+    shapes have the same vertices and triangles in the same order. More than one of --threads may change the last bits.
     """
     from meshmatch.shapes.files import check_suffix
 
@@ -214,7 +216,7 @@ def evaluate(
     curve: Path | None = optional("FILE", "Draw the cumulative error curve, .png, .svg or .pdf (needs the truth)."),
     picture: Path | None = optional("PNG", "Draw both shapes, the errors as a color map (needs the truth)."),
     unit: options.ErrorUnit = Option(
-        "cm", help="Of curve and picture: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100."
+        "cm", help="Of curve and picture: cm on a person (1.9 m2 of skin), or 1/100 of sqrt(area) of the target."
     ),
     seed: options.Seed = 0,
     json: options.Json = False,

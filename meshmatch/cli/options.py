@@ -40,7 +40,7 @@ Truth = Annotated[
     Path | None,
     Option(
         metavar="FILE",
-        help="True pairs, a source vertex and a target vertex a line (.txt .csv .npy); or one column: the "
+        help="True pairs, a source vertex and a target vertex a line (.txt, .csv or .npy); or one column: the "
         "target vertex of every source vertex.",
     ),
 ]
@@ -158,13 +158,13 @@ class FitOptions:
     only: list[str] | None = Option(
         None,
         metavar="NAME",
-        help="Of a glb or gltf file, fit only the meshes of this name, which may hold * and ?; more than once. See "
-        "`meshmatch info FILE` for the names.",
+        help="Fit only this part, by number, or of a glb or gltf file the meshes of this name, which may hold * and ?; more "
+        "than once. `meshmatch info FILE` lists names and numbers.",
     )
     without: list[str] | None = Option(
         None,
         metavar="NAME",
-        help="Or all meshes but these: weapons, capes. Their vertices are matched like the nearest.",
+        help="Or all but these: weapons, capes, the floor. Their vertices are matched like the nearest.",
     )
     refine: Refine = Option(
         "nodes",

@@ -11,7 +11,7 @@ import meshmatch
 from meshmatch.cli import options, words
 from meshmatch.cli.transfer_options import Transfer, ViewMapOptions
 from meshmatch.cli.words import Console, print_json
-from meshmatch.errors import ModelError, OptionError
+from meshmatch.errors import InputError, ModelError, OptionError, warn
 from meshmatch.models.registry import TEMPLATE, locate_model
 
 if TYPE_CHECKING:
@@ -32,16 +32,18 @@ class PictureOptions:
     confidence: bool = Option(False, "--confidence", help="With --map: its confidence, as a color map.")
     truth: options.Truth = None
     points: options.Points = None
-    unit: options.ErrorUnit = Option("cm", help="Of errors: cm at 1.9 m2 of skin, or sqrt(area of the target) / 100.")
+    unit: options.ErrorUnit = Option(
+        "cm", help="Of errors: cm on a person (1.9 m2 of skin), or 1/100 of sqrt(area) of the target."
+    )
     values: list[Path] | None = options.optional(
-        "FILE", "A number per vertex, as a color map (.npy .csv); or three, as a color. Once for each shape."
+        "FILE", "A number per vertex, as a color map (.npy or .csv); or three, as a color. Once for each shape."
     )
     title: str | None = options.optional("TEXT", "What the numbers of --values are, with their unit.")
     range: tuple[float, float] | None = options.optional(
         "LOW HIGH", "Ends of the scale of a heat; chosen if not given."
     )
     labels: list[Path] | None = options.optional(
-        "FILE", "A label for each vertex or face (.npy .csv .txt .json). Once for each shape."
+        "FILE", "A label for each vertex or face (.npy, .csv, .txt or .json). Once for each shape."
     )
     on: Literal["vertices", "faces"] | None = Option(
         None, help="What the labels belong to; told by their count if not given."
@@ -165,13 +167,22 @@ def picture(
 
 def _load_subject(path: Path, shown: PictureOptions) -> Subject:
     """Read a shape, or a template by its file or name, or that of a model."""
+    from meshmatch.shapes.appearance import vertex_colors_alone
     from meshmatch.shapes.textured_files import find_appearance
 
     if (template := _template(path)) is not None:
         return template, None
     shape = meshmatch.load_shape(path)
     textured = not (shown.plain or shown.map or shown.values or shown.labels or shown.fit)
-    return shape, find_appearance(path, shape, shown.image) if textured else None
+    if not textured:
+        return shape, None
+    try:
+        return shape, find_appearance(path, shape, shown.image)
+    except InputError as error:
+        if shown.image is not None:
+            raise
+        warn(f"{shape.name} is drawn without its texture: {error.message}")
+        return shape, None if shape.colors is None else vertex_colors_alone(shape)
 
 
 def _template(path: Path) -> "Template | None":

@@ -37,7 +37,7 @@ class PrepareOptions:
     )
     landmarks: str | None = optional(
         "WHERE",
-        "Known points of the shapes: a folder of NAME.npy, or a suffix beside them such as .landmarks.npy "
+        "Known points of the shapes: a folder of NAME.npy, or a suffix beside them such as .landmarks.npy or .fcsv "
         "(docs/formats.md).",
     )
     strategy: Literal["parts", "spectral", "geodesic", "uniform"] = Option(

@@ -20,13 +20,14 @@ def transfer_color(
     source: Source,
     target: Target,
     output: Path = output_option(
-        "FILE", "TGT with colors: .ply .glb .obj .off, or the colors alone: .npy .csv. With --values: .npy .csv .ply."
+        "FILE",
+        "TGT with colors (.ply, .glb, .obj or .off), or colors alone (.npy or .csv). With --values: .npy, .csv or .ply.",
     ),
     maps: MapOptions,
     rules: RuleOptions,
     run: RunOptions,
     values: Path | None = optional(
-        "FILE", "Transfer these numbers, a row per vertex of SRC (.npy .csv), not its colors."
+        "FILE", "Transfer these numbers, a row per vertex of SRC (.npy or .csv), not its colors."
     ),
     directions: bool = Option(
         False,
@@ -81,9 +82,9 @@ def transfer_labels(
     *,
     source: Source,
     target: Target,
-    output: Path = output_option("FILE", "Labels: .npy .csv .txt .json, or TGT as .ply."),
+    output: Path = output_option("FILE", "Labels: .npy, .csv, .txt or .json, or TGT as .ply."),
     labels: Path = Option(
-        ..., metavar="FILE", help="A whole number or a word per vertex or face of SRC: .npy .csv .txt .json."
+        ..., metavar="FILE", help="A whole number or a word per vertex or face of SRC: .npy, .csv, .txt or .json."
     ),
     maps: MapOptions,
     rules: RuleOptions,
@@ -131,10 +132,10 @@ def transfer_weights(
     *,
     source: Source,
     target: Target,
-    output: Path = output_option("FILE", "Skin weights of TGT: .npz .json."),
+    output: Path = output_option("FILE", "Skin weights of TGT: .npz or .json."),
     maps: MapOptions,
     run: RunOptions,
-    weights: Path | None = optional("FILE", "Skin weights of SRC: .npz .json .glb. Default: the skin in SRC."),
+    weights: Path | None = optional("FILE", "Skin weights of SRC: .npz, .json or .glb. Default: the skin in SRC."),
     influences: int = Option(4, min=1, help="Maximum number of joints per vertex."),
     fill: bool = Option(False, "--fill", help="Replace weights of low confidence by those of their neighbours."),
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Minimum confidence for weights to be trusted."),
@@ -180,12 +181,13 @@ def transfer_landmarks(
     *,
     source: Source,
     target: Target,
-    output: Path = output_option("FILE", "Landmarks of TGT: .csv .json .pp."),
+    output: Path = output_option("FILE", "Landmarks of TGT: .csv, .json, .pp, .fcsv or .mrk.json."),
     landmarks: Path = Option(
         ...,
         "--landmarks",
         metavar="FILE",
-        help="Landmarks of SRC, as vertices or positions: .csv .json, MeshLab's .pp, or .txt .npy of vertices.",
+        help="Landmarks of SRC, as vertices or positions: .csv, .txt, .npy or .json, MeshLab's .pp, 3D Slicer's .fcsv and "
+        ".mrk.json, .pts or .tps.",
     ),
     maps: MapOptionsWithPairs,
     run: RunOptions,
@@ -195,10 +197,11 @@ def transfer_landmarks(
     """Transfer landmarks to exact points on the surface of another shape.
 
     The output has for each: its vertex, its position, its face with barycentric weights, and its confidence (.csv,
-    .json); or name and position (.pp). A position in FILE stands for the nearest point of SRC.
+    .json); or name and position (.pp, .fcsv, .mrk.json). A position in FILE stands for the nearest point of SRC.
     """
     import numpy as np
 
+    from meshmatch.shapes.landmark_files import mesh_space
     from meshmatch.transfer.landmarks import check_landmarks_suffix, load_landmarks, save_landmarks
 
     transfer = Transfer(source, target, output, maps, run, picture)
@@ -206,7 +209,9 @@ def transfer_landmarks(
     check_landmarks_suffix(output)
     with transfer.outputs(landmarks) as (temporary,):
         a, b = meshmatch.load_shape(source), meshmatch.load_shape(target)
-        given, furthest = load_landmarks(landmarks, a)
+        given, furthest = load_landmarks(landmarks, a, mesh_space(source))
+        for note in given.notes:
+            console.warn(note)
         if furthest > _FAR * a.diagonal:
             console.warn(
                 f"a landmark lies {furthest:.4g} from {a.name}, {100 * furthest / a.diagonal:.0f} % of its size: the "
@@ -214,7 +219,7 @@ def transfer_landmarks(
             )
         result = meshmatch.transfer_landmarks(a, b, given, transfer, rule=meshmatch.ConfidenceRule(min_confidence))
         found = result.data
-        save_landmarks(temporary, found)
+        save_landmarks(temporary, found, mesh_space(target) or "LPS", output.name)
     low = np.flatnonzero(found.confidence < min_confidence)
     for k in low[:10].tolist():
         console.warn(f"landmark {found.names[k]} is uncertain: its confidence is {found.confidence[k]:.2f}")

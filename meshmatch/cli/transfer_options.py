@@ -36,7 +36,7 @@ class MapOptions(PairOptions):
         None,
         "--map",
         metavar="MAP",
-        help="Map from SRC to TGT that `meshmatch match` wrote, or the folder of their fits that `meshmatch fit` made. "
+        help="Map from SRC to TGT (as in `meshmatch match SRC TGT`), or the folder of their fits that `meshmatch fit` made. "
         "Default: match them.",
     )
 
@@ -116,12 +116,16 @@ class Transfer:
     def tell_low(self, low: LowConfidence, minimum: float, what: str = "vertices") -> Json:
         """Say how many values are not trusted and what became of them; the same for --json."""
         kept = low.low - low.filled - low.blank
-        parts = (low.filled, "filled in from their neighbours"), (low.blank, "left blank"), (kept, "kept as they are")
+        parts = (
+            (low.filled, "filled in from their neighbours"),
+            (low.blank, "left blank"),
+            (kept, "transferred all the same"),
+        )
         became = ", ".join(f"{count} {done}" for count, done in parts if count > 0)
         if low.low:
             self.console.say(
-                f"{100.0 * low.low / low.total:.1f} % of the {what} ({low.low} of {low.total}) have no value to take, "
-                f"or less confidence than {minimum:g}: {became}"
+                f"{100.0 * low.low / low.total:.1f} % of the {what} ({low.low} of {low.total}) have no counterpart with "
+                f"a value, or a confidence below {minimum:g}: {became}"
             )
         shares = {"min_confidence": minimum, "low_confidence": low.low, "low_confidence_share": low.low / low.total}
         return shares | {"blank": low.blank, "filled": low.filled}

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 Json = dict[str, Any]
 """One JSON object; paths become strings."""
 _HINT = "is it the model's category? try --up and --front, or leave out --strict to see the result"
+_MOST_PARTS = 1000  # of which --json tells the numbers
 _QUIET = 10.0  # seconds without a word, where nobody watches a bar
 
 
@@ -210,6 +211,9 @@ def fit_record(name: str, fit: meshmatch.Fit) -> Json:
     """A fit for --json."""
     record = {"shape": name, "verdict": fit.verdict, "reasons": fit.reasons, "trust": round(fit.trust, 4)}
     record["residual"] = float(fit.residual)
+    record |= {"left_out_parts": fit.left_out[:_MOST_PARTS]} if fit.left_out else {}
+    if fit.regularity is not None:
+        record["regularity"] = {name: round(value, 5) for name, value in asdict(fit.regularity).items()}
     return record | {"up": fit.up, "front": fit.front, "seconds": round(fit.seconds, 3), "seed": fit.seed}
 
 

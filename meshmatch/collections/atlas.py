@@ -11,7 +11,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Float, Floats, Int, Ints, as_numbers, frozen
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints, Pickled, as_numbers, frozen
 from meshmatch.collections.groups import Comparison, Statistic, compare_groups
 from meshmatch.collections.modes import components
 from meshmatch.collections.superimpose import Poses, Scale, Shapes, Superimposed, blocks, superimpose
@@ -42,8 +42,8 @@ class Projection:
     residual: float
 
 
-@dataclass(frozen=True, eq=False)
-class Atlas:
+@dataclass(frozen=True, eq=False, repr=False)
+class Atlas(Brief, Pickled):
     """The mean of S registered shapes, and the M modes in which they vary.
 
     Attributes

@@ -221,14 +221,14 @@ def _draw_comparison(path: Path, atlas: Atlas, findings: Findings, turn: Float[F
     found, (first, second) = findings.comparison, findings.groups
     assert found is not None
     along = found.along_normal
-    title = f"{second} less {first}, outwards (unit of the files)"
+    title = f"{second} - {first}, along the outward normal (unit of the files)"
     scale = Scale.of(np.concatenate([along, -along]), title)
     panels = [
         Panel(atlas.mean_shape, scale.colors(np.where(shown, along, np.nan)), label, rotation=turn)
         for label, shown in {
             "difference": np.ones(len(along), bool),
-            f"{LEVEL:.0%} false discoveries": found.p_fdr <= LEVEL,
-            f"p <= {LEVEL:g} for all at once": found.p_corrected <= LEVEL,
+            f"false discovery rate <= {LEVEL:.0%}": found.p_fdr <= LEVEL,
+            f"family-wise p <= {LEVEL:g}": found.p_corrected <= LEVEL,
         }.items()
     ]
     render_shapes(panels, path, Look(legend=scale))

@@ -51,6 +51,8 @@ class Collection:
     Fits are read when they are asked for, and some are kept in memory. Of a folder without fits, all but `fit` is an
     `InputError`.
 
+    A Collection can be pickled: the pickle holds the folder and ``workers``, not the fits, and not ``progress``.
+
     >>> collection = meshmatch.Collection("fits")
     >>> collection.fit("scans")
     >>> collection.map("anna", "ben").index
@@ -63,6 +65,16 @@ class Collection:
         self.workers = workers
         self.progress = progress
         self._read = lru_cache(maxsize=_KEPT)(self._load)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"store": self.store, "workers": self.workers, "progress": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._read = lru_cache(maxsize=_KEPT)(self._load)
+
+    def __repr__(self) -> str:
+        return f"Collection({self.store.location!r})"
 
     def fit(
         self,
@@ -87,9 +99,12 @@ class Collection:
         are fitted; the fits are those of a run that nobody stopped, bit for bit. ``tell`` is called with the record of
         each shape, as they come in.
 
-        A shape that cannot be read or fitted is a record, and stops nobody. `MeshmatchError`: there is no shape, two have
-        the same name, none could be fitted, or the folder holds fits of another model or made in another way, or is
-        written to by somebody else.
+        Parts of a file that are no part of what is fitted, such as a floor, are left out as by `match`; records say which.
+        A shape that cannot be read or fitted becomes a record, and the others go on. Where no processes can be started, this
+        one does the work, and warns.
+
+        `MeshmatchError`: there is no shape, two have the same name, none could be fitted, or the folder holds fits of
+        another model or made in another way, or is written to by somebody else.
         """
         sources = find_sources(shapes, self.store)
         wish = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without), sequence)

@@ -36,7 +36,7 @@ class Comparison:
     p_corrected : (V,) share of the labellings whose largest statistic is as large: holds for all vertices at once
     p_fdr : (V,) Benjamini and Hochberg's, by which of the vertices found a share is found by chance
     p_overall : whether the groups differ at all: share of the labellings whose means are as far apart over the surface
-    labellings : how many, the one that is given included; ``exact`` if these are all there are
+    labellings : how many permutations of the group labels, the given one included; ``exact`` if these are all there are
     seed : of the random ones
     counts : shapes in A, and in B
     """

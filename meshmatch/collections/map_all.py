@@ -44,7 +44,7 @@ class MapTask:
 
 
 def load_pairs(path: str | Path) -> list[Pair]:
-    """Names of a source and a target a line, with a tab, a comma or spaces between them; ``#`` begins a comment.
+    """Names of a source and a target a line, a tab, semicolon, comma or spaces between them; ``#`` begins a comment.
 
     `InputError` if the file is missing, or a line holds anything else.
     """
@@ -56,7 +56,7 @@ def load_pairs(path: str | Path) -> list[Pair]:
         raise InputError(f"{path.name} is not text", "save it in UTF-8") from error
     for number, line in enumerate(lines, 1):
         text = line.partition("#")[0].strip()
-        mark = next((each for each in "\t," if each in text), None)
+        mark = next((each for each in "\t;," if each in text), None)
         words = [word.strip() for word in text.split(mark)]
         if text and len(words) != 2:
             hint = "a source and a target a line; put a comma between names that hold spaces"

@@ -78,11 +78,14 @@ class Record:
     trust: float = 0.0
     reasons: str = ""
     residual: float = float("nan")  # units of sqrt(area)
+    inverted: float = float("nan")  # share of the template, and mean change of volume, see `Regularity`
+    volume: float = float("nan")
     up: str = ""
     front: str = ""
     vertices: int = 0
     seconds: float = 0.0
     digest: str = ""
+    notes: str = ""  # which parts were left out, if any
 
     @property
     def fitted(self) -> bool:

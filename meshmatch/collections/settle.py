@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from meshmatch.api.inputs import as_model, check_config, validated
+from meshmatch.api.inputs import as_model, check_config, usable, validated
 from meshmatch.api.kinds import choose_model
 from meshmatch.collections.setting import FIRST, TEMPLATE, Setting, Source
 from meshmatch.collections.stores import Store
@@ -113,7 +113,7 @@ def _chosen(sources: Sequence[Source], config: FitConfig) -> str:
     trouble: MeshmatchError | None = None
     for source in sources[:_READ_AHEAD]:
         try:
-            chosen = choose_model([validated(source.load())], [config]).model
+            chosen = choose_model([usable(source.load())], [config]).model
         except MeshmatchError as error:
             trouble = trouble or error
         else:

@@ -8,22 +8,26 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
+import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
-from typing import Protocol, TypeVar
+from contextlib import closing, contextmanager, nullcontext, suppress
+from typing import Any, Protocol, TypeVar
 
-from meshmatch.errors import InputError, MeshmatchError, OptionError, needs
+from meshmatch.errors import InputError, MeshmatchError, OptionError, needs, warn
 from meshmatch.threads import set_threads
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 _PARENT_SEEN = 1.0  # seconds between two looks
 _CONNECT = 30.0  # seconds
+_hiding = threading.Lock()
 
 
 class Died(MeshmatchError):
@@ -40,60 +44,145 @@ class Workers(Protocol):
         """Leave the work."""
 
 
+class CannotStart(Exception):
+    """No processes can be started here; the reason, in words."""
+
+
 class Processes:
     """So many processes on this machine; one is this process itself.
 
-    A process that dies takes no other item's result with it. What it worked on is tried once more, alone.
+    A process that dies takes no other item's result with it. What it worked on is tried once more, alone. Where no
+    processes can be started, this one does the work, and warns.
     """
 
     def __init__(self, count: int = 1) -> None:
         self.count = count
-        self._pool: ProcessPoolExecutor | None = None
+        self._pool: _Pool | None = None
 
     def each(self, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result | Died]]:
         """As `Workers.each`."""
-        if min(self.count, len(items)) <= 1:
-            yield from ((number, task(item)) for number, item in enumerate(items))
-            return
         suspects: list[int] = []
         waiting = list(range(len(items)))[::-1]
-        while waiting:
-            self._pool = self._pool or _pool(self.count)
+        while waiting and min(self.count, len(items)) > 1:
             in_flight: dict[Future[Result], int] = {}
             try:
+                self._pool = self._pool or _Pool(self.count, _needs_main(task, items))
                 while waiting or in_flight:
                     while waiting and len(in_flight) < self.count:
-                        number = waiting.pop()
-                        in_flight[self._pool.submit(task, items[number])] = number
+                        in_flight[self._pool.submit(task, items[waiting[-1]])] = waiting[-1]
+                        waiting.pop()
                     for done in wait(in_flight, return_when=FIRST_COMPLETED).done:
                         result = done.result()
                         yield in_flight.pop(done), result
             except BrokenProcessPool:
-                suspects += in_flight.values()
                 self.close()
+                if _processes_work(_needs_main(task, items)):
+                    suspects += in_flight.values()
+                else:
+                    waiting += in_flight.values()
+                    self._work_here("processes that were started ended at once")
+            except CannotStart as error:
+                waiting += in_flight.values()
+                self._work_here(str(error))
+                self.close()
+        yield from ((number, task(items[number])) for number in reversed(waiting))
         for number in sorted(suspects):
-            with _pool(1) as alone:
-                try:
-                    yield number, alone.submit(task, items[number]).result()
-                except BrokenProcessPool:
-                    yield number, Died("the process that worked on it died", "is there enough memory?")
+            try:
+                with closing(_Pool(1, _needs_main(task, items))) as alone:
+                    result = alone.submit(task, items[number]).result()
+            except (BrokenProcessPool, CannotStart):
+                yield number, Died("the process that worked on it died", "is there enough memory?")
+            else:
+                yield number, result
+
+    def _work_here(self, why: str) -> None:
+        self.count = 1
+        warn(f"this process does all the work, one shape after the other: {why}")
 
     def close(self) -> None:
         """Let the processes finish what they are at, and end."""
         if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+            self._pool.close()
             self._pool = None
 
 
-def _pool(count: int) -> ProcessPoolExecutor:
-    # spawned, for a fork would inherit locks and the thread pools of the numerical libraries
-    return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin, (os.getpid(),))
+class _Pool:
+    """Processes that are spawned, for a fork would inherit locks and the thread pools of the numerical libraries.
+
+    A spawned process runs the program again that started it, up to what stands behind ``if __name__ == "__main__"``. A
+    program from standard input cannot be run again, and one without such a line should not be; so it is left alone unless
+    the work needs what it defines. Raises `CannotStart` where there can be no processes.
+    """
+
+    def __init__(self, count: int, needs_main: bool) -> None:
+        if multiprocessing.current_process().daemon:
+            raise CannotStart("it is a daemonic process, which cannot start others")
+        if getattr(sys, "frozen", False) or not sys.executable:
+            raise CannotStart("a frozen program has no Python to start others with")
+        if needs_main and not _main_can_be_imported():
+            raise CannotStart("other processes cannot import the program, which is no file")
+        self._needs_main = needs_main
+        with _starting():
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(count, context, _begin, (os.getpid(),))
+
+    def submit(self, task: Callable[..., Result], *items: Any) -> Future[Result]:
+        """A future of the task's result for an item. The processes are started here, whenever one is missing."""
+        with _starting(), nullcontext() if self._needs_main else _hidden_main():
+            return self._pool.submit(task, *items)
+
+    def close(self) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+
+def _processes_work(needs_main: bool) -> bool:
+    """Whether a process that is given next to nothing to do can do it."""
+    try:
+        with closing(_Pool(1, needs_main)) as pool:
+            return pool.submit(os.getpid).result() > 0
+    except (BrokenProcessPool, CannotStart):
+        return False
+
+
+@contextmanager
+def _starting() -> Iterator[None]:
+    try:
+        yield
+    except BrokenProcessPool:
+        raise
+    except (OSError, ImportError, NotImplementedError, RuntimeError, AssertionError) as error:
+        raise CannotStart(f"others cannot be started ({error})") from error
+
+
+def _needs_main(task: Callable[[Item], Result], items: Sequence[Item]) -> bool:
+    """Whether tasks or items are of classes that the running program itself defines."""
+    return b"__main__" in pickle.dumps((task, items))
+
+
+def _main_can_be_imported() -> bool:
+    main = sys.modules["__main__"]
+    return getattr(main, "__spec__", None) is not None or os.path.isfile(getattr(main, "__file__", ""))
+
+
+@contextmanager
+def _hidden_main() -> Iterator[None]:
+    """Inside, a process that is spawned finds no program to run again."""
+    main = vars(sys.modules["__main__"])
+    with _hiding:
+        kept: dict[str, Any] = {name: main[name] for name in ("__spec__", "__file__") if name in main}
+        main.pop("__file__", None)
+        main["__spec__"] = None
+        try:
+            yield
+        finally:
+            main.update(kept)
 
 
 def _begin(parent: int) -> None:
-    """A worker leaves Ctrl-C to its parent, uses one thread, and does not outlive its parent."""
+    """A worker leaves Ctrl-C to its parent, uses one thread, warns in a line, and does not outlive its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     set_threads(1)
+    warnings.formatwarning = _in_a_line
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -101,6 +190,11 @@ def _begin(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def _in_a_line(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> str:
+    """A warning as the command line shows it, without the place in the code."""
+    return f"warning: {message}\n"
 
 
 class Cluster:

@@ -55,7 +55,9 @@ SUMMARY = (
     Row(name="SCAPE", file="accuracy", where={"set": "scape", "refine": "nodes"}, cells=_CM, unit="cm"),
     Row(name="FAUST", file="accuracy", where={"set": "faust", "refine": "nodes"}, cells=_CM, unit="cm"),
     Row(name="SHREC'19", file="accuracy", where={"set": "shrec19", "refine": "nodes"}, cells=_CM, unit="cm"),
-    Row(name="SCAPE, noisy points", file="accuracy", where={"set": "scape-pcn", "refine": "nodes"}, cells=_CM, unit="cm"),
+    Row(
+        name="SCAPE, noisy points", file="accuracy", where={"set": "scape-pcn", "refine": "nodes"}, cells=_CM, unit="cm"
+    ),
     Row(
         name="FAUST, points with outliers",
         file="outliers",
@@ -81,13 +83,7 @@ SUMMARY = (
         cells={"mean": "mean cm", "pairs": "pairs"},
         unit="cm",
     ),
-    Row(
-        name="animals",
-        file="animals",
-        where={"geodesic error × 100 / √area": "all"},
-        cells=_X100,
-        unit="% of √area",
-    ),
+    Row(name="animals", file="animals", where={"geodesic error × 100 / √area": "all"}, cells=_X100, unit="% of √area"),
     Row(
         name="hands, generated",
         file="hands-and-heads",

@@ -27,10 +27,11 @@ from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_matrix
 
-from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.errors import TemplateError
+from meshmatch.arrays import Float, Floats, Int, Ints, as_numbers
+from meshmatch.errors import InputError, OptionError, TemplateError
 from meshmatch.geometry.kernels import KERNELS, MINIMUM_EIGENVALUE, Kernel, support_pairs, support_scale
 
 FieldName = Literal["mls", "rbf", "pointwise"]
@@ -96,21 +97,35 @@ def shape_functions(
     return build_rbf(points, nodes) if name == "rbf" else build_field(points, nodes, radius, kernel)
 
 
-def build_field(
-    points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"], radius: float | Float[Floats, " K"], kernel: Kernel
-) -> ShapeFunctions:
+def build_field(points: ArrayLike, nodes: ArrayLike, radius: ArrayLike, kernel: Kernel) -> ShapeFunctions:
     """Evaluate moving least squares and their gradient on fixed points: sparse, computed in float64.
 
-    Points, nodes and the nodes' support radius (of all, or of each) are in one unit and frame. The kernel is the model's:
-    vectors learned with one mean something else with another. `TemplateError` names the points that have fewer than four
-    non-coplanar nodes in reach.
+    Points (P, 3), nodes (K, 3) and the nodes' support radius (of all, or (K,) of each) are in one unit and frame. The
+    kernel is the model's: vectors learned with one mean something else with another.
+
+    `TemplateError` names the points that have fewer than four non-coplanar nodes in reach. `InputError` for positions or
+    radii that are not finite numbers of these shapes, `OptionError` for a kernel that is not known.
     """
-    points, nodes = np.array(points, np.float64), np.array(nodes, np.float64)
-    radii = np.broadcast_to(np.array(radius, np.float64), (len(nodes),))
+    if kernel not in KERNELS:
+        raise OptionError(f"invalid kernel {kernel!r}", f"choose one of {', '.join(KERNELS)}")
+    points, nodes = _positions(points, "points"), _positions(nodes, "nodes")
+    radii = as_numbers(radius, "the radius", finite=True)
+    if radii.shape not in ((), (len(nodes),)) or not (radii > 0).all():
+        what = f"the radius must be positive, one number or one for each of {len(nodes)} nodes"
+        raise InputError(f"{what}, not {radii if radii.ndim == 0 else radii.shape}")
+    radii = np.broadcast_to(radii, (len(nodes),))
     fit = _LocalFits.of(points, nodes, radii, kernel)
     phi = (fit.weight * fit.along).astype(np.float32)
     values = csr_matrix((phi, (fit.at, fit.of_node)), (len(points), len(nodes)))
     return ShapeFunctions(values, lambda some: _slopes(points[some], nodes, radii, kernel))
+
+
+def _positions(values: ArrayLike, what: str) -> Float[Floats, "N 3"]:
+    """A copy of positions; `InputError` for anything but finite numbers in three columns."""
+    found = as_numbers(values, what, finite=True)
+    if found.ndim != 2 or found.shape[1] != 3 or not len(found):
+        raise InputError(f"{what} must be an array of (N, 3), not {found.shape}", "one position in each row")
+    return np.array(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,14 +199,14 @@ def _check_support(moment: Float[Floats, "P 4 4"]) -> None:
         raise TemplateError(problem, "use more nodes or a larger radius")
 
 
-def build_rbf(points: Float[Floats, "P 3"], nodes: Float[Floats, "K 3"]) -> ShapeFunctions:
+def build_rbf(points: ArrayLike, nodes: ArrayLike) -> ShapeFunctions:
     """Evaluate radial basis functions and their gradient on fixed points: dense, computed in float64.
 
-    Points and nodes are in one unit and frame. The paper's numbers are for shapes in the unit sphere, so lengths are
-    measured in the largest distance of a node from the middle of all: the functions do not depend on the unit.
-    `TemplateError` if two nodes are (nearly) in one place.
+    Points (P, 3) and nodes (K, 3) are in one unit and frame. The paper's numbers are for shapes in the unit sphere, so
+    lengths are measured in the largest distance of a node from the middle of all: the functions do not depend on the unit.
+    `TemplateError` if two nodes are (nearly) in one place; `InputError` as `build_field`.
     """
-    points, nodes = np.asarray(points, np.float64), np.asarray(nodes, np.float64)
+    points, nodes = _positions(points, "points"), _positions(nodes, "nodes")
     unit = float(np.linalg.norm(nodes - nodes.mean(0), axis=1).max())
     q = nodes / unit
     among = multiquadric(q[:, None] - q)

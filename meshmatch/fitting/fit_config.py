@@ -101,10 +101,11 @@ class FitConfig:
     samples, coarse_samples : points drawn on the surface, and how many of them are used to screen orientations
     copies : turned copies of the samples that vote on the orientation
     hypotheses : voted orientations that are tried, each with its flips
-    careful : the best so many of these are fitted again with all samples
-    variants, tilt : further interpretations of the best of these: predictions from frames tilted at random, by about so
-        many degrees
-    finalists, screening : so many interpretations get so many node steps before the best one gets them all
+    careful : how many of the best of these are fitted again with all samples
+    variants, tilt : how many further interpretations of the best of these are tried: predictions from frames tilted at
+        random, by about so many degrees
+    finalists, screening : how many interpretations are refined by a few node steps, and by how many, before the best one
+        gets all steps
     device : where the network is evaluated and codes are searched: "cpu", or one of torch's, such as "cuda" (needs the
         extra ``train``)
     nodes, latent : how node vectors, or codes, are refined

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, off_torch
 from meshmatch.errors import OptionError
 from meshmatch.fitting.candidates import fit_part, fit_whole
 from meshmatch.fitting.fit import Fit, Reason, Verdict, axis_name
@@ -21,6 +21,7 @@ from meshmatch.fitting.refinement import REFINEMENTS
 from meshmatch.fitting.signs import empty_share
 from meshmatch.fitting.task import FitTask, Registration
 from meshmatch.fitting.verdict import EVEN_TRUST, FAIR_RESIDUAL, judge_registration
+from meshmatch.geometry.oriented import quick_tree
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.repair import Repaired
@@ -144,6 +145,7 @@ def as_fit(found: Registration, partial: bool, began: float) -> Fit:
         reasons=judged.reasons,
         trust=judged.trust,
         signs=judged.signs,
+        regularity=task.system.regularity(found.candidate.vectors),
         up=axis_name(frame.rotation[1]),
         front=axis_name(frame.rotation[2]),
         seconds=time.monotonic() - began,
@@ -159,20 +161,33 @@ def boundary_length(shape: Shape) -> float:
     Those that lie against another connected part of the shape do not count: where an arm ends in a sleeve, nothing is cut.
     """
     ends = shape.verts[shape.edges.open]  # N 2 3
-    part = shape.face_parts
-    counts = np.ones(len(ends), bool)
-    if len(ends) and part.max() > 0:
-        corners = shape.verts[shape.faces]
-        points = np.concatenate(
-            [*corners.transpose(1, 0, 2), *(0.5 * (corners[:, k] + corners[:, k - 1]) for k in range(3))]
-        )
-        of_point, of_edge = np.tile(part, 6), shape.vertex_parts[shape.edges.open[:, 0]]
-        near = _AGAINST * np.sqrt(shape.area)
-        for own in np.unique(of_edge):
-            mine = of_edge == own
-            others = cKDTree(points[of_point != own])
-            counts[mine] = others.query(ends[mine].mean(1), distance_upper_bound=near)[0] > near
+    counts = ~_against_another_part(shape, ends.mean(1))
     return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)[counts].sum())
+
+
+def _against_another_part(shape: Shape, middles: Float[Floats, "N 3"]) -> Bool[Bools, " N"]:
+    """Whether the middle of each open edge is near to another connected part than its own.
+
+    The numbers of two parts differ in some binary digit: for each digit, edges of parts that have a 0 there are looked up
+    among the points of parts that have a 1, and the other way round. So the cost grows with the logarithm of the number of
+    parts, where a tree of all other parts for each of them would make it grow with the square.
+    """
+    own = shape.vertex_parts[shape.edges.open[:, 0]]
+    against = np.zeros(len(own), bool)
+    if not len(own) or shape.face_parts.max() == 0:
+        return against
+    edges, used = shape.edges.vertices, np.flatnonzero(shape.vertex_parts >= 0)
+    points = np.concatenate([shape.verts[used], shape.verts[edges].mean(1)])
+    part = shape.vertex_parts[np.concatenate([used, edges[:, 0]])]
+    near = _AGAINST * np.sqrt(shape.area)
+    for digit in range(int(part.max()).bit_length()):
+        one, sought = part >> digit & 1, own >> digit & 1
+        for value in (0, 1):
+            asked = np.flatnonzero(~against & (sought == value))
+            if len(asked):
+                others = quick_tree(points[one != value])
+                against[asked] = others.query(middles[asked], distance_upper_bound=near)[0] <= near
+    return against
 
 
 def check_landmarks(model: TrainedModel) -> None:
@@ -208,7 +223,7 @@ def landmark_places(clean: Sequence[Repaired], landmarks: Sequence[ArrayLike]) -
         raise OptionError(f"landmarks must be two lists of vertices, not {len(landmarks)}", _HINT)
     places = []
     for part, vertices in zip(clean, landmarks, strict=True):
-        chosen, V = np.asarray(vertices), len(part.original_to_repaired)
+        chosen, V = np.asarray(off_torch(vertices)), len(part.original_to_repaired)
         if chosen.ndim != 1 or len(chosen) == 0 or chosen.dtype.kind not in "iu" or chosen.min() < 0:
             raise OptionError("landmarks must be lists of vertex numbers", _HINT)
         if chosen.max() >= V:

@@ -30,9 +30,9 @@ FAMILIAR, STRANGE = 0.0465, 0.062
 arms: a fit tells, see `told`."""
 SURE = 0.042
 """Up to this a reading needs no other model's beside it: another kind's were 0.0439 at least (docs/results.md)."""
-# Trust from which on such a fit tells the kind; of a mesh, and a template with limbs, any that is not poor. A head has none,
-# so that much is like it: a fair fit of it can be of a heart. Clouds of aeroplanes have fair fits of people.
-_BELONGS = 0.7
+BELONGS = 0.7
+"""Trust from which on such a fit tells the kind; of a mesh, and a template with limbs, any that is not poor. A head has
+none, so that much is like it: a fair fit of it can be of a heart. Clouds of aeroplanes have fair fits of people."""
 # Isoperimetric quotient of a template up to which it has limbs: people have 0.08, hands 0.12, animals 0.15, heads 0.27.
 _LIMBED = 0.2
 _SAMPLES, _THIN = 2048, 768  # how many the reading is of, and how many rank the orientations
@@ -79,4 +79,4 @@ def told(
     if fit.partial:
         return reading <= KNOWN, fit
     clear = has_limbs(model) and not shape.is_cloud
-    return fit.verdict != "poor" and (fit.trust >= _BELONGS or clear), fit
+    return fit.verdict != "poor" and (fit.trust >= BELONGS or clear), fit

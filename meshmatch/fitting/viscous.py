@@ -110,7 +110,7 @@ def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: 
     points = system.moved(vectors)
     residual = two_way_residual(system, local, vectors)
     judged = judge(signs_of(system, vectors, local, residual, template.labels))
-    unsure = Reason("unsupervised", "fitted without a model that was learned: near may be wrong")
+    unsure = Reason("unsupervised", "fitted without a trained model: surfaces that lie close need not correspond")
     return Fit(
         template_hash=template.hash,
         frame=core,
@@ -124,6 +124,7 @@ def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: 
         reasons=(*judged.reasons, unsure),
         trust=min(judged.trust, EVEN_TRUST),
         signs=judged.signs,
+        regularity=system.regularity(vectors),
         up=axis_name(core.rotation[1]),
         front=axis_name(core.rotation[2]),
         seconds=time.monotonic() - began,

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Float, Floats, read_only
+from meshmatch.arrays import Brief, Float, Floats, Pickled, off_torch, read_only
 from meshmatch.errors import InputError
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
+@dataclass(frozen=True, eq=False, repr=False)
+class Frame(Brief, Pickled):
     """A similarity: the way from a file's own coordinates into a model's, and back; for a shape that is known by its
     mirror image, a reflection too."""
 
@@ -50,11 +50,11 @@ class Frame:
 
     def apply(self, points: ArrayLike) -> Float[Floats, "... 3"]:
         """Points (..., 3) of the file, in the model's frame: ``((points - center) @ rotation.T) / scale``."""
-        return ((np.asarray(points, np.float64) - self.center) @ self.rotation.T) / self.scale
+        return ((np.asarray(off_torch(points), np.float64) - self.center) @ self.rotation.T) / self.scale
 
     def undo(self, points: ArrayLike) -> Float[Floats, "... 3"]:
         """Points (..., 3) of the model's frame, back in the file's."""
-        return (np.asarray(points, np.float64) * self.scale) @ self.rotation + self.center
+        return (np.asarray(off_torch(points), np.float64) * self.scale) @ self.rotation + self.center
 
     def compose(self, outer: Frame) -> Frame:
         """This frame first, then `outer`: ``self.compose(outer).apply(x) = outer.apply(self.apply(x))``."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Float, Floats, Floats32, frozen
+from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, frozen, off_torch
 from meshmatch.errors import InputError
 from meshmatch.maps.geodesics import GEODESIC, GeodesicDistances
 from meshmatch.maps.vertex_map import VertexMap
@@ -22,8 +22,8 @@ LOST_CM = 15.0
 """An error above this is a point on the wrong limb; a pair whose mean lies above it is a left-right flip."""
 
 
-@dataclass(frozen=True, eq=False)
-class Errors:
+@dataclass(frozen=True, eq=False, repr=False)
+class Errors(Brief, Pickled):
     """Errors of a map, one for each point whose truth is known: distance between predicted and true point along the
     target's surface, over the square root of its area; as "cm", with the target scaled to 1.9 m2 of skin.
     """
@@ -85,7 +85,7 @@ def map_errors(
     `index` (V_source,) is the map; both kinds of points (N,) are vertices, `geodesics` those of the target.
     `InputError` if the lists are no integers, differ in length, or name a vertex that is not there.
     """
-    index, a, b = (np.asarray(ids) for ids in (index, source_points, target_points))
+    index, a, b = (np.asarray(off_torch(ids)) for ids in (index, source_points, target_points))
     for ids in (a, b):
         if ids.dtype.kind not in "iu":
             raise InputError(f"the truth must be numbers of vertices, not {ids.dtype}", "integers, counted from 0")

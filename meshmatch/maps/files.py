@@ -12,9 +12,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -29,7 +26,8 @@ from meshmatch.maps.mat_file import read_mat
 from meshmatch.maps.vertex_map import DIRECTION, UNKNOWN, VertexMap, check_map
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.files import ShapeLike, as_shape
-from meshmatch.shapes.input_files import check_memory, read_bytes, read_json, read_npy, read_npz, read_text
+from meshmatch.shapes.input_files import check_memory, read_bytes, read_json, read_npy, read_npz
+from meshmatch.shapes.text_tables import read_table, whole
 
 CSV_COLUMNS = ("source_vertex", "target_vertex", "face", "w0", "w1", "w2", "confidence")
 _ARRAYS = ("index", "face", "barycentric", "confidence")
@@ -105,14 +103,7 @@ def _write_txt(path: Path, m: VertexMap) -> None:
 
 
 def _read_txt(path: Path) -> dict[str, Any]:
-    with io.StringIO(read_text(path, _VERTEX)) as file:
-        return _bare(_numbers(file, dtype=np.int64, ndmin=1))
-
-
-def _numbers(file: io.StringIO, **how: Any) -> NDArray[Any]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of a file without numbers, which is refused as a map
-        return np.loadtxt(file, **how)
+    return _bare(whole(read_table(path, comments="ends", whole=True).numbers()[1]))
 
 
 def _write_npz(path: Path, m: VertexMap) -> None:
@@ -131,17 +122,17 @@ def _write_csv(path: Path, m: VertexMap) -> None:
 
 
 def _read_csv(path: Path) -> dict[str, Any]:
-    with io.StringIO(read_text(path, _VERTEX, 16)) as file:
-        names = [name.strip() for name in next(csv.reader(file))]
-        if "target_vertex" not in names:
-            raise InputError("there is no column 'target_vertex'", f"the columns are {','.join(CSV_COLUMNS)}")
-        table = _numbers(file, delimiter=",", ndmin=2)
-    column = {name: table[:, k] for k, name in enumerate(names)}
+    names, table = read_table(path, whole=True).numbers()
+    if not names and table.shape[1] == 1:
+        return _bare(table)
+    column = {name.lower(): table[:, k] for k, name in enumerate(names)}
+    if "target_vertex" not in column:
+        raise InputError("there is no column 'target_vertex'", f"the columns are {','.join(CSV_COLUMNS)}")
     if "source_vertex" in column:
         table_files.check_numbered(column["source_vertex"])
-    record = {name: column[name] for name in names if name in ("face", "confidence")}
+    record = {name: column[name] for name in column if name in ("face", "confidence")}
     record["index"] = column["target_vertex"]
-    if {"w0", "w1", "w2"} <= set(names):
+    if {"w0", "w1", "w2"} <= set(column):
         record["barycentric"] = np.column_stack([column[name] for name in ("w0", "w1", "w2")])
     return record
 

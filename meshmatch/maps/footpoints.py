@@ -11,7 +11,7 @@ reveal it: the small islands that such discontinuities cut off are searched agai
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from typing import Self, TypeVar
@@ -84,6 +84,12 @@ class Footpoints:
         for name, array in arrays.items():
             array[rows] = getattr(other, name)
         return replace(self, **arrays)
+
+
+def joined(parts: Sequence[Footpoints]) -> Footpoints:
+    """Points one after the other."""
+    names = [field.name for field in fields(Footpoints)]
+    return Footpoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 class Surface:

@@ -119,7 +119,7 @@ class Places:
         asked = resting.astype(np.float64)
         if len(self._used):
             used = self._used if among is None else among
-            surface = self._surface if among is None else self._surface_of(among)
+            surface = self._surface if among is None else self._surface_of_some(among)
             found = surface.query(asked, None, workers)
             corners = self.faces[used].take(found.face, 0)
             nearest = np.take_along_axis(corners, found.barycentric.argmax(1)[:, None], 1)[:, 0]
@@ -139,6 +139,11 @@ class Places:
     def _surface(self) -> Surface:
         """The faces as they lie on the resting template."""
         return self._surface_of(self._used)
+
+    def _surface_of_some(self, faces: Int[Ints, " F"]) -> Surface:
+        """The same of some faces, of their corners alone: what is asked of one part must not cost the whole."""
+        corners, faces = np.unique(self.stands[self.faces[faces]], return_inverse=True)
+        return Surface(self.resting[corners].astype(np.float64), faces.reshape(-1, 3).astype(np.int64))
 
     def _surface_of(self, faces: Int[Ints, " F"]) -> Surface:
         return Surface(self.resting.astype(np.float64), self.stands[self.faces[faces]].astype(np.int64))

@@ -2,8 +2,8 @@
 lists of known vertices: pairs of two shapes (landmarks, a partial truth), or points of one.
 
 The text of such a list has one pair, or one vertex, a line: numbers separated by spaces, tabs, commas or semicolons;
-``#`` begins a comment; a first line of words is taken for a header. ``.npy`` files hold the same as an integer array.
-Vertices are counted from 0, in the order of the shape's file.
+``#`` begins a comment; a first line of words is taken for a header. ``.npy`` files hold the same as an array of whole
+numbers. Vertices are counted from 0, in the order of the shape's file.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.outputs import as_path, plain_text
-from meshmatch.shapes.input_files import existing, read_npy, read_text
+from meshmatch.shapes.input_files import existing, read_npy
+from meshmatch.shapes.text_tables import DECIMAL_COMMA, number, read_table, whole
 
 T = TypeVar("T")
 _PAIRS = "one pair a line: a vertex of the source, then a vertex of the target, counted from 0"
@@ -60,15 +61,18 @@ def read_by_suffix(path: str | Path, readers: Mapping[str, Callable[[Path], T]],
         raise InputError(f"{path.name} does not hold {what} that can be read: {error}", hint) from error
 
 
-def read_rows(path: Path) -> list[list[str]]:
-    """The rows of a csv file that are not empty, without spaces around the cells."""
-    return [[cell.strip() for cell in row] for row in csv.reader(read_text(path, 280, 120).splitlines()) if row]
+def is_numbered(numbers: ArrayLike | Sequence[str]) -> bool:
+    """Whether the rows are numbered 0, 1, 2, ...: by numbers, or by cells of a table that hold them."""
+    try:
+        rows = np.array([number(each) if isinstance(each, str) else each for each in np.asarray(numbers).tolist()])
+    except ValueError:
+        return False
+    return np.array_equal(rows, np.arange(len(rows)))
 
 
-def check_numbered(numbers: ArrayLike) -> None:
+def check_numbered(numbers: ArrayLike | Sequence[str]) -> None:
     """`InputError` if the rows are not numbered 0, 1, 2, ..."""
-    rows = np.asarray(numbers, np.float64)
-    if not np.array_equal(rows, np.arange(len(rows))):
+    if not is_numbered(numbers):
         raise InputError("its rows are not 0, 1, 2, ... in order", "sort it, one row for each")
 
 
@@ -117,40 +121,23 @@ def load_points(path: str | Path) -> Int[Ints, " N"]:
 def _table(path: Path, columns: int, hint: str) -> Ints:
     existing(path, hint)
     try:
-        rows = read_npy(path) if path.suffix.lower() == ".npy" else _from_text(path)
-        if rows.dtype.kind not in "iu":
-            raise ValueError("its numbers are not whole")
-    except (ValueError, OSError, EOFError) as error:
+        if path.suffix.lower() == ".npy":
+            rows = whole(read_npy(path))
+        else:
+            rows = whole(read_table(path, comments="ends", whole=True).numbers()[1])
+    except (ValueError, OSError, EOFError, csv.Error) as error:
         raise InputError(f"{path.name} is not a list of vertices: {error}", hint) from error
-    rows = rows.astype(np.int64)
+    except InputError as error:
+        words = error.message if error.message.startswith(path.name) else f"{path.name}: {error.message}"
+        raise InputError(words, error.hint or hint) from error
     if rows.ndim == 1 and columns == 1:
         rows = rows[:, None]
     if rows.size == 0:
         raise InputError(f"{path.name} holds no vertex", hint)
     if rows.ndim != 2 or rows.shape[1] != columns:
         shape = " x ".join(str(n) for n in rows.shape)
-        raise InputError(f"{path.name} has {shape} numbers, not {columns} a line", hint)
+        comma = f"; {DECIMAL_COMMA}" if columns == 1 and rows.shape[1:] == (2,) else ""
+        raise InputError(f"{path.name} has {shape} numbers, not {columns} a line", hint + comma)
     if rows.min() < 0:
         raise InputError(f"{path.name} names vertex {int(rows.min())}", hint)
     return rows
-
-
-def _from_text(path: Path) -> Ints:
-    rows: list[list[int]] = []
-    words_allowed = True
-    for number, line in enumerate(read_text(path, 240, 100).splitlines(), 1):
-        cells = line.partition("#")[0].replace(",", " ").replace(";", " ").split()
-        if not cells:
-            continue
-        try:
-            rows.append([int(cell) for cell in cells])
-        except ValueError:
-            if not words_allowed:
-                raise ValueError(f"line {number} is {line.strip()[:40]!r}") from None
-        words_allowed = False
-        if rows and len(rows[-1]) != len(rows[0]):
-            raise ValueError(f"line {number} has {len(rows[-1])} numbers, the first has {len(rows[0])}")
-    try:
-        return np.array(rows, np.int64)
-    except OverflowError:
-        raise ValueError("a number is too large to be a vertex") from None

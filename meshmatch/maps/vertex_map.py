@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, as_numbers, frozen
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Pickled, as_numbers, frozen, off_torch
 from meshmatch.errors import InputError
 from meshmatch.geometry.quick_scipy import csr_array
 from meshmatch.geometry.triangles import interpolate
@@ -26,7 +26,7 @@ _READ_WITH_SHAPES = "read it with load_map(path, source, target)"
 
 
 @dataclass(frozen=True, eq=False)
-class VertexMap:
+class VertexMap(Pickled):
     """A map from every vertex of a source to a target: *index[i] is the vertex of the target matched to
     vertex i of the source.*
 
@@ -298,7 +298,7 @@ def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None
 
 @np.errstate(invalid="ignore")  # of a nan that is rounded; it is refused
 def _whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
-    array = np.asarray(values)
+    array = np.asarray(off_torch(values))
     whole = array.dtype.kind == "f" and np.array_equal(array, np.round(array))
     if whole and (np.abs(array.astype(np.float64)) < 2**53).all():
         return array.astype(np.int64)  # MATLAB's numbers are doubles

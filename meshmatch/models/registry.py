@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import threading
 from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +32,7 @@ HOME_VARIABLE = "MESHMATCH_HOME"
 AUTO = "auto"
 """In place of a model's name: the shapes decide which of the installed models fits them."""
 _ELSEWHERE = f"try again, or set {HOME_VARIABLE} to a folder of yours"
+_loading = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -138,13 +141,45 @@ def check_weights(folder: Path, card: ModelCard | ImplicitCard) -> None:
 def load_model(name: str | Path = "human") -> TrainedModel:
     """Load a model by its registry name or folder; processes share the weights of a model of the registry.
 
+    The model can be pickled, see `TrainedModel`: the pickle holds its name or folder, and it is loaded again from there.
+
     `ModelError` for an unknown name, damaged files, a kernel that is not known here, weights that are not those of the
     card's network, or a template that is not the one the model was trained with; `TemplateError` if its file is damaged.
     """
     from meshmatch.models.trained import trained_model  # torch
 
     folder, card = find_model(name)
-    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, folder.name if _is_registered(folder) else None)
+    shared_as = folder.name if _is_registered(folder) else None
+    again = partial(_unpickled, shared_as or os.path.abspath(folder), card)
+    return trained_model(card, folder / TEMPLATE, folder / WEIGHTS, shared_as, again)
+
+
+def load_once(name: str | Path) -> TrainedModel:
+    """As `load_model`, but once in each process, and again if the model's files have changed since."""
+    folder = locate_model(name)
+    try:
+        changed = os.stat(folder / WEIGHTS).st_mtime_ns
+    except OSError:
+        changed = 0  # the reader says what is missing
+    with _loading:
+        return _loaded(folder.resolve(), changed)
+
+
+@lru_cache(maxsize=8)
+def _loaded(folder: Path, changed: int) -> TrainedModel:
+    return load_model(folder)
+
+
+def _unpickled(name: str, card: ModelCard) -> TrainedModel:
+    """What a pickled model becomes: the model of this name or folder, which must be the same."""
+    hint = "add the same model here (`meshmatch models add`), or make the Matcher where it is used"
+    try:
+        model = load_once(name)
+    except ModelError as error:
+        raise ModelError(f"the pickled model {card.name} cannot be loaded here: {error.message}", hint) from error
+    if model.card != card:
+        raise ModelError(f"the model {name} is not the one that was pickled", hint)
+    return model
 
 
 def verify_model(name: str | Path) -> ModelCard | ImplicitCard:

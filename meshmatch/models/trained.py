@@ -32,6 +32,10 @@ class TrainedModel:
 
     ``inference`` answers in arrays; `network` is the same network in torch, for training and searches by gradient.
     ``derived`` holds what was computed from the model alone, see `once_per_model`.
+
+    A model can be pickled, for processes of Python. One that `load_model` returned travels as its name or folder and its
+    card: whoever unpickles it loads it there, once in each process (`ModelError` if it is missing there, or has other
+    weights). Of any other model the arrays travel. What was derived stays behind.
     """
 
     card: ModelCard
@@ -39,6 +43,7 @@ class TrainedModel:
     inference: Network
     derived: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
     deriving: Any = field(default_factory=threading.RLock, init=False, repr=False)
+    load_again: Callable[[], TrainedModel] | None = field(default=None, init=False, repr=False)
 
     @classmethod
     def of(cls, card: ModelCard, template: Template, network: Deformer) -> TrainedModel:
@@ -50,6 +55,15 @@ class TrainedModel:
         made = cls(card, template, inference)
         made.derived[torch_network.__wrapped__, (), ()] = network  # type: ignore[attr-defined]
         return made
+
+    def __reduce__(self) -> tuple[Callable[..., TrainedModel], tuple[Any, ...]]:
+        if self.load_again is not None:
+            return self.load_again, ()
+        return TrainedModel, (self.card, self.template, self.inference)
+
+    def __repr__(self) -> str:
+        size = f"{self.template.shape.V} vertices, {self.template.K} nodes"
+        return f"TrainedModel({self.card.name!r}, category {self.card.category!r}, {size})"
 
     def field(self, points: Float[Floats, "P 3"]) -> ShapeFunctions | PointwiseField:
         """The field on points of the template's frame, with the kernel that the network was trained with.
@@ -102,11 +116,16 @@ def torch_network(model: TrainedModel, device: str = "cpu") -> Deformer:
 
 
 def trained_model(
-    card: ModelCard, template_file: Path, weights_file: Path, shared_as: str | None = None
+    card: ModelCard,
+    template_file: Path,
+    weights_file: Path,
+    shared_as: str | None = None,
+    load_again: Callable[[], TrainedModel] | None = None,
 ) -> TrainedModel:
     """The model of a card, from files that are safe to read; `meshmatch.models.registry.load_model` finds them.
 
-    Processes share the weights under the name ``shared_as``, where there is one.
+    Processes share the weights under the name ``shared_as``, where there is one. ``load_again`` is what a pickle of the
+    model holds, a function that survives it.
 
     `ModelError` for a kernel that is not known here, weights that are not those of the card's network, or a template that
     is not the one the model was trained with; `TemplateError` if its file is damaged.
@@ -121,4 +140,6 @@ def trained_model(
         raise ModelError(problem, "it may need a newer meshmatch: update it")
     shared = None if shared_as is None else (shared_as, card.weights_sha256)
     network = load_network(weights_file, NetworkConfig.from_dict(card.network), template.K, shared)
-    return TrainedModel(card, template, network)
+    made = TrainedModel(card, template, network)
+    object.__setattr__(made, "load_again", load_again)
+    return made

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.geometry.triangles import same_rows, vertex_normals
 from meshmatch.shapes.appearance import Appearance, Material
+from meshmatch.shapes.colors import INVISIBLE
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.texels import pyramids_of
 
@@ -28,7 +29,6 @@ Paint = Callable[[Rows, Weights, float], Float[AnyFloats, "N C"]]
 which a fourth below a half is a hole. The last argument is the size of a pixel in view coordinates: finer detail is
 averaged.
 """
-_INVISIBLE = 0.05  # an alpha below this is meant to be invisible
 
 
 def corners_of(faces: Int[Ints, "F 3"]) -> Rows:
@@ -69,6 +69,7 @@ class TexturePaint:
         self._colors = None if look.colors is None else np.nan_to_num(look.colors).astype(np.float32)
         self._pyramids = pyramids_of(look)
         texels = np.array([0.0 if m.image is None else m.image[..., 0].size for m in look.materials])
+        self._most = [1.0 if m.image is None else float(m.image[..., 3].max(initial=0)) / 255.0 for m in look.materials]
         # Texels per unit of length on each face: a pixel averages as many as it is wide.
         a, b = look.uv[:, 1] - look.uv[:, 0], look.uv[:, 2] - look.uv[:, 0]
         flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
@@ -90,19 +91,21 @@ class TexturePaint:
                 out[rows] = self._pyramids[number].look(uv[:, 0], uv[:, 1], wide).T
             own = tint[rows] * np.array(material.factor, np.float32)
             out[rows, :3] *= own[:, :3]
-            out[rows, 3] = _solid(material, out[rows, 3], own[:, 3])
+            out[rows, 3] = _solid(material, out[rows, 3], own[:, 3], self._most[number])
         return out
 
 
-def _solid(material: Material, image: Float[Floats32, " N"], factor: Float[Floats32, " N"]) -> Bool[Bools, " N"]:
+def _solid(
+    material: Material, image: Float[Floats32, " N"], factor: Float[Floats32, " N"], most: float
+) -> Bool[Bools, " N"]:
     """Whether there is anything, by the alpha of the image and of its factor: half-transparent glass is drawn as if it were
-    solid, what an image cuts out, such as hair from its card, is not.
+    solid, what an image cuts out, such as hair from its card, is not. `most` is the largest alpha in the image.
     """
     if material.alpha == "opaque":
         return np.ones(len(image), bool)
     if material.alpha == "mask":
         return np.asarray(image * factor >= material.cutoff)
-    return np.asarray((image >= 0.5) & (factor >= _INVISIBLE))
+    return np.asarray((image >= 0.5 * most) & (factor >= INVISIBLE))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from typing import Literal
 
@@ -21,8 +21,8 @@ import numpy as np
 from PIL import Image
 
 from meshmatch.arrays import Float, Floats, Int, Ints, UInts8
-from meshmatch.errors import InputError
-from meshmatch.shapes.colors import light
+from meshmatch.errors import InputError, warn
+from meshmatch.shapes.colors import INVISIBLE, light
 from meshmatch.shapes.shape import Shape
 
 Pixels = UInts8
@@ -90,6 +90,42 @@ class Appearance:
         """True if there is nothing to see: no image, no vertex colors, one color all over."""
         factors = {self.materials[k].factor for k in np.unique(self.material).tolist()}
         return not self.textured and self.colors is None and len(factors) <= 1
+
+
+def visible(look: Appearance, name: str) -> Appearance:
+    """The look of a file of a name, but no material is wholly transparent: such a one is never meant, and becomes opaque.
+
+    Many programs write the opacity of a material as its transparency, or 0 where they know of neither. It is said which
+    materials these were (`MeshmatchWarning`).
+    """
+    materials, hidden = list(look.materials), []
+    for number in np.unique(look.material).tolist():
+        made = opaque_if_hidden(materials[number])
+        if made is not materials[number]:
+            hidden.append(made.name or "without a name")
+            materials[number] = made
+    if not hidden:
+        return look
+    some = ", ".join(dict.fromkeys(hidden[:5])) + (", ..." if len(hidden) > 5 else "")
+    what = (
+        f"the material {some} of {name} is" if len(hidden) == 1 else f"{len(hidden)} materials of {name} ({some}) are"
+    )
+    warn(f"{what} wholly transparent; taken as opaque")
+    return replace(look, materials=tuple(materials))
+
+
+def opaque_if_hidden(material: Material) -> Material:
+    """The same material, or, if nothing of it would be seen, one that is opaque but for what its image cuts out."""
+    if material.alpha == "opaque":
+        return material
+    most = 1.0 if material.image is None else float(material.image[..., 3].max(initial=0)) / 255.0
+    least = INVISIBLE if material.alpha == "blend" else min(material.cutoff, 1.0)
+    if material.factor[3] * most >= least:
+        return material
+    solid = replace(material, factor=(*material.factor[:3], 1.0))
+    if most < least or material.image is None or bool((material.image[..., 3] == 255).all()):
+        return replace(solid, alpha="opaque")
+    return solid
 
 
 def vertex_colors_alone(shape: Shape) -> Appearance:

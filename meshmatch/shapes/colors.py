@@ -12,6 +12,8 @@ from meshmatch.arrays import Float, Floats, Floats32, UInt8, UInts8
 
 UNKNOWN = (0.62, 0.64, 0.67)
 """What has no value."""
+INVISIBLE = 0.05
+"""An alpha below this is not seen."""
 _STEPS = 1 << 14  # of the table of `bytes_of`
 
 

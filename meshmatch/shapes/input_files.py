@@ -4,8 +4,10 @@ can promise more than they hold. Nothing is unpickled.
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
+import re
 import warnings
 import zipfile
 from collections.abc import Iterable
@@ -27,8 +29,10 @@ LARGEST = 1 << 30
 """Uncompressed bytes of one array in an npz file; a million vertices with 120 dense weights fit."""
 ROOM = 800_000_000
 """Bytes that a file may take besides four times its size; the rest of a gigabyte is the program's."""
+_MAYBE_TEXT = (".ply", ".obj", ".mtl", ".off", ".stl", ".gltf", ".xyz", ".pcd")  # tables are read by `read_text`
 _COPIES = 24  # bytes for each number of an array: it becomes one of 64 bits, and is compared and copied
 _LAST_CHARACTER = 0x10FFFF
+_NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1f\x7f]")  # what no editor puts into a text
 _LINE_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e\x85"  # where `str.splitlines` splits
 
 
@@ -69,22 +73,48 @@ def _similar(path: Path, suffixes: tuple[str, ...]) -> str:
 
 
 def read_bytes(path: Path, hint: str = "", largest: int = LARGEST_FILE) -> bytes:
-    """All of a file; `InputError` as `existing`, for one of text that is larger than that, or if reading fails."""
+    """All of a file, of text without the mark of its encoding (`_unmarked`); `InputError` as `existing`, for one of text
+    that is larger than that, or if reading fails.
+    """
     try:
         if existing(path, hint).stat().st_size > largest:
             raise _much_text(path.name, path.stat().st_size, largest)
-        return path.read_bytes()
+        data = path.read_bytes()
+        return _unmarked(path.name, data) if path.suffix.lower() in _MAYBE_TEXT else data
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}", hint or "check the disk") from error
 
 
+def _unmarked(name: str, data: bytes) -> bytes:
+    """Text without a byte order mark, and in UTF-8 where the mark is that of UTF-16."""
+    if name.lower().endswith(".stl") and b"solid" not in data[:16].replace(b"\0", b"").lower():
+        return data  # binary, with a header that may hold anything
+    if data.startswith(codecs.BOM_UTF8):
+        return data[len(codecs.BOM_UTF8) :]
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        if len(data) > LARGEST_TEXT:
+            raise _much_text(name, len(data), LARGEST_TEXT)
+        return data.decode("utf-16", "replace").encode("utf-8", "replace")
+    return data
+
+
 def read_text(path: Path, line: int, cell: int = 0) -> str:
-    """A file's text in UTF-8, where a line takes so many bytes of memory, and each further cell; `InputError` if that
+    """A file's text, where a line takes so many bytes of memory, and each further cell; `InputError` if that
     would be too much (`check_memory`), or the file is too large.
     """
     data = read_bytes(path, largest=LARGEST_TEXT // 2)
     check_memory(path.name, len(data), line * sum(map(data.count, _LINE_ENDS)) + cell * sum(map(data.count, b",;")))
-    return data.decode("utf-8-sig")
+    return _decoded(data)
+
+
+def _decoded(data: bytes) -> str:
+    """Text in UTF-8, UTF-16 with a byte order mark, or else in Windows' Latin letters; `ValueError` for what is no text."""
+    try:
+        return data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
+    except UnicodeDecodeError:
+        if _NO_TEXT.search(data):
+            raise
+        return data.decode("cp1252")
 
 
 def check_text(name: str, data: bytes) -> None:
@@ -119,15 +149,6 @@ def check_memory(name: str, size: int, need: int) -> None:
     if need > 4 * size + ROOM:
         large = f"{name} promises too much: of {size / 1e6:,.0f} MB it would make {need / 1e9:.1f} GB"
         raise InputError(large, "make it smaller, or save it uncompressed in a binary format")
-
-
-def beside(folder: Path, name: str) -> Path | None:
-    """The file of that name in a folder or below it; None if it is not there, or elsewhere."""
-    try:
-        file = (folder / name).resolve()
-        return file if file.is_relative_to(folder.resolve()) and file.is_file() else None
-    except (OSError, RuntimeError, ValueError):  # a name too long, a circle of links, a NUL in the name
-        return None
 
 
 def read_npy(path: Path) -> NDArray[Any]:

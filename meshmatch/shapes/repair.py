@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Bools, Float, Floats, Int, Ints
+from meshmatch.arrays import Bools, Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
@@ -19,11 +19,12 @@ from meshmatch.shapes.faces import duplicate_faces, find_parts, flat_faces, seam
 from meshmatch.shapes.noise import without_noise
 from meshmatch.shapes.shape import Shape
 
-_NOT_TRUSTED = "of weight 0 left out"
+NOT_TRUSTED = "left out, as was asked for (weight 0)"
+"""The end of a note about faces or points that nobody trusts."""
 
 
-@dataclass(frozen=True, eq=False)
-class Repaired:
+@dataclass(frozen=True, eq=False, repr=False)
+class Repaired(Brief):
     """A shape that is fit for work, and how it relates to the one that it came from.
 
     All vertices of `shape` are valid and, in a mesh, used by a face; they are where they were, unless noise was smoothed.
@@ -32,7 +33,8 @@ class Repaired:
     there is none the nearest in the file's order. `kept_vertex` and `kept_face` are the original vertex (increasing) or
     face that each repaired one is; corners may be turned, or stand for twins. `notes` say what was found and done, a line
     each; none for a shape that was fine. `far_parts` counts big parts that lie far from the largest one: perhaps two
-    objects in one file. They are kept.
+    objects in one file. They are kept. `left_out` are numbers of parts (`meshmatch.shapes.parts`) that were tried apart and
+    are no part of what is fitted.
     """
 
     shape: Shape
@@ -42,6 +44,7 @@ class Repaired:
     original: Shape
     kept_face: Int[Ints, " F"]
     far_parts: int = 0
+    left_out: tuple[int, ...] = ()
 
     def original_face(
         self, face: Int[Ints, " N"], weights: Float[Floats, "N 3"]
@@ -82,7 +85,7 @@ def _repair_cloud(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     kept = valid & (twin == np.arange(shape.V))
     _note(notes, int(valid.sum() - kept.sum()), "point", "merged with another at the same position")
     if shape.weights is not None:
-        _note(notes, int((kept & (shape.weights == 0)).sum()), "point", _NOT_TRUSTED)
+        _note(notes, int((kept & (shape.weights == 0)).sum()), "point", NOT_TRUSTED)
         kept &= shape.weights > 0
     chosen = np.flatnonzero(kept)
     outlier = outlier_points(shape.verts[chosen])
@@ -96,7 +99,7 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     _note(notes, int(bad.sum()), "face", "at such vertices dropped")
     if shape.weights is not None:
         ignored = ~bad & ~(shape.weights > 0)[shape.faces].any(axis=1)
-        _note(notes, int(ignored.sum()), "face", _NOT_TRUSTED)
+        _note(notes, int(ignored.sum()), "face", NOT_TRUSTED)
         bad |= ignored
     faces, cross, which = _without(bad, shape.faces, shape.face_vectors, np.arange(shape.F))
     twin = np.where(valid, seams(shape.verts, faces), np.arange(shape.V))

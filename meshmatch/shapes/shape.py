@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, frozen, read_only
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Pickled, frozen, off_torch, read_only
 from meshmatch.errors import InputError
 from meshmatch.geometry import triangles
 from meshmatch.geometry.triangles import average_normals, share_areas, squared_lengths, triangle_vectors
@@ -24,7 +24,7 @@ LARGEST = 1e60
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class Shape(Pickled):
     """A triangle mesh, or a point cloud if it has no faces. Valid once built; its arrays are read-only.
 
     `verts` are positions in the file's own frame and unit, always finite; `faces` the corners of each triangle, (0, 3)
@@ -47,14 +47,16 @@ class Shape:
     def __post_init__(self) -> None:
         label = self.name or "the shape"
         verts = read_only(self.verts, np.float64, label)
-        faces = np.empty((0, 3), np.int64) if self.faces is None or np.size(self.faces) == 0 else self.faces
+        faces = off_torch(self.faces)
+        faces = np.empty((0, 3), np.int64) if faces is None or np.size(faces) == 0 else faces
         if np.asarray(faces).dtype.kind not in "iu":
             raise InputError(f"{label}: faces must be integers, not {np.asarray(faces).dtype}")
         faces = read_only(faces, np.int64, label)
         if verts.ndim != 2 or verts.shape[1] != 3:
             raise InputError(f"{label}: vertices must be an array of (V, 3), not {verts.shape}")
         if faces.ndim != 2 or faces.shape[1] != 3:
-            raise InputError(f"{label}: faces must be an array of (F, 3), not {faces.shape}")
+            hint = "each names three vertices, from 0"
+            raise InputError(f"{label}: faces must be an array of (F, 3), not {faces.shape}", hint)
         V = len(verts)
         if V == 0:
             raise InputError(f"{label} has no vertices")

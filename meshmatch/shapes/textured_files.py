@@ -1,4 +1,4 @@
-"""Appearances from files: materials and images of glb, gltf and obj, vertex colors of all others; and textured meshes
+"""Appearances from files: materials and images of glb, gltf, obj and ply, vertex colors of all others; and textured meshes
 to files: one glb, or an obj with its mtl and png. All of these appear whole, or none does.
 """
 
@@ -15,7 +15,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Appearance, ImageReader, Pixels, png_bytes
-from meshmatch.shapes.formats import Textured, gltf_attributes, gltf_out, obj, obj_look
+from meshmatch.shapes.formats import Textured, gltf_attributes, gltf_out, obj, obj_look, ply_look
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
@@ -26,7 +26,8 @@ def load_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
     """What a file says about the look of its surface.
 
     glb and gltf: materials with base color image and factor, samplers, texture transforms, vertex colors.
-    obj: its mtl with Kd, map_Kd, d and map_d, beside it. Everything else: vertex colors.
+    obj: its mtl with Kd, map_Kd, d and map_d, beside it. ply: the images that its comments name, beside it, or else vertex
+    colors. Everything else: vertex colors.
 
     `shape` is what `load_shape` made of the same file; `image` a picture that takes the place of those that the file
     names, or that it fails to name. `InputError`: an image or material file is missing, damaged, too large, or outside
@@ -50,13 +51,15 @@ def find_appearance(path: str | Path, shape: Shape, image: str | Path | None = N
             found = gltf_attributes.read_look(path, read_bytes(path), reader, picture)
         elif suffix == ".obj":
             found = obj_look.read_look(path, read_bytes(path), shape, reader, picture)
+        elif suffix == ".ply":
+            found = ply_look.read_look(path, read_bytes(path), shape, reader, picture)
         elif picture is not None:
             raise appearance.no_coordinates(path.name)
         else:
             found = appearance.vertex_colors_alone(shape)
     if len(found.material) != shape.F or (found.colors is not None and len(found.colors) != shape.V):
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
-    return None if found.plain else found
+    return None if found.plain else appearance.visible(found, path.name)
 
 
 def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] | None:
@@ -65,8 +68,13 @@ def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] |
     `shape` is what `load_shape` made of the same file; `InputError` if that is damaged.
     """
     path = Path(path)
-    reader = {".glb": gltf_attributes, ".gltf": gltf_attributes, ".obj": obj_look}.get(path.suffix.lower())
-    found = None if reader is None else reader.read_coordinates(path, read_bytes(path))
+    suffix, found = path.suffix.lower(), None
+    if suffix in (".glb", ".gltf"):
+        found = gltf_attributes.read_coordinates(path, read_bytes(path))
+    elif suffix == ".obj":
+        found = obj_look.read_coordinates(path, read_bytes(path), shape)
+    elif suffix == ".ply":
+        found = ply_look.read_coordinates(path, read_bytes(path), shape)
     if found is not None and len(found) != shape.F:
         raise InputError(f"{path.name} is not the file that {shape.name or 'the shape'} was read from")
     return found if shape.F else None

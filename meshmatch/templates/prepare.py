@@ -15,6 +15,7 @@ from meshmatch.outputs import as_path, make_folder, replace_on_success
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.files import SUFFIXES, load_shape, save_shape
+from meshmatch.shapes.landmark_files import mesh_space
 from meshmatch.shapes.normalise import Align, Mirroring, sqrt_area_frame
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
@@ -87,7 +88,7 @@ def prepare(
             raise OptionError("labels are of one shape, not of a folder", "name the shape itself")
         if output.is_dir() and output.samefile(shapes):
             raise OptionError(f"cannot prepare {shapes} into itself", "choose another folder with -o")
-        return _prepare_folder(shapes, output, config, Progress(progress, shapes.name).stage("checked"))
+        return _prepare_folder(shapes, output, config, Progress(progress, shapes.name).stage("checking and aligning"))
     for name in ("template", "align", "landmarks"):
         if getattr(config, name) is not None:
             raise OptionError(f"{name} goes with a folder of shapes", "one shape is its own template")
@@ -170,7 +171,7 @@ def _read_shapes(
         raise InputError(f"no shapes in {folder}", f"files that end in {', '.join(SUFFIXES)} are read")
     make_folder(output / "normalised")
     found: list[Repaired] = []
-    marks: list[Float[Floats, "L 3"] | None] = []
+    known: list[prepared_folder.KnownPoints | None] = []
     for number, (path, file) in enumerate(pairs):
         try:
             clean = _check_size(repair(load_shape(path)))
@@ -179,11 +180,12 @@ def _read_shapes(
         else:
             notes += [f"{path.name}: {note}" for note in clean.notes]
             found.append(clean)
-            marks.append(None if file is None else prepared_folder.read_landmarks(file, clean))
+            space = mesh_space(path)
+            known.append(None if file is None else prepared_folder.read_known_points(file, clean, space))
         progress((number + 1) / len(pairs))
     if not found:
         raise InputError(f"no shape in {folder} could be used", notes[0])
-    return found, marks
+    return found, prepared_folder.in_one_order(known)
 
 
 def _mirror_some(

@@ -7,8 +7,7 @@ on each of a folder's shapes, in one order.
 
 from __future__ import annotations
 
-import io
-import warnings
+import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -23,7 +22,8 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
-from meshmatch.shapes.input_files import read_json, read_npy, read_text
+from meshmatch.shapes.input_files import read_json
+from meshmatch.shapes.landmark_files import LANDMARK_READERS, Space, read_landmark_file
 from meshmatch.shapes.normalise import ALIGNS, Align, align, residual
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.sampling import sample_surface
@@ -38,6 +38,7 @@ _MIN_SAMPLES, _MAX_SAMPLES = 1024, 4096  # of a shape
 _ALL_SAMPLES = 200_000  # of a folder
 _COMPARED = 40  # shapes among which the medoid is looked for
 _ALIKE = 30.0  # degrees: registered shapes that are turned less stand alike; set by hand
+_LANDMARKS_HINT = "either one vertex a line (-1: missing), or x, y and z of a point on each line"
 ARRAYS = ("points", "normals", "landmarks", "template_landmarks")
 
 
@@ -159,33 +160,79 @@ def collect_samples(
     return ShapeSamples(stack[0], stack[1], known, vertices, how, scale), frames, residuals
 
 
+@dataclass(frozen=True, eq=False)
+class KnownPoints:
+    """Landmarks of a shape, in its file's frame."""
+
+    points: Float[Floats, "L 3"]  # NaN for a missing one
+    names: tuple[str, ...]  # () if the file has none
+
+
 def read_landmarks(file: Path, clean: Repaired) -> Float[Floats, "L 3"]:
-    """Landmarks of a shape, in its file's frame, from vertices (L,) or positions (L, 3); -1 or NaN for a missing one.
-    `InputError` if the file cannot be read, or names a vertex that is not there.
+    """Landmarks of a shape, in its file's frame, NaN for a missing one; see `read_known_points`."""
+    return read_known_points(file, clean).points
+
+
+def read_known_points(file: Path, clean: Repaired, space: Space = "") -> KnownPoints:
+    """Landmarks of a shape: vertices, points of faces, or positions, as in every format of landmarks.
+
+    Parameters
+    ----------
+    file
+        The file of landmarks.
+    clean
+        The shape, repaired; vertices and faces are those of its file.
+    space
+        The frame that 3D Slicer gave the shape's file (`mesh_space`).
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or names a vertex or face that is not there.
     """
+    if file.suffix.lower() not in LANDMARK_READERS:
+        known = " ".join(LANDMARK_READERS)
+        raise InputError(
+            f"{file.name}: landmarks are not read from '{file.suffix}' files", f"they are read from {known}"
+        )
     try:
-        if file.suffix == ".npy":
-            values = read_npy(file)
-        else:
-            text = read_text(file, 100, 40)
-            delimiter = "," if "," in text else None
-            with warnings.catch_warnings():  # of a file without numbers, which is refused below
-                warnings.simplefilter("ignore", UserWarning)
-                values = np.asarray(np.loadtxt(io.StringIO(text), delimiter=delimiter))
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read the landmarks {file.name}", "numbers, one point a line") from error
-    if values.ndim == 2 and values.shape[1] == 3 and values.dtype.kind in "fiu":
-        return values.astype(np.float64)
-    numbers = values.dtype.kind in "fiu" and values.ndim == 1 and len(values)
-    if not numbers or not np.array_equal(values, np.round(values)):
-        problem = f"{file.name} holds no landmarks"
-        raise InputError(problem, "either one vertex a line (-1: missing), or x, y and z of a point on each line")
-    for outside in values[(values < -1) | (values >= clean.original.V)]:
-        problem = f"{file.name} names vertex {outside:.0f}, but {clean.original.name} has {clean.original.V}"
-        raise InputError(problem, "vertices are counted from 0; -1 is a missing one")
-    points = clean.shape.verts[clean.original_to_repaired[values.astype(np.int64)]].copy()
-    points[values < 0] = np.nan
-    return points
+        found = read_landmark_file(file, clean.original.name).in_space(space)
+    except InputError as error:
+        words = error.message if error.message.startswith(file.name) else f"{file.name}: {error.message}"
+        raise InputError(words, error.hint or _LANDMARKS_HINT) from error
+    except (OSError, ValueError, TypeError, LookupError, ArithmeticError, csv.Error) as error:
+        raise InputError(f"{file.name} holds no landmarks that can be read: {error}", _LANDMARKS_HINT) from error
+    original, points = clean.original, np.full((len(found.places), 3), np.nan)
+    for k, place in enumerate(found.places):
+        if place.kind == "position":
+            points[k] = place.where
+        elif place.kind != "missing":
+            limit = original.F if place.kind == "face" else original.V
+            number = place.where[0] if place.kind == "face" else place.where
+            if not 0 <= number < limit:
+                problem = f"{file.name} names {place.kind} {number}, but {original.name} has {limit}"
+                raise InputError(problem, "they are counted from 0; vertex -1 is a missing one")
+            corners = original.faces[number] if place.kind == "face" else [number]
+            weights = place.where[1] if place.kind == "face" else [1.0]
+            points[k] = weights @ clean.shape.verts[clean.original_to_repaired[corners]]
+    return KnownPoints(points, tuple(place.name for place in found.places) if found.has_names else ())
+
+
+def in_one_order(known: Sequence[KnownPoints | None]) -> list[Float[Floats, "L 3"] | None]:
+    """The landmarks of shapes by their names, in the order of the first shape, where all have names and share some; else
+    as they stand.
+    """
+    named = [one for one in known if one is not None]
+    together = set.intersection(*(set(one.names) for one in named)) if named else set()
+    if not together or any(len(set(one.names)) < len(one.names) for one in named):
+        return [None if one is None else one.points for one in known]
+    order = list(dict.fromkeys(name for one in named for name in one.names))
+    found: list[Float[Floats, "L 3"] | None] = []
+    for one in known:
+        place = {} if one is None else dict(zip(one.names, one.points, strict=True))
+        rows = np.array([place.get(name, np.full(3, np.nan)) for name in order])
+        found.append(None if one is None else rows)
+    return found
 
 
 def find_landmarks(where: str | Path | None, folder: Path, files: Sequence[Path]) -> list[Path | None]:
@@ -194,7 +241,8 @@ def find_landmarks(where: str | Path | None, folder: Path, files: Sequence[Path]
         return [None] * len(files)
     place, suffixes = folder, [str(where)]
     if Path(where).is_dir():
-        place, suffixes = Path(where), [".landmarks.npy", ".npy", ".landmarks.txt", ".txt"]
+        kinds = (".npy", ".txt", ".csv", ".mrk.json", ".json", ".fcsv", ".pp", ".pts", ".tps")
+        place, suffixes = Path(where), [stem + kind for kind in kinds for stem in (".landmarks", "")]
     found = []
     for file in files:
         names = (place / f"{file.stem}{suffix}" for suffix in suffixes)

@@ -13,7 +13,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints, Pickled
 from meshmatch.errors import InputError, TemplateError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
@@ -35,8 +35,8 @@ _ARRAYS = ("verts", "faces", "dense_verts", "dense_faces", "nodes", "labels", "c
 _WHOLE = ("faces", "dense_faces", "labels", "core")
 
 
-@dataclass(frozen=True, eq=False)
-class Template:
+@dataclass(frozen=True, eq=False, repr=False)
+class Template(Brief, Pickled):
     """The reference shape of a category.
 
     Frame: surface area 1, area-weighted centroid at 0; human templates stand y up, face +z, left hand at +x.

@@ -15,23 +15,25 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.arrays import Int, Ints
+from meshmatch.arrays import Brief, Int, Ints
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import label_colors
 from meshmatch.shapes.input_files import read_json, read_npy, read_text
 from meshmatch.shapes.shape import Shape
+from meshmatch.shapes.text_tables import is_missing, is_number, number, read_table, unquoted
 
 On = Literal["vertices", "faces"]
 Label = int | str
 LABEL_SUFFIXES = (".npy", ".csv", ".txt", ".json", ".ply")
 check_labels_suffix = partial(table_files.check_suffix, suffixes=LABEL_SUFFIXES, what="labels")
+_AS_FLOAT = re.compile(r"[+-]?[0-9]+[.,][0-9]*(?:[eE][+-]?[0-9]+)?")
 _HINT = "one label for each vertex or triangle of the source, in the order of its file; polygons are fans of triangles"
 
 
-@dataclass(frozen=True, eq=False)
-class Labels:
+@dataclass(frozen=True, eq=False, repr=False)
+class Labels(Brief):
     """Which label each vertex or face has."""
 
     codes: Int[Ints, " N"]  # a place in `names`; -1 for none
@@ -74,7 +76,7 @@ def load_labels(path: str | Path, shape: Shape, on: On | None = None) -> Labels:
     readers = {
         ".npy": lambda path: (_listed(read_npy(path)), None),
         ".csv": lambda path: _read_csv(path, (shape.V, shape.F)),
-        ".txt": lambda path: ([line.strip() for line in read_text(path, 240).rstrip().splitlines()], None),
+        ".txt": lambda path: _read_txt(path, (shape.V, shape.F)),
         ".json": lambda path: _read_json(path, shape, on),
     }
     values, written = table_files.read_by_suffix(path, readers, "labels", _HINT)
@@ -97,7 +99,7 @@ def _listed(array: NDArray[Any]) -> list[Any]:
 
 
 def _labels(name: str, values: Sequence[Any], shape: Shape, on: str | None) -> Labels:
-    """Labels from what a file or an array has; empty entries and nan are none."""
+    """Labels from what a file or an array has; empty entries and nan are none, and among numbers NA and the like."""
     sizes: dict[On, int] = {"vertices": shape.V, "faces": shape.F}
     fits = [kind for kind, size in sizes.items() if size == len(values) and on in (None, kind)]
     owner = shape.name or "the source"
@@ -109,7 +111,9 @@ def _labels(name: str, values: Sequence[Any], shape: Shape, on: str | None) -> L
         problem = f"{name} has {len(values)} labels, but {owner} has {shape.V} vertices and {shape.F} faces{asked}"
         raise InputError(problem, _HINT)
     cells: list[Any] = [_whole(value) for value in values]
-    if any(cell is None and raw not in (None, "") and raw == raw for cell, raw in zip(cells, values, strict=True)):
+    others = [raw for cell, raw in zip(cells, values, strict=True) if cell is None and not _is_none(raw)]
+    if others or all(cell is None for cell in cells):
+        _check_decimals(name, others)
         cells = [_word(name, raw) for raw in values]
     names = tuple(sorted({cell for cell in cells if cell is not None}))
     if not names:
@@ -118,16 +122,30 @@ def _labels(name: str, values: Sequence[Any], shape: Shape, on: str | None) -> L
     return Labels(np.array([place[cell] for cell in cells], np.int64), names, fits[0])
 
 
+def _is_none(value: Any) -> bool:
+    """Whether an entry has no label, in a list whose other labels are numbers."""
+    return value is None or value != value or (isinstance(value, str) and is_missing(value))
+
+
 def _whole(value: Any) -> int | None:
-    """A whole number, also one written as text, in plain digits, or with a decimal point."""
+    """A whole number, also one written as text: in plain digits, or as NumPy and pandas write it, with a decimal point."""
     try:
-        if isinstance(value, str) and not re.fullmatch(r"\s*[+-]?[0-9]+\s*", value):
-            return None
-        if isinstance(value, str | int):
-            return int(value)
-        return int(value) if float(value) == int(value) else None
+        if isinstance(value, str):
+            if re.fullmatch(r"\s*[+-]?[0-9]+\s*", value):
+                return int(value)
+            if not _AS_FLOAT.fullmatch(value.strip()):
+                return None
+            value = number(value)
+        return int(value) if isinstance(value, int) or float(value) == int(value) else None
     except (ValueError, TypeError, OverflowError):
         return None
+
+
+def _check_decimals(name: str, others: Sequence[Any]) -> None:
+    """`InputError` if the labels that are not whole are all numbers with a decimal comma."""
+    if others and all(isinstance(raw, str) and "," in raw and is_number(raw) for raw in others):
+        problem = f"{name}: {others[0]} is not a label: a number with a decimal comma, or two columns?"
+        raise InputError(problem, "for two columns, vertex and label: put semicolons between them, or name them")
 
 
 def _word(name: str, raw: Any) -> str | None:
@@ -140,12 +158,34 @@ def _word(name: str, raw: Any) -> str | None:
 
 
 def _read_csv(path: Path, counts: tuple[int, int]) -> tuple[list[str], str | None]:
-    rows = table_files.read_rows(path)
-    if len({len(row) for row in rows}) != 1:
-        raise InputError("its rows are not equally long", "one row each: vertex,label")
-    head = [cell.lower() for cell in rows[0]]
-    written = {"vertex": "vertices", "face": "faces"}.get(head[0])
-    has_names = written is not None or "label" in head
+    return _from_rows(read_table(path, blanks=False, comments="", whole=True).rows(), counts)
+
+
+def _read_txt(path: Path, counts: tuple[int, int]) -> tuple[list[str], str | None]:
+    """A label on each line, whatever it is; two columns if the first one says so, or counts the lines."""
+    lines = [line.strip() for line in read_text(path, 480).rstrip().splitlines()]
+    for mark in ("\t", ";", ",", None):
+        rows = [[unquoted(cell.strip()) for cell in line.split(mark, 1)] for line in lines]
+        if all(len(row) == 2 for row in rows):
+            numbers = [row[0] for row in rows[_owner(rows[0]) is not None :]]
+            if _owner(rows[0]) or (len(rows) > 2 and table_files.is_numbered(numbers)):
+                return _from_rows(rows, counts)
+    quoted = all(unquoted(line) != line for line in lines)
+    return _from_rows([[unquoted(line) if quoted else line] for line in lines], counts)
+
+
+def _owner(head: list[str]) -> On | None:
+    """What the first column numbers, by its name in a table of several columns."""
+    owners: dict[str, On] = {"vertex": "vertices", "face": "faces"}
+    return owners.get(head[0].lower().lstrip("# ")) if len(head) > 1 else None
+
+
+def _from_rows(rows: list[list[str]], counts: tuple[int, int]) -> tuple[list[str], str | None]:
+    """The labels in a table, and what they belong to if it says so."""
+    if not rows:
+        raise InputError("it holds no label at all")
+    head, written = [cell.lower() for cell in rows[0]], _owner(rows[0])
+    has_names = written is not None or (len(head) > 1 and "label" in head)
     if has_names or (len(rows) - 1 in counts and len(rows) not in counts):
         rows = rows[1:]
     column = head.index("label") if "label" in head else len(head) - 1

@@ -5,38 +5,39 @@ docs/formats.md says how.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Float, Floats, Int, Ints
+from meshmatch.arrays import Brief, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps import table_files
 from meshmatch.maps.vertex_map import VertexMap, corners_of
-from meshmatch.outputs import plain_text
-from meshmatch.shapes.input_files import read_bytes, read_json
+from meshmatch.shapes.landmark_files import (
+    LANDMARK_READERS,
+    LandmarkFile,
+    Space,
+    fcsv_lines,
+    markups_record,
+    read_landmark_file,
+)
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.mapped_mesh import MappedMesh, discontinuous_faces, known_normals
 
 # A landmark this far from the surface, in diagonals of the shape, belongs to another shape.
 _ELSEWHERE = 0.25
-LANDMARK_SUFFIXES = (".csv", ".json", ".pp")
+LANDMARK_SUFFIXES = (".csv", ".json", ".pp", ".fcsv", ".mrk.json")
 check_landmarks_suffix = partial(table_files.check_suffix, suffixes=LANDMARK_SUFFIXES, what="landmarks")
-_LARGEST_PP = 10_000_000
-_PLACES = ({"vertex"}, {"x", "y", "z"}, {"face", "w0", "w1", "w2"})
-# One as a file has it: name; vertex, face and barycentric, or position. What is missing may be left out.
-_Record = dict[str, Any]
-_HINT = "a row each: name,vertex or name,x,y,z; or MeshLab's .pp, or .json"
+_HINT = "a row each: name,vertex or name,x,y,z; MeshLab's .pp, 3D Slicer's .mrk.json or .fcsv, .pts, .tps, .json"
 
 
-@dataclass(frozen=True, eq=False)
-class Landmarks:
+@dataclass(frozen=True, eq=False, repr=False)
+class Landmarks(Brief):
     """Named points on a shape, in its own frame and unit."""
 
     names: tuple[str, ...]
@@ -45,6 +46,7 @@ class Landmarks:
     face: Int[Ints, " N"]  # -1 where the point is the vertex itself (always on a cloud)
     barycentric: Float[Floats, "N 3"]  # weights of the face's corners; (1, 0, 0) where the face is -1
     confidence: Float[Floats, " N"]  # 0 (a guess) to 1 (certain)
+    notes: tuple[str, ...] = ()  # what was left out or turned while they were read
 
 
 def at_vertices(shape: Shape, vertex: Int[Ints, " N"], names: tuple[str, ...] = ()) -> Landmarks:
@@ -134,142 +136,85 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
     return _on_surface(target, landmarks.names, vertex, face, weights, np.clip(confidence, 0, 1))
 
 
-def load_landmarks(path: str | Path, shape: Shape) -> tuple[Landmarks, float]:
-    """Landmarks of `shape`, in the order of the file, and the largest distance from a position to the surface;
-    `InputError` if there is none, or one is not on `shape`.
+def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[Landmarks, float]:
+    """Landmarks in a file, on `shape`.
+
+    Parameters
+    ----------
+    path
+        The file; `meshmatch.shapes.landmark_files.LANDMARK_READERS` has the suffixes.
+    shape
+        The shape that they are on.
+    space
+        The frame that 3D Slicer gave the shape's file (`mesh_space`): landmarks in its other frame are turned.
+
+    Returns
+    -------
+    tuple[Landmarks, float]
+        Landmarks in the order of the file, without the missing ones, which `Landmarks.notes` names; and the largest
+        distance from a position to the surface.
+
+    Raises
+    ------
+    InputError
+        The file holds no landmark, or one is not on `shape`.
     """
-    readers = {".csv": _read_csv, ".json": _read_json, ".pp": _read_pp, ".txt": _read_vertices, ".npy": _read_vertices}
-    on_shape = dict.fromkeys(readers, lambda path: _on_shape(readers[path.suffix.lower()](path), shape))
+    on_shape = dict.fromkeys(
+        LANDMARK_READERS, lambda path: _on_shape(read_landmark_file(path, shape.name), shape, space)
+    )
     return table_files.read_by_suffix(path, on_shape, "landmarks", _HINT)
 
 
-def _on_shape(records: list[_Record], shape: Shape) -> tuple[Landmarks, float]:
-    """Landmarks in the order of the records; and the largest distance of a position from the surface."""
-    if not records:
-        raise InputError("it holds no landmark")
-    entries = [_named_place(record, k) for k, record in enumerate(records)]
+def _on_shape(found: LandmarkFile, shape: Shape, space: Space) -> tuple[Landmarks, float]:
+    """Landmarks in the order of the file; and the largest distance of a position from the surface."""
+    notes = []
+    if found.turns_to(space):
+        notes.append(f"the landmarks are in {found.space}, {shape.name} is in {space}: x and y change their signs")
+    places = found.in_space(space).places
+    missing = [f"landmark {place.name}{place.where}" for place in places if place.kind == "missing"]
+    if len(missing) == len(places):
+        raise InputError(missing[0] + (f", and {len(missing) - 1} more are missing" if len(missing) > 1 else ""))
+    if missing:
+        notes.append(
+            missing[0] + (f", and {len(missing) - 1} more are missing" if len(missing) > 1 else "") + ": left out"
+        )
     parts: list[Landmarks] = []
     rows: list[int] = []
     largest = 0.0
     for kind in ("vertex", "face", "position"):
-        own = [(k, name, place) for k, (name, its, place) in enumerate(entries) if its == kind]
+        own = [(k, place.name, place.where) for k, place in enumerate(places) if place.kind == kind]
         if not own:
             continue
-        numbers, names, places = zip(*own, strict=True)
+        numbers, names, where = zip(*own, strict=True)
         rows += numbers
         if kind == "vertex":
-            parts.append(at_vertices(shape, np.array(places), names))
+            parts.append(at_vertices(shape, np.array(where), names))
         elif kind == "face":
-            face, weights = (np.array(each) for each in zip(*places, strict=True))
+            face, weights = (np.array(each) for each in zip(*where, strict=True))
             parts.append(at_faces(shape, face, weights, names))
         else:
-            found, distance = at_points(shape, np.array(places), names)
-            parts.append(found)
+            on_surface, distance = at_points(shape, np.array(where), names)
+            parts.append(on_surface)
             largest = float(distance.max())
-    return joined(parts, np.argsort(rows)), largest
+    return replace(joined(parts, np.argsort(rows)), notes=tuple(notes)), largest
 
 
-def _read_vertices(path: Path) -> list[_Record]:
-    return [{"vertex": vertex} for vertex in table_files.load_points(path).tolist()]
+def save_landmarks(path: Path, landmarks: Landmarks, space: Space = "LPS", name: str = "") -> None:
+    """Write landmarks; `OptionError` if the suffix is not one of `LANDMARK_SUFFIXES`.
 
-
-def _read_csv(path: Path) -> list[_Record]:
-    rows = [row for row in table_files.read_rows(path) if not row[0].startswith("#")]
-    if not rows:
-        return []
-    head = [cell.lower() for cell in rows[0]]
-    if any(place <= set(head) for place in _PLACES):
-        rows = rows[1:]
-    else:
-        width = len(head)
-        if width not in (1, 2, 3, 4) or (width == 2 and head[0].lstrip("-").isdigit()):
-            raise InputError("its first row names no columns")
-        head = {1: ["vertex"], 2: ["name", "vertex"], 3: ["x", "y", "z"], 4: ["name", "x", "y", "z"]}[width]
-    records = []
-    for number, row in enumerate(rows):
-        if len(row) != len(head):
-            raise InputError(f"row {number} has {len(row)} cells, not {len(head)}")
-        cell = dict(zip(head, row, strict=True))
-        record: _Record = {"name": cell.get("name")}
-        # The most exact of what a row has: a face with weights, then a vertex, then a position.
-        if cell.get("face", "") not in ("", "-1") and {"w0", "w1", "w2"} <= set(cell):
-            record |= {"face": int(cell["face"]), "barycentric": [float(cell[name]) for name in ("w0", "w1", "w2")]}
-        elif cell.get("vertex", "") != "":
-            record["vertex"] = int(cell["vertex"])
-        else:
-            record["position"] = [float(cell.get(axis, "nan")) for axis in "xyz"]
-        records.append(record)
-    return records
-
-
-def _read_json(path: Path) -> list[_Record]:
-    found = read_json(path)
-    if isinstance(found, dict) and isinstance(found.get("landmarks"), list | dict):
-        found = found["landmarks"]
-    if isinstance(found, dict):
-        return [{"name": name, **_record(value)} for name, value in found.items()]
-    if isinstance(found, list):
-        return [_record(value) for value in found]
-    raise InputError("it holds no list of landmarks")
-
-
-def _record(value: Any) -> _Record:
-    """A vertex, a position or a description."""
-    return value if isinstance(value, dict) else {"vertex" if isinstance(value, int) else "position": value}
-
-
-def _named_place(record: _Record, number: int) -> tuple[str, str, Any]:
-    """The name, and a "vertex", a "face" with three weights, or a "position"."""
-    words = "".join(c if c.isprintable() else " " for c in str(record.get("name") or number))
-    name = plain_text(" ".join(words.split()))
-    face, weights = record.get("face"), record.get("barycentric")
-    if face is not None and face != -1 and weights is not None:
-        return name, "face", (_whole(face, name), _three(weights, name))
-    if record.get("vertex") is not None:
-        return name, "vertex", _whole(record["vertex"], name)
-    if record.get("position") is not None:
-        return name, "position", _three(record["position"], name)
-    raise InputError(f"landmark {name} has no place")
-
-
-def _whole(value: Any, name: str) -> int:
-    if isinstance(value, bool) or int(value) != value or abs(int(value)) >= 2**62:
-        raise InputError(f"landmark {name}: {str(value)[:40]} is not the number of a vertex or face")
-    return int(value)
-
-
-def _three(values: Any, name: str) -> list[float]:
-    if not isinstance(values, list) or len(values) != 3:
-        raise InputError(f"landmark {name}: three numbers are needed, not {str(values)[:40]}")
-    return [float(value) for value in values]
-
-
-def _read_pp(path: Path) -> list[_Record]:
-    data = read_bytes(path)
-    if len(data) > _LARGEST_PP:
-        raise InputError(f"it is too large: over {_LARGEST_PP // 10**6} MB", "landmarks are a few named points")
-    if b"<!ENTITY" in data:
-        raise InputError("it defines XML entities, which a file of picked points has no use for")
-    try:
-        root = ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
-        raise InputError(f"it is not XML: {error}") from error
-    if root.tag != "PickedPoints":
-        raise InputError(f"it is not a file of MeshLab's picked points: its root is '{root.tag}'")
-    return [
-        {"name": point.get("name"), "position": [float(point.get(axis, "nan")) for axis in "xyz"]}
-        for point in root.iter("point")
-        if point.get("active", "1") != "0"  # the name of a template that nobody has placed
-    ]
-
-
-def save_landmarks(path: Path, landmarks: Landmarks) -> None:
-    """Write landmarks; `OptionError` if the suffix is not one of `LANDMARK_SUFFIXES`."""
+    `space` is the frame that a file for 3D Slicer (.fcsv, .mrk.json) states; it takes a mesh that states none to be in
+    LPS. `name` is what the file will be called, where `path` is a temporary name.
+    """
     suffix = check_landmarks_suffix(path)
     columns = (landmarks.vertex, landmarks.points, landmarks.face, landmarks.barycentric)
     sure = table_files.short_floats(landmarks.confidence)
     rows = list(zip(landmarks.names, *(column.tolist() for column in columns), sure, strict=True))
-    if suffix == ".csv":
+    points = zip(landmarks.names, landmarks.points.tolist(), landmarks.confidence.tolist(), strict=True)
+    if suffix == ".fcsv":
+        path.write_text("\n".join(fcsv_lines(points, space)) + "\n", encoding="utf-8")
+    elif (name or path.name).lower().endswith(".mrk.json"):
+        table_files.write_json(path, markups_record(points, space), indent=1)
+    elif suffix == ".csv":
         cells = ([name, vertex, *xyz, face, *weights, trust] for name, vertex, xyz, face, weights, trust in rows)
         table_files.write_rows(path, ["name", "vertex", "x", "y", "z", "face", "w0", "w1", "w2", "confidence"], cells)
     elif suffix == ".json":

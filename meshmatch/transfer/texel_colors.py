@@ -59,8 +59,9 @@ class MaterialSampler:
             return self._of_one(0, face, weights, footprint)
         out = np.ones((4, len(face)), np.float32)
         material = self._material.take(face)
-        for number in np.unique(material).tolist():
-            rows = np.flatnonzero(material == number)
+        order = np.argsort(material, kind="stable")
+        used, begins = np.unique(material[order], return_index=True)
+        for number, rows in zip(used.tolist(), np.split(order, begins[1:]), strict=True):
             out[:, rows] = self._of_one(number, face[rows], weights[:, rows], footprint[rows])
         return out
 

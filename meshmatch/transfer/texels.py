@@ -226,11 +226,15 @@ def pyramids_of(
     keys = [(id(m.image), m.wrap, m.nearest, m.alpha == "opaque") for m in look.materials]
     used = [k for k in np.unique(look.material).tolist() if look.materials[k].image is not None]
     made: dict[tuple[object, ...], Pyramid] = {}
+    group = {key: k for k, key in enumerate(dict.fromkeys(keys))}
+    kind = np.array([group[key] for key in keys], np.int64)[look.material] if keys else look.material
+    order = np.argsort(kind, kind="stable")
+    begins = np.searchsorted(kind[order], np.arange(len(group) + 1))
     for number in used:
         if keys[number] not in made:
-            alike = np.array([key == keys[number] for key in keys])[look.material]
+            k = group[keys[number]]
             material = look.materials[number]
-            made[keys[number]] = Pyramid(material, known(material, look.uv[alike]))
+            made[keys[number]] = Pyramid(material, known(material, look.uv[order[begins[k] : begins[k + 1]]]))
     return {number: made[keys[number]] for number in used}
 
 

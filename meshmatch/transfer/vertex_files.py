@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array, issparse
 
-from meshmatch.arrays import Float, Floats
+from meshmatch.arrays import Brief, Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps import table_files
 from meshmatch.outputs import plain_text
@@ -24,6 +24,7 @@ from meshmatch.shapes.colors import light
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.input_files import read_bytes, read_json, read_npy, read_npz
 from meshmatch.shapes.shape import LARGEST, Shape
+from meshmatch.shapes.text_tables import read_table
 
 VALUE_SUFFIXES = (".npy", ".csv", ".ply")
 _COLOR_SUFFIXES = (".ply", ".glb", ".obj", ".off", ".npy", ".csv")
@@ -49,7 +50,7 @@ class Values:
 
 def load_values(path: str | Path, shape: Shape) -> Values:
     """Read numbers of the vertices of `shape`; `InputError` if there is not one row for each."""
-    readers = {".npy": _read_npy, ".csv": _read_csv, ".txt": _read_csv}
+    readers = {".npy": _read_npy} | dict.fromkeys((".csv", ".txt"), lambda path: _read_text(path, shape.V))
     found = table_files.read_by_suffix(path, readers, "values", _HINT)
     name, rows = Path(path).name, len(found.numbers)
     if rows != shape.V:
@@ -66,27 +67,31 @@ def _read_npy(path: Path) -> Values:
     return Values(array.astype(np.float64))
 
 
-def _read_csv(path: Path) -> Values:
-    rows = table_files.read_rows(path)
-    if not rows:
+def _read_text(path: Path, count: int) -> Values:
+    """The numbers of a table of text, one row for each of `count` vertices."""
+    table = read_table(path)
+    names, numbers = table.numbers()
+    if not names and len(numbers) == count + 1 and _counts_columns(numbers[0]):
+        names, numbers = ("", *map(str, range(numbers.shape[1] - 1))), numbers[1:]  # as pandas names columns
+    if not names and numbers.size == 0:
         raise InputError(f"{path.name} is empty")
-    names: tuple[str, ...] = ()
-    try:
-        _numbers(rows[:1])
-    except ValueError:
-        names, rows = tuple(rows[0]), rows[1:]
-    widths = {len(row) for row in rows} | ({len(names)} if names else set())
-    if len(widths) > 1:
-        raise InputError(f"it has rows of {min(widths)} and of {max(widths)} cells")
-    table = _numbers(rows).reshape(len(rows), widths.pop())
+    if len(numbers) == count:
+        table.check_no_doubt()
     if names and names[0].lower() == "vertex":
-        table_files.check_numbered(table[:, 0])
-        names, table = names[1:], table[:, 1:]
-    return Values(table[:, 0] if table.shape[1] == 1 else table, names)
+        table_files.check_numbered(numbers[:, 0])
+        names, numbers = names[1:], numbers[:, 1:]
+    elif len(names) > 1 and names[0] in ("", "Unnamed: 0") and _is_row_number(numbers[:, 0]):
+        names, numbers = names[1:], numbers[:, 1:]
+    return Values(numbers[:, 0] if numbers.shape[1] == 1 else numbers, names)
 
 
-def _numbers(rows: list[list[str]]) -> Floats:
-    return np.array([[float(cell or "nan") for cell in row] for row in rows])
+def _counts_columns(row: Floats) -> bool:
+    return bool(np.isnan(row[0])) and len(row) > 1 and np.array_equal(row[1:], np.arange(len(row) - 1))
+
+
+def _is_row_number(column: Floats) -> bool:
+    """Whether a column without a name counts the rows, from 0 as pandas or from 1 as R."""
+    return any(np.array_equal(column, np.arange(len(column)) + first) for first in (0, 1))
 
 
 def save_values(path: Path, values: Values, shape: Shape) -> None:
@@ -169,8 +174,8 @@ def save_colors(path: Path, shape: Shape, colors: Float[Floats, "V 4"]) -> None:
         save_shape(path, Shape(shape.verts, shape.faces, shape.name, colors, shape.invalid))
 
 
-@dataclass(frozen=True, eq=False)
-class SkinWeights:
+@dataclass(frozen=True, eq=False, repr=False)
+class SkinWeights(Brief):
     """How much each joint moves each vertex."""
 
     matrix: csr_array  # (V, J), not negative; rows sum to 1, or to 0 for a vertex that nothing moves

@@ -82,7 +82,7 @@ def test_later_shapes_are_of_the_kind_before(models: list[TrainedModel]) -> None
 
 @pytest.mark.usefixtures("models")
 def test_a_complete_shape_of_no_kind_is_refused() -> None:
-    with pytest.raises(InputError, match=r"chair 7 7 6 is of no kind .*: human, quadruped"):
+    with pytest.raises(InputError, match=r"chair 7 7 6 does not look like .*: human, quadruped"):
         choose(ball("man 3 4 6"), ball("chair 7 7 6"))
 
 
@@ -119,6 +119,15 @@ def test_a_fit_as_a_part_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("models")
+def test_a_shape_that_is_said_to_be_a_part_is_not_fitted_to_tell_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kind, "Fitter", None)
+    part, config = validated(ball("half 7 7 5.5", opened=True)), FitConfig(partial="yes")
+    choice = kinds.choose_model([part, validated(ball("man 3 4 6"))], [config] * 2)
+    assert choice.model.card.name == "human" and "may be a part" in choice.words[0]
+    assert kinds.choose_model([part], [config]).model.card.name == "quadruped"  # alone, what reads it best
+
+
+@pytest.mark.usefixtures("models")
 def test_what_reads_strangely_is_of_the_kind_that_fits_it(monkeypatch: pytest.MonkeyPatch) -> None:
     dancer = load_shape(SAMPLES / "dancer.ply")
     strange = Shape(dancer.verts, dancer.faces, "robot 5.5 5.6 7")
@@ -129,9 +138,9 @@ def test_what_reads_strangely_is_of_the_kind_that_fits_it(monkeypatch: pytest.Mo
     fit = Matcher().fit(strange)
     assert fit.verdict == "good" and fit.repaired is not None
     for words in ("robot 7 7.1 7.2", "robot 7 7.1 5.5"):  # too strange; and no animal
-        with pytest.raises(InputError, match="is of no kind"):
+        with pytest.raises(InputError, match="does not look like"):
             choose(Shape(dancer.verts, dancer.faces, words))
-    with pytest.raises(InputError, match="is of no kind"):  # read like a body, or nearly, but nothing fits it
+    with pytest.raises(InputError, match="does not look like"):  # read like a body, or nearly, but nothing fits it
         choose(ball("aeroplane 4.7 4.8 7"))
 
 
@@ -215,7 +224,7 @@ def test_hands_and_heads_are_told_apart() -> None:
 
 def test_a_ring_is_of_no_kind() -> None:
     ring = trimesh.creation.torus(1.0, 0.3)
-    with pytest.raises(InputError, match="ring is of no kind"):
+    with pytest.raises(InputError, match="ring does not look like"):
         meshmatch.register(Shape(ring.vertices, ring.faces, "ring"))
 
 

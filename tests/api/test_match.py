@@ -112,8 +112,9 @@ def test_shapes_that_cannot_be_fitted(cube: Shape, dancer: Shape) -> None:
         np.concatenate([dancer.faces, dancer.faces + dancer.V]),
         "two",
     )
-    with pytest.raises(InputError, match="far apart"):
+    with pytest.raises(InputError, match="more than one shape of a kind") as caught:
         register(apart)
+    assert "--only 1 or --only 2" in caught.value.hint
 
 
 def test_what_is_no_body_is_called_poor(torus: Shape) -> None:

@@ -6,11 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from meshmatch import __version__
 from meshmatch.cli import main
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, MeshmatchWarning
+from meshmatch.shapes.files import load_shape
 from tests.cli.conftest import Run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -259,3 +261,32 @@ def test_python_m_meshmatch_passes_the_status_on(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stdout == ""
     assert "Traceback" not in done.stderr
+
+
+def cut_short(folder: Path) -> Path:
+    """An stl of three triangles that promises five."""
+    rows = b"".join(bytes(12) + np.eye(3, dtype="<f4").tobytes() + bytes(2) for _ in range(3))
+    path = folder / "a.stl"
+    path.write_bytes(b"x".ljust(80) + (5).to_bytes(4, "little") + rows)
+    return path
+
+
+def test_a_warning_is_one_line_on_stderr(run: Run, tmp_path: Path) -> None:
+    answer = run("info", cut_short(tmp_path), "--json")
+    assert answer.status == 0
+    assert answer.err == "warning: a.stl promises 5 triangles, but holds 3: these are read\n"
+    assert answer.out.count("\n") == 1
+
+
+@pytest.mark.parametrize("asked", ["error", "ignore"])
+def test_a_warning_is_shown_whatever_python_was_asked(tmp_path: Path, asked: str) -> None:
+    code = "import sys; from meshmatch.cli import main; sys.exit(main(['info', sys.argv[1]]))"
+    command = [sys.executable, f"-W{asked}", "-c", code, cut_short(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert done.stderr.count("warning: a.stl promises") == 1
+
+
+def test_a_program_gets_a_usual_warning(tmp_path: Path) -> None:
+    with pytest.warns(MeshmatchWarning, match="promises 5 triangles"):
+        assert load_shape(cut_short(tmp_path)).F == 3

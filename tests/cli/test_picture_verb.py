@@ -272,11 +272,28 @@ def test_a_texture_is_shown_unless_plain(run: Run, tmp_path: Path, drawn: Drawn)
     assert drawn.panels[0].appearance is not None
     assert run("picture", tmp_path / "square.obj", "-o", out, "--plain").status == 0
     assert drawn.panels[0].appearance is None
-    (tmp_path / "skin.png").unlink()
-    answer = run("picture", tmp_path / "square.obj", "-o", out)
-    assert answer.status == 1
-    assert "skin.png" in answer.err
-    assert run("picture", tmp_path / "square.obj", "-o", out, "--plain").status == 0
+
+
+@pytest.mark.parametrize(("lost", "word"), [("square.mtl", "square.mtl"), ("p.png", "the image p.png")])
+@pytest.mark.parametrize("colored", [False, True])
+def test_a_shape_is_drawn_where_its_texture_is_lost(
+    run: Run, tmp_path: Path, drawn: Drawn, lost: str, word: str, colored: bool
+) -> None:
+    write_square_obj(tmp_path / "a.obj", vt=True)
+    (tmp_path / "square.mtl").write_text("newmtl paint\nmap_Kd p.png\n")
+    (tmp_path / "p.png").write_bytes(encoded(quarters()))
+    if colored:
+        text = (tmp_path / "a.obj").read_text()
+        rows = [f"{row} 1 0 0" if row.startswith("v ") else row for row in text.splitlines()]
+        (tmp_path / "a.obj").write_text("\n".join(rows) + "\n")
+    (tmp_path / lost).unlink()
+    answer = run("picture", tmp_path / "a.obj", "-o", tmp_path / "p2.png", *SMALL)
+    assert answer.status == 0
+    look = drawn.panels[0].appearance
+    assert (look is not None) == colored
+    if not (colored and lost == "square.mtl"):  # then it wears its colors, without a word
+        assert "warning: a.obj is drawn without its texture" in answer.err and word in answer.err
+    assert run("picture", tmp_path / "a.obj", "--image", tmp_path / lost, "-o", tmp_path / "p3.png").status == 1
 
 
 def test_another_image(run: Run, tmp_path: Path) -> None:

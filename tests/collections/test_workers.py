@@ -1,15 +1,18 @@
 """Who does the work, and what happens when a process dies."""
 
+import multiprocessing
 import os
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from meshmatch.collections.workers import Died, Processes, hired
-from meshmatch.errors import OptionError
+from meshmatch.errors import MeshmatchWarning, OptionError
 
 ROOT = Path(__file__).parents[2]
 
@@ -98,3 +101,101 @@ def test_one_process_is_this_one() -> None:
 
 def own_process(_: int) -> int:
     return os.getpid()
+
+
+def pid_after_a_while(_: int) -> int:
+    time.sleep(0.2)
+    return os.getpid()
+
+
+PROGRAM = """
+import os
+from meshmatch.collections.workers import Processes
+from tests.collections.test_workers import pid_after_a_while
+print("once")
+found = dict(Processes(2).each(pid_after_a_while, range(4)))
+print(len(found), os.getpid() in found.values())
+"""
+
+
+@pytest.mark.parametrize("way", ["standard input", "unguarded script", "command"])
+def test_a_program_of_any_kind_has_processes(tmp_path: Path, way: str) -> None:
+    """A spawned process must not look for a program that is no file, nor run an unguarded one again."""
+    script = tmp_path / "unguarded.py"
+    script.write_text(PROGRAM)
+    words = {"standard input": ["-"], "unguarded script": [str(script)], "command": ["-c", PROGRAM]}[way]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    given = PROGRAM if way == "standard input" else ""
+    done = subprocess.run([sys.executable, *words], input=given, capture_output=True, text=True, env=environment)
+    assert (done.stdout, done.stderr, done.returncode) == ("once\n4 False\n", "", 0)
+
+
+OWN_CLASS = """
+import os, warnings
+from dataclasses import dataclass
+from meshmatch.collections.workers import Processes
+from tests.collections.test_workers import name_of
+@dataclass
+class Own:
+    name: str
+warnings.simplefilter("always")
+if __name__ == "__main__":
+    print(sorted(Processes(2).each(name_of, [Own("a"), Own("b")])))
+"""
+
+
+def name_of(item: SimpleNamespace) -> str:
+    return str(item.name)
+
+
+@pytest.mark.parametrize("way", ["standard input", "script"])
+def test_classes_of_the_program_itself_reach_the_work(tmp_path: Path, way: str) -> None:
+    script = tmp_path / "guarded.py"
+    script.write_text(OWN_CLASS)
+    words = ["-"] if way == "standard input" else [str(script)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    given = OWN_CLASS if way == "standard input" else ""
+    done = subprocess.run([sys.executable, *words], input=given, capture_output=True, text=True, env=environment)
+    assert done.stdout == "[(0, 'a'), (1, 'b')]\n" and "Traceback" not in done.stderr
+    assert ("cannot import the program" in done.stderr) == (way == "standard input")
+
+
+def no_semaphores(*_: object, **__: object) -> None:
+    raise OSError(38, "Function not implemented")
+
+
+def test_without_shared_memory_this_process_works_and_says_so_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("meshmatch.collections.workers.ProcessPoolExecutor", no_semaphores)
+    check_alone("Function not implemented")
+
+
+def test_a_frozen_program_works_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "frozen", True, raising=False)
+    check_alone("frozen")
+
+
+def test_processes_that_end_at_once_are_not_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "meshmatch.collections.workers._begin", os._exit
+    )  # of the parent's number: as if it could not start
+    check_alone("ended at once")
+
+
+def check_alone(why: str) -> None:
+    with warnings.catch_warnings(record=True) as said, hired(2) as crew:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            assert dict(crew.each(own_process, range(3))) == dict.fromkeys(range(3), os.getpid())
+    assert [each.category for each in said] == [MeshmatchWarning] and why in str(said[0].message)
+
+
+def in_a_daemon(count: int) -> tuple[dict[int, object], list[str], int]:
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        return dict(Processes(count).each(own_process, range(3))), [str(each.message) for each in said], os.getpid()
+
+
+def test_a_daemonic_process_works_alone() -> None:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        found, said, own = pool.apply(in_a_daemon, (2,))
+    assert found == dict.fromkeys(range(3), own) and len(said) == 1 and "daemonic" in said[0]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshmatch.errors import MeshmatchError
+from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments.bench import speed
 from meshmatch.experiments.bench.speed import Case, cost_of, keep_to_cores, main, measure, shape_file, sized, split
 from meshmatch.shapes.files import load_shape
@@ -29,6 +29,21 @@ def cores() -> Iterator[None]:
 
 def python(code: str) -> list[str]:
     return [sys.executable, "-c", code]
+
+
+def test_an_earlier_run_stands_beside_this_one(tmp_path: Path) -> None:
+    path = tmp_path / "before.json"
+    path.write_text('a table\n{"cases": [{"case": "help", "wall": 2, "cpu": 0.5, "gigabytes": 0}]}\n')
+    row = speed.compared({"case": "help", "wall": 1.0, "cpu": 1.0, "gigabytes": 1.0}, speed.earlier(path)["help"])
+    assert (row["wall_before"], row["wall_ratio"], row["cpu_ratio"]) == (2.0, 0.5, 2.0)
+    assert "gigabytes_ratio" not in row
+    path.write_text("[]")
+    with pytest.raises(InputError, match="holds no run"):
+        speed.earlier(path)
+
+
+def test_the_numbers_of_the_last_release_are_of_all_cases() -> None:
+    assert list(speed.earlier(Path(__file__).parents[2] / "docs" / "results" / "speed.json")) == list(speed.CASES)
 
 
 def test_a_triangle_in_four() -> None:

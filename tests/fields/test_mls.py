@@ -1,10 +1,12 @@
 """Moving least squares: a slow textbook oracle, finite differences in float64, and the laws."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
-from meshmatch.errors import TemplateError
+from meshmatch.errors import InputError, MeshmatchError, OptionError, TemplateError
 from meshmatch.fields.field import Field, arap_energy, determinant, volume_energy
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.geometry.kernels import KERNELS, poorly_supported
@@ -140,3 +142,26 @@ def test_wide_nodes_among_narrow_ones_are_as_well_conditioned():
     both = build_field(points, nodes, radii, "smooth").phi.toarray()
     wide = build_field(points, nodes[200:], 2.0, "smooth").phi.toarray()
     assert np.allclose(both[:, 200:], wide, atol=1e-6) and not both[:, :200].any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"points": np.full((2, 3), np.nan)}, InputError, "points must be finite"),
+        ({"points": np.zeros((2, 2))}, InputError, r"points must be an array of \(N, 3\), not \(2, 2\)"),
+        ({"nodes": np.zeros(3)}, InputError, "nodes must be an array"),
+        ({"nodes": [["a", "b", "c"]]}, InputError, "nodes must be numbers"),
+        ({"radius": 0.0}, InputError, "radius must be positive"),
+        ({"radius": np.inf}, InputError, "radius must be finite"),
+        ({"radius": np.ones(3)}, InputError, "one for each of 8 nodes"),
+        ({"kernel": "gaussian"}, OptionError, "invalid kernel 'gaussian'"),
+    ],
+)
+def test_what_a_field_cannot_be_made_of_is_refused_in_words(
+    changes: dict[str, Any], error: type[MeshmatchError], words: str
+) -> None:
+    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * 3), -1).reshape(-1, 3)
+    given: dict[str, Any] = {"points": corners / 2, "nodes": corners, "radius": 2.0, "kernel": "smooth"}
+    assert build_field(**given).phi.shape == (8, 8)
+    with pytest.raises(error, match=words):
+        build_field(**(given | changes))

@@ -167,3 +167,19 @@ def test_frames_of_a_part_are_tried_along_the_body(dancer: Shape) -> None:
     placed = replace(model, card=replace(model.card, frame={"orientation": "none", "scale": "area"}))
     likely, others = frames_of_part(placed, scan, plain, wide=True)
     assert len(likely) == 1 and not others
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 40, 129])
+def test_boundaries_against_another_part_do_not_count(parts: int) -> None:
+    """What all distances between the parts say, for any number of them."""
+    rng = np.random.default_rng(parts)
+    corners = rng.random((parts, 1, 3)) * parts**0.5 + 0.5 * rng.standard_normal((parts, 3, 3))
+    shape = Shape(corners.reshape(-1, 3), np.arange(3 * parts).reshape(-1, 3))
+    middles = 0.5 * (corners + np.roll(corners, -1, axis=1))
+    points = np.concatenate([corners, middles], axis=1)
+    apart = np.linalg.norm(middles[:, :, None, None] - points, axis=-1)  # part edge part point
+    apart[np.arange(parts), :, np.arange(parts)] = np.inf
+    free = apart.min((2, 3)) > 0.06 * np.sqrt(shape.area)
+    lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1)
+    assert boundary_length(shape) == pytest.approx(lengths[free].sum())
+    assert free.any() and (parts < 40 or not free.all())

@@ -47,10 +47,11 @@ RISING = {
     "partial": [False, True],
     "hidden": np.linspace(0, 1, 30),
     "spread": np.geomspace(0.005, 0.3, 30),
+    "inverted": np.linspace(0, 0.2, 30),
 }
 
 
-APART = {"empty", "stretch", "against", "partial"}  # bound the verdict by themselves, or are reasons alone
+APART = {"empty", "stretch", "against", "partial", "inverted"}  # bound the verdict by themselves, or are reasons alone
 
 
 def test_all_signs_are_tried() -> None:
@@ -94,7 +95,7 @@ def test_where_nearness_says_nothing_a_fit_is_as_likely_wrong_as_right() -> None
 def test_reasons_are_sentences_with_codes() -> None:
     (reason,) = judge(replace(SOUND, residual=0.1)).reasons
     assert reason.code == "residual"
-    assert str(reason) == "template and shape stay 10.0 % of sqrt(area) apart on average"
+    assert str(reason) == "template and shape are 10.0 % of sqrt(area) apart on average (13.8 cm on a person)"
     judged = (
         judge(replace(SOUND, residual=0.028, stretch=0.98, spread=value)) for value in np.linspace(0.02, 0.06, 400)
     )

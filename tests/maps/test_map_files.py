@@ -116,7 +116,7 @@ def test_maps_of_other_programs(tmp_path: Path) -> None:
         ("a.txt", b"1.5\n", "1.5"),
         ("a.csv", b"x,y\n1,2\n", "target_vertex"),
         ("a.csv", b"source_vertex,target_vertex\n1,2\n0,3\n", "in order"),
-        ("a.csv", b"source_vertex,target_vertex\n0,2\n1\n", "can be read"),
+        ("a.csv", b"source_vertex,target_vertex\n0,2\n1\n", "line 3 has 1 cell, the first 2"),
         ("a.csv", b"source_vertex,target_vertex,confidence\n0,2,nan\n", "0..1"),
     ],
 )

@@ -49,7 +49,7 @@ def test_points_from_text(tmp_path: Path) -> None:
         ("1 2 3\n", "not 2 a line"),
         ("1 2\n3\n", "line 2"),
         ("1 2\n3 x\n", "line 2"),
-        ("1.5 2\n2.5 3\n", "line 2"),
+        ("1.5 2\n2.5 3\n", "1.5 is not a whole number"),
         ("nose toe\nhand foot\n", "line 2"),
         ("1 -2\n", "-2"),
         ("1 99999999999999999999\n", "too large"),

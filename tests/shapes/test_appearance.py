@@ -228,7 +228,7 @@ def test_options_of_a_map_opacity_and_an_alpha_image(tmp_path: Path) -> None:
     (tmp_path / "square.mtl").write_text(mtl + "map_d a.png\n")
     (tmp_path / "my image.png").write_bytes(encoded(quarters()))
     alpha = np.full((2, 2, 4), 255, np.uint8)
-    alpha[..., :3] = np.arange(4).reshape(2, 2, 1)
+    alpha[..., :3] = 60 * np.arange(4).reshape(2, 2, 1)
     (tmp_path / "a.png").write_bytes(encoded(alpha))
     found = look(tmp_path / "a.obj")
     np.testing.assert_allclose(found.uv[0, :, 0], [0.25, 2.25, 2.25])

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
+from meshmatch.arrays import as_numbers
 from meshmatch.errors import InputError
 from meshmatch.shapes.files import as_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -78,6 +80,162 @@ def test_a_trimesh_there_and_back(cube: Shape) -> None:
     assert as_shape(cube.to_trimesh()).colors is None
     assert as_shape(as_shape(cube.verts).to_trimesh()).is_cloud
     assert as_shape(trimesh.PointCloud(cube.verts)).colors is None
+
+
+CELLS = [[0, 1, 2, 3], [4, 5, 6]]  # a quad and a triangle
+FANS = [[0, 1, 2], [0, 2, 3], [4, 5, 6]]
+FLAT = np.array([4, 0, 1, 2, 3, 3, 4, 5, 6])  # the same as VTK has them
+
+
+def thing(**attributes: Any) -> Any:
+    return SimpleNamespace(**attributes)
+
+
+def dataset(kind: str) -> Any:
+    """What vedo keeps an object of VTK in."""
+    return type(kind, (), {})()
+
+
+class Batch:
+    """The way PyTorch3D holds meshes."""
+
+    def __init__(self, count: int, verts: np.ndarray) -> None:
+        self.count, self.verts = count, verts
+
+    def __len__(self) -> int:
+        return self.count
+
+    def verts_packed(self) -> Any:
+        return torch.tensor(self.verts, requires_grad=True)
+
+    def faces_packed(self) -> Any:
+        return torch.tensor(FANS)
+
+
+class Legacy:
+    """The way Open3D's tensor geometry gives its older kind."""
+
+    def __init__(self, older: Any) -> None:
+        self.to_legacy = lambda: older
+
+
+def meshes_of_libraries(verts: np.ndarray) -> dict[str, Any]:
+    blocks = [thing(type="quad", data=np.array(CELLS[:1])), thing(type="triangle", data=np.array(CELLS[1:]))]
+    loose = [thing(type="line", data=np.array([[0, 1]])), thing(type="vertex", data=np.array([[0]]))]
+    open3d = thing(vertices=verts, triangles=np.array(FANS, np.int32), has_vertex_colors=lambda: False)
+    return {
+        "vedo": thing(vertices=verts, points=verts, cells=CELLS, lines=[], dataset=dataset("vtkPolyData")),
+        "vedo of old": thing(points=lambda: verts, faces=lambda: CELLS),
+        "PyVista": thing(points=verts, faces=FLAT, verts=np.empty(0, int), lines=np.array([2, 0, 1]), n_cells=2),
+        "PyVista, a grid of faces": thing(points=verts, cells=FLAT, celltypes=np.array([9, 5]), n_cells=2),
+        "PyVista, a grid with points": thing(
+            points=verts, cells=np.append(FLAT, [1, 7]), celltypes=np.array([9, 5, 1]), n_cells=3
+        ),
+        "Open3D": open3d,
+        "Open3D, tensors": Legacy(open3d),
+        "meshio": thing(points=verts, cells=[*loose, *blocks]),
+        "meshio of old": thing(points=verts, cells=[("quad", np.array(CELLS[:1])), ("triangle", np.array(CELLS[1:]))]),
+        "PyMeshLab": thing(vertex_matrix=lambda: verts, face_matrix=lambda: np.array(FANS)),
+        "PyTorch3D": Batch(1, verts),
+        "floats": (verts, np.array(FANS, float)),
+        "lists of polygons": (verts.tolist(), CELLS),
+        "tensors": (torch.tensor(verts, requires_grad=True), torch.tensor(FANS)),
+        "list of tensors": [torch.tensor(verts), torch.tensor(FANS, dtype=torch.int32)],
+        "a parameter": thing(vertices=torch.nn.Parameter(torch.tensor(verts)), faces=torch.tensor(FANS).float()),
+    }
+
+
+VERTS = np.arange(24.0).reshape(8, 3) ** 1.5
+
+
+@pytest.mark.parametrize("library", meshes_of_libraries(VERTS))
+def test_meshes_of_other_libraries_keep_their_faces(library: str) -> None:
+    shape = as_shape(meshes_of_libraries(VERTS)[library])
+    assert np.array_equal(shape.verts, VERTS)
+    assert sorted(map(tuple, shape.faces)) == sorted(map(tuple, FANS))
+
+
+@pytest.mark.parametrize(
+    "cloud",
+    [
+        thing(points=VERTS, colors=np.ones((8, 3)), has_colors=lambda: True),
+        thing(points=VERTS, faces=np.empty(0, int), verts=np.tile([1, 0], 8), lines=[], n_cells=8),
+        thing(vertices=VERTS, cells=[], lines=[], dataset=dataset("vtkPolyData")),
+        thing(points=VERTS, cells=[thing(type="vertex", data=np.arange(8)[:, None])]),
+        thing(vertices=VERTS, faces=None),
+        torch.tensor(VERTS, requires_grad=True),
+        torch.tensor(VERTS, dtype=torch.float64),
+        np.ma.masked_array(VERTS),
+        (VERTS, None),
+    ],
+)
+def test_clouds_of_other_libraries_are_clouds(cloud: Any) -> None:
+    shape = as_shape(cloud)
+    assert shape.is_cloud and np.array_equal(shape.verts, VERTS)
+    assert (shape.colors is not None) == hasattr(cloud, "has_colors")
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        (thing(points=VERTS, cells=np.array([4, 0, 1, 2, 3]), celltypes=np.array([10]), n_cells=1), "volumes"),
+        (thing(vertices=VERTS, cells=[CELLS[0]], cell_types_array=np.array([10])), "volumes"),
+        (thing(points=VERTS, cells=[thing(type="tetra", data=np.array(CELLS[:1]))]), "cells of type tetra"),
+        (thing(points=VERTS, cells=[thing(type="line", data=np.array([[0, 1]]))]), "cells of type line"),
+        (thing(vertices=VERTS, cells=CELLS[:1]), "faces or volumes"),
+        (thing(points=VERTS, cells=FLAT), "without their types"),
+        (thing(points=VERTS, cells=FLAT, celltypes=np.array([9])), "2 cells and 1 types"),
+        (thing(points=VERTS, faces=FLAT[:-1]), "counts and corners"),
+        (thing(points=VERTS, faces=np.array([-1, 0])), "counts and corners"),
+        (thing(points=VERTS, faces=[], strips=np.array([4, 0, 1, 2, 3])), r"\.strips"),
+        (thing(points=VERTS, n_cells=1), "a grid"),
+        (thing(points=VERTS, cells=[], dataset=dataset("vtkImageData")), "a grid"),
+        (thing(vertices=VERTS, entities=[1]), r"\.entities"),
+        (thing(points=VERTS, simplices=np.array(FANS)), r"\.simplices"),
+        (thing(vertices=VERTS, faces=[[[0, 1], [2, 3]], [[0, 1, 2]]]), "list of vertices"),
+        (thing(vertices=VERTS[None]), r"batch of \(1, 8, 3\)"),
+        (thing(vertices=7), r"\(V, 3\)"),
+        (Batch(2, VERTS), "batch of 2"),
+        ((VERTS, CELLS[:1]), "quads or tetrahedra"),
+        ((VERTS, [[1, 2, 8]]), "from 1 to 8"),
+        (VERTS * 1j, "complex"),
+        (torch.tensor(VERTS).to_sparse(), "not an array"),
+        (torch.empty(8, 3, device="meta"), "not an array"),
+    ],
+)
+def test_what_is_no_surface_is_refused_and_never_a_cloud(source: Any, words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        as_shape(source)
+    assert caught.value.hint
+
+
+def test_masked_positions_are_invalid() -> None:
+    shape = as_shape(np.ma.masked_greater(VERTS, VERTS[7, 0] - 1))
+    assert shape.invalid is not None and np.flatnonzero(shape.invalid).tolist() == [7]
+
+
+def test_a_trimesh_scene_is_one_shape_in_place(cube: Shape) -> None:
+    moved = trimesh.transformations.translation_matrix([5, 0, 0])
+    mirrored = np.diag([-1.0, 1, 1, 1])
+    mesh, scene = trimesh.Trimesh(cube.verts, cube.faces, process=False), trimesh.Scene()
+    for matrix in (moved, mirrored):
+        scene.add_geometry(mesh, transform=matrix)
+    shape = as_shape(scene)
+    parts = [cube.verts + np.array([5, 0, 0]), cube.verts * [-1, 1, 1]]
+    assert np.allclose(shape.verts, np.concatenate(parts)) and shape.F == 2 * cube.F
+    volumes = [trimesh.Trimesh(shape.verts, faces, process=False).volume for faces in np.split(shape.faces, 2)]
+    assert np.allclose(volumes, mesh.volume)  # the mirrored one faces out as well
+    with pytest.raises(InputError, match="without meshes"):
+        as_shape(trimesh.Scene())
+
+
+def test_tensors_are_numbers_everywhere() -> None:
+    values = torch.tensor([[0.5, 1.0]], requires_grad=True)
+    assert as_numbers(values, "values").tolist() == [[0.5, 1.0]]
+    assert as_numbers(values.bfloat16(), "values").tolist() == [[0.5, 1.0]]
+    assert as_numbers([values[0], values[0]], "values").shape == (2, 2)
+    with pytest.raises(InputError, match="values must be numbers"):
+        as_numbers(torch.empty(2, device="meta"), "values")
 
 
 def test_only_stl_loads_trimesh(tmp_path: Path, cube: Shape) -> None:

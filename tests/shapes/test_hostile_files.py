@@ -235,6 +235,7 @@ def test_gltf_of_one_mesh_a_thousand_times(tmp_path: Path, monkeypatch: pytest.M
         load_shape(path)
 
 
+@pytest.mark.filterwarnings("ignore::meshmatch.errors.MeshmatchWarning")
 @pytest.mark.parametrize("case", ["points", "faces", "a polygon", "rows of unequal length"])
 def test_ply_of_more_than_its_bytes_can_mean(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str) -> None:
     """Numbers of one byte become eight, and a polygon of a thousand corners a thousand faces."""

@@ -62,7 +62,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "no columns": ("a.npy", lambda path: np.save(path, np.ones((42, 0))), "no columns"),
     "a cube": ("a.npy", lambda path: np.save(path, np.ones((42, 2, 2))), r"array of \(42, 2, 2\)"),
     "words": ("a.npy", lambda path: np.save(path, np.array(["a"] * 42)), "not numbers"),
-    "ragged": ("a.csv", lambda path: path.write_text("1,2\n" * 41 + "1\n"), "rows of 1 and of 2"),
+    "ragged": ("a.csv", lambda path: path.write_text("1,2\n" * 41 + "1\n"), "line 42 has 1 cell, the first 2"),
     "a word": ("a.csv", lambda path: path.write_text("1\n" * 41 + "many\n"), "many"),
     "unsorted": (
         "a.csv",

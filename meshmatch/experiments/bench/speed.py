@@ -5,10 +5,13 @@ warm but the disk's cache. Shown is the median of several runs after one that do
 seconds of CPU (both cores together), and the largest memory that a run ever held. Bars are for two cores, and all
 processes are kept on two where the system allows that. The shapes are the two samples, split and decimated to the sizes
 that the cases ask for.
+
+``--against`` puts an earlier run beside this one: a file that ends with its JSON line, such as docs/results/speed.json.
 """
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import statistics
@@ -24,7 +27,7 @@ from typing import Annotated, Any
 import numpy as np
 from typer import Option
 
-from meshmatch.errors import MeshmatchError
+from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
 from meshmatch.geometry.triangles import edge_keys
 from meshmatch.shapes.decimate import decimate
@@ -189,20 +192,47 @@ COLUMNS = {
 }
 
 
+AGAINST = {"s before": "wall_before:.2f", "CPU s before": "cpu_before:.2f", "GB before": "gigabytes_before:.2f"}
+RATIOS = {"s, ratio": "wall_ratio:.2f", "CPU, ratio": "cpu_ratio:.2f", "GB, ratio": "gigabytes_ratio:.2f"}
+
+
+def earlier(path: Path) -> dict[str, dict[str, Any]]:
+    """The rows of an earlier run by the name of their case; `InputError` if the file does not hold one."""
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8").strip().splitlines()[-1])["cases"]
+        return {row["case"]: {name: float(row[name]) for name in ("wall", "cpu", "gigabytes")} for row in rows}
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(
+            f"{path} holds no run of this experiment", "give a file that ends with its JSON line"
+        ) from error
+
+
+def compared(row: dict[str, Any], before: dict[str, float]) -> dict[str, Any]:
+    """A row with the numbers of an earlier one, and how many times as much it takes."""
+    return (
+        row
+        | {f"{name}_before": value for name, value in before.items()}
+        | {f"{name}_ratio": round(row[name] / value, 3) for name, value in before.items() if value > 0}
+    )
+
+
 @runner.command
 def main(
     cases: Annotated[str, Option(help=f"of {', '.join(CASES)}")] = ",".join(CASES),
     runs: Annotated[int, Option(min=1, help="counted runs of each case")] = 5,
     cores: Annotated[int, Option(min=1, help="cores that all processes share")] = 2,
+    against: Annotated[Path | None, Option(help="JSON line of an earlier run, to be compared with")] = None,
 ) -> runner.Report:
+    before = {} if against is None else earlier(against)
     kept = keep_to_cores(cores)
     with tempfile.TemporaryDirectory() as folder:
         rows = [
-            record_of(name, CASES[name], measure(CASES[name], runs, Path(folder)))
+            compared(record_of(name, CASES[name], measure(CASES[name], runs, Path(folder))), before.get(name, {}))
             for name in runner.track(runner.names_of(cases, CASES, "case"), "running")
         ]
     title = f"Whole processes on {kept} cores, median of {runs} runs"
-    return runner.Report({"kept_to_cores": kept, "cases": rows}, [runner.table(title, rows, COLUMNS)])
+    columns = COLUMNS if against is None else {**COLUMNS, **AGAINST, **RATIOS}
+    return runner.Report({"kept_to_cores": kept, "cases": rows}, [runner.table(title, rows, columns)])
 
 
 if __name__ == "__main__":

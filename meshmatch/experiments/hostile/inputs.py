@@ -20,7 +20,7 @@ from typing import IO
 
 import numpy as np
 
-from meshmatch.errors import LONGEST, MeshmatchError, visible
+from meshmatch.errors import LONGEST, MeshmatchError, MeshmatchWarning, visible
 from meshmatch.experiments.hostile.damage import damaged
 from meshmatch.experiments.hostile.learned import sign, trainers
 from meshmatch.experiments.hostile.readers import BadMessage, readers
@@ -80,6 +80,7 @@ def judge(family: str, path: Path, shape: Shape, printed: IO[bytes]) -> tuple[st
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("always")
+                warnings.simplefilter("ignore", MeshmatchWarning)  # words for the user
                 read()
         except MeshmatchError as error:
             if "allocate" in error.message:

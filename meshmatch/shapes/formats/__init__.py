@@ -1,12 +1,13 @@
 """Files of shapes: bytes to plain arrays, and a `Shape` to bytes. Here is what the readers of several formats share.
 
 A map answers for every vertex of a file, so readers keep them all, in order, and never allocate what a header merely
-promises. STL goes through trimesh. The other readers are our own, because of what trimesh 5.2 does (measured):
+promises. The readers are our own, because of what trimesh 5.2 does (measured):
 
 - ply: text takes 1.4 s instead of 0.4 s for 164,000 vertices; importing trimesh takes 0.7 s, and ply is what
   benchmarks and scans come in. Triangle strips become points, and 16-bit colors lose their upper byte.
 - obj: a file with several materials becomes several meshes, each with all the vertices.
 - off: vertex colors are lost, and a face that is cut short vanishes without a word.
+- stl: bytes behind the triangles, a count of 0 or -1, a text without its last line are refused.
 - gltf: meshes come in another order than the scene's (`Rogue.glb`), skins are ignored, strips without indices fail.
 
 Its writers round: ply to 32 bits, off to ten digits and obj to eight behind the point (1e-20 becomes 0), colors of
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
+from meshmatch.shapes.colors import light, seen
 
 NO_FACES = np.empty((0, 3), np.int64)
 NO_MESH = "is it a mesh or a point cloud at all?"
@@ -34,6 +36,8 @@ MOST_PLACES = 40_000_000
 """Vertices and faces of one file: more than anything here can work on."""
 FEW_PLACES = 3_500_000
 """How many a file of any size may have; and one more for every 12 of its bytes, or 24 where it is text."""
+DECIMAL_COMMA = "is that a decimal comma? export it with decimal points, split by spaces"
+_ODD_COMMA = re.compile(rb"(?<!\S)(?![+-]?\d*,\d+(?:[eE][+-]?\d+)?(?!\S))[^\s,]*+,\S*")
 _CHUNK = 1 << 22
 _GAP = re.compile(rb"\s")
 _SPACE = np.zeros(256, bool)
@@ -106,12 +110,25 @@ def indices(name: str, values: NDArray[Any]) -> Ints:
     return values.astype(np.int64)
 
 
-def painted(channels: Float[Floats, "V C"]) -> Float[Floats, "V 4"]:
-    """Colors of 3 or 4 channels, which count to 255 if one is above 1, else to 1."""
+def painted(channels: Float[Floats, "N C"]) -> Float[Floats, "N 4"]:
+    """Colors of 3 or 4 channels, which count to 255 if one is above 1, else to 1; of alpha this is told apart."""
     channels = np.nan_to_num(channels)
     colors = np.ones((len(channels), 4))
-    colors[:, : channels.shape[1]] = np.clip(channels / (255.0 if (channels > 1).any() else 1.0), 0.0, 1.0)
+    for some in (slice(0, 3), slice(3, channels.shape[1])):
+        largest = 255.0 if (channels[:, some] > 1).any() else 1.0
+        colors[:, some] = np.clip(channels[:, some] / largest, 0.0, 1.0)
     return colors
+
+
+def colors_of_faces(count: int, faces: Int[Ints, "F 3"], colors: Float[Floats, "F 4"]) -> Float[Floats, "count 4"]:
+    """Colors of vertices where a file has them for faces: the mean light of those around; white where there are none."""
+    total, many = np.zeros((count, 4)), np.zeros(count)
+    own = light(colors)
+    for k in range(3):
+        many += np.bincount(faces[:, k], minlength=count)[:count]
+        for channel in range(4):
+            total[:, channel] += np.bincount(faces[:, k], own[:, channel], minlength=count)[:count]
+    return np.where(many[:, None] > 0, seen(total / np.maximum(many, 1)[:, None]), 1.0)
 
 
 def without_comments(text: bytes) -> bytes:
@@ -119,9 +136,14 @@ def without_comments(text: bytes) -> bytes:
 
 
 def numbers(name: str, text: bytes) -> Float[Floats, " N"]:
-    """All the whitespace-separated numbers of a text, fast, nan and inf included; `InputError` for other words."""
+    """All the whitespace-separated numbers of a text, fast, nan and inf included; `InputError` for other words.
+
+    A decimal comma counts as a decimal point where no number of the text has a point.
+    """
     if not text.strip():
         return np.empty(0)
+    if b"," in text:
+        text = with_points(name, text)
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # how fromstring says that it met a word
         try:
@@ -136,6 +158,18 @@ def numbers(name: str, text: bytes) -> Float[Floats, " N"]:
         except ValueError as error:
             raise damaged(name, f"found {error} where a number should be") from None
     return np.concatenate(parts)
+
+
+def with_points(name: str, text: bytes) -> bytes:
+    """A text of numbers that are split by spaces, its decimal commas made points; `InputError` where commas may mean
+    something else.
+    """
+    other = _ODD_COMMA.search(text)
+    if other or b"." in text:
+        mixed = "some of its numbers have a comma, others a point"
+        odd = mixed if other is None else f"found {other[0][:20].decode(errors='replace')!r} where a number should be"
+        raise InputError(f"{name}: {odd}", DECIMAL_COMMA)
+    return text.replace(b",", b".")
 
 
 def _number(word: bytes) -> float:

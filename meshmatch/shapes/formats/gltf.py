@@ -9,24 +9,33 @@ from __future__ import annotations
 
 import base64
 import binascii
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
-from urllib.parse import unquote
+from urllib.parse import unquote_to_bytes
 
 import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, warn
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_srgb
+from meshmatch.shapes.companions import beside
 from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, check_places, damaged
-from meshmatch.shapes.input_files import beside, check_text, json_of, read_bytes
+from meshmatch.shapes.input_files import check_text, json_of, read_bytes
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+_INSTANCES, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
+# What a file may require: extensions that are read, and others that change neither what is drawn nor where.
+_KNOWN = ("KHR_mesh_quantization", _INSTANCES, _VISIBILITY)
+_HARMLESS = re.compile(
+    r"[A-Z0-9]+_(?:materials?|textures?|lights?|techniques?|animations?|audio|xmp|node_hover|node_select|interactiv)\w*|"
+    r"EXT_(?:structural_metadata|mesh_features|instance_features)|FB_ngon_encoding|MSFT_lod|VRM(?:C_\w+)?"
+)
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
 MOST_NODES = 100_000
 """Nodes of a scene, and primitives that it draws: each takes up to 0.1 ms."""
@@ -70,10 +79,19 @@ class Document:
             raise InputError(f"{self.name} is not glTF version 2", "export it as glTF 2.0")
         for extension in self.json.get("extensionsRequired", []):
             if extension in _COMPRESSED:
-                raise InputError(f"{self.name} is compressed ({extension})", "export it without mesh compression")
+                raise self._compressed(extension)
+            if extension not in _KNOWN and not _HARMLESS.fullmatch(extension):
+                unknown = f"{self.name} requires the glTF extension {extension[:80]}, which meshmatch does not read"
+                raise InputError(unknown, "export it as plain glTF 2.0")
         self.nodes = self.json.get("nodes", [])
         self.buffers: dict[int, bytes] = {}
         self.world: dict[int, Floats] = {}
+        self.hidden: set[int] = set()
+        self._bones: dict[int, Floats] = {}  # a thousand meshes may hang from one skin of a thousand joints
+        self._bound: int | None = None
+
+    def _compressed(self, extension: str) -> InputError:
+        return InputError(f"{self.name} is compressed ({extension})", "export it without mesh compression")
 
     def _chunks(self, data: bytes) -> bytes:
         """The JSON chunk; the binary one is kept in `body`."""
@@ -94,13 +112,13 @@ class Document:
         meshes: list[tuple[tuple[str, ...], int]] = []
         places = seen = 0
         # One mesh may stand in a scene a thousand times, so that a small file can promise any number.
-        for node, primitive in self.primitives():
+        for node, primitive, place in self.primitives():
             vertices = self.count(primitive["attributes"]["POSITION"])
             corners = self.count(primitive["indices"]) if "indices" in primitive else vertices
             thirds = 1 if primitive.get("mode", _TRIANGLES) in (_STRIP, _FAN) else 3
             places += vertices + (corners // thirds if primitive.get("mode", _TRIANGLES) != _POINTS else 0)
             check_places(self.name, self.size, places)
-            own = self._placed(node, primitive)
+            own = self._placed(node, primitive, place)
             triangles = self.triangles(primitive)
             if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
                 raise damaged(self.name, f"a face refers to vertex {int(triangles.max())} of {len(own)}")
@@ -109,6 +127,7 @@ class Document:
             colors.append(self.colors(primitive))
             meshes.append((self._names(node), len(own)))
             seen += len(own)
+        self._tell_hidden()
         if not verts:
             raise InputError(f"{self.name} holds no triangles and no points", "is there a mesh in its scene?")
         painted = joined_colors(colors, [len(own) for own in verts])
@@ -122,16 +141,40 @@ class Document:
         found = node.get("name"), self.json["meshes"][node["mesh"]].get("name")
         return tuple(dict.fromkeys(plain_text(name) for name in found if isinstance(name, str) and name))
 
-    def primitives(self) -> Iterator[tuple[int, dict[str, Any]]]:
-        """Node and primitive of all that is drawn but lines, in the order of `scene`."""
+    def _tell_hidden(self) -> None:
+        """Say which meshes are left out because the file hides them."""
+        hidden = [node for node in self.world if node in self.hidden and "mesh" in self.nodes[node]]
+        if hidden:
+            names = ", ".join(dict.fromkeys(next(iter(self._names(node)), f"node {node}") for node in hidden))
+            warn(f"{self.name} hides {len(hidden)} of its meshes, which are left out: {names[:200]}")
+
+    def primitives(self) -> Iterator[tuple[int, dict[str, Any], Float[Floats, "4 4"]]]:
+        """Node, primitive and where it stands, of all that is drawn but lines, in the order of `scene`."""
         seen = 0
         for node in self._walk():
-            if "mesh" in self.nodes[node]:
+            if "mesh" not in self.nodes[node] or node in self.hidden:
+                continue
+            for place in self._places(node):
+                seen += 1
+                self._check_many(seen)
                 for primitive in self.json["meshes"][self.nodes[node]["mesh"]]["primitives"]:
                     seen += 1
                     self._check_many(seen)
-                    if primitive.get("mode", _TRIANGLES) in (_POINTS, _TRIANGLES, _STRIP, _FAN):
-                        yield node, primitive
+                    drawn = primitive.get("mode", _TRIANGLES) in (_POINTS, _TRIANGLES, _STRIP, _FAN)
+                    if drawn and "POSITION" in primitive.get("attributes", {}):  # else there is nothing to draw
+                        yield node, primitive, place
+
+    def _places(self, number: int) -> Iterator[Float[Floats, "4 4"]]:
+        """Where a node's mesh stands: once, or at each of its instances."""
+        world = self.world[number]
+        given = self.nodes[number].get("extensions", {}).get(_INSTANCES, {}).get("attributes", {})
+        keys = [key for key in ("TRANSLATION", "ROTATION", "SCALE") if key in given]
+        if not keys:
+            yield world
+            return
+        self._check_many(max(self.count(given[key]) for key in keys))
+        for rows in zip(*(self.accessor(given[key]) for key in keys), strict=True):
+            yield world @ _local({key.lower(): row for key, row in zip(keys, rows, strict=True)})
 
     def _check_many(self, number: int) -> None:
         if number > MOST_NODES:
@@ -152,21 +195,23 @@ class Document:
             if node in self.world:
                 raise damaged(self.name, f"node {node} has two parents")
             self.world[node] = parent @ _local(self.nodes[node])
+            shown = self.nodes[node].get("extensions", {}).get(_VISIBILITY, {}).get("visible", True)
+            if shown is False or node in self.hidden:
+                self.hidden |= {node, *self.nodes[node].get("children", [])}
             stack += [(child, self.world[node]) for child in reversed(self.nodes[node].get("children", []))]
         return list(self.world)
 
-    def _placed(self, number: int, primitive: dict[str, Any]) -> Floats:
+    def _placed(self, number: int, primitive: dict[str, Any], place: Floats) -> Floats:
         """(V, 3) positions in the scene."""
+        for extension in _COMPRESSED:  # there may be plain data as well
+            if extension in primitive.get("extensions", {}) and not self._has_data(primitive["attributes"]["POSITION"]):
+                raise self._compressed(extension)
         node, attributes = self.nodes[number], primitive["attributes"]
         own = np.hstack([self.accessor(attributes["POSITION"]), np.ones((self.count(attributes["POSITION"]), 1))])
-        hanging = np.asarray(own @ self.world[number].T)[:, :3]
+        hanging = np.asarray(own @ place.T)[:, :3]
         if "skin" not in node or "JOINTS_0" not in attributes:
             return hanging
-        skin = self.json["skins"][node["skin"]]
-        bones = np.stack([self.world[joint] for joint in skin["joints"]])
-        if "inverseBindMatrices" in skin:
-            inverse = self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
-            bones = bones @ inverse[: len(bones)]
+        bones = self._skin(node["skin"])
         moved, total = np.zeros((len(own), 4)), np.zeros((len(own), 1))
         for joints, weights in self.influences(primitive):
             for column in range(4):
@@ -174,6 +219,17 @@ class Document:
                 moved += weight * np.einsum("vij,vj->vi", bones[joints[:, column].astype(np.int64)], own)
                 total += weight
         return np.where(total > 0, moved[:, :3] / np.where(total > 0, total, 1.0), hanging)
+
+    def _skin(self, number: int) -> Floats:
+        """(J, 4, 4) where the joints of a skin put what hangs from each."""
+        if number not in self._bones:
+            skin = self.json["skins"][number]
+            bones = np.stack([self.world[joint] for joint in skin["joints"]])
+            if "inverseBindMatrices" in skin:
+                inverse = self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+                bones = bones @ inverse[: len(bones)]
+            self._bones[number] = bones
+        return self._bones[number]
 
     def influences(self, primitive: dict[str, Any]) -> Iterator[tuple[Float[Floats, "V 4"], Float[Floats, "V 4"]]]:
         """Numbers of joints and their weights for each vertex, four at a time."""
@@ -211,6 +267,9 @@ class Document:
         out[:, : values.shape[1]] = np.clip(np.nan_to_num(values), 0.0, 1.0)
         return out
 
+    def _has_data(self, number: int) -> bool:
+        return any(key in self.json["accessors"][number] for key in ("bufferView", "sparse"))
+
     def count(self, number: int) -> int:
         """How many values an accessor has."""
         return int(self.json["accessors"][number]["count"])
@@ -223,8 +282,10 @@ class Document:
         if "bufferView" in accessor:
             values = self._view(accessor, count, width, kind)
         else:  # zeros, then filled sparsely
-            bound = sum(len(self._buffer(k)) for k in range(len(self.json.get("buffers", []))))
-            if not 0 <= count <= max(bound, 1):
+            if self._bound is None:
+                held = [k for k in range(len(self.json.get("buffers", []))) if self._held(k)]
+                self._bound = sum(len(self._buffer(k)) for k in held)
+            if not 0 <= count <= max(self._bound, 1):
                 raise damaged(self.name, f"it promises {count} values that it does not hold")
             values = np.zeros((count, width), kind)
         if "sparse" in accessor:
@@ -241,6 +302,9 @@ class Document:
     def _view(self, entry: dict[str, Any], count: int, width: int, kind: np.dtype[Any]) -> NDArray[Any]:
         """(count, width) values from the place in a buffer view that an entry names."""
         view, offset = self.json["bufferViews"][entry["bufferView"]], entry.get("byteOffset", 0)
+        for extension in _COMPRESSED:
+            if extension in view.get("extensions", {}) and not self._held(view["buffer"]):
+                raise self._compressed(extension)
         data = self._buffer(view["buffer"])
         start = view.get("byteOffset", 0) + offset
         row = width * kind.itemsize
@@ -255,25 +319,50 @@ class Document:
         size = int(self.json["bufferViews"][number]["byteLength"])
         return self._view({"bufferView": number}, size, 1, np.dtype("u1")).tobytes()
 
+    def _held(self, number: int) -> bool:
+        """Whether the data of a buffer is anywhere: that of plain data beside compressed need not be."""
+        buffer = self.json["buffers"][number]
+        fallback = any(buffer.get("extensions", {}).get(each, {}).get("fallback") for each in _COMPRESSED)
+        return "uri" in buffer or (number == 0 and bool(self.body) and not fallback)
+
     def _buffer(self, number: int) -> bytes:
         if number not in self.buffers:
             uri = self.json["buffers"][number].get("uri")
+            if uri is None and number:
+                raise damaged(self.name, f"its buffer {number} has no data")
             self.buffers[number] = self.body if uri is None else self.resource(uri)
-            self.size += 0 if uri is None or uri.startswith("data:") else len(self.buffers[number])
+            self.size += 0 if uri is None or embedded(uri) else len(self.buffers[number])
         return self.buffers[number]
 
     def resource(self, uri: str) -> bytes:
         """What a URI names: data within it, or a file in the folder of this one."""
-        if uri.startswith("data:"):
+        if embedded(uri):
             try:
-                return base64.b64decode(uri.split(",", 1)[1], validate=True)
-            except (binascii.Error, IndexError) as error:
+                return _data_of(uri)
+            except (binascii.Error, ValueError) as error:
                 raise damaged(self.name, "its embedded data is not base64") from error
-        file = beside(self.path.parent, unquote(uri))
+        file = beside(self.path.parent, uri, uri=True)
         if file is None:
             missing = f"{self.name} needs the file {uri[:200]}, which is not in its folder"
             raise InputError(missing, "copy it beside the gltf")
         return read_bytes(file)
+
+
+def embedded(uri: str) -> bool:
+    """Whether a URI holds its data itself."""
+    return uri[:5].lower() == "data:"
+
+
+def _data_of(uri: str) -> bytes:
+    """The data of a URI: base64, also without padding and in the alphabet of URLs, or else plain bytes."""
+    kind, comma, text = uri[5:].partition(",")
+    if not comma:
+        raise ValueError("it has no comma")
+    data = unquote_to_bytes(text)
+    if not kind.lower().rstrip().endswith("base64"):
+        return data
+    data = b"".join(data.translate(bytes.maketrans(b"-_", b"+/")).split()).rstrip(b"=")
+    return base64.b64decode(data + b"=" * (-len(data) % 4), validate=True)
 
 
 def joined_colors(colors: list[Float[Floats, "_ 4"] | None], counts: list[int]) -> Float[Floats, "V 4"] | None:

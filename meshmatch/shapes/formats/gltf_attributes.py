@@ -7,8 +7,9 @@ ignored. Vertices and faces are those of `meshmatch.shapes.formats.gltf.read`, i
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap, no_coordinates
 from meshmatch.shapes.formats import damaged
-from meshmatch.shapes.formats.gltf import Document, joined_colors, understood
+from meshmatch.shapes.formats.gltf import Document, embedded, joined_colors, understood
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _ALPHAS: dict[str, Alpha] = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
@@ -48,7 +49,7 @@ def read_skin(path: Path, data: bytes) -> tuple[csr_array, tuple[str, ...]]:
 
 def _coordinates(document: Document) -> Floats | None:
     parts = [np.empty((0, 3, 2))]
-    for _, primitive in document.primitives():
+    for _, primitive, _ in document.primitives():
         attributes = primitive["attributes"]
         faces = document.triangles(primitive)
         if len(faces) and "TEXCOORD_0" not in attributes:
@@ -69,7 +70,8 @@ class _Look:
         kinds: list[Ints] = [np.empty(0, np.int64)]
         colors: list[Floats | None] = []
         counts: list[int] = []
-        for _, primitive in self.document.primitives():
+        numbers: dict[tuple[int, bool], int] = {}
+        for _, primitive, _ in self.document.primitives():
             counts.append(self.document.count(primitive["attributes"]["POSITION"]))
             colors.append(self.document.colors(primitive))
             faces = self.document.triangles(primitive)
@@ -77,7 +79,7 @@ class _Look:
             key = primitive.get("material", -1), uv is not None
             if key not in self.materials:
                 self.materials[key] = self._read(*key)
-            kinds.append(np.full(len(faces), list(self.materials).index(key)))
+            kinds.append(np.full(len(faces), numbers.setdefault(key, len(numbers))))
             uvs.append(np.zeros((len(faces), 3, 2)) if uv is None else uv[faces])
         painted = joined_colors(colors, counts)
         found = Appearance(tuple(self.materials.values()), np.concatenate(kinds), np.concatenate(uvs), painted)
@@ -122,7 +124,7 @@ class _Look:
             entry = self.json["images"][number]
             uri = entry.get("uri")
             data = self.document.view_bytes(entry["bufferView"]) if uri is None else self.document.resource(uri)
-            inside = uri is None or uri.startswith("data:")
+            inside = uri is None or embedded(uri)
             self.images[number] = self.reader.decode(data, f"image {number} of {self.document.name}" if inside else uri)
         return self.images[number]
 
@@ -156,12 +158,16 @@ def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
     place = {node: k for k, node in enumerate(nodes)}
     parent = {int(c): k for k, node in enumerate(document.nodes) for c in node.get("children", [])}
     found: list[tuple[Ints, Ints, Floats]] = []  # vertices, joints, weights
+    listed: dict[int, Ints] = {}  # of each skin, the places of its joints
+    above: dict[int, int | None] = {}  # of each node, the joint that it hangs from
     seen = 0
-    for number, primitive in document.primitives():
+    for number, primitive, _ in document.primitives():
         attributes = primitive["attributes"]
         V, node = document.count(attributes["POSITION"]), document.nodes[number]
         if "skin" in node and "JOINTS_0" in attributes:
-            own = np.array([place[int(joint)] for joint in skins[node["skin"]]["joints"]])
+            if node["skin"] not in listed:
+                listed[node["skin"]] = np.array([place[int(joint)] for joint in skins[node["skin"]]["joints"]])
+            own = listed[node["skin"]]
             for numbers, amount in document.influences(primitive):
                 if numbers.shape != (V, 4) or amount.shape != (V, 4):
                     raise ValueError("joints or weights are not four for each vertex")
@@ -172,8 +178,12 @@ def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
                 found.append((seen + row, own[used.astype(np.int64)], amount[row, column]))
         else:
             joint: int | None = number
-            while joint is not None and joint not in place:
+            passed: list[int] = []
+            while joint is not None and joint not in place and joint not in above:
+                passed.append(joint)
                 joint = parent.get(joint)
+            joint = above.get(joint, joint) if joint is not None else None
+            above |= dict.fromkeys(passed, joint)
             if joint is not None:
                 found.append((seen + np.arange(V), np.full(V, place[joint]), np.ones(V)))
         seen += V
@@ -182,7 +192,14 @@ def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
     vertices, joints, weights = (np.concatenate(each) for each in zip(*found, strict=True))
     labels = [document.nodes[node].get("name") or f"joint {node}" for node in nodes]
     names: dict[str, None] = {}
+    others: dict[str, Iterator[str]] = {}  # of each label, the names that are left for joints called so
     for label in (plain_text(str(label)) for label in labels):
-        again = (f"{label} {k}" for k in count(2))
-        names[next(word for word in chain([label], again) if word not in names)] = None
+        left = others.setdefault(label, _numbered(label))
+        names[next(word for word in left if word not in names)] = None
     return csr_array((weights, (vertices, joints)), (seen, len(nodes))), tuple(names)
+
+
+def _numbered(label: str) -> Iterator[str]:
+    """A label, then the same with 2, 3, ... behind it, without end."""
+    yield label
+    yield from (f"{label} {k}" for k in count(2))

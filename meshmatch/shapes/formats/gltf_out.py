@@ -1,5 +1,8 @@
 """Writing glTF 2.0, binary (glb): one node, one mesh, one primitive, and within the file its texture or its morph targets.
 
+Positions are 32-bit floats, with about seven digits. Those of a shape that lies far from the origin, as a scan in
+coordinates of a country does, are written from a center near it; the center is the node's translation, in all its digits.
+
 Specification: Khronos glTF 2.0.
 """
 
@@ -22,6 +25,7 @@ from meshmatch.shapes.shape import Shape
 # Coincident vertices whose normals are further than this cosine (32 degrees) from their mean are an edge of the shape,
 # not a seam; a cube stays one. Set by hand.
 _SHARP = 0.85
+_FAR = 8.0  # three of the 24 bits of a float
 _POINTS, _TRIANGLES = 0, 4
 _FLOAT, _UNSIGNED = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
@@ -69,6 +73,21 @@ def write_textured(path: Path, name: str, mesh: Textured, png: bytes) -> None:
     _write(path, name, attributes, faces, look, png)
 
 
+def center_of(verts: Float[Floats, "V 3"]) -> Float[Floats, " 3"]:
+    """The point that positions should be measured from to keep their digits as 32-bit floats.
+
+    The origin, unless it is over `_FAR` times further from the middle of the shape than most of its vertices are; else a
+    point in the middle of them. The middle is the median, which a stray vertex does not move. Its coordinates are rounded
+    to a power of two near the size of the shape, so that positions that were 32-bit floats lose nothing.
+    """
+    middle = np.median(verts, axis=0)
+    size = float(np.median(np.abs(verts - middle).max(axis=1)))
+    if float(np.abs(middle).max()) <= _FAR * size:
+        return np.zeros(3)
+    step = 2.0 ** np.floor(np.log2(size)) if size > 0 else 0.0
+    return np.asarray(np.round(middle / step) * step if step > 0 else middle)
+
+
 def _write(
     path: Path,
     name: str,
@@ -79,6 +98,8 @@ def _write(
     moves: Mapping[str, dict[str, Floats]] | None = None,
 ) -> None:
     """Arrays and an image one after the other, each at a multiple of four bytes, behind what describes them."""
+    center = center_of(attributes["POSITION"])
+    attributes = attributes | {"POSITION": attributes["POSITION"] - center}
     arrays: list[NDArray[Any]] = [values.astype("<f4") for values in attributes.values()]
     primitive: dict[str, Any] = {"attributes": {key: k for k, key in enumerate(attributes)}, "mode": _POINTS}
     if len(faces):
@@ -109,7 +130,8 @@ def _write(
     for k in places:
         accessors[k] |= {"min": arrays[k].min(0).tolist(), "max": arrays[k].max(0).tolist()}
     document = {"asset": {"version": "2.0", "generator": "meshmatch"}, "scene": 0, "scenes": [{"nodes": [0]}]}
-    document |= {"nodes": [{"mesh": 0, "name": name}], "meshes": [mesh]} | look
+    node = {"mesh": 0, "name": name} | ({"translation": center.tolist()} if center.any() else {})
+    document |= {"nodes": [node], "meshes": [mesh]} | look
     document |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
     if png:
         primitive["material"] = 0

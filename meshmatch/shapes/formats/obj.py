@@ -10,11 +10,24 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, warn
 from meshmatch.shapes import formats
-from meshmatch.shapes.formats import Raw, columns, damaged, fan, numbers, words_per_line
+from meshmatch.shapes.formats import Raw, columns, damaged, numbers, words_per_line
+from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import check_text
 from meshmatch.shapes.shape import Shape
+
+_ENTRIES = (
+    rb"v|vt|vn|vp|vc|f|fo|l|p|g|o|s|mg|usemtl|mtllib|newmtl|illum|"
+    rb"d|tr|k[ade]|ks|ns|ni|tf|bump|disp|decal|refl|norm|map_\w+"
+)
+_ENDS_IN_BACKSLASH = re.compile(rb"\\[ \t]*(?:\n|\Z)")
+_LINE_THAT_GOES_ON = re.compile(rb"^[^\n]*\\[ \t]*$", re.MULTILINE)
+_GOES_ON = re.compile(rb"\\[ \t]*\n(?![ \t]*(?:" + _ENTRIES + rb")[ \t])", re.IGNORECASE)
+_COMMENT = re.compile(rb"(?:^|[ \t])#")
+_SLASH_APART = re.compile(rb"(?<![ \t])[ \t]++(//?)[ \t]*+")
+_MIXED_CORNERS = re.compile(rb"/[ \t]++[^\s/]++(?!/)")
+_POLYPAINT = re.compile(rb"(?:[0-9a-fA-F]{8})+")
 
 
 def read(path: Path, data: bytes) -> Raw:
@@ -23,7 +36,8 @@ def read(path: Path, data: bytes) -> Raw:
     if b"\0" in data[:4096]:
         raise InputError(f"{name} is not an obj file: it is binary", formats.WRONG_SUFFIX)
     check_text(name, data)
-    text, vertex_lines, faces_text, sizes, face_lines = entries_and_faces(name, joined_lines(data), b"v")
+    data = joined_lines(data)
+    text, vertex_lines, faces_text, sizes, face_lines = entries_and_faces(name, data, b"v")
     formats.check_places(name, len(data), len(vertex_lines), max(int(sizes.sum()) - 2 * len(sizes), 0), text=True)
     if len(vertex_lines) == 0:
         raise InputError(f"{name} holds no vertices: it has no 'v' lines", formats.NO_MESH)
@@ -31,21 +45,82 @@ def read(path: Path, data: bytes) -> Raw:
     if len(counts) < len(vertex_lines) or counts.min() < 3:
         raise damaged(name, "a vertex has fewer than 3 coordinates")
     values = numbers(name, text)
-    if b"/" in faces_text:
-        faces_text = re.sub(rb"/\S*", b"", faces_text)  # position/texture/normal: the first alone
-    corners = numbers(name, faces_text)
+    verts = columns(values, counts, 0, 3)
+    corner = vertices_of_corners(name, faces_text, sizes, vertex_lines, face_lines)
+    faces = corner[triangles_of(name, verts, corner, sizes)]
+    return Raw(verts, faces, _colors(name, data, values, counts))
+
+
+def vertices_of_corners(
+    name: str, faces: bytes, sizes: Int[Ints, " P"], vertex_lines: Int[Ints, " V"], face_lines: Int[Ints, " P"]
+) -> Int[Ints, " N"]:
+    """The vertex, from 0, at each corner of all faces, which are as `entries_and_faces` finds them."""
+    if b"/" in faces:
+        faces = re.sub(rb"/\S*", b"", faces)  # position/texture/normal: the first alone
+    corners = numbers(name, faces)
+    if len(corners) != sizes.sum():
+        raise damaged(name, "a corner of a face has no vertex before its slash")
     if (corners == 0).any():
         raise damaged(name, "a face refers to vertex 0, but obj files count from 1")
-    corner = from_one(name, "vertex", corners, vertex_lines, np.repeat(face_lines, sizes)) - 1
-    colors = formats.painted(columns(values, counts, 3, 6)) if counts.min() >= 6 else None
-    return Raw(columns(values, counts, 0, 3), fan(corner, sizes), colors)
+    return from_one(name, "vertex", corners, vertex_lines, np.repeat(face_lines, sizes)) - 1
 
 
 def joined_lines(data: bytes) -> bytes:
-    """Text whose lines end in a newline, and none in a backslash."""
-    if b"\n" not in data:
-        data = data.replace(b"\r", b"\n")
-    return re.sub(rb"\\\r?\n", b" ", data) if b"\\" in data else data
+    """Text whose lines end in a newline, and go on where one ended in a backslash.
+
+    A comment ends with its line, also one that ends in a backslash, as a path may; and a line that begins with the word of
+    an entry is one of its own, so that a name that ends in a backslash does not swallow it.
+    """
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if b"\\" not in data or not _ENDS_IN_BACKSLASH.search(data):
+        return data
+    data = _LINE_THAT_GOES_ON.sub(_comment_ended, data)
+    return _ENDS_IN_BACKSLASH.sub(b"\n", _GOES_ON.sub(b" ", data))
+
+
+def _comment_ended(line: re.Match[bytes]) -> bytes:
+    return line[0].rstrip(b"\\ \t") if _COMMENT.search(line[0]) else line[0]
+
+
+def _colors(name: str, data: bytes, values: Floats, counts: Ints) -> Floats | None:
+    """(V, 4) colors of vertices: as numbers behind their positions, as lines of their own, or as ZBrush writes them."""
+    painted = counts >= 6
+    if painted.any():
+        width = 4 if (counts == 7).all() else 3
+        starts = (np.cumsum(counts) - counts)[painted]
+        found = formats.painted(values[starts[:, None] + np.arange(3, 3 + width)])
+        if painted.all():
+            return found
+        colors = np.ones((len(counts), 4))
+        colors[painted] = found
+        return colors
+    if b"#MRGB" in data:
+        # Eight digits a vertex: mask, red, green, blue. The mask says what ZBrush may change, and is no part of the look.
+        rows = formats.lines_of(data, b"#MRGB")[0][0].split()
+        if not all(map(_POLYPAINT.fullmatch, rows)):
+            warn(f"{name} has polypaint (#MRGB) that is not of eight hexadecimal digits a vertex; it is left out")
+            return None
+        masked = np.frombuffer(bytes.fromhex(b"".join(rows).decode()), np.uint8).reshape(-1, 4)
+        return _for_all(name, "polypaint (#MRGB)", masked[:, 1:] / 255.0, len(counts))
+    if b"\nvc " in data:
+        [(text, lines)] = formats.lines_of(formats.without_comments(data), b"vc")
+        own = words_per_line(text)
+        if len(own) == len(lines) and len(own) and own.min() >= 3:
+            return _for_all(name, "colors (vc)", formats.painted(columns(numbers(name, text), own, 0, 3)), len(counts))
+    return None
+
+
+def _for_all(name: str, what: str, found: Floats, count: int) -> Floats | None:
+    """Colors that are listed apart, white where there are fewer of them than vertices."""
+    if len(found) == 0:
+        return None
+    if len(found) != count:
+        rest = "others are white" if len(found) < count else "what is too much is left out"
+        warn(f"{name} has {what} for {len(found):,} vertices, but {count:,} of these: {rest}")
+    colors = np.ones((count, 4))
+    colors[: len(found), : found.shape[1]] = found[:count]
+    return colors
 
 
 def entries_and_faces(name: str, data: bytes, word: bytes) -> tuple[bytes, Ints, bytes, Ints, Ints]:
@@ -57,6 +132,10 @@ def entries_and_faces(name: str, data: bytes, word: bytes) -> tuple[bytes, Ints,
     (text, listed), (faces, lines), (old, old_lines) = formats.lines_of(data, word, b"f", b"fo")
     if len(old_lines):
         faces, lines = faces + b"\n" + old, np.concatenate([lines, old_lines])
+    if b" /" in faces or b"\t/" in faces:  # 1 / 2 is the corner 1/2
+        faces = _SLASH_APART.sub(rb"\1", faces)
+    if (b"/ " in faces or b"/\t" in faces) and _MIXED_CORNERS.search(faces):
+        raise damaged(name, "a face has a slash at the end of one corner, and none at the next: where do they end?")
     sizes = words_per_line(faces)
     if len(sizes) < len(lines):
         raise damaged(name, "a face has no corners")

@@ -6,22 +6,26 @@ An image is taken as it is: Kd counts for faces without one (many programs write
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 
 from meshmatch.arrays import Bools, Float, Floats, Ints
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, warn
 from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap
 from meshmatch.shapes.colors import to_linear
-from meshmatch.shapes.formats import columns, damaged, fan, lines_of, numbers, words_per_line
-from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines
-from meshmatch.shapes.input_files import beside, read_bytes
+from meshmatch.shapes.companions import beside, folded
+from meshmatch.shapes.formats import columns, damaged, lines_of, numbers, words_per_line
+from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines, vertices_of_corners
+from meshmatch.shapes.formats.polygons import triangles_of
+from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 _LARGEST_MTL = 10_000_000  # bytes
+_MOST_LIBRARIES = 100  # names in one line
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
 _OPTION = re.compile(
     rf"(?:(-o|-s|-t)((?:\s+{_NUMBER}(?!\S)){{0,3}})|-mm\s+\S+\s+\S+|(-clamp)\s+(\S+)|"
@@ -45,31 +49,44 @@ class _Entry:
     """A material as the mtl has it."""
 
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    opacity: float = 1.0
+    dissolve: float | None = None
+    transparency: float = 0.0
     image: _Map | None = None
     alpha: _Map | None = None
     folder: Path = field(default_factory=Path)
+
+    @property
+    def opacity(self) -> float:
+        """In 0..1. What is given as such (d) counts more than its opposite (Tr), which some programs write for it."""
+        return float(np.clip(1.0 - self.transparency if self.dissolve is None else self.dissolve, 0.0, 1.0))
 
 
 def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
     """Materials and texture coordinates, face by face in the order of `obj.read`; `picture` replaces all images."""
     data = joined_lines(data)
     named, libraries = (_words(*found) for found in lines_of(data, b"usemtl", b"mtllib"))
-    corners, laid, lines = _coordinates(path.name, data)
-    used = np.searchsorted([line for _, line in named], lines, side="right") - 1  # -1: none named yet
+    corners, laid, lines = _coordinates(path.name, data, shape)
+    names = list(dict.fromkeys(name for name, _ in named))
+    place = {name: k for k, name in enumerate(names)}
+    used = np.searchsorted([line for _, line in named], lines, side="right") - 1
+    used = np.array([*(place[name] for name, _ in named), -1])[used]  # -1: none named yet
+    names.append("")
     entries = {} if picture is not None else _libraries(path, [name for name, _ in libraries], shape)
+    wanted = {names[k] for k in np.unique(used).tolist()}
+    meant = _materials_meant(path.name, wanted, entries.keys()) if entries else {name: name for name in wanted}
     # Only what faces use is read; a material counts twice where some of its faces have no coordinates.
     _, which, kind = np.unique(2 * used + laid, return_index=True, return_inverse=True)
     kind = kind.reshape(-1).astype(np.int64)
     materials: list[Material] = []
+    scale, offset = np.ones((len(which), 2)), np.zeros((len(which), 2))
     for number, face in enumerate(which.tolist()):
-        name = named[used[face]][0] if used[face] >= 0 else ""
+        name = meant[names[used[face]]]
         entry = entries.get(name, _Entry())
         image = picture if picture is not None else _image(path, name, entry, reader, bool(laid[face]))
         materials.append(_material(name, entry, image if laid[face] else None))
         if laid[face] and entry.image is not None:
-            rows = kind == number
-            corners[rows] = corners[rows] * entry.image.scale + entry.image.offset
+            scale[number], offset[number] = entry.image.scale, entry.image.offset
+    corners[laid] = corners[laid] * scale[kind[laid], None] + offset[kind[laid], None]
     corners[laid, :, 1] = 1.0 - corners[laid, :, 1]
     if not materials or (picture is None and all(material.image is None for material in materials)):
         bare = appearance.vertex_colors_alone(shape)
@@ -80,9 +97,9 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     return Appearance(tuple(materials), kind, corners)
 
 
-def read_coordinates(path: Path, data: bytes) -> Float[Floats, "F 3 2"] | None:
-    """Texture coordinates of all faces, v down; None where a face has none."""
-    uv, laid, _ = _coordinates(path.name, joined_lines(data))
+def read_coordinates(path: Path, data: bytes, shape: Shape) -> Float[Floats, "F 3 2"] | None:
+    """Texture coordinates of all faces, v down; None where a face has none. `shape` is of the same file."""
+    uv, laid, _ = _coordinates(path.name, joined_lines(data), shape)
     uv[:, :, 1] = 1.0 - uv[:, :, 1]
     return uv if laid.all() else None
 
@@ -98,7 +115,7 @@ def _words(text: bytes, lines: Ints) -> list[tuple[str, int]]:
     return list(zip(names, lines.tolist(), strict=False))
 
 
-def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
+def _coordinates(name: str, data: bytes, shape: Shape) -> tuple[Floats, Bools, Ints]:
     """(F, 3, 2) coordinates with v up, (F,) whether all three corners have them, and (F,) the line of each face."""
     text, vt_lines, faces, sizes, face_lines = entries_and_faces(name, data, b"vt")
     counts = words_per_line(text)
@@ -112,19 +129,42 @@ def _coordinates(name: str, data: bytes) -> tuple[Floats, Bools, Ints]:
     if b"/" in faces:
         values = numbers(name, second_index(faces))
         index = from_one(name, "texture coordinate", values, vt_lines, np.repeat(face_lines, sizes))
-    triangles = fan(index, sizes)
+    vertices = index
+    if (sizes > 3).any():  # how polygons are split, depends on where their vertices are
+        [(_, v_lines)] = lines_of(data, b"v")
+        vertices = vertices_of_corners(name, faces, sizes, v_lines, face_lines)
+    triangles = index[triangles_of(name, shape.verts_or_nan, vertices, sizes)]
     laid = np.asarray((triangles > 0).all(axis=1))
     uv = np.zeros((len(triangles), 3, 2))
     uv[laid] = pairs[triangles[laid] - 1]
     return uv, laid, np.repeat(face_lines, np.maximum(sizes - 2, 0))
 
 
+def _materials_meant(file: str, wanted: set[str], known: Collection[str]) -> dict[str, str]:
+    """For each name that faces use ("" for none at all) that of a material: the same, or one that differs in nothing but
+    case; where there is but one material, that one for faces without a name. Names without a material are said.
+    """
+    alike: dict[str, str] = {}
+    for name in known:
+        alike.setdefault(folded(name), name)
+    meant = {name: name if name in known else alike.get(folded(name), name) for name in wanted}
+    if "" in wanted and len(known) == 1:
+        [meant[""]] = known
+    elif wanted == {""}:
+        warn(f"{file} does not say which of the {len(known)} materials of its mtl it wears: its faces have no image")
+    missing = sorted(name for name in wanted if name and meant[name] not in known)
+    if missing:
+        some = ", ".join(name[:60] for name in missing[:5]) + (", ..." if len(missing) > 5 else "")
+        what = f"a material {some}" if len(missing) == 1 else f"{len(missing)} materials ({some})"
+        warn(f"{file} names {what} that its mtl does not have: those faces have no image")
+    return meant
+
+
 def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
     """The materials of all mtl files that are named. A shape with vertex colors may miss them."""
     entries: dict[str, _Entry] = {}
-    for name in names:
-        whole = _beside(path.parent, name)
-        for file in [whole] if whole is not None else [_beside(path.parent, word) for word in name.split()]:
+    for name in dict.fromkeys(names):
+        for file in _named(path.parent, name):
             if file is not None:
                 entries |= _parse(file)
             elif shape.colors is None:
@@ -133,17 +173,20 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
     return entries
 
 
-def _beside(folder: Path, name: str) -> Path | None:
-    """A file that is named relative to a folder, within it; else one of the same name in it; else None."""
-    windows = PureWindowsPath(name.strip().strip('"'))  # takes both kinds of slash
-    return beside(folder, windows.as_posix()) or beside(folder, windows.name)
+def _named(folder: Path, names: str) -> list[Path | None]:
+    """The files of a line that names one, maybe with spaces, or several; None for one that is not there."""
+    several = [beside(folder, word) for word in names.split(None, _MOST_LIBRARIES)[:_MOST_LIBRARIES]]
+    if len(several) > 1 and not all(file is not None and file.suffix.lower() == ".mtl" for file in several):
+        whole = beside(folder, names)
+        return several if whole is None else [whole]
+    return several
 
 
 def _parse(file: Path) -> dict[str, _Entry]:
     entries: dict[str, _Entry] = {}
     entry = _Entry()
     data = joined_lines(read_bytes(file, largest=_LARGEST_MTL))
-    for line in data.decode("utf-8", "surrogateescape").splitlines():
+    for line in data.decode("utf-8", "surrogateescape").split("\n"):
         word, rest = (*line.split(None, 1), "", "")[:2]
         word, rest = word.lower(), rest.strip()
         try:
@@ -153,9 +196,9 @@ def _parse(file: Path) -> dict[str, _Entry]:
                 values = [float(number) for number in rest.split()[:3]]
                 entry.color = (values[0], values[1], values[2]) if len(values) == 3 else (values[0],) * 3
             elif word == "d":
-                entry.opacity = float(rest.split()[-1])  # d -halo 0.5
+                entry.dissolve = float(rest.split()[-1])  # d -halo 0.5
             elif word == "tr":
-                entry.opacity = 1.0 - float(rest.split()[-1])
+                entry.transparency = float(rest.split()[-1])
             elif word == "map_kd":
                 entry.image = _map(rest)
             elif word == "map_d":
@@ -186,7 +229,7 @@ def _map(text: str) -> _Map:
 
 def _material(name: str, entry: _Entry, image: Pixels | None) -> Material:
     red, green, blue = to_linear(np.clip(entry.color, 0.0, 1.0)).tolist()
-    opacity = float(np.clip(entry.opacity, 0.0, 1.0))
+    opacity = entry.opacity
     alpha: Alpha = "opaque" if opacity == 1.0 and (image is None or (image[..., 3] == 255).all()) else "blend"
     if image is None:
         return Material(name, None, (red, green, blue, opacity), alpha=alpha)
@@ -198,7 +241,7 @@ def _image(path: Path, name: str, entry: _Entry, reader: ImageReader, laid: bool
     """The image of a material; if it is `laid` on, with the alpha of map_d: of that its own, else how bright it is."""
 
     def decode(wanted: _Map) -> Pixels:
-        file = _beside(entry.folder, wanted.file)
+        file = beside(entry.folder, wanted.file) or beside(path.parent, wanted.file)
         if file is None:
             what = f"{path.name} needs the image {wanted.file[:200]} of its material {name}, which is not there"
             raise InputError(what, f"copy it to {entry.folder}, or name another with --image")

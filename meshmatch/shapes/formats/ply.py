@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias
@@ -12,52 +13,118 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Floats, Ints
-from meshmatch.errors import InputError
-from meshmatch.shapes.formats import NO_FACES, NO_MESH, WRONG_SUFFIX, Raw, check_places, damaged, fan
+from meshmatch.errors import InputError, warn
+from meshmatch.shapes.colors import to_linear, to_srgb
+from meshmatch.shapes.formats import NO_FACES, NO_MESH, WRONG_SUFFIX, Raw, check_places, damaged, indices
 from meshmatch.shapes.formats.ply_rows import TYPES, Body, Element, Property
+from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.shape import Shape
 
 _MOST_LINES = 4096  # of a header that declare something
-_FACE_LISTS = ("vertex_indices", "vertex_index")
+_FACE_LISTS = ("vertexindices", "vertexindex", "vertexindexes", "vertices")  # without "_", in lower case
+_FACE_HINT = "export its faces as 'property list uchar int vertex_indices'"
+_NAMES = {
+    "vertex": ("vertices", "point", "points"),
+    "face": ("faces", "triangle", "triangles", "polygon", "polygons"),
+    "tristrips": ("tristrip",),
+}
 _END = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:\r\n|[\r\n]|\Z)")
 _DATA = re.compile(rb"^DATA[ \t]+(ascii|binary)[ \t]*\r?\n", re.MULTILINE)
 _CHANNELS = ("red", "green", "blue", "alpha")
+_PREFIXES = ("", "diffuse_", "color_", "vertex_", "face_", "ambient_")
+Table: TypeAlias = dict[str, Any]
 Columns: TypeAlias = Mapping[str, NDArray[Any]]
 _NONE: Columns = MappingProxyType({})
 _NUMBERS = ("x", "y", "z", *_CHANNELS, "r", "g", "b", "a")
 
 
+@dataclass(frozen=True)
+class Content:
+    """What a ply file holds: its vertices, its polygons or strips, and the comments of its header."""
+
+    comments: list[str]
+    vertices: tuple[Element, Table]
+    faces: list[tuple[Element, Table]]
+    strips: list[tuple[Element, Table]]
+
+
 def read(path: Path, data: bytes) -> Raw:
-    """Vertices, faces (polygons or strips) and vertex colors."""
+    """Vertices, faces (polygons or strips) and colors of vertices, or else of faces."""
     name = path.name
-    order, elements, start = _header(name, data)
-    known = [element.name for element in elements]
-    if "vertex" not in known:
+    content = parsed(name, data)
+    element, table = content.vertices
+    verts = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    colors = _colors(element, table)
+    lists = [corners_of(name, *each) for each in content.faces]
+    faces = [corners[triangles_of(name, verts, corners, sizes)] for corners, sizes in lists]
+    faces += [faces_of(*corners_of(name, *each)) for each in content.strips]
+    joined = np.concatenate([NO_FACES, *faces])
+    listed = sum(element.count for element, _ in [*content.faces, *content.strips])
+    if listed and not len(joined):
+        warn(f"{name}: none of its {listed} faces has three corners, so it is read as a point cloud")
+    for (corners, sizes), (faced, own) in zip(lists, content.faces, strict=True) if colors is None else ():
+        painted = _colors(faced, own)
+        if painted is not None and len(painted):
+            colors = _of_vertices(painted, corners, sizes, len(verts))
+            warn(f"{name} has a color for each face: each vertex gets the mean of the faces around it")
+            break
+    return Raw(verts, joined, colors)
+
+
+def parsed(name: str, data: bytes) -> Content:
+    """The elements of a file that make a shape; `InputError` where there are no positions, or the file is damaged."""
+    order, elements, start, comments = _header(name, data)
+    roles = _roles(elements)
+    if "vertex" not in roles:
         raise InputError(f"{name}: the header declares no vertices", NO_MESH)
-    wanted = [k for k, element in enumerate(elements) if element.name in ("vertex", "face", "tristrips")]
-    promised = sum(element.count for element in elements if element.name in ("vertex", "face") and element.properties)
+    counted = zip(elements, roles, strict=True)
+    promised = sum(element.count for element, role in counted if role in ("vertex", "face") and element.properties)
     if promised < len(data):  # else it is told as damage, below
         check_places(name, len(data), promised, text=order is None)
     body = Body(name, data, start, order)
-    places, faces, colors = [], NO_FACES, None
-    for element in elements[: max(wanted) + 1]:
+    found: dict[str, list[tuple[Element, Table]]] = {role: [] for role in _NAMES}
+    last = max(k for k, role in enumerate(roles) if role)
+    for element, role in zip(elements[: last + 1], roles, strict=False):
         if not element.properties:
             continue  # rows of nothing, however many
-        _check_kinds(name, element)
+        _check_kinds(name, element, role)
         table = body.element(element)
-        if element.name == "vertex":
-            places = [table[axis].astype(np.float64) for axis in "xyz" if axis in table]
-            colors = _colors(table, {p.name: p.kind for p in element.properties})
-            if len(places) < 3:
-                break
-        elif element.name == "face":
-            lists = next((table[key] for key in _FACE_LISTS if key in table), None)
-            faces = faces if lists is None else fan(*lists)
-        elif element.name == "tristrips":
-            faces = _strips(table[element.properties[0].name][0])
-    if len(places) < 3:
+        if role:
+            found[role].append((element, table))
+        if role == "vertex" and not set("xyz") <= set(table):
+            break
+    if not found["vertex"] or not set("xyz") <= set(found["vertex"][0][1]):
         raise InputError(f"{name}: the vertices have no x, y and z", NO_MESH)
-    return Raw(np.stack(places, axis=1), faces, colors)
+    faces, strips = ([each for each in found[role] if each[0].count] for role in ("face", "tristrips"))
+    return Content(comments, found["vertex"][0], faces, strips)
+
+
+def _roles(elements: Sequence[Element]) -> list[str]:
+    """For each element whether it is the "vertex", a "face" or "tristrips", by its usual name, or, where there is none of
+    that, by one that it has elsewhere; else "".
+    """
+    roles = []
+    usual = {element.name for element in elements}
+    for element in elements:
+        role = next((role for role, others in _NAMES.items() if element.name.lower() in (role, *others)), "")
+        roles.append(role if element.name == role or role not in usual else "")
+    first = roles.index("vertex") if "vertex" in roles else 0
+    return [role if role != "vertex" or k == first else "" for k, role in enumerate(roles)]
+
+
+def corners_of(name: str, element: Element, table: Table) -> tuple[Ints, Ints]:
+    """Vertices of polygons or strips, one after the other, and how many each has: the list with a usual name, or else
+    the only list of whole numbers. `InputError` where no list is that, for faces must not be lost without a word.
+    """
+    lists = [p for p in element.properties if p.count_kind]
+    usual = [p for p in lists if p.name.lower().replace("_", "") in _FACE_LISTS]
+    whole = [p for p in lists if p.kind[0] != "f"]
+    chosen = next((few for few in (usual, whole) if len(few) == 1), usual[:1])
+    if not chosen:
+        which = "none of its lists is" if not whole else "it cannot be told which of its lists is"
+        raise InputError(f"{name}: {which} that of the vertices of each {element.name}", _FACE_HINT)
+    items, sizes = table[chosen[0].name]
+    return indices(name, items), sizes
 
 
 def read_pcd(path: Path, data: bytes) -> Raw:
@@ -65,19 +132,28 @@ def read_pcd(path: Path, data: bytes) -> Raw:
     name, start, colors = path.name, _DATA.search(data), None
     if not start:
         raise InputError(f"{name} is not a pcd file of text or plain binary points", "write it uncompressed, or as ply")
-    lines = data[: start.start()].decode("latin-1").splitlines()
+    lines = data[: start.start()].removeprefix(b"\xef\xbb\xbf").decode("latin-1").splitlines()
     head = {line.split()[0]: line.split()[1:] for line in lines if line.strip()}
     try:
-        points = Element("vertex", int(head["POINTS"][0]))
         counts = head.get("COUNT", ["1"] * len(head["FIELDS"]))
+        points = Element("vertex", 0)
         for label, kind, size, count in zip(head["FIELDS"], head["TYPE"], head["SIZE"], counts, strict=True):
             known = TYPES[{"F": "float", "I": "int", "U": "uint"}[kind] + str(8 * int(size))]
-            points.properties += [Property(label, known)] * min(int(count), len(data))
+            points.properties += [Property(label.lower(), known)] * min(int(count), len(data))
+        grid = int(head["WIDTH"][0]) * int(head["HEIGHT"][0]) if "WIDTH" in head and "HEIGHT" in head else 0
+        promised = int(head["POINTS"][0]) if "POINTS" in head else grid
+        body = Body(name, data, start.end(), None if start[1] == b"ascii" else "<")
+        held = body.rows_left(points)
+        points.count = held if held and (promised <= 0 or promised > held or grid == held) else promised
         check_places(name, len(data), points.count)
-        table = Body(name, data, start.end(), None if start[1] == b"ascii" else "<").element(points)
+        table = body.element(points)
         verts = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     except (KeyError, ValueError, IndexError) as error:
         raise damaged(name, "its header makes no sense, or names no x, y and z") from error
+    if points.count != promised:
+        warn(f"{name} promises {promised} points, but holds {points.count}: these are read")
+    elif held > points.count:
+        warn(f"{name} holds more than its {points.count} points, which is not read")
     for p in points.properties:
         if p.name in ("rgb", "rgba"):  # of a float its bits count, not its value
             packed = table[p.name].astype(p.kind[0] + "4").view(np.uint32)[:, None]
@@ -124,8 +200,8 @@ def _rows(table: dict[str, NDArray[Any]], count: int, fields: list[Any], header:
     return rows.tobytes()
 
 
-def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int]:
-    """Byte order (None: text), elements, and where the body starts."""
+def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int, list[str]]:
+    """Byte order (None: text), elements, where the body starts, and comments."""
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
         raise InputError(f"{name} is not a ply file: it does not begin with 'ply'", WRONG_SUFFIX)
     end = _END.search(data)
@@ -135,9 +211,13 @@ def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int]:
         raise damaged(name, f"its header has over {_MOST_LINES} lines")
     order: str | None = ""
     elements: list[Element] = []
+    comments: list[str] = []
     try:
         for line in data[: end.start()].decode("latin-1").replace("\r\n", "\n").replace("\r", "\n").split("\n"):
             match line.split():
+                case ["comment", *_]:
+                    text = line.strip()[len("comment") :].encode("latin-1")
+                    comments.append(text.decode("utf-8", "surrogateescape").strip())
                 case ["format", kind, *_]:
                     order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}[kind]
                 case ["element", element, count, *_]:
@@ -153,37 +233,58 @@ def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int]:
     for each in elements:
         if len({p.name for p in each.properties}) < len(each.properties):
             raise damaged(name, f"its header declares a property of the element {each.name} twice")
-    return order, elements, end.end()
+    return order, elements, end.end(), comments
 
 
-def _check_kinds(name: str, element: Element) -> None:
+def _check_kinds(name: str, element: Element, role: str) -> None:
     """Refuse a list where a number is needed, and the other way round."""
     for place, p in enumerate(element.properties):
-        lists = {"face": p.name in _FACE_LISTS, "tristrips": place == 0}.get(element.name, False)
-        number = element.name == "vertex" and p.name in _NUMBERS
+        lists = {"face": p.name in ("vertex_indices", "vertex_index"), "tristrips": place == 0}.get(role, False)
+        number = role == "vertex" and p.name in _NUMBERS
         if (number and p.count_kind) or (lists and not p.count_kind):
             what = "lists" if p.count_kind else "numbers"
             raise damaged(name, f"its header declares {p.name} of the element {element.name} as {what}")
 
 
-def _strips(lists: Ints) -> Ints:
-    """Triangles of strips, -1 between two strips; every second triangle of a strip is turned round."""
-    a, b, c = lists[:-2], lists[1:-1], lists[2:]
-    place = np.arange(len(lists))
-    begin = np.maximum.accumulate(np.where(lists < 0, place + 1, 0))[: len(a)]
+def faces_of(corners: Ints, sizes: Ints) -> Ints:
+    """Triangles of strips, which are a row each, or split by -1; every second triangle of a strip is turned round."""
+    a, b, c = corners[:-2], corners[1:-1], corners[2:]
+    place, row = np.arange(len(corners)), np.repeat(np.arange(len(sizes)), sizes)
+    begins = np.where(corners < 0, place + 1, np.repeat(np.cumsum(sizes) - sizes, sizes))
+    begin = np.maximum.accumulate(begins)[: len(a)]
     odd = (place[: len(a)] - begin) % 2 == 1
     faces = np.stack([np.where(odd, b, a), np.where(odd, a, b), c], axis=1)
-    return faces[(a >= 0) & (b >= 0) & (c >= 0)]
+    return np.asarray(faces[(a >= 0) & (b >= 0) & (c >= 0) & (row[: len(a)] == row[2:])])
 
 
-def _colors(table: dict[str, Any], kinds: dict[str, str]) -> Floats | None:
-    names = next((n for n in (("red", "green", "blue"), ("r", "g", "b")) if set(n) <= set(table)), None)
-    if names is None:
+def _colors(element: Element, table: Table) -> Floats | None:
+    """(N, 4) sRGB colors and alpha of the rows of an element; None if it has none."""
+    kinds = {p.name.lower(): p for p in element.properties if not p.count_kind}
+    prefix = next((p for p in _PREFIXES if all(p + channel in kinds for channel in _CHANNELS[:3])), None)
+    names = [f"{prefix}{channel}" for channel in _CHANNELS] if prefix is not None else list("rgba")
+    if not all(name in kinds for name in names[:3]):
         return None
-    out = np.ones((len(table[names[0]]), 4))
-    for k, name in enumerate([*names, *[a for a in ("alpha", "a") if a in table][:1]]):
-        values = table[name].astype(np.float64)
-        small = kinds[name][0] == "f" and not (values > 1).any()
-        largest = 1.0 if small else 65535.0 if kinds[name] == "u2" else 255.0
-        out[:, k] = np.clip(np.nan_to_num(values) / largest, 0.0, 1.0)
+    alpha = next((name for name in (names[3], "alpha", "a") if name in kinds), None)
+    out = np.ones((element.count, 4))
+    for first, last, group in ((0, 3, names[:3]), (3, 4, [alpha] if alpha else [])):
+        values = [table[kinds[name].name].astype(np.float64) for name in group]
+        small = all(kinds[name].kind[0] == "f" for name in group) and not any((each > 1).any() for each in values)
+        for k, name, each in zip(range(first, last), group, values, strict=False):
+            largest = 1.0 if small else 65535.0 if kinds[name].kind == "u2" else 255.0
+            out[:, k] = np.clip(np.nan_to_num(each) / largest, 0.0, 1.0)
+    return out
+
+
+def _of_vertices(painted: Floats, corners: Ints, sizes: Ints, count: int) -> Floats:
+    """(V, 4) the mean, as light, of the colors (P, 4) of the polygons around each vertex; white where there is none."""
+    face = np.repeat(np.arange(len(sizes)), sizes)
+    fine = (corners >= 0) & (corners < count)
+    corners, face = corners[fine], face[fine]
+    lit = np.concatenate([to_linear(painted[:, :3]), painted[:, 3:]], axis=1)
+    around = np.bincount(corners, minlength=count)
+    out = np.ones((count, 4))
+    for k in range(4):
+        total = np.bincount(corners, lit[face, k], count)
+        out[around > 0, k] = total[around > 0] / around[around > 0]
+    out[:, :3] = to_srgb(out[:, :3])
     return out

@@ -50,11 +50,18 @@ class Body:
             self.data, self.at = numbers(name, data[start:]).view(np.uint8).data, 0
 
     def element(self, element: Element) -> dict[str, Any]:
-        """By property: its numbers, or, of lists, all their items and the size of each."""
+        """By property: its numbers, or, of lists, all their items (whole numbers unless declared as floats) and the size of
+        each.
+        """
         kinds = [self._dtype(p.count_kind or p.kind) for p in element.properties]
         self._check(element, self.at + element.count * sum(kind.itemsize for kind in kinds))
         table = self._equal_rows(element) if element.count else None
         return table if table is not None else self._walk(element)
+
+    def rows_left(self, element: Element) -> int:
+        """How many whole rows of an element without lists there may be from here on."""
+        row = sum(self._dtype(p.kind).itemsize for p in element.properties)
+        return (len(self.data) - self.at) // row if row else 0
 
     def _check(self, element: Element, end: int) -> None:
         if element.count < 0 or end > len(self.data):
@@ -89,7 +96,8 @@ class Body:
                 if (sizes != sizes[0]).any() or sizes[0] < 0:
                     return None
                 self._check_corners(rows[f"v{k}"].size)
-                out[p.name] = indices(self.name, rows[f"v{k}"]).ravel(), indices(self.name, sizes)
+                items = rows[f"v{k}"].ravel()
+                out[p.name] = items if p.kind[0] == "f" else indices(self.name, items), indices(self.name, sizes)
         self.at = end
         return out
 
@@ -114,7 +122,8 @@ class Body:
                 counts = np.maximum(indices(self.name, self._gather(starts, p.count_kind)), 0)
                 self._check_corners(int(counts.sum()))
                 items = runs(starts + self._dtype(p.count_kind).itemsize, counts, item)
-                out[p.name] = indices(self.name, self._gather(items, p.kind)), counts
+                found = self._gather(items, p.kind)
+                out[p.name] = found if p.kind[0] == "f" else indices(self.name, found), counts
             else:
                 out[p.name] = self._gather(starts, p.kind)
         return out

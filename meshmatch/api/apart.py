@@ -1,0 +1,150 @@
+"""What of a file is fitted where the whole is of no known kind, or fits poorly: its parts are tried apart.
+
+A body may stand on a pedestal or a floor, carry a box, or share its file with a chair. Readings by models tell which parts
+are a shape that they know; the others are left out, as `load_shape` leaves out those that a user names, and are said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from meshmatch.api.inputs import usable
+from meshmatch.arrays import Float, Floats
+from meshmatch.errors import InputError, MeshmatchError, OptionError
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.fitting.kind import BELONGS, FAMILIAR, STRANGE, SURE, kind_samples, read_kind, told
+from meshmatch.models.trained import TrainedModel
+from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.parts import Parts, apart, tries, without_parts
+from meshmatch.shapes.repair import NOT_TRUSTED, Repaired
+from meshmatch.shapes.shape import Shape
+from meshmatch.threads import beside
+
+Loader = Callable[[], TrainedModel]
+_AS_WELL = 0.003  # what also reads so much worse (units of sqrt(area)) keeps what touches it, such as clothes
+_AS_LARGE = 0.5  # share of the area of what reads best from which on another shape of the kind may be meant instead
+_MOST_FITS = 2  # of parts that read strangely
+_TOLD = 6  # numbers of parts in a line
+
+
+@dataclass(frozen=True, eq=False)
+class Alone:
+    """Some parts of a shape that are a shape by themselves.
+
+    ``clean`` is what is left, with the way back to all vertices of the file; ``readings`` are by the models that were asked,
+    infinite for others, ``row`` is the model that reads it best, and ``fit`` the one by it, with refined nodes, that had to
+    tell, if any.
+    """
+
+    clean: Repaired
+    readings: Float[Floats, " M"]
+    row: int
+    fit: Fit | None = None
+
+    def usable_fit(self, config: FitConfig) -> Fit | None:
+        """The fit, if it is one that the config asks for."""
+        return self.fit if config.refine == "nodes" else None
+
+
+def find_alone(
+    models: Sequence[Loader],
+    whole: Shape,
+    config: FitConfig,
+    order: Iterable[Sequence[int]] | None = None,
+    progress: ProgressCallback | None = None,
+) -> Alone | None:
+    """The parts of a shape that are a shape which one of the models knows; None where there are none, or where its user
+    chose parts or says that it is a part itself. ``order`` says which models (rows) are asked together, until one knows
+    some parts; by default all.
+
+    `InputError` where different parts are such shapes, and nothing tells which one is meant.
+    """
+    if whole.is_cloud or whole.weights is not None or config.partial == "yes":
+        return None
+    parts = Parts.of(whole)
+    sets, clean = [], []
+    for chosen in tries(parts):
+        with suppress(InputError):  # too few faces to be fitted
+            rest = usable(without_parts(whole, parts, parts.others(chosen)))
+            if not rest.far_parts:
+                sets.append(chosen)
+                clean.append(rest)
+    if not sets:
+        return None
+    found = _readings(models, [each.shape for each in clean], config, order or [range(len(models))])
+    value = found.min(axis=0)
+    known = [k for k in range(len(sets)) if value[k] <= FAMILIAR]
+    if known:
+        best = _fullest(parts, sets, value, known)
+        _refuse_others(whole, parts, sets, best, known)
+        chosen, fit = best, None
+    else:
+        for chosen in [int(k) for k in value.argsort(kind="stable")[:_MOST_FITS] if value[k] <= STRANGE]:
+            model = models[int(found[:, chosen].argmin())]()
+            of_kind, fit = told(model, clean[chosen].shape, value[chosen], config, progress)
+            if of_kind and fit is not None and fit.trust >= BELONGS and not fit.partial:
+                break
+        else:
+            return None
+    left_out = parts.others(sets[chosen])
+    notes = [note for note in clean[chosen].notes if not note.endswith(NOT_TRUSTED)]
+    rest = replace(clean[chosen], notes=(left_out_words(parts, left_out), *notes), left_out=left_out)
+    return Alone(rest, found[:, chosen], int(found[:, chosen].argmin()), fit)
+
+
+def left_out_words(parts: Parts, numbers: Sequence[int]) -> str:
+    """What is said of parts that were left out."""
+    those = f"{len(numbers)} of {len(parts)} parts, {100 * parts.share(numbers):.0f} % of the area"
+    return f"left out {those}: {_listed(numbers)} (--only and --without choose parts)"
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    more = f" and {len(numbers) - _TOLD} more" if len(numbers) > _TOLD else ""
+    return f"{'part' if len(numbers) == 1 else 'parts'} {', '.join(map(str, numbers[:_TOLD]))}{more}"
+
+
+def _readings(
+    models: Sequence[Loader], shapes: Sequence[Shape], config: FitConfig, order: Iterable[Sequence[int]]
+) -> Float[Floats, "M S"]:
+    samples = beside(kind_samples, shapes, [config.seed] * len(shapes))
+    found = np.full((len(models), len(shapes)), np.inf)
+
+    def reading(row: int, number: int) -> float:
+        try:
+            return read_kind(models[row](), shapes[number], samples[number], config)
+        except OptionError:
+            raise
+        except MeshmatchError:  # a damaged model, or a shape that it cannot see
+            return np.inf
+
+    for rows in order:
+        at = [(row, number) for row in rows for number in range(len(shapes))]
+        for place, value in zip(at, beside(lambda at: reading(*at), at), strict=True):
+            found[place] = value
+        if found.min() <= FAMILIAR:
+            break
+    return found
+
+
+def _fullest(parts: Parts, sets: Sequence[frozenset[int]], value: Floats, known: Sequence[int]) -> int:
+    """The set that reads best, or one around it that reads as well: a body in its clothes rather than without."""
+    best = min(known, key=lambda k: value[k])
+    as_well = max(SURE, value[best] + _AS_WELL)
+    return max((k for k in known if sets[k] >= sets[best] and value[k] <= as_well), key=lambda k: parts.share(sets[k]))
+
+
+def _refuse_others(whole: Shape, parts: Parts, sets: Sequence[frozenset[int]], best: int, known: Sequence[int]) -> None:
+    """Refuse to choose between two people in one file (`InputError`)."""
+    least = _AS_LARGE * parts.share(sets[best])
+    rivals = [k for k in known if apart(parts, sets[k], sets[best]) and parts.share(sets[k]) >= least]
+    if not rivals:
+        return
+    firsts = sorted({min(sets[k]) for k in (best, *rivals)})
+    shares = " and ".join(f"part {n} ({100 * parts.shares[n - 1]:.0f} % of the area)" for n in firsts[:3])
+    problem = f"{whole.name or 'the shape'} holds more than one shape of a kind: {shares} fit alike"
+    raise InputError(problem, f"choose one with --only {firsts[0]} or --only {firsts[1]} (only= of load_shape)")

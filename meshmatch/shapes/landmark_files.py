@@ -1,0 +1,376 @@
+"""Landmarks in files: tables of vertices or positions, JSON, MeshLab's picked points, 3D Slicer's markups, and the .pts and
+.tps of landmark editors. What a file says of each point is read here; `meshmatch.transfer.landmarks` puts it on a shape.
+
+3D Slicer writes points and meshes in one of two frames, which differ in the signs of x and y, and says which: LPS or RAS.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from xml.etree import ElementTree
+
+import numpy as np
+
+from meshmatch.errors import InputError
+from meshmatch.outputs import plain_text
+from meshmatch.shapes.input_files import check_memory, read_bytes, read_json, read_npy, read_text
+from meshmatch.shapes.text_tables import DECIMAL_COMMA, is_missing, is_number, number, read_table
+
+Space = Literal["", "LPS", "RAS"]
+Kind = Literal["vertex", "face", "position", "missing"]
+# One as a file has it: name; vertex, face and barycentric, or position. What is missing is None or nan.
+Record = dict[str, Any]
+_LARGEST_PP = 10_000_000
+_HEAD = 4096  # bytes of a mesh's file within which 3D Slicer says its frame
+_RECORD = 1200  # bytes of memory that a landmark takes while it is read
+_ABSENT = 9999.0  # all three coordinates, in a .pts file: the point is missing
+_PLACES = ({"vertex"}, {"x", "y", "z"}, {"face", "w0", "w1", "w2"})
+_NAMES = ("name", "label", "landmark", "id")
+_SPACES: dict[str, Space] = {"0": "RAS", "RAS": "RAS", "1": "LPS", "LPS": "LPS"}
+_FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a file says of one landmark."""
+
+    name: str
+    kind: Kind
+    where: Any  # a vertex; a face and three weights; three coordinates; why it is missing
+
+
+@dataclass(frozen=True)
+class LandmarkFile:
+    """What a file of landmarks holds."""
+
+    places: tuple[Place, ...]
+    has_names: bool  # names are the file's, else they are numbers
+    space: Space  # the frame, where 3D Slicer says it
+
+    def in_space(self, space: Space) -> LandmarkFile:
+        """The same landmarks for a mesh in a frame of 3D Slicer: x and y change signs if theirs is the other one."""
+        if not self.turns_to(space):
+            return self
+        turned = [
+            Place(p.name, p.kind, [-p.where[0], -p.where[1], p.where[2]]) if p.kind == "position" else p
+            for p in self.places
+        ]
+        return LandmarkFile(tuple(turned), self.has_names, space)
+
+    def turns_to(self, space: Space) -> bool:
+        """Whether `in_space` changes anything."""
+        return "" not in (space, self.space) and space != self.space
+
+
+def mesh_space(path: str | Path) -> Space:
+    """The frame that 3D Slicer wrote into the header of a mesh's file; "" if it is not said."""
+    try:
+        with Path(path).open("rb") as file:
+            found = re.search(rb"SPACE=(LPS|RAS)\b", file.read(_HEAD))
+    except OSError:
+        return ""
+    return _SPACES[found[1].decode()] if found else ""
+
+
+def read_landmark_file(path: Path, shape: str = "") -> LandmarkFile:
+    """The landmarks in a file, by its suffix (see `LANDMARK_READERS`).
+
+    Parameters
+    ----------
+    path
+        The file.
+    shape
+        The name of the shape that they are on: a .tps file may hold landmarks of several.
+
+    Raises
+    ------
+    InputError, ValueError
+        The file holds no landmarks, or some that cannot be read.
+    """
+    reader = LANDMARK_READERS[path.suffix.lower()]
+    records, space = reader(path, Path(shape).stem) if reader is _read_tps else reader(path)
+    if not records:
+        raise InputError(f"{path.name} holds no landmark")
+    named = [not is_missing(str(record.get("name") or "")) for record in records]
+    return LandmarkFile(tuple(_place(record, k) for k, record in enumerate(records)), all(named), space)
+
+
+def _place(record: Record, number: int) -> Place:
+    given = record.get("name")
+    words = "".join(c if c.isprintable() else " " for c in str(number if given in (None, "") else given))
+    name = plain_text(" ".join(words.split()))
+    face, weights, vertex = record.get("face"), record.get("barycentric"), record.get("vertex")
+    if face is not None and face != -1 and weights is not None:
+        return Place(name, "face", (_whole(face, name), _three(weights, name)))
+    if not (vertex is None or vertex == -1 or vertex != vertex):
+        return Place(name, "vertex", _whole(vertex, name))
+    if record.get("position") is not None:
+        position = _three(record["position"], name)
+        absent = any(each != each for each in position)
+        return Place(name, "missing", " has no position") if absent else Place(name, "position", position)
+    if not {"vertex", "position"} & set(record):
+        raise InputError(f"landmark {name} has no place")
+    return Place(name, "missing", " is vertex -1" if vertex == -1 else " has no place")
+
+
+def _whole(value: Any, name: str) -> int:
+    if isinstance(value, bool) or int(value) != value or abs(int(value)) >= 2**62:
+        raise InputError(f"landmark {name}: {str(value)[:40]} is not the number of a vertex or face")
+    return int(value)
+
+
+def _three(values: Any, name: str) -> list[float]:
+    if not isinstance(values, list) or len(values) != 3:
+        comma = DECIMAL_COMMA if isinstance(values, list) and len(values) == 6 else ""
+        raise InputError(f"landmark {name}: three numbers are needed, not {str(values)[:40]}", comma)
+    return [number(value) if isinstance(value, str) else float("nan" if value is None else value) for value in values]
+
+
+def _bare(records: list[Record]) -> tuple[list[Record], Space]:
+    return records, ""
+
+
+def _read_npy(path: Path) -> tuple[list[Record], Space]:
+    array = read_npy(path)
+    check_memory(path.name, path.stat().st_size, _RECORD * len(array) if array.ndim else 0)
+    if array.dtype.kind in "fiu" and array.ndim == 2 and array.shape[1] == 3:
+        return _bare([{"position": row} for row in array.astype(np.float64).tolist()])
+    flat = array[:, 0] if array.ndim == 2 and array.shape[1] == 1 else array
+    with np.errstate(invalid="ignore"):
+        is_list = (
+            flat.dtype.kind in "fiu" and flat.ndim == 1 and bool((np.isnan(flat) | (flat == np.round(flat))).all())
+        )
+    if not is_list or not len(flat):
+        shape = " x ".join(map(str, array.shape))
+        problem = f"it holds no landmarks, but {shape} numbers of type {array.dtype}"
+        raise InputError(
+            problem, "either a list of vertices (-1: missing), or x, y and z of every point (nan: missing)"
+        )
+    return _bare([{"vertex": vertex} for vertex in flat.tolist()])
+
+
+def _read_table(path: Path) -> tuple[list[Record], Space]:
+    """A row for each: a vertex, three coordinates, or these behind a name; or columns that are named."""
+    table = read_table(path, comments="ends" if path.suffix.lower() == ".txt" else "lines", whole=True)
+    rows = table.rows()
+    if not rows:
+        return _bare([])
+    check_memory(path.name, path.stat().st_size, _RECORD * len(rows))
+    head = _columns(rows[0])
+    said = _columns(next(csv.reader([table.comment.replace(";", ",").replace("\t", ",")]), []))
+    if head:
+        rows = rows[1:]
+    elif said and len(said) == len(rows[0]):
+        head = said
+    else:
+        head = _usual_columns(rows[0])
+        numbers = [k for k, name in enumerate(head) if name != "name"]
+        if len(rows) > 1 and not any(is_number(rows[0][k]) for k in numbers):
+            rows = rows[1:] if all(is_number(rows[1][k]) for k in numbers) else rows  # names of other columns
+    own = next((name for name in _NAMES if name in head), "")
+    counted = [k for k, name in enumerate(head) if name in ("x", "y", "z", "w0", "w1", "w2")]
+    table.check_marks([[row[k] for k in counted] for row in rows])
+    records = []
+    for row in rows:
+        cell = dict(zip(head, row, strict=True))
+        value = {name: number(cell[name]) for name in cell if any(name in place for place in _PLACES)}
+        record: Record = {"name": cell.get(own)}
+        # The most exact of what a row has: a face with weights, then a vertex, then a position.
+        if {"face", "w0", "w1", "w2"} <= set(value) and value["face"] >= 0:
+            record |= {"face": value["face"], "barycentric": [value[name] for name in ("w0", "w1", "w2")]}
+        if "vertex" in value:
+            record["vertex"] = value["vertex"]
+        if {"x", "y", "z"} <= set(value):
+            record["position"] = [value[axis] for axis in "xyz"]
+        records.append(record)
+    return _bare(records)
+
+
+def _columns(row: Sequence[str]) -> list[str]:
+    """The names of columns in small letters, if a row holds those of a place."""
+    names = [cell.strip().lower() for cell in row]
+    return names if any(place <= set(names) for place in _PLACES) else []
+
+
+def _usual_columns(row: Sequence[str]) -> list[str]:
+    width = len(row)
+    if width not in (1, 2, 3, 4) or (width == 2 and row[0].lstrip("-").isdigit()):
+        comma = f"; {DECIMAL_COMMA}" if all(cell.lstrip("-").isdigit() for cell in row[-2:]) else ""
+        problem = "its first row names no columns"
+        raise InputError(problem, f"name them: name,vertex or name,x,y,z{comma}")
+    return {1: ["vertex"], 2: ["name", "vertex"], 3: ["x", "y", "z"], 4: ["name", "x", "y", "z"]}[width]
+
+
+def _read_json(path: Path) -> tuple[list[Record], Space]:
+    found = read_json(path)
+    if isinstance(found, dict) and isinstance(found.get("markups"), list):
+        return _markups(path, found["markups"])
+    if isinstance(found, dict) and isinstance(found.get("landmarks"), list | dict):
+        found = found["landmarks"]
+    if isinstance(found, dict | list):
+        check_memory(path.name, path.stat().st_size, _RECORD * len(found))
+    if isinstance(found, dict):
+        return _bare([{"name": name, **_record(value)} for name, value in found.items()])
+    if isinstance(found, list):
+        return _bare([_record(value) for value in found])
+    raise InputError("it holds no list of landmarks")
+
+
+def _record(value: Any) -> Record:
+    """A vertex, a position or a description."""
+    if isinstance(value, dict):
+        axes = {key.lower(): value[key] for key in value}
+        if {"x", "y", "z"} <= set(axes) and "position" not in value:
+            return value | {"position": [axes[axis] for axis in "xyz"]}
+        return value
+    return {"vertex" if isinstance(value, int) else "position": value}
+
+
+def _markups(path: Path, lists: list[Any]) -> tuple[list[Record], Space]:
+    """The control points of 3D Slicer's markups."""
+    records: list[Record] = []
+    spaces = set()
+    for markup in lists:
+        points = markup.get("controlPoints") if isinstance(markup, dict) else None
+        if not isinstance(points, list) or not all(isinstance(point, dict) for point in points):
+            raise InputError("its markups hold no list of control points")
+        check_memory(path.name, path.stat().st_size, _RECORD * (len(records) + len(points)))
+        if points:
+            spaces.add(_SPACES.get(str(markup.get("coordinateSystem", "")).upper(), ""))
+        for point in points:
+            is_set = point.get("positionStatus", "defined") == "defined"
+            records.append({"name": point.get("label"), "position": point.get("position") if is_set else None})
+    if len(spaces) > 1:
+        raise InputError("its markups are in several coordinate systems", "save each list in a file of its own")
+    return records, next(iter(spaces), "")
+
+
+def _read_fcsv(path: Path) -> tuple[list[Record], Space]:
+    """3D Slicer's fiducials: comments say the frame and the columns."""
+    text = read_text(path, _RECORD)
+    space = re.search(r"^#\s*CoordinateSystem\s*=\s*(\w+)", text, re.MULTILINE)
+    if space and space[1].upper() not in _SPACES:
+        raise InputError(f"its coordinate system is {space[1][:20]}, not LPS or RAS")
+    columns = re.search(r"^#\s*columns\s*=\s*(.+)$", text, re.MULTILINE)
+    head = [name.strip() for name in (columns[1] if columns else _FCSV_COLUMNS).split(",")]
+    if not {"x", "y", "z"} <= set(head):
+        raise InputError("its columns have no x, y and z")
+    records = []
+    for row in csv.reader(line for line in text.splitlines() if line.strip() and not line.startswith("#")):
+        cell = dict(zip(head, row, strict=False))  # later columns may be left out
+        name = cell.get("label") or cell.get("id")
+        records.append({"name": name, "position": [number(cell.get(axis, "")) for axis in "xyz"]})
+    return records, _SPACES[space[1].upper()] if space else ""
+
+
+def _read_pts(path: Path) -> tuple[list[Record], Space]:
+    """Points a line, with or without a name before the three coordinates, among lines that count them."""
+    records = []
+    for line in read_text(path, _RECORD).splitlines():
+        words = line.replace("\t", " ").split()
+        counts = len(words) == 1 and (words[0].isdigit() or words[0] in "{}")
+        declares = words and re.fullmatch(r"(version|n_points|points|dim|landmarks)\b.*", line.strip(), re.IGNORECASE)
+        if not words or words[0].startswith(("#", "//")) or counts or declares:
+            continue
+        if len(words) not in (3, 4) or not all(map(is_number, words[-3:])):
+            flat = len(words) == 2 and all(map(is_number, words))
+            problem = "its points lie in a plane" if flat else f"{line.strip()[:40]!r} is not a point"
+            raise InputError(problem, "a point a line: x y z, or name x y z")
+        position = [number(word) for word in words[-3:]]
+        missing = all(abs(each) == _ABSENT for each in position)
+        name = words[0] if len(words) == 4 else None
+        records.append({"name": name, "position": None if missing else position})
+    return _bare(records)
+
+
+def _read_tps(path: Path, shape: str) -> tuple[list[Record], Space]:
+    """Landmarks of one specimen (LM3=), then the points of its curves; of several, those of the shape's name."""
+    specimens: list[tuple[list[list[float]], dict[str, str]]] = []
+    for line in read_text(path, _RECORD).splitlines():
+        key, has_value, value = (part.strip() for part in line.partition("="))
+        key = key.upper()
+        if key == "LM" or key == "LM3":
+            if key == "LM" and value != "0":
+                raise InputError("its landmarks lie in a plane (LM=)", "those of a shape have three coordinates: LM3=")
+            specimens.append(([], {}))
+        elif not line.strip():
+            continue
+        elif not specimens:
+            raise InputError(f"it begins with {line.strip()[:40]!r}", "landmarks begin with LM3= and their number")
+        elif has_value:
+            specimens[-1][1][key] = value
+        else:
+            specimens[-1][0].append(_three(line.split(), str(len(specimens[-1][0]))))
+    own = [one for one in specimens if shape and shape in (Path(one[1].get(key, "")).stem for key in ("ID", "IMAGE"))]
+    chosen = own if len(specimens) > 1 else specimens
+    if specimens and len(chosen) != 1:
+        problem = f"it holds landmarks of {len(specimens)} shapes, {len(chosen)} of them of {shape or 'this one'}"
+        raise InputError(problem, "write the name of the shape's file behind ID=, or save each in a file of its own")
+    points, facts = chosen[0] if chosen else ([], {})
+    scale = number(facts.get("SCALE", "1"))
+    return _bare([{"position": [scale * each for each in point]} for point in points])
+
+
+def _read_pp(path: Path) -> tuple[list[Record], Space]:
+    data = read_bytes(path)
+    if len(data) > _LARGEST_PP:
+        raise InputError(f"it is too large: over {_LARGEST_PP // 10**6} MB", "landmarks are a few named points")
+    if b"<!ENTITY" in data:
+        raise InputError("it defines XML entities, which a file of picked points has no use for")
+    try:
+        root = ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        raise InputError(f"it is not XML: {error}") from error
+    if root.tag != "PickedPoints":
+        raise InputError(f"it is not a file of MeshLab's picked points: its root is '{root.tag}'")
+    return _bare(
+        [
+            {"name": point.get("name"), "position": [number(point.get(axis, "")) for axis in "xyz"]}
+            for point in root.iter("point")
+            if point.get("active", "1") != "0"  # the name of a template that nobody has placed
+        ]
+    )
+
+
+LANDMARK_READERS: Mapping[str, Callable[..., tuple[list[Record], Space]]] = {
+    ".csv": _read_table,
+    ".json": _read_json,
+    ".pp": _read_pp,
+    ".fcsv": _read_fcsv,
+    ".pts": _read_pts,
+    ".tps": _read_tps,
+    ".txt": _read_table,
+    ".npy": _read_npy,
+}
+
+
+def fcsv_lines(points: Iterable[tuple[str, Sequence[float], float]], space: Space) -> Iterable[str]:
+    """The lines of 3D Slicer's fiducials, from names, positions and confidences, in a frame."""
+    yield "# Markups fiducial file version = 4.11"
+    yield f"# CoordinateSystem = {space}"
+    yield f"# columns = {_FCSV_COLUMNS}"
+    for k, (name, (x, y, z), confidence) in enumerate(points, 1):
+        label = '"' + name.replace('"', '""') + '"' if set(name) & set('",') else name
+        yield f"{k},{x!r},{y!r},{z!r},0.0,0.0,0.0,1.0,1,1,0,{label},confidence {confidence:.3g},"
+
+
+def markups_record(points: Iterable[tuple[str, Sequence[float], float]], space: Space) -> dict[str, Any]:
+    """3D Slicer's markups (.mrk.json), from names, positions and confidences, in a frame."""
+    controls = [
+        {
+            "id": str(k),
+            "label": name,
+            "description": f"confidence {confidence:.3g}",
+            "position": list(position),
+            "positionStatus": "defined",
+        }
+        for k, (name, position, confidence) in enumerate(points, 1)
+    ]
+    schema = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
+    markup = {"type": "Fiducial", "coordinateSystem": space, "controlPoints": controls}
+    return {"@schema": f"{schema}markups-schema-v1.0.3.json#", "markups": [markup]}

@@ -1,0 +1,200 @@
+"""Where a whole file cannot be fitted its parts are tried apart: by readings, and at the end with the models that ship."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import meshmatch
+from meshmatch.api import apart, matching
+from meshmatch.api.apart import find_alone
+from meshmatch.api.inputs import as_model, usable
+from meshmatch.api.matching import Matcher
+from meshmatch.errors import InputError
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.shapes.parts import Parts
+from meshmatch.shapes.shape import Shape
+from tests.shapes.scenes import beside, chair, coat, eyes, floor, pack, pedestal, sample, second, together
+
+CONFIG = FitConfig()
+BODY = sample("climber")
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[int, float]], list[int]]:
+    """Readings in hundredths of the shapes that have so many vertices, 8 of all others; gives which were read."""
+
+    def install(known: dict[int, float]) -> list[int]:
+        asked: list[int] = []
+
+        def read(model: Any, shape: Shape, *_: Any) -> float:
+            asked.append(shape.V)
+            return known.get(shape.V, 8.0) / 100
+
+        monkeypatch.setattr(apart, "read_kind", read)
+        return asked
+
+    return install
+
+
+def loaders(count: int = 1) -> list[Callable[[], Any]]:
+    return [lambda: as_model("human")] * count
+
+
+Reads = Callable[[dict[int, float]], list[int]]
+
+
+def test_the_parts_that_are_known_are_kept_and_the_others_said(reads: Reads) -> None:
+    asked = reads({BODY.V: 3.7})
+    scene = together("scan.ply", BODY, floor(BODY), pack(BODY))
+    alone = find_alone(loaders(), scene, CONFIG)
+    assert alone is not None and alone.fit is None and alone.readings == pytest.approx([0.037])
+    body = int(Parts.of(scene).number[0])
+    assert alone.clean.left_out == tuple({1, 2, 3} - {body})
+    assert alone.clean.shape.V == BODY.V and len(alone.clean.original_to_repaired) == scene.V
+    share = 100 * (1 - BODY.area / scene.area)
+    assert alone.clean.notes[0].startswith(f"left out 2 of 3 parts, {share:.0f} % of the area: parts ")
+    assert not any("weight 0" in note for note in alone.clean.notes)
+    assert len(asked) <= 6
+
+
+def test_clothes_stay_where_they_read_as_well(reads: Reads) -> None:
+    dressed = together("dressed", BODY, coat(BODY), eyes(BODY))
+    scene = together("scan.ply", dressed, pedestal(BODY))
+    kept = usable(dressed).shape.V  # without the eyes, which repair drops
+    for with_coat, expected in ((4.0, kept), (4.6, BODY.V)):
+        reads({BODY.V: 3.7, kept: with_coat})
+        alone = find_alone(loaders(), scene, CONFIG)
+        assert alone is not None and alone.clean.shape.V == expected
+        assert len(alone.clean.left_out) == (1 if expected == kept else 2)
+
+
+def test_two_bodies_are_for_the_user_to_choose_from(reads: Reads) -> None:
+    reads({BODY.V: 3.7})
+    scene = together("two.ply", BODY, second(BODY))
+    with pytest.raises(
+        InputError, match=r"two\.ply holds more than one shape of a kind: part 1 .* and part 2 "
+    ) as caught:
+        find_alone(loaders(), scene, CONFIG)
+    assert "--only 1 or --only 2" in caught.value.hint
+
+
+def test_what_its_user_chose_and_what_has_no_parts_is_left_alone(reads: Reads) -> None:
+    asked = reads({BODY.V: 3.7})
+    scene = together("scan.ply", BODY, floor(BODY))
+    chosen = Shape(scene.verts, scene.faces, weights=np.ones(scene.V))
+    cloud = Shape(scene.verts, np.empty((0, 3), np.int64))
+    for shape in (chosen, cloud, BODY):
+        assert find_alone(loaders(), shape, CONFIG) is None
+    assert find_alone(loaders(), scene, FitConfig(partial="yes")) is None
+    assert asked == []
+
+
+def test_nothing_is_made_of_what_nobody_knows(reads: Reads, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = reads({})
+    scene = together("room.ply", chair(beside(BODY)), floor(BODY))
+    assert find_alone(loaders(2), scene, CONFIG, [[0], [1]]) is None
+    assert 0 < len(asked) <= 12  # both models were asked
+    # what reads strangely needs a fit that can be trusted
+    table = chair(beside(BODY))
+    reads({table.V: 5.5})
+    for fit, found in (("fair", 0.6, False), False), (("fair", 0.8, True), False), (("fair", 0.8, False), True):
+        made = SimpleNamespace(verdict=fit[0], trust=fit[1], partial=fit[2])
+        monkeypatch.setattr(apart, "told", lambda *_, made=made: (made.verdict != "poor", made))
+        alone = find_alone(loaders(), together("room.ply", table, floor(BODY)), CONFIG)
+        assert (alone is not None) is found
+
+
+def test_a_model_that_knows_some_parts_spares_the_others(reads: Reads) -> None:
+    asked = reads({BODY.V: 3.7})
+    scene = together("scan.ply", BODY, floor(BODY))
+    alone = find_alone(loaders(2), scene, CONFIG, [[0], [1]])
+    assert alone is not None and alone.row == 0 and np.isinf(alone.readings[1])
+    assert len(asked) == len(set(asked))
+
+
+def a_fit(verdict: str, shape: Shape) -> Any:
+    from tests.cli.conftest import fake_fit
+
+    return fake_fit(shape, verdict)
+
+
+@pytest.mark.parametrize(
+    ("whole", "alone", "kept"), [("poor", "good", "good"), ("poor", "poor", "whole"), ("fair", "", "whole")]
+)
+def test_only_a_poor_fit_of_the_whole_gives_way_to_a_better_one(
+    reads: Reads, monkeypatch: pytest.MonkeyPatch, whole: str, alone: str, kept: str
+) -> None:
+    asked = reads({BODY.V: 3.7})
+    scene = together("scan.ply", BODY, floor(BODY))
+    monkeypatch.setattr(
+        matching.Fitter, "fit", lambda self, shape: a_fit(whole if shape.V == scene.V else alone, shape)
+    )
+    fit = Matcher("human").fit(scene)
+    assert fit.left_out == (() if kept == "whole" else (1,))
+    assert any("left out 1 of 2 parts" in note for note in fit.notes) is (kept != "whole")
+    assert fit.repaired is not None and fit.repaired.original.V == scene.V
+    assert fit.verdict == (whole if kept == "whole" else alone)
+    assert (asked == []) is (whole == "fair")
+
+
+def test_parts_far_apart_are_tried_before_they_are_refused(reads: Reads, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = together("scan.ply", BODY, chair(beside(BODY, 3.0)))
+    assert usable(scene).far_parts
+    monkeypatch.setattr(matching.Fitter, "fit", lambda self, shape: a_fit("good", shape))
+    reads({BODY.V: 3.7})
+    assert len(Matcher("human").fit(scene).left_out) == 6
+    reads({})
+    with pytest.raises(InputError, match="large parts far apart") as caught:
+        Matcher("human").fit(scene)
+    assert "--only" in caught.value.hint
+
+
+@pytest.mark.slow
+def test_a_body_on_a_floor_is_matched_as_if_it_were_alone(remembered_fits: Any) -> None:
+    scene = together("scan.ply", BODY, floor(BODY), pack(BODY), chair(beside(BODY)))
+    fit = meshmatch.register(scene)
+    alone = meshmatch.register(BODY)
+    assert fit.verdict == "good" and len(fit.left_out) == 8
+    assert "scan.ply: human" in fit.notes
+    away = np.linalg.norm(fit.points_in_file - alone.points_in_file, axis=1) / np.sqrt(BODY.area)
+    assert away.mean() < 0.005
+    matcher = Matcher("human")
+    found = matcher.map(fit, alone, agree=False)
+    off = np.linalg.norm(BODY.verts[found.index[: BODY.V]] - BODY.verts, axis=1) / np.sqrt(BODY.area)
+    assert len(found.index) == scene.V and off.mean() < 0.01
+    assert found.confidence[: BODY.V].mean() > 0.8 > 0.2 > found.confidence[BODY.V :].mean()
+
+
+@pytest.mark.slow
+def test_a_calf_on_a_pedestal_is_a_calf(remembered_fits: Any) -> None:
+    calf = sample("calf")
+    scene = together("zoo.ply", calf, pedestal(calf))
+    fit = meshmatch.register(scene)
+    assert fit.verdict != "poor" and "zoo.ply: quadruped" in fit.notes and len(fit.left_out) == 1
+
+
+@pytest.mark.slow
+def test_a_chair_and_boxes_stay_of_no_kind() -> None:
+    for scene in (chair(np.zeros(3)), together("boxes", pedestal(BODY), pack(BODY))):
+        with pytest.raises(InputError, match="of no kind"):
+            meshmatch.register(scene)
+
+
+@pytest.mark.slow
+def test_a_collection_leaves_the_floor_out_and_says_so(tmp_path: Path, remembered_fits: Any) -> None:
+    scene = together("", BODY, floor(BODY))
+    meshmatch.save_shape(tmp_path / "scan.ply", scene)
+    meshmatch.save_shape(tmp_path / "body.ply", BODY)
+    collection = meshmatch.Collection(tmp_path / "fits", workers=1)
+    made = collection.fit(tmp_path, model="human", agree=False)
+    notes = {record.name: record.notes for record in made.records}
+    assert notes["body"] == "" and notes["scan"].startswith("left out 1 of 2 parts")
+    assert collection.fit_of("scan").left_out == (1,)
+    found = collection.map("scan", "body")
+    off = np.linalg.norm(BODY.verts[found.index[: BODY.V]] - BODY.verts, axis=1) / np.sqrt(BODY.area)
+    assert len(found.index) == scene.V and off.mean() < 0.01
+    assert "left out 1 of 2 parts" in (tmp_path / "fits" / "fits.csv").read_text()
