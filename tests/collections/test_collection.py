@@ -395,7 +395,7 @@ def test_without_a_model_the_shapes_make_their_template(tmp_path: Path) -> None:
     collection = meshmatch.Collection(tmp_path / "fits", workers=1)
     made = collection.fit(folder, model="none")
     assert {record.verdict for record in made.records} == {"fair"} and made.agreed == 0
-    assert "without a model" in made.records[0].reasons
+    assert "without a trained model" in made.records[0].reasons
     for source, target in collection.pairs():
         found, here, there = collection.map(source, target), eggs[source], eggs[target]
         place, matched = here.verts / np.abs(here.verts).max(0), there.verts[found.index] / np.abs(there.verts).max(0)

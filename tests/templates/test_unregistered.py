@@ -175,7 +175,7 @@ def test_wrong_known_points_are_told(pears: Path, tmp_path: Path, values: list, 
     assert told in caught.value.message + caught.value.hint
     for words in ("# nothing\n", "# only words\n"):
         (tmp_path / "x.txt").write_text(words)
-        with pytest.raises(InputError, match="holds no landmarks"):
+        with pytest.raises(InputError, match="holds no landmark"):
             read_landmarks(tmp_path / "x.txt", repair(load_shape(pears / "pear0.ply")))
     (tmp_path / "x.npy").write_bytes(b"no numbers")
     with pytest.raises(InputError, match="is not an npy file"):
