@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -210,6 +210,8 @@ def fit_record(name: str, fit: meshmatch.Fit) -> Json:
     """A fit for --json."""
     record = {"shape": name, "verdict": fit.verdict, "reasons": fit.reasons, "trust": round(fit.trust, 4)}
     record["residual"] = float(fit.residual)
+    if fit.regularity is not None:
+        record["regularity"] = {name: round(value, 5) for name, value in asdict(fit.regularity).items()}
     return record | {"up": fit.up, "front": fit.front, "seconds": round(fit.seconds, 3), "seed": fit.seed}
 
 

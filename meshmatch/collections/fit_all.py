@@ -15,6 +15,7 @@ from meshmatch.collections.sources import natural
 from meshmatch.collections.stores import Store
 from meshmatch.collections.tasks import (
     AgreeTask,
+    Finished,
     FinishTask,
     FitTask,
     Group,
@@ -23,17 +24,32 @@ from meshmatch.collections.tasks import (
     finish,
     fit_alone,
     is_finished,
+    load_array,
+    regularity_words,
     save_array,
 )
 from meshmatch.collections.workers import Died, Item, Result, Workers
 from meshmatch.errors import InputError
-from meshmatch.fitting.agree import AgreeConfig, stretch_of
+from meshmatch.fitting.agree import AgreeConfig, held_mean, log_stretch, stretch_of
 from meshmatch.fitting.viscous import NO_MODEL
 from meshmatch.maps.vertex_map import VERDICTS
 from meshmatch.progress import ProgressCallback
 
 TABLE = "fits.csv"
-COLUMNS = ("name", "file", "verdict", "trust", "reasons", "residual", "up", "front", "vertices", "seconds")
+COLUMNS = (
+    "name",
+    "file",
+    "verdict",
+    "trust",
+    "reasons",
+    "residual",
+    "inverted",
+    "volume",
+    "up",
+    "front",
+    "vertices",
+    "seconds",
+)
 _GROUP = 4  # fits that one task of the agreement takes a step with: fixed, for sums must not depend on the workers
 
 
@@ -73,13 +89,14 @@ def fit_all(
         raise InputError(f"none of {len(records)} shapes could be fitted: {records[0].name}: {records[0].reasons}")
     agreeing = [number for number in fitted if records[number].verdict != "poor"]
     parts = [f"{records[number].name} {records[number].digest} {records[number].verdict}" for number in fitted]
-    everybody = digest_of(*parts)
+    how = AgreeConfig.for_collection(setting.trained) if setting.agrees else None
+    everybody = digest_of(*parts, str(how))  # fits that agreed in another way agree again
     groups = run.groups(agreeing, everybody) if agree and setting.agrees and len(agreeing) > 1 else []
     tasks = run.last_tasks({number: records[number] for number in fitted}, groups)
     if groups and not all(is_finished(setting.store, task) for task in tasks.values()):
         run.agree(groups, len(agreeing))
-    for number, trouble in run.finish(tasks):
-        records[number] = replace(records[number], verdict=FAILED, reasons=trouble)
+    for number, done in run.finish(tasks):
+        records[number] = _finished(records[number], done)
     setting.store.remove(AGREEING)
     _write_table(setting.store, records)
     return Fitted(tuple(records), len(agreeing) if groups else 0, setting.model)
@@ -156,7 +173,8 @@ class _Run:
         """All steps of the agreement that were not taken before; the cost grows as the number of fits. Sums are taken in
         the order of the groups.
         """
-        steps, store = AgreeConfig.for_collection(self.setting.trained).steps, self.setting.store
+        how, store = AgreeConfig.for_collection(self.setting.trained), self.setting.store
+        steps, first = how.steps, common_file(groups[0].agreement, 1)
         for step in range(steps + 1):
             common = common_file(groups[0].agreement, step + 1)
             if store.exists(common):
@@ -173,15 +191,28 @@ class _Run:
                     total, next_one = here if total is None else total + here, next_one + 1
             assert total is not None
             if step < steps:
-                save_array(store, common, stretch_of(total / count))
+                mean = total / count
+                if step > 0:
+                    mean = held_mean(log_stretch(load_array(store, first)), mean, how)
+                save_array(store, common, stretch_of(mean))
 
-    def finish(self, tasks: Mapping[int, FinishTask]) -> Iterator[tuple[int, str]]:
-        """Place the vertices of every shape; gives the numbers of those where that failed, and why."""
+    def finish(self, tasks: Mapping[int, FinishTask]) -> Iterator[tuple[int, Finished]]:
+        """Place the vertices of every shape; gives numbers, and what is said of each fit now, or what went wrong."""
         numbers = list(tasks)
-        for at, trouble in self._each(finish, list(tasks.values()), "placing vertices"):
-            trouble = trouble.message if isinstance(trouble, Died) else trouble
-            if trouble:
-                yield numbers[at], trouble
+        for at, done in self._each(finish, list(tasks.values()), "placing vertices"):
+            yield numbers[at], Finished(done.message) if isinstance(done, Died) else done
+
+
+def _finished(alone: Record, done: Finished) -> Record:
+    """The record of a fit alone, with what became of it when it agreed with others."""
+    if done.trouble:
+        return replace(alone, verdict=FAILED, reasons=done.trouble)
+    known = replace(alone, **regularity_words(done.regularity))
+    return (
+        known
+        if done.verdict == alone.verdict
+        else replace(known, verdict=done.verdict, reasons="; ".join(done.reasons))
+    )
 
 
 def _write_table(store: Store, records: Sequence[Record]) -> None:

@@ -8,7 +8,8 @@ template, which a collection keeps once, nor anything that differs from run to r
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import math
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 
 from meshmatch.errors import InputError, ModelError
 from meshmatch.fitting.fit import Fit, Reason
+from meshmatch.fitting.regularity import Regularity
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.maps.places import Places
@@ -62,6 +64,8 @@ def save_fit(
     arrays |= {"rotation": fit.frame.rotation, "center": fit.frame.center}
     about: Words = {name: getattr(fit, name) for name in _FIT_WORDS}
     about |= {"reasons": [[reason.code, str(reason)] for reason in fit.reasons], "scale": fit.frame.scale}
+    if fit.regularity is not None:
+        about["regularity"] = asdict(fit.regularity)
     if places is not None:
         arrays |= {name: getattr(places, name) for name in _PLACES}
         arrays |= {name: kept for name in _OPTIONAL if (kept := getattr(places, name)) is not None}
@@ -90,6 +94,8 @@ def load_words(path: str | Path) -> tuple[Words, Words]:
             odd = ["trust"]
         if odd or about["verdict"] not in VERDICTS:
             raise InputError(f"{path.name}: its {odd[0] if odd else 'verdict'} cannot be", _HINT)
+        about["reasons"] = [(str(code), str(sentence)) for code, sentence in about["reasons"]]
+        regularity_of(about)
         return about, more
     except ModelError as error:
         raise InputError(error.message, _HINT) from error
@@ -117,6 +123,7 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
             verts=np.empty((0, 3)),
             reasons=tuple(Reason(code, str(sentence)) for code, sentence in about["reasons"]),
             seconds=0.0,
+            regularity=regularity_of(about),
             **{name: about[name] for name in _FIT_WORDS},
         )
         if not (1 / LARGEST < fit.frame.scale < LARGEST and (np.abs(fit.frame.center) < LARGEST).all()):
@@ -124,6 +131,20 @@ def load_fit(path: str | Path, template: Template) -> StoredFit:
         return StoredFit(fit, _places(arrays, about, fit), _samples(arrays, about), more)
     except (SafetensorError, KeyError, TypeError, ValueError, OverflowError, OSError) as error:
         raise InputError(f"{path.name} is damaged: {error}", _HINT) from error
+
+
+def regularity_of(about: Words) -> Regularity | None:
+    """How regular the deformation is, by what a fit's file says of it; None if it is of a version that did not say.
+
+    `ValueError`, `KeyError` or `TypeError` for numbers that cannot be.
+    """
+    if "regularity" not in about:
+        return None
+    found = Regularity(*(about["regularity"][field.name] for field in fields(Regularity)))
+    numbers = found.inverted, found.volume
+    if {*map(type, numbers)} != {float} or not (0 <= found.inverted <= 1 and 0 <= found.volume < math.inf):
+        raise ValueError("its regularity cannot be")
+    return found
 
 
 def load_finished(path: str | Path, template: Template) -> tuple[Fit, Places]:

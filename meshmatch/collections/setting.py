@@ -78,6 +78,8 @@ class Record:
     trust: float = 0.0
     reasons: str = ""
     residual: float = float("nan")  # units of sqrt(area)
+    inverted: float = float("nan")  # share of the template, and mean change of volume, see `Regularity`
+    volume: float = float("nan")
     up: str = ""
     front: str = ""
     vertices: int = 0

@@ -10,18 +10,21 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from meshmatch.api.inputs import validated
 from meshmatch.api.kinds import other_kind
 from meshmatch.arrays import Float, Floats
-from meshmatch.collections.fit_files import StoredFit, load_words, save_fit
+from meshmatch.collections.fit_files import StoredFit, load_words, regularity_of, save_fit
 from meshmatch.collections.setting import AGREEING, ALONE, FITS, SUFFIX, Record, Setting, Source, digest_of
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.fitting.agree import AgreeConfig, Member, agree_step, log_stretch, member_of
+from meshmatch.fitting.regularity import Regularity
 from meshmatch.fitting.system import node_system
+from meshmatch.fitting.verdict import with_vectors
 from meshmatch.fitting.viscous import NO_MODEL
 from meshmatch.maps.places import Places
 from meshmatch.outputs import replace_on_success
@@ -67,6 +70,7 @@ def fit_alone(task: FitTask) -> Record:
             trust=round(fit.trust, 4),
             reasons=reasons,
             residual=float(fit.residual),
+            **regularity_words(fit.regularity),
             up=fit.up,
             front=fit.front,
             vertices=fit.repaired.original.V,
@@ -126,7 +130,8 @@ def save_array(store: Store, name: str, array: Floats) -> None:
         np.save(file, array)
 
 
-def _array(store: Store, name: str) -> Floats:
+def load_array(store: Store, name: str) -> Floats:
+    """Read one array."""
     with store.reading(name) as path:
         return np.asarray(read_npy(path), np.float64)
 
@@ -142,13 +147,13 @@ def agree_a_little(task: AgreeTask) -> Float[Floats, "G 3 3"]:
     members = [_member(setting.read(ALONE, name), how) for name in group.names]
 
     def after(step: int) -> Floats:
-        return _array(store, group.file(step)) if step > 0 else np.array([member.vectors for member in members])
+        return load_array(store, group.file(step)) if step > 0 else np.array([member.vectors for member in members])
 
     now, before = after(0), after(max(task.step - 1, 0))
     if task.step > 0 and store.exists(group.file(task.step)):
         now = after(task.step)
     elif task.step > 0:
-        common = _array(store, common_file(group.agreement, task.step))
+        common = load_array(store, common_file(group.agreement, task.step))
         nodes = setting.config.for_model(setting.trained).nodes
         starts = _starts(members, before, after(max(task.step - 2, 0)))
         gradients = [system.deformation_gradient(start) for start in starts]
@@ -199,23 +204,45 @@ def is_finished(store: Store, task: FinishTask) -> bool:
     return False
 
 
-def finish(task: FinishTask) -> str:
-    """Find the places of a shape's vertices on its fit, unless that was done before; what went wrong, or nothing."""
-    setting, name = task.setting, task.source.name
+@dataclass(frozen=True)
+class Finished:
+    """What is said of a finished fit, or what went wrong."""
+
+    trouble: str = ""
+    verdict: str = ""
+    reasons: tuple[str, ...] = ()
+    regularity: Regularity | None = None
+
+
+def finish(task: FinishTask) -> Finished:
+    """Find the places of a shape's vertices on its fit, unless that was done before."""
     try:
-        if is_finished(setting.store, task):
-            return ""
-        alone = setting.read(ALONE, name)
-        part = validated(task.source.load(setting.only, setting.without))
-        before = replace(alone.fit, repaired=part, verts=part.shape.verts)
-        fit = before
-        if task.group is not None:
-            vectors = _array(setting.store, task.group.file(task.step))[task.group.names.index(name)]
-            fit = replace(before, vectors=vectors, points=node_system(setting.trained).moved(vectors))
-        places = Places.of(part, fit, before if task.group is not None else None)
-        words = {"digest": task.digest, "agreed_with": task.agreed_with}
-        with setting.store.writing(task.file) as path:
-            save_fit(path, fit, places, words=words)
+        if not is_finished(task.setting.store, task):
+            _finish(task)
+        with task.setting.store.reading(task.file) as path:
+            about = load_words(path)[0]
+            reasons = tuple(str(sentence) for _, sentence in about["reasons"])
+            return Finished("", about["verdict"], reasons, regularity_of(about))
     except MeshmatchError as error:
-        return error.message
-    return ""
+        return Finished(error.message)
+
+
+def _finish(task: FinishTask) -> None:
+    setting, name = task.setting, task.source.name
+    alone = setting.read(ALONE, name)
+    part = validated(task.source.load(setting.only, setting.without))
+    before = replace(alone.fit, repaired=part, verts=part.shape.verts)
+    fit = before
+    if task.group is not None:
+        vectors = load_array(setting.store, task.group.file(task.step))[task.group.names.index(name)]
+        system = node_system(setting.trained)
+        fit = with_vectors(system, before, system.unfolded(vectors))
+    places = Places.of(part, fit, before if task.group is not None else None)
+    words = {"digest": task.digest, "agreed_with": task.agreed_with}
+    with setting.store.writing(task.file) as path:
+        save_fit(path, fit, places, words=words)
+
+
+def regularity_words(regularity: Regularity | None) -> dict[str, Any]:
+    """As a `Record` has it; nothing where it is not known."""
+    return {} if regularity is None else {name: round(value, 5) for name, value in asdict(regularity).items()}

@@ -24,6 +24,7 @@ from meshmatch.fitting.fit_config import FitConfig, NodeRefineConfig, geometric_
 from meshmatch.fitting.nodes import add_landmarks, nearest_rotations, pair_terms
 from meshmatch.fitting.system import NodeSystem, node_system
 from meshmatch.fitting.task import Landmarks, take_samples, without_inside
+from meshmatch.fitting.verdict import with_vectors
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.symmetric import entries_of, exponential, logarithm, matrices_of
 from meshmatch.models.trained import TrainedModel
@@ -45,6 +46,7 @@ class AgreeConfig:
     strain: float = 0.0001  # weight of the common stretch
     scale: float = 0.05  # of the robust weight (units of sqrt(area))
     momentum: float = 0.6  # how far each step goes on along the last: what slides along the surface has far to go
+    drift: float = 0.4  # how far the common stretch follows the fits as they move, against where they began
     alike: float = 0.4  # two whose logarithms of stretch lie so far apart (median) follow their mean half way
     point_share: float = 0.01
     pair_normals: float = 0.012
@@ -104,9 +106,7 @@ def agreed_fits(
     with ThreadPoolExecutor(threads) as pool:
         members = list(pool.map(member, range(len(fits))))
     refined = agree(system, members, config.nodes, threads)
-    return [
-        replace(fit, vectors=vectors, points=system.moved(vectors)) for fit, vectors in zip(fits, refined, strict=True)
-    ]
+    return [with_vectors(system, fit, vectors) for fit, vectors in zip(fits, refined, strict=True)]
 
 
 def member_of(
@@ -143,13 +143,14 @@ def agree(
 
     refined = before = [member.vectors for member in members]
     own = [log_stretch(system.deformation_gradient(vectors)) for vectors in refined]
+    first = mean_log(own)
     follows = [likeness(log, own, member.config.alike) for log, member in zip(own, members, strict=True)]
     with ThreadPoolExecutor(threads) as pool:
         for _ in range(members[0].config.steps):
             paths = zip(members, refined, before, strict=True)
             before, refined = refined, [now + each.config.momentum * (now - last) for each, now, last in paths]
             gradients = [system.deformation_gradient(vectors) for vectors in refined]
-            mean = mean_log([log_stretch(F) for F in gradients])
+            mean = held_mean(first, mean_log([log_stretch(F) for F in gradients]), members[0].config)
             shared = stretch_of(mean)
             wanted = [
                 shared if share > _SAME else stretch_of(log + share * (mean - log))
@@ -158,7 +159,7 @@ def agree(
             refined = list(
                 pool.map(lambda *each: agree_step(system, nodes, *each), members, refined, gradients, wanted)
             )
-    return refined
+    return [system.unfolded(vectors) for vectors in refined]
 
 
 def likeness(log: Float[Floats, "G 3 3"], others: Sequence[Float[Floats, "G 3 3"]], half: float) -> float:
@@ -187,6 +188,17 @@ def agree_step(
         add_landmarks(terms, member.landmarks, nodes.landmark_weight)
     targets = nearest_rotations(F, common) @ common
     return system.solve(*terms, config.strain / len(F), targets, nodes.damping / system.K, vectors)
+
+
+def held_mean(
+    first: Float[Floats, "G 3 3"], now: Float[Floats, "G 3 3"], config: AgreeConfig
+) -> Float[Floats, "G 3 3"]:
+    """Logarithm of the common stretch: between the mean of the fits before they agreed and their mean now.
+
+    Pairs hold fits across the surface alone. If nothing held the mean, all fits could slide together until a nose or a
+    finger is flat.
+    """
+    return first + config.drift * (now - first)
 
 
 def mean_log(logs: Sequence[Float[Floats, "G 3 3"]]) -> Float[Floats, "G 3 3"]:

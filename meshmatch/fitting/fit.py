@@ -10,6 +10,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
+from meshmatch.fitting.regularity import Regularity
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.quick_scipy import cKDTree
 from meshmatch.shapes.repair import Repaired
@@ -23,12 +24,23 @@ if TYPE_CHECKING:
 
 Verdict = Literal["good", "fair", "poor"]
 ReasonCode = Literal[
-    "residual", "unreached", "empty", "torn", "crushed", "facing", "unsure", "doubt", "part", "side", "unsupervised"
+    "residual",
+    "unreached",
+    "empty",
+    "torn",
+    "crushed",
+    "folded",
+    "facing",
+    "unsure",
+    "doubt",
+    "part",
+    "side",
+    "unsupervised",
 ]
 """Template and shape stay apart; some of the shape is not reached; template lies where the shape has no surface;
-neighbours belong far apart; the template is stretched or crushed; the shape faces the other way; the network reads copies
-of the shape differently; no sign alone, but all together; it was taken for a part; its mirror image fits as well; the
-model was learned without correspondence."""
+neighbours belong far apart; the template is stretched or crushed; it is folded, or inside out, in places; the shape faces
+the other way; the network reads copies of the shape differently; no sign alone, but all together; it was taken for a part;
+its mirror image fits as well; the model was learned without correspondence."""
 
 
 class Reason(str):
@@ -62,6 +74,8 @@ class Fit:
     verdict, reasons : "good", "fair" or "poor", and why it is not good
     trust : probability (0..1) that the fit is right: on a person, to 8 cm on average
     signs : by what it was judged; None if it was read from a file
+    regularity : share of template vertices where the deformation folds (det F <= 0), and mean change of volume, of these
+        node vectors; None if it was read from a file that does not say
     up, front : the axes of the file that the fit took for up and front, such as "+y" and "-z"
     seconds, seed : how long the fit took, and with which random numbers
     partial : the shape was taken for a part; the residual is from the shape to the template only
@@ -90,6 +104,7 @@ class Fit:
     model: str = ""
     trust: float = 1.0
     signs: Signs | None = None
+    regularity: Regularity | None = None
 
     @cached_property
     def vertex_distance(self) -> Floats:

@@ -144,6 +144,7 @@ def as_fit(found: Registration, partial: bool, began: float) -> Fit:
         reasons=judged.reasons,
         trust=judged.trust,
         signs=judged.signs,
+        regularity=task.system.regularity(found.candidate.vectors),
         up=axis_name(frame.rotation[1]),
         front=axis_name(frame.rotation[2]),
         seconds=time.monotonic() - began,

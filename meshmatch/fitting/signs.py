@@ -63,6 +63,7 @@ class Signs:
     partial : whether the shape was taken for a part
     hidden : share (0..1) of the template that a part does not show
     spread : how far the network's readings of tilted copies lie from the fit (units of sqrt(area)), see `Predictor.spread`
+    inverted : share (0..1) of the template's vertices where the deformation folds, see `Regularity`
     """
 
     residual: float
@@ -75,10 +76,11 @@ class Signs:
     partial: bool = False
     hidden: float = 0.0
     spread: float = USUAL_SPREAD
+    inverted: float = 0.0
 
     def values(self) -> tuple[float, ...]:
         """Numbers that grow about as the doubt does; ``empty``, ``stretch``, ``against`` and ``partial`` told nothing beside
-        them."""
+        them; ``inverted`` was not tried."""
         return (
             100 * self.residual,
             float(np.sqrt(10 * min(self.missed, 0.2))),
@@ -126,6 +128,7 @@ def signs_of(
         partial,
         1 - area_share(system, shown) if partial else 0.0,
         USUAL_SPREAD if spread_at is None or not shown.any() else spread_at(shown),
+        system.regularity(vectors).inverted,
     )
 
 

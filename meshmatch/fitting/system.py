@@ -23,6 +23,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.fields.shape_functions import ShapeFunctions
+from meshmatch.fitting.regularity import Regularity, Unfolding
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import triangle_vectors
 from meshmatch.models.trained import TrainedModel, once_per_model
@@ -102,6 +103,16 @@ class NodeSystem:
         if not self.linear:
             return self.field.strain(vectors, self.strain_points)
         return (self.equations.slopes @ vectors).reshape(-1, 3, 3).transpose(0, 2, 1) + np.eye(3)
+
+    def regularity(self, vectors: Float[Floats, "K 3"]) -> Regularity:
+        """How regular the deformation is, at all vertices."""
+        return Regularity.of(self.field.strain(vectors))
+
+    def unfolded(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "K 3"]:
+        """Node vectors near the given ones under which no vertex is folded, or fewer; see `Unfolding`."""
+        field = self.field
+        assert isinstance(field, ShapeFunctions)
+        return self._once("unfolding", lambda: Unfolding(field.phi, field.gradient))(vectors)
 
     def surface(self, vectors: Float[Floats, "K 3"]) -> OrientedPoints:
         """Template vertices under node vectors, with their normals."""

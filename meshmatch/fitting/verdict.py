@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools
-from meshmatch.fitting.fit import Reason, ReasonCode, Verdict
+from meshmatch.arrays import Bool, Bools, Float, Floats
+from meshmatch.fitting.fit import Fit, Reason, ReasonCode, Verdict
 from meshmatch.fitting.network_fit import reads_alike
 from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, connected_parts, signs_of, unexplained
+from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import Registration, without_inside
 
 # Trust from which on a fit is good, and fair: more likely right than wrong; a part is fair at best.
@@ -20,6 +21,9 @@ _GOOD_SHARE, _FAIR_SHARE = 0.02, 0.06
 _HIDDEN = 0.6  # share of the template: of a part that shows less than the rest, such as a leg, too little can be told
 # A stretch of the template from which on no fit is good, and from which on it is poor. Set by hand.
 _CRUSHED, _FLAT = 1.0, 2.0
+# Share of the template's vertices that are folded, up to which a fit is good: right fits of generated animals have up to
+# 0.03, those of people up to 0.01. What folds only when fits agree is no property of the shape: less of it is too much.
+_FOLDED, _FOLDED_SINCE = 0.05, 0.01
 # A residual (units of sqrt(area)) from which on a fit may be one of a part, and the search for parts goes on. Set by hand.
 FAIR_RESIDUAL = 0.031
 
@@ -78,7 +82,13 @@ def judge(signs: Signs) -> Judgement:
         reasons.append(Reason("part", f"taken for a part: {lost}"))
     if trust < FAIR_TRUST or signs.empty > _FAIR_SHARE or signs.hidden > _HIDDEN or signs.stretch > _FLAT:
         verdict: Verdict = "poor"
-    elif trust < GOOD_TRUST or signs.partial or lacking > _GOOD_SHARE or signs.stretch > _CRUSHED:
+    elif (
+        trust < GOOD_TRUST
+        or signs.partial
+        or lacking > _GOOD_SHARE
+        or signs.stretch > _CRUSHED
+        or signs.inverted > _FOLDED
+    ):
         verdict = "fair"
     else:
         return Judgement("good", (), signs)
@@ -101,6 +111,7 @@ def _reasons(signs: Signs) -> list[Reason]:
         (signs.empty > _GOOD_SHARE, "empty", empty),
         (signs.torn > 0.02, "torn", f"{100 * signs.torn:.0f} % of neighbours on the shape belong far apart"),
         (signs.stretch > _CRUSHED, "crushed", crushed),
+        (signs.inverted > _FOLDED, "folded", _folds(signs.inverted)),
         (signs.against > 0.1, "facing", facing),
         (signs.spread > 0.06, "unsure", unsure),
     ]
@@ -109,3 +120,24 @@ def _reasons(signs: Signs) -> list[Reason]:
 
 def _gap(residual: float) -> str:
     return f"template and shape stay {100 * residual:.1f} % of sqrt(area) apart on average"
+
+
+def _folds(inverted: float) -> str:
+    return f"the template is folded or inside out at {100 * inverted:.1f} % of its vertices"
+
+
+def with_vectors(system: NodeSystem, fit: Fit, vectors: Float[Floats, "K 3"]) -> Fit:
+    """The same fit with other node vectors, such as agreement finds.
+
+    Residual, trust and verdict stay those that it had, but a deformation that folds more than right ones do, or clearly more
+    than before, is not good.
+    """
+    regularity = system.regularity(vectors)
+    moved = replace(fit, vectors=vectors, points=system.moved(vectors), regularity=regularity)
+    before = 0.0 if fit.regularity is None else fit.regularity.inverted
+    if regularity.inverted <= min(_FOLDED, before + _FOLDED_SINCE) or any(
+        reason.code == "folded" for reason in fit.reasons
+    ):
+        return moved
+    verdict: Verdict = "fair" if fit.verdict == "good" else fit.verdict
+    return replace(moved, verdict=verdict, reasons=(*fit.reasons, Reason("folded", _folds(regularity.inverted))))

@@ -124,6 +124,7 @@ def fit_viscously(template: Template, system: NodeSystem, shape: Shape, config: 
         reasons=(*judged.reasons, unsure),
         trust=min(judged.trust, EVEN_TRUST),
         signs=judged.signs,
+        regularity=system.regularity(vectors),
         up=axis_name(core.rotation[1]),
         front=axis_name(core.rotation[2]),
         seconds=time.monotonic() - began,

@@ -13,6 +13,7 @@ from meshmatch.api.inputs import as_model
 from meshmatch.api.results import MatchResult
 from meshmatch.cli import main
 from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.regularity import Regularity
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
@@ -63,6 +64,7 @@ def fake_fit(shape: Shape, verdict: str = "good", reasons: tuple[str, ...] = (),
     """A fit that nobody made: of two triangles."""
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     rest: dict[str, Any] = {"frame": Frame(2.0, np.eye(3), np.array([10.0, 0, 0])), "front": "-z", "residual": 0.0123}
+    rest["regularity"] = Regularity(0.001, 0.25)
     rest |= {"template_hash": "0" * 16, "model": "human", "verts": shape.verts, "verdict": verdict, "reasons": reasons}
     return some_fit(corners, np.array([[0, 1, 2], [0, 2, 3]]), seconds=1.0, **(rest | other))
 

@@ -93,6 +93,7 @@ def test_match_json_is_one_line_of_data(run: Run, two: tuple[Path, Path], stub: 
     assert record["notes"] == ["a.ply: 3 faces dropped"]
     assert [each["shape"] for each in record["fits"]] == ["a.ply", "b.ply"]
     assert record["fits"][0]["residual"] == 0.0123
+    assert record["fits"][0]["regularity"] == {"inverted": 0.001, "volume": 0.25}
 
 
 def test_quiet_is_silent(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:

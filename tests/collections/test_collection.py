@@ -20,6 +20,7 @@ from meshmatch.errors import InputError, MeshmatchError, OptionError, OutputErro
 from meshmatch.experiments.hostile_learned import write_eggs
 from meshmatch.fitting.agree import agree_step
 from meshmatch.fitting.fitter import Fitter
+from meshmatch.fitting.system import node_system
 from meshmatch.locks import locked
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -63,6 +64,7 @@ def test_a_bad_shape_is_told_and_stops_nobody(made: tuple[Path, tuple[Record, ..
     with open(folder / "fits.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["name"] for row in rows] == ["broken", *NAMES]
+    assert 0 <= float(rows[1]["inverted"]) < 0.003 and 0 < float(rows[1]["volume"]) < 0.4
     assert float(rows[1]["residual"]) == records[1].residual and rows[1]["file"].endswith("/climber.ply")
     assert meshmatch.Collection(folder).names == NAMES
 
@@ -85,6 +87,9 @@ def test_a_fit_that_was_read_is_the_fit(made: tuple[Path, tuple[Record, ...]]) -
     assert np.array_equal(fit.frame.rotation, alone.frame.rotation) and fit.frame.scale == alone.frame.scale
     moved = np.linalg.norm(fit.points - alone.points, axis=1)
     assert 0 < moved.mean() < 0.02  # it has agreed with the others
+    model = meshmatch.load_model("human")
+    system = node_system(model)
+    assert fit.regularity == system.regularity(fit.vectors) != alone.regularity == system.regularity(alone.vectors)
 
 
 def test_the_maps_are_close_to_those_of_a_pair(made: tuple[Path, tuple[Record, ...]]) -> None:

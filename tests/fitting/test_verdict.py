@@ -47,10 +47,11 @@ RISING = {
     "partial": [False, True],
     "hidden": np.linspace(0, 1, 30),
     "spread": np.geomspace(0.005, 0.3, 30),
+    "inverted": np.linspace(0, 0.2, 30),
 }
 
 
-APART = {"empty", "stretch", "against", "partial"}  # bound the verdict by themselves, or are reasons alone
+APART = {"empty", "stretch", "against", "partial", "inverted"}  # bound the verdict by themselves, or are reasons alone
 
 
 def test_all_signs_are_tried() -> None:
