@@ -1,4 +1,4 @@
-"""How honest verdicts are on people as nobody drew them for training: thousands of generated bodies in poses, clothes and cuts.
+"""How honest verdicts are on people as nobody drew them for training, in other poses, clothes and cuts, by the thousand.
 
 Every body is a function of the seed and its number alone: other people than the training's, in poses beyond its (squatting,
 cross-legged, curled up, handstands, folded forward, hugging the knees, arms crossed or behind the back, any joint anywhere),
@@ -57,7 +57,12 @@ _STYLES = (0.78, 0.12, 0.06, 0.04, 0.0)  # plain, child, free, stylised, built o
 # Angles of `Limbs` in the order of its fields, of both arms (elevation, azimuth, twist, elbow, pronation) and of both legs
 # (hip flexion, abduction, twist, knee, ankle), and of the spine (flexion, side, twist); degrees.
 _HANG, _AHEAD, _UP = (12, 10, 0, 8, 10), (85, 88, 0, 15, 10), (172, 40, -60, 8, 0)
-_CROSSED, _FACE, _BEHIND, _KNEES = (38, 82, 62, 98, 40), (58, 82, 20, 138, 10), (25, -50, 70, 85, 20), (50, 85, 10, 20, 60)
+_CROSSED, _FACE, _BEHIND, _KNEES = (
+    (38, 82, 62, 98, 40),
+    (58, 82, 20, 138, 10),
+    (25, -50, 70, 85, 20),
+    (50, 85, 10, 20, 60),
+)
 _HUG, _HIPS = (62, 88, 40, 70, 30), (48, -10, 55, 95, 20)
 _STRAIGHT = (2, 6, 2, 4, 0)
 POSES: dict[str, tuple[tuple[Sequence[float], ...], tuple[Sequence[float], ...], tuple[float, float, float]]] = {
@@ -74,7 +79,11 @@ POSES: dict[str, tuple[tuple[Sequence[float], ...], tuple[Sequence[float], ...],
     "arms crossed": ((_CROSSED,), (_STRAIGHT, (3, -10, 5, 5, 0)), (5, 0, 0)),
     "arms behind": ((_BEHIND, _HIPS), (_STRAIGHT, (-15, 5, 0, 20, 0)), (-10, 0, 0)),
     "bridge": ((_UP,), ((-30, 15, 0, 85, 10),), (-75, 0, 0)),
-    "splits": ((_UP, _HANG, (90, 0, 0, 5, 0)), ((95, 0, 0, 4, 30), (-55, 0, 0, 10, 30), (20, 80, 0, 4, 20)), (10, 0, 0)),
+    "splits": (
+        (_UP, _HANG, (90, 0, 0, 5, 0)),
+        ((95, 0, 0, 4, 30), (-55, 0, 0, 10, 30), (20, 80, 0, 4, 20)),
+        (10, 0, 0),
+    ),
     "twisted": ((_HIPS, _AHEAD, _HUG), (_STRAIGHT, (100, 10, 0, 95, 0)), (15, 25, 55)),
     "anywhere": ((_HANG,), (_STRAIGHT,), (0, 0, 0)),
 }
