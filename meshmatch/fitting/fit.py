@@ -30,6 +30,9 @@ ReasonCode = Literal[
     "torn",
     "crushed",
     "folded",
+    "pieces",
+    "uncut",
+    "bent",
     "facing",
     "unsure",
     "doubt",
@@ -38,9 +41,10 @@ ReasonCode = Literal[
     "unsupervised",
 ]
 """Template and shape stay apart; some of the shape is not reached; template lies where the shape has no surface;
-neighbours belong far apart; the template is stretched or compressed; it is folded, or inside out, in places; the shape
-faces the other way; the network predicts other points for tilted and mirrored copies of the shape; no sign alone, but all
-together; it was taken for a part; its mirror image fits as well; the model was learned without correspondence."""
+neighbours belong far apart; the template is stretched or compressed; it is folded, or inside out, in places; pieces of a
+part lie beside it; a part ends where the shape has no edge; a knee bends forward; the shape faces the other way; the network
+predicts other points for tilted and mirrored copies of the shape; no sign alone, but all together; it was taken for a part;
+its mirror image fits as well; the model was learned without correspondence."""
 
 
 class Reason(str):

@@ -43,6 +43,14 @@ _WEIGHTS, _OFFSET = (0.909, 3.628, 1.163, 2.653, 5.308, 2.133), 9.935
 # docs/results.md. Between so many parts of equal area and so many, set by hand, it grows to that.
 _BUILT, _FEW, _MANY = 0.033, 2.0, 8.0
 _AGAINST_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
+# Signs that tell by themselves, and how much each adds to the logit of a wrong fit. Set by hand, between what right and
+# wrong fits of `experiments.bench.campaign` have: knees that bend forward by so many degrees (16 at most where right, 34 to 73 of
+# bodies taken back to front), pieces of a part beside the template (2 and 4 % of its surface, 3 cm on average), and a border
+# of what a part shows that is not cut (21 and 73 %).
+_ALONE = 8.0
+_FORWARD, _ASTRAY, _UNCUT = 27.0, 0.03, 0.5
+_ASIDE = 0.022  # mean distance from the template (units of sqrt(area), 3 cm on a person) of a piece that is beside it
+_CUT = 0.12  # a border further from an edge of the shape than this (units of sqrt(area)) is not that of a cut
 
 
 @dataclass(frozen=True)
@@ -62,6 +70,10 @@ class Signs:
     against : share (0..1) of the shape that faces the other way than the template
     partial : whether the shape was taken for a part
     hidden : share (0..1) of the template that a part does not show
+    astray : share (0..1) of a part's surface in separate pieces that lie beside the template
+    uncut : share (0..1) of the border between what a part shows of the template and what it hides, by length, where the
+        shape has no edge
+    forward : degrees by which a knee bends forward, the one that does so most
     spread : how far the network's readings of tilted copies lie from the fit (units of sqrt(area)), see `Predictor.spread`
     inverted : share (0..1) of the template's vertices where the deformation folds, see `Regularity`
     """
@@ -75,6 +87,9 @@ class Signs:
     against: float = 0.0
     partial: bool = False
     hidden: float = 0.0
+    astray: float = 0.0
+    uncut: float = 0.0
+    forward: float = 0.0
     spread: float = USUAL_SPREAD
     inverted: float = 0.0
 
@@ -91,9 +106,14 @@ class Signs:
         )
 
     @property
+    def alone(self) -> tuple[bool, bool, bool]:
+        """Whether each sign speaks that tells by itself: ``astray``, ``uncut``, ``forward``."""
+        return self.astray > _ASTRAY, self.uncut > _UNCUT, self.forward > _FORWARD
+
+    @property
     def trust(self) -> float:
         """Probability (0..1) that the fit is right."""
-        return float(1 / (1 + np.exp(_OFFSET + np.dot(_WEIGHTS, self.values()))))
+        return float(1 / (1 + np.exp(_OFFSET + np.dot(_WEIGHTS, self.values()) + _ALONE * sum(self.alone))))
 
 
 def signs_of(
@@ -127,8 +147,9 @@ def signs_of(
         float(weighted_mean(against, local.weights)) if local.signed else _AGAINST_IF_UNSIGNED,
         partial,
         1 - area_share(system, shown) if partial else 0.0,
-        USUAL_SPREAD if spread_at is None or not shown.any() else spread_at(shown),
-        system.regularity(vectors).inverted,
+        astray_share(connected, gap, local.weights) if partial and connected is not None else 0.0,
+        spread=USUAL_SPREAD if spread_at is None or not shown.any() else spread_at(shown),
+        inverted=system.regularity(vectors).inverted,
     )
 
 
@@ -153,6 +174,31 @@ def shortened_to(system: NodeSystem, gradient: Float[Floats, "G 3 3"]) -> Float[
     least = np.sqrt(np.maximum(half - np.sqrt(np.maximum(half**2 - area**2, 0.0)), 0.0))
     near = cKDTree(system.verts[points]).query(system.verts)[1]
     return np.asarray(np.clip(least, _SHORTEST, 1.0)[near])
+
+
+def astray_share(
+    connected: Int[Ints, " P"], gap: Float[Floats, " P"], weights: Float[Floats, " P"] | None = None
+) -> float:
+    """Share (0..1) of samples on connected parts that lie beside the template as a whole, by the ``gap`` to it of each."""
+    weight = np.bincount(connected, weights)
+    mean = np.bincount(connected, gap if weights is None else weights * gap) / np.maximum(weight, 1e-300)
+    return float(weight[mean > _ASIDE].sum() / weight.sum())
+
+
+def uncut_share(
+    system: NodeSystem, local: OrientedPoints, vectors: Float[Floats, "K 3"], edges: Float[Floats, "N 3"]
+) -> float:
+    """Share (0..1) by length of the border of what samples show of the template that is far from all open ``edges`` of the
+    shape (their middles, core frame): there the template goes on, and nothing was cut off.
+    """
+    shown, faces = visible_vertices(system, local, vectors), system.faces
+    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    border = np.unique(sides[shown[sides[:, 0]] != shown[sides[:, 1]]], axis=0)
+    if not len(border) or not len(edges):
+        return 0.0
+    length = np.linalg.norm(system.verts[border[:, 0]] - system.verts[border[:, 1]], axis=1)
+    middles = system.surface(vectors).points[border].mean(1)
+    return float(length[cKDTree(edges).query(middles)[0] > _CUT].sum() / length.sum())
 
 
 def unexplained(residual: float, allowance: float) -> float:

@@ -8,8 +8,17 @@ import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.fitting.fit import Fit, Reason, ReasonCode, Verdict
+from meshmatch.fitting.joints import knees_forward
 from meshmatch.fitting.network_fit import reads_alike
-from meshmatch.fitting.signs import Signs, built_allowance, cloud_allowance, connected_parts, signs_of, unexplained
+from meshmatch.fitting.signs import (
+    Signs,
+    built_allowance,
+    cloud_allowance,
+    connected_parts,
+    signs_of,
+    uncut_share,
+    unexplained,
+)
 from meshmatch.fitting.system import NodeSystem
 from meshmatch.fitting.task import Registration, without_inside
 
@@ -60,6 +69,10 @@ def judge_registration(found: Registration, partial: bool) -> Judgement:
     connected = connected_parts(task.shape, found.local)
     known = residual, parts, partial, spread_at if told else None, connected
     signs = signs_of(task.system, vectors, found.local, *known)
+    signs = replace(signs, forward=knees_forward(task.system, vectors, task.model.template))
+    if partial and not task.shape.is_cloud:
+        edges = found.core_frame.apply(task.shape.verts[task.shape.edges.open].mean(1))
+        signs = replace(signs, uncut=uncut_share(task.system, found.local, vectors, edges))
     return judge(signs) if task.shape.is_cloud else judge_excused(signs, found.candidate.residual)
 
 
@@ -106,6 +119,9 @@ def _reasons(signs: Signs) -> list[Reason]:
     crushed = f"the template had to be stretched or compressed {np.exp(signs.stretch):.1f}-fold on average"
     facing = f"{100 * signs.against:.0f} % of the shape faces the other way than the template"
     unsure = f"what the network predicts for tilted and mirrored copies is {100 * signs.spread:.0f} % of sqrt(area) off"
+    pieces = f"{100 * signs.astray:.0f} % of the shape are separate pieces that lie beside the template"
+    uncut = f"{100 * signs.uncut:.0f} % of the border of what the part shows is no edge of the shape"
+    astray, open_border, forward = signs.alone
     told: list[tuple[bool, ReasonCode, str]] = [
         (signs.residual > 0.0285, "residual", _gap(signs.residual)),
         (signs.missed > _GOOD_SHARE, "unreached", unreached),
@@ -113,6 +129,9 @@ def _reasons(signs: Signs) -> list[Reason]:
         (signs.torn > 0.02, "torn", f"{100 * signs.torn:.0f} % of neighbours on the shape belong far apart"),
         (signs.stretch > _CRUSHED, "crushed", crushed),
         (signs.inverted > _FOLDED, "folded", _folds(signs.inverted)),
+        (astray, "pieces", pieces),
+        (open_border, "uncut", uncut),
+        (forward, "bent", f"a knee bends forward by {signs.forward:.0f} degrees, as if front and back were exchanged"),
         (signs.against > 0.1, "facing", facing),
         (signs.spread > 0.06, "unsure", unsure),
     ]

@@ -13,12 +13,15 @@ from meshmatch.arrays import Floats, Ints
 from meshmatch.fitting.fit import Reason
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import Fitter, doubted
+from meshmatch.fitting.joints import knees_forward, nearest_rotation
 from meshmatch.fitting.signs import (
     Signs,
+    astray_share,
     built_allowance,
     connected_parts,
     shortened_to,
     signs_of,
+    uncut_share,
     unevenness,
     unexplained,
 )
@@ -46,17 +49,21 @@ RISING = {
     "against": np.linspace(0, 1, 30),
     "partial": [False, True],
     "hidden": np.linspace(0, 1, 30),
+    "astray": np.linspace(0, 1, 30),
+    "uncut": np.linspace(0, 1, 30),
+    "forward": np.linspace(0, 90, 30),
     "spread": np.geomspace(0.005, 0.3, 30),
     "inverted": np.linspace(0, 0.2, 30),
 }
 
 
 APART = {"empty", "stretch", "against", "partial", "inverted"}  # bound the verdict by themselves, or are reasons alone
+ALONE = {"astray", "uncut", "forward"}  # tell by themselves
 
 
 def test_all_signs_are_tried() -> None:
     assert list(RISING) == [each.name for each in fields(Signs)]
-    assert len(SOUND.values()) == len(RISING) - len(APART)
+    assert len(SOUND.values()) == len(RISING) - len(APART | ALONE)
 
 
 @pytest.mark.parametrize("sign", RISING)
@@ -71,6 +78,19 @@ def test_trust_falls_as_a_sign_rises_and_verdicts_never_improve(sign: str) -> No
     for each in judged:
         assert bool(each.reasons) == (each.verdict != "good")
         assert each.trust == each.signs.trust
+
+
+@pytest.mark.parametrize(("sign", "code"), [("astray", "pieces"), ("uncut", "uncut"), ("forward", "bent")])
+def test_some_signs_tell_by_themselves(sign: str, code: str) -> None:
+    """A fit that is fair otherwise is poor, and says by which sign; below its limit a sign does not count."""
+    fair = replace(SOUND, residual=0.03, partial=True)
+    assert fair.trust > 0.9 and judge(fair).verdict == "fair"
+    limits = {"astray": 0.03, "uncut": 0.5, "forward": 27.0}
+    below, above = (replace(fair, **{sign: factor * limits[sign]}) for factor in (0.99, 1.01))
+    assert below.trust == fair.trust and judge(below).verdict == "fair"
+    assert above.trust < 0.3 and judge(above).verdict == "poor"
+    told = {reason.code for reason in judge(above).reasons}
+    assert code in told and code not in {reason.code for reason in judge(below).reasons}
 
 
 def test_where_verdicts_change() -> None:
@@ -300,3 +320,49 @@ def test_a_registration_is_judged_by_the_parts_of_its_shape(monkeypatch: pytest.
     assert 0 < len(strict[0]) < len(pairs[0])
     shortened = shortened_to(system, system.deformation_gradient(vectors))
     assert fit.signs.torn == torn_share(system, strict, local, vectors, shortened)
+
+
+@pytest.mark.parametrize("bend", [-120.0, -30.0, 0.0, 20.0, 60.0])
+def test_a_knee_bends_forward_by_so_many_degrees(bend: float) -> None:
+    """The lower half of an egg that is called a shin swings about the egg's middle; the upper half is called a thigh."""
+    template = egg_model().template
+    upper = template.shape.verts[:, 1] > 0
+    names = ("left thigh", "left shin", "right thigh", "right shin")
+    legs = replace(template, labels=np.where(upper, 0, 1), label_names=names)
+    angle, nodes = np.radians(bend), template.nodes
+    swing = np.array([[1, 0, 0], [0, np.cos(angle), np.sin(angle)], [0, -np.sin(angle), np.cos(angle)]])  # front is +z
+    low = nodes[:, 1] < -0.15 * np.ptp(nodes[:, 1])
+    low_points = system().verts[system().strain_points][:, 1]
+    vectors = np.where(low[:, None], nodes @ swing.T - nodes, 0.0)
+    found = knees_forward(system(), vectors, legs)
+    assert (low_points < 0).any()
+    assert found == 0 if bend <= 0 else 0.4 * bend < found < 1.1 * bend
+    assert knees_forward(system(), vectors, template) == 0  # an egg has no knees
+
+
+def test_the_nearest_rotation_is_a_rotation_and_its_own_nearest() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        rotation = nearest_rotation(rng.normal(size=(3, 3)))
+        assert rotation @ rotation.T == pytest.approx(np.eye(3)) and np.linalg.det(rotation) == pytest.approx(1)
+        assert nearest_rotation(rotation * 1.3) == pytest.approx(rotation)
+
+
+def test_pieces_beside_the_template_are_astray() -> None:
+    part, gap = np.repeat([0, 1, 2], [70, 20, 10]), np.repeat([0.008, 0.03, 0.015], [70, 20, 10])
+    assert astray_share(part, gap) == pytest.approx(0.2)
+    weights = np.where(part == 1, 2.0, 1.0)
+    assert astray_share(part, gap, weights) == pytest.approx(40 / 120)
+    assert astray_share(part, 0.5 * gap) == 0
+
+
+def test_the_border_of_a_part_is_where_it_is_cut() -> None:
+    """Half an egg whose edge is known, is elsewhere, or is known on one side alone."""
+    still, scan = np.zeros((system().K, 3)), scan_of(egg_model().template.shape, 2000)
+    half, turn = scan.rows(scan.points[:, 1] > 0), np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    radius = np.linalg.norm(half.points[half.points[:, 1] < 0.05][:, [0, 2]], axis=1).mean()
+    ring = radius * np.stack([np.cos(turn), 0 * turn, np.sin(turn)], 1)
+    assert uncut_share(system(), half, still, ring) == 0
+    assert uncut_share(system(), half, still, ring + np.array([0, 0.5, 0])) > 0.9
+    assert 0.2 < uncut_share(system(), half, still, ring[:100]) < 0.5
+    assert uncut_share(system(), half, still, ring[:0]) == 0  # a cloud, or a closed mesh, says nothing

@@ -1,0 +1,275 @@
+"""How honest verdicts are on people as nobody drew them for training, in other poses, clothes and cuts, by the thousand.
+
+Every body is a function of the seed and its number alone: other people than the training's, in poses beyond its (squatting,
+cross-legged, curled up, handstands, folded forward, hugging the knees, arms crossed or behind the back, any joint anywhere),
+naked, clothed, in skirts, or of other proportions, in other triangles, now and then noisy, with holes, without a limb, or
+only a half. The human model is fitted to each as `match` does it. The error is the mean distance between the fitted
+template's vertices and where they belong, over those that the shape shows, in centimetres of a person of 1.9 m2.
+
+Each body is a line of ``bodies.jsonl``, and its fit a file beside it: a run that was stopped goes on with what is missing.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from typer import Option
+
+from meshmatch.api.matching import Matcher
+from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
+from meshmatch.collections.fit_files import save_fit
+from meshmatch.errors import MeshmatchError
+from meshmatch.experiments import runner
+from meshmatch.experiments.bench.verdict_shapes import LIMBS, direction, faces_kept
+from meshmatch.experiments.bench.verdicts import REFUSED, VERDICTS
+from meshmatch.fitting.fit import Fit
+from meshmatch.fitting.fit_config import FitConfig
+from meshmatch.generators.bodies import draw_identities, pose_limbs, template_rig
+from meshmatch.generators.clothes import dressed, skirted
+from meshmatch.generators.figure import Figure
+from meshmatch.generators.limbs import Draw, Limbs
+from meshmatch.generators.proportions import TOON, draw_style, rounded, stretched
+from meshmatch.generators.rig import forward_kinematics, penetration, skin
+from meshmatch.generators.rotations import DEGREE, rotation_from_vector
+from meshmatch.maps.evaluate import CM_PER_UNIT
+from meshmatch.outputs import make_folder
+from meshmatch.shapes.decimate import decimate
+from meshmatch.shapes.shape import Shape
+from meshmatch.templates.template import Template, read_template
+
+BANDS = (5.0, 8.0, 15.0, 30.0)
+_LOST_CM = 15.0
+_PEOPLE, _OTHER_PEOPLE = 64, 5300
+_TRIES = 6  # of which the pose is taken in which the body runs into itself least
+_STYLES = (0.78, 0.12, 0.06, 0.04, 0.0)  # plain, child, free, stylised, built of parts
+# Angles of `Limbs` in the order of its fields, of both arms (elevation, azimuth, twist, elbow, pronation) and of both legs
+# (hip flexion, abduction, twist, knee, ankle), and of the spine (flexion, side, twist); degrees.
+_HANG, _AHEAD, _UP = (12, 10, 0, 8, 10), (85, 88, 0, 15, 10), (172, 40, -60, 8, 0)
+_CROSSED, _FACE, _BEHIND, _KNEES = (
+    (38, 82, 62, 98, 40),
+    (58, 82, 20, 138, 10),
+    (25, -50, 70, 85, 20),
+    (50, 85, 10, 20, 60),
+)
+_HUG, _HIPS = (62, 88, 40, 70, 30), (48, -10, 55, 95, 20)
+_STRAIGHT = (2, 6, 2, 4, 0)
+POSES: dict[str, tuple[tuple[Sequence[float], ...], tuple[Sequence[float], ...], tuple[float, float, float]]] = {
+    "squat": ((_AHEAD, _HANG, _KNEES, _FACE), ((125, 18, 5, 145, -25), (120, 35, 20, 140, -20)), (30, 0, 0)),
+    "kneel": ((_HANG, _UP, _CROSSED, _BEHIND), ((5, 10, 5, 100, 40), (90, 12, 5, 150, 45)), (5, 0, 0)),
+    "cross-legged": ((_KNEES, _HANG, _FACE, _CROSSED), ((85, 45, 50, 120, 0), (95, 35, 60, 135, 10)), (20, 0, 0)),
+    "sit": ((_KNEES, _CROSSED, _HANG), ((90, 4, 0, 90, 0), (88, -12, 0, 70, 0), (95, 8, 0, 10, 0)), (10, 0, 0)),
+    "curled up": ((_HUG, _CROSSED, _FACE), ((132, 5, 0, 140, 20), (120, 0, 0, 125, 10)), (50, 0, 0)),
+    "lie": ((_HANG, _UP, _BEHIND), (_STRAIGHT, (0, 2, 0, 2, 35)), (0, 0, 0)),
+    "hands on knees": ((_KNEES,), ((55, 12, 5, 35, -10),), (40, 0, 0)),
+    "hands on face": ((_FACE,), (_STRAIGHT, (60, 5, 0, 90, 0)), (15, 0, 0)),
+    "handstand": ((_UP,), (_STRAIGHT, (35, 50, 10, 70, 30), (-20, 10, 0, 60, 30)), (-15, 0, 0)),
+    "folded forward": ((_AHEAD, (130, 85, 0, 5, 0), _HUG), ((115, 5, 0, 5, 0), (100, 25, 0, 3, 0)), (65, 0, 0)),
+    "arms crossed": ((_CROSSED,), (_STRAIGHT, (3, -10, 5, 5, 0)), (5, 0, 0)),
+    "arms behind": ((_BEHIND, _HIPS), (_STRAIGHT, (-15, 5, 0, 20, 0)), (-10, 0, 0)),
+    "bridge": ((_UP,), ((-30, 15, 0, 85, 10),), (-75, 0, 0)),
+    "splits": (
+        (_UP, _HANG, (90, 0, 0, 5, 0)),
+        ((95, 0, 0, 4, 30), (-55, 0, 0, 10, 30), (20, 80, 0, 4, 20)),
+        (10, 0, 0),
+    ),
+    "twisted": ((_HIPS, _AHEAD, _HUG), (_STRAIGHT, (100, 10, 0, 95, 0)), (15, 25, 55)),
+    "anywhere": ((_HANG,), (_STRAIGHT,), (0, 0, 0)),
+}
+_LOW, _HIGH = (0, -70, -120, 0, -90, -45, -25, -40, 0, -40, -0.3), (178, 135, 90, 150, 95, 140, 85, 60, 155, 45, 1.0)
+_OWN_LEGS = ("splits", "anywhere", "kneel", "handstand", "cross-legged")  # left and right may differ
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A generated shape, and where the template's vertices belong on it (``places``), of which it ``has`` some."""
+
+    shape: Shape
+    places: Float[Floats, "T 3"]
+    has: Bool[Bools, " T"]
+    words: dict[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class People:
+    """Draws bodies of one seed."""
+
+    template: Template
+    seed: int
+
+    @cached_property
+    def figure(self) -> Figure:
+        return Figure.of(template_rig(self.template, _PEOPLE, _OTHER_PEOPLE + self.seed))
+
+    def draw(self, number: int) -> Body:
+        """A body, turned anywhere, in any unit."""
+        rng = np.random.default_rng([self.seed, number])
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        pose = list(POSES)[int(rng.integers(len(POSES)))]
+        verts, worn = self._posed(pose, rng, generator)
+        whole, tris = Shape(verts, np.asarray(self.template.shape.faces)), "template's"
+        shape = whole
+        if rng.random() < 0.5:
+            tris, fine = "others", trimesh.Trimesh(verts, whole.faces, process=False).subdivide()
+            shape = decimate(Shape(fine.vertices, fine.faces), int(rng.integers(4_000, 16_000)))
+        cut, kept = self._cut(verts, rng)
+        near = cKDTree(verts).query(shape.verts)[1]
+        shape, near = faces_kept(shape, near, np.asarray(kept(shape.verts, near)[shape.faces].all(1)))
+        noise = rng.uniform(0.002, 0.012) if rng.random() < 0.15 else 0.0
+        off = noise * rng.standard_normal(shape.verts.shape)
+        turn, unit = Rotation.random(random_state=rng).as_matrix(), 10.0 ** rng.uniform(-1, 3)
+        moved = Shape(unit * (shape.verts + off) @ turn.T, shape.faces, f"body {self.seed}-{number}")
+        words = {"pose": pose, "worn": worn, "cut": cut, "triangles": tris, "noise": f"{1000 * noise:.0f} mm"}
+        return Body(moved, unit * verts @ turn.T, kept(verts, np.arange(len(verts))), words)
+
+    def _posed(self, pose: str, rng: np.random.Generator, generator: torch.Generator) -> tuple[Floats, str]:
+        """Vertices in metres, and what is worn or odd about them."""
+        figure, rig = self.figure, self.figure.rig
+        rest, heads = draw_identities(rig, 1, generator)
+        style = draw_style(1, generator, _STYLES)
+        worn = str(rng.choice(["naked", "clothed", "skirt"], p=[0.4, 0.4, 0.2]))
+        kind = ("", "child, ", "stretched, ", "stylised, ")[int(style.kind)]
+        if kind:
+            rest, heads = stretched(figure, rest, heads, style)
+        if int(style.kind) >= TOON:
+            rest = rounded(figure, rest, heads, style.kind, generator)
+        if worn != "naked":
+            rest = dressed(figure, rest, heads, generator)
+        many = heads.repeat(_TRIES, 1, 1)
+        world, offset = forward_kinematics(rig, many, self._angles(pose, many, rng, generator))
+        best = int(penetration(rig, many, world, offset).argmin())
+        world, offset = world[best : best + 1], offset[best : best + 1]
+        verts = skin(rig, rest, world, offset)
+        if worn == "skirt":
+            joints = (world @ heads[..., None])[..., 0] + offset
+            verts = skirted(figure, verts, heads, joints, generator)
+        return verts[0].double().numpy(), kind + worn
+
+    def _angles(
+        self, pose: str, heads: torch.Tensor, rng: np.random.Generator, generator: torch.Generator
+    ) -> torch.Tensor:
+        """Rotations of all joints, one for each of the tries."""
+        B, rig, draw = len(heads), self.figure.rig, Draw(len(heads), generator)
+        arms, legs, spine = POSES[pose]
+        same_arms, same_legs = rng.random() < 0.7, pose not in _OWN_LEGS or rng.random() < 0.5
+        picks = [(arms[rng.integers(len(arms))], legs[rng.integers(len(legs))]) for _ in range(2)]
+        sides = []
+        for side in (0, 1):
+            arm, leg = picks[0 if same_arms else side][0], picks[0 if same_legs else side][1]
+            middle = np.array([*arm, *leg, rng.choice([-0.2, 0.1, 0.8])], float)
+            deviation = np.r_[np.full(10, 7.0), 0.08]
+            columns = [draw.normal(a, d) for a, d in zip(middle, deviation, strict=True)]
+            if pose == "anywhere":
+                columns = [draw.uniform(a, b) for a, b in zip(_LOW, _HIGH, strict=True)]
+            names = [field.name for field in fields(Limbs)]
+            sides.append(Limbs(**dict(zip(names, columns, strict=True))))
+        vectors = torch.zeros(B, heads.shape[1], 3)
+        matrices = pose_limbs(vectors, rig, heads, sides[0], sides[1], draw)
+        bend = torch.stack([draw.normal(angle, 10) for angle in spine], -1)[:, [0, 2, 1]] * DEGREE
+        for name, share in (("spine05", 0.15), ("spine04", 0.25), ("spine03", 0.2), ("spine02", 0.2), ("spine01", 0.2)):
+            vectors[:, rig.joint(name)] = share * bend
+        nod = torch.stack([draw.normal(0.3 * spine[0], 18), draw.normal(0, 28), draw.normal(0, 14)], -1) * DEGREE
+        for name in ("neck01", "neck02", "neck03", "head"):
+            vectors[:, rig.joint(name)] = 0.25 * nod
+        rotations = rotation_from_vector(vectors)
+        for index, rotation in matrices.items():
+            rotations[:, index] = rotation
+        return rotations
+
+    def _cut(self, verts: Floats, rng: np.random.Generator) -> tuple[str, Callable[[Floats, Ints], Bools]]:
+        """What is cut off, and which points are kept, by their places and the template's vertices that they are at."""
+        which = str(rng.choice(["none", "half", "limb off", "limb alone", "holes"], p=[0.85, 0.05, 0.02, 0.01, 0.07]))
+        names, labels = self.template.label_names, np.asarray(self.template.labels)
+        if which == "half":
+            name = str(rng.choice(["lower", "upper", "left", "right", "front", "back", "oblique"]))
+            axis = {"lower": [0, -1, 0], "upper": [0, 1, 0], "left": [1, 0, 0], "right": [-1, 0, 0], "front": [0, 0, 1]}
+            along = np.asarray(axis.get(name, [0, 0, -1]) if name != "oblique" else direction(rng), float)
+            at = np.quantile(verts @ along, rng.uniform(0.35, 0.65))
+            return f"{name} half", lambda points, _: points @ along >= at
+        if which.startswith("limb"):
+            asked = [names.index(name) for name in LIMBS[int(rng.integers(8))]]
+            alone = which == "limb alone"
+            return which, lambda _, near: np.isin(labels[near], asked) == alone
+        middles = verts[rng.integers(len(verts), size=int(rng.integers(1, 8)) if which == "holes" else 0)]
+        sizes = rng.uniform(0.04, 0.18, len(middles))
+        return which, lambda points, _: (np.linalg.norm(points[:, None] - middles, axis=2) > sizes).all(1)
+
+
+def measured(body: Body, fit: Fit, template: Template) -> dict[str, Any]:
+    """The errors of a fit, and what is said of it."""
+    unit = CM_PER_UNIT / np.sqrt(Shape(body.places, template.shape.faces).area)
+    cm = unit * np.linalg.norm(fit.points_in_file - body.places, axis=1)
+    opposite = cKDTree(template.shape.verts).query(template.shape.verts * [-1, 1, 1])[1]
+    exchanged = unit * np.linalg.norm(fit.points_in_file[opposite] - body.places, axis=1)
+    labels = np.asarray(template.labels)[body.has]
+    parts = {template.label_names[k]: round(float(cm[body.has][labels == k].mean()), 1) for k in np.unique(labels)}
+    assert fit.signs is not None
+    row: dict[str, Any] = {"error": float(cm[body.has].mean()), "lost": float((cm[body.has] > _LOST_CM).mean())}
+    row |= {"exchanged": float(exchanged[body.has].mean()), "parts": parts, "shown": float(body.has.mean())}
+    row |= {"verdict": fit.verdict, "trust": fit.trust, "reasons": [reason.code for reason in fit.reasons]}
+    return row | {"partial": fit.partial, "residual": fit.residual, "signs": asdict(fit.signs)}
+
+
+def band_of(error: float) -> str:
+    """Between which limits an error lies."""
+    low = max((limit for limit in BANDS if error >= limit), default=0.0)
+    return f"over {low:g} cm" if low == BANDS[-1] else f"{low:g} to {BANDS[BANDS.index(low) + 1 if low else 0]:g} cm"
+
+
+def counted(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for every band of error: how many fits of each verdict."""
+    found = []
+    for name in [band_of(limit) for limit in (0.0, *BANDS)]:
+        some = [row["verdict"] for row in rows if row["verdict"] != REFUSED and band_of(row["error"]) == name]
+        found.append({"error": name, **{verdict: some.count(verdict) for verdict in VERDICTS}, "all": len(some)})
+    return found
+
+
+@runner.command
+def main(
+    bodies: Annotated[int, Option(min=1, help="how many")] = 5000,
+    output: Annotated[Path, Option(help="folder of what was measured")] = Path("campaign"),
+    threads: runner.Threads = 1,
+    seed: runner.Seed = 1,
+    seeds: Annotated[int, Option(min=1, help="the bodies are, by turns, of so many seeds from that one on")] = 2,
+) -> runner.Report:
+    make_folder(output / "fits")
+    path, template, matcher = output / "bodies.jsonl", read_template("human-T"), Matcher("human", FitConfig(), threads)
+    rows = [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.exists() else []
+    known = {(row["seed"], row["number"]) for row in rows}
+    drawn = [People(template, seed + k) for k in range(seeds)]
+    for k in runner.track(range(bodies), "bodies"):
+        people, number = drawn[k % seeds], k // seeds
+        if (people.seed, number) in known:
+            continue
+        body, began = people.draw(number), time.process_time()
+        row: dict[str, Any] = {"seed": people.seed, "number": number, **body.words, "V": body.shape.V}
+        try:
+            fit = matcher.fit(body.shape)
+            row |= measured(body, fit, template)
+            save_fit(output / "fits" / f"{people.seed}-{number}.safetensors", fit)
+        except MeshmatchError as error:
+            row |= {"verdict": REFUSED, "reasons": [error.message]}
+        row["seconds"] = time.process_time() - began
+        rows.append(row)
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(runner.plain(row)) + "\n")
+    found, refused = counted(rows), sum(row["verdict"] == REFUSED for row in rows)
+    columns = {"error": "error"} | {name: f"{name}:d" for name in (*VERDICTS, "all")}
+    tables = [runner.table(f"{len(rows)} bodies, of which {refused} refused", found, columns)]
+    return runner.Report({"bodies": len(rows), "refused": refused, "bands": found}, tables)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
