@@ -43,10 +43,10 @@ _WEIGHTS, _OFFSET = (0.909, 3.628, 1.163, 2.653, 5.308, 2.133), 9.935
 # docs/results.md. Between so many parts of equal area and so many, set by hand, it grows to that.
 _BUILT, _FEW, _MANY = 0.033, 2.0, 8.0
 _AGAINST_IF_UNSIGNED = 0.015  # normals of a cloud have no side: taken for a usual share
-# Signs that tell by themselves, and how much each adds to the logit of a wrong fit. Set by hand, between what right
-# and wrong fits of `experiments.bench.campaign` have: knees that bend forward by so many degrees (16 at most where
-# right, 34 to 73 of bodies taken back to front), pieces of a part beside the template (2 and 4 % of its surface, 3 cm
-# on average), and a border of what a part shows that is not cut (21 and 73 %).
+# Signs that tell by themselves, and how much each adds to the logit of a wrong fit. Set by hand, between what right and
+# wrong fits of `experiments.bench.campaign` have: knees that bend forward by so many degrees (16 at most where right, 31
+# to 74 of bodies taken back to front), pieces of a part beside the template (2 and 4 % of its surface), and a border of
+# what a part shows that is not cut (7 % where right and fair, 57 to 91 % of limbs taken for more).
 _ALONE = 8.0
 _FORWARD, _ASTRAY, _UNCUT = 27.0, 0.03, 0.5
 _ASIDE = 0.022  # mean distance from the template (units of sqrt(area), 3 cm on a person) of a piece that is beside it
