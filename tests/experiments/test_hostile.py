@@ -31,6 +31,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> list[Sample]:
     return make_samples(tmp_path_factory.mktemp("samples") / "all")
 
 
+@pytest.mark.filterwarnings("ignore::meshmatch.errors.MeshmatchWarning")
 def test_samples_are_read_undamaged(samples: list[Sample]) -> None:
     shape = hostile_inputs.small_shape()
     refused = []
@@ -117,7 +118,7 @@ def test_it_goes_on_where_it_was_stopped(
     monkeypatch.setattr(hostile, "make_samples", lambda folder: [Sample("maps", folder, ("a",))])
     monkeypatch.setattr(hostile_inputs, "run_batch", lambda samples, seed, numbers, keep: seen.append(numbers) or [])
     clock = iter(np.arange(0.0, 100.0))
-    monkeypatch.setattr("meshmatch.experiments.hostile.time", type("Clock", (), {"monotonic": lambda: next(clock)}))
+    monkeypatch.setattr(hostile, "time", type("Clock", (), {"monotonic": lambda: next(clock)}))
     for _ in range(2):
         assert hostile.main(["--minutes", "0.03", "--killing", "0", "--output", str(tmp_path)]) == 0
     assert [numbers.start for numbers in seen] == [k * hostile_inputs.BATCH for k in range(len(seen))]

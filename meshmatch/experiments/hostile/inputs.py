@@ -10,11 +10,12 @@ import signal
 import sys
 import tempfile
 import traceback
+import unicodedata
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import IO
 
@@ -37,6 +38,10 @@ _SIGNED = (
     "implicit models",
     "templates",
 )  # with hashes that whoever damages a file on purpose would write too
+_NAMES: tuple[Callable[[str], str], ...] = (
+    *(str.swapcase, str.upper, lambda name: name.replace(" ", "%20"), lambda name: f"textures\\{name}"),
+    *(partial(unicodedata.normalize, form) for form in ("NFC", "NFD")),
+)  # what a file beside another may be called on its way through other systems
 _PATIENCE = 15.0  # seconds beyond, for a library that hears no signal
 _ROOM = 1 << 30
 
@@ -70,6 +75,10 @@ def make_input(samples: Sequence[Sample], seed: int, number: int, folder: Path) 
     (folder / chosen).write_bytes(damaged(data, (other.folder / other.files[0]).read_bytes(), rng))
     if family in _SIGNED and rng.random() < 0.5:
         sign(folder)
+    if family == "shapes" and len(sample.files) > 1 and rng.random() < 0.3:
+        other_name = str(rng.choice(sample.files[1:]))
+        rename = _NAMES[int(rng.integers(len(_NAMES)))]
+        os.replace(folder / other_name, folder / rename(other_name))
     return sample, folder / sample.files[0]
 
 

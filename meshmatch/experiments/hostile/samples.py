@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -74,11 +75,14 @@ def make_samples(folder: Path) -> list[Sample]:
         add("shapes", f"a{suffix}", lambda path: save_shape(path, shape))
     for suffix in (".xyz", ".npy", ".ply"):
         add("shapes", f"a{suffix}", lambda path: save_shape(path, cloud))
-    for name, data in _plys().items():
-        add("shapes", f"{name}.ply", Path.write_bytes, data)
+    for name, data in _texts().items():
+        add("shapes", name, Path.write_bytes, data)
     add("shapes", "a.pcd", lambda path: path.write_bytes(_pcd()))
     add("shapes", "skin.gltf", lambda path: path.write_text(json.dumps(_skinned())))
     add("shapes", "apart.gltf", _write_apart)
+    add("shapes", "scan.obj", _write_scan)
+    for wedges in (False, True):
+        add("shapes", "scan.ply", _write_textured_ply, wedges)
     paint = np.random.default_rng(0).integers(0, 256, (16, 16, 4)).astype(np.uint8)
     uv = np.random.default_rng(1).random((shape.F, 3, 2))
     for suffix in (".obj", ".glb"):
@@ -92,6 +96,12 @@ def make_samples(folder: Path) -> list[Sample]:
     for suffix in (".npy", ".csv"):
         add("tables", f"v{suffix}", lambda path: save_values(path, values, shape))
     add("tables", "c.csv", lambda path: save_colors(path, shape, colors))
+    add(
+        "tables",
+        "v.csv",
+        Path.write_text,
+        "vertex;a\n" + "".join(f"{k};{k / 7:.3f}\n".replace(".", ",") for k in range(shape.V)),
+    )
     add("lists", "p.txt", lambda path: path.write_text("# pairs\n" + "".join(f"{k} {k + 1}\n" for k in range(40))))
     add("lists", "p.npy", lambda path: np.save(path, np.arange(60).reshape(-1, 2)))
     add("known points", "k.npy", lambda path: np.save(path, shape.verts[:9]))
@@ -108,12 +118,23 @@ def make_samples(folder: Path) -> list[Sample]:
         labels = Labels(np.arange(shape.V) % 3, names, "vertices")
         for suffix in LABEL_SUFFIXES:
             add("labels", f"l{suffix}", save_labels, labels, shape)
+    add("labels", "l.csv", Path.write_text, "vertex;label\n" + "".join(f"{k};{k % 3}\n" for k in range(shape.V)))
+    add("labels", "l.txt", Path.write_text, "".join(f"{k % 3:.3e}\n" for k in range(shape.V)))
     matrix = csr_array(np.random.default_rng(3).dirichlet(np.ones(4), shape.V))
     for suffix in (".npz", ".json"):
         add("weights", f"w{suffix}", lambda path: save_weights(path, SkinWeights(matrix, tuple("abcd"))))
-    for suffix in (".csv", ".json", ".pp"):
-        marks = at_vertices(shape, np.arange(5), ("nose", "knee", "l", "r", "x"))
-        add("landmarks", f"k{suffix}", save_landmarks, marks)
+    for name in ("k.csv", "k.json", "k.pp", "k.fcsv", "k.mrk.json"):
+        add("landmarks", name, save_landmarks, at_vertices(shape, np.arange(5), ("nose", "knee", "l", "r", "x")))
+    points = [" ".join(map(str, point)) for point in shape.verts[:4].tolist()]
+    add("landmarks", "k.pts", Path.write_text, "version: 1\nn_points: 4\n{\n" + "\n".join(points) + "\n}\n")
+    add("landmarks", "k.tps", Path.write_text, "LM3=4\n" + "\n".join(points) + "\nID=small\nSCALE=1\n")
+    add(
+        "landmarks",
+        "k.txt",
+        Path.write_text,
+        "".join(f"p{k}\t{point}\n".replace(" ", "\t") for k, point in enumerate(points)),
+    )
+    add("landmarks", "k.npy", lambda path: np.save(path, np.append(shape.verts[:3], [[np.nan] * 3], axis=0)))
     for suffix, kind in IMAGES.items():
         add("images", f"i.{suffix}", Path.write_bytes, _image(paint, kind))
     built_in = bundled_folder() / "models" / "human"
@@ -163,22 +184,65 @@ def _implicit() -> ImplicitCard:
     )  # fmt: skip
 
 
-def _plys() -> dict[str, bytes]:
-    """Text, big-endian, strips and polygons of several sizes: what our writer does not write."""
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+def _texts() -> dict[str, bytes]:
+    """What other programs write, and ours does not: text, big-endian, strips, polygons, colors and counts of many kinds."""
     places = np.random.default_rng(5).random((9, 3))
     rows = "".join(" ".join(f"{x:.4f}" for x in row) + "\n" for row in places)
-    head = "ply\nformat {} 1.0\ncomment made by hand\nelement vertex 9\n" + axes
+    head = "ply\nformat {} 1.0\ncomment made by hand\nelement vertex 9\n" + "".join(
+        f"property float {c}\n" for c in "xyz"
+    )
     faces = "element face 3\nproperty list uchar int vertex_indices\n"
+    strips = "element tristrips {}\nproperty list int int vertex_indices\nend_header\n"
+    painted = "property uchar diffuse_red\nproperty uchar diffuse_green\nproperty uchar diffuse_blue\n"
     mixed = "3 0 1 2\n4 2 3 4 5\n5 4 5 6 7 8\n"
-    strips = "element tristrips 1\nproperty list int int vertex_indices\n"
+    swapped = head.format("binary_big_endian") + faces + "end_header\n"
     big = b"".join(bytes([3]) + np.array([k, k + 1, k + 2], ">i4").tobytes() for k in range(3))
-    return {
-        "text": (head.format("ascii") + faces + "end_header\n" + rows + mixed).encode(),
-        "strips": (head.format("ascii") + strips + "end_header\n" + rows + "8 0 1 2 3 -1 4 5 6\n").encode(),
-        "big": (head.format("binary_big_endian") + faces + "end_header\n").encode()
-        + places.astype(">f4").tobytes() + big,
+    corner = "0 0 0\n2 0 0\n2 2 0\n1 0.5 0\n0 2 0\n"  # of a polygon that turns back
+    facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+    triangles = np.zeros(3, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    triangles["corners"] = places.reshape(3, 3, 3)
+    stl = b"COLOR=\xff\0\0\xff".ljust(80, b"\0")
+    found = {
+        "text.ply": head.format("ascii") + faces + "end_header\n" + rows + mixed,
+        "strips.ply": head.format("ascii") + strips.format(1) + rows + "8 0 1 2 3 -1 4 5 6\n",
+        "rows.ply": head.format("ascii") + strips.format(2) + rows + "4 0 1 2 3\n3 4 5 6\n",
+        "indexes.ply": (head.format("ascii") + painted + faces + "end_header\n").replace("vertex_indices", "VertexIndexes")
+        + rows.replace("\n", " 255 0 7\n") + mixed,
+        "text.stl": f"solid k\u00f6rper\n{facet}{facet}",
+        "concave.off": f"OFF\n5 1 0\n{corner}5 0 1 2 3 4 255 0 0\n",
+        "polypaint.obj": re.sub("(?m)^(?=.)", "v ", corner) + "#MRGB " + "ffff0000" * 5 + "\nf 1 2 3 4 5\n",
+        "comma.xyz": rows.replace(".", ","), "head.xyz": "//X Y Z R G B\n9\n" + rows.replace("\n", " 1 2 3\n"),
     }  # fmt: skip
+    return {name: text.encode("utf-16" if name == "head.xyz" else "utf-8") for name, text in found.items()} | {
+        "big.ply": swapped.encode() + places.astype(">f4").tobytes() + big,
+        "count.stl": stl + b"\0" * 4 + triangles.tobytes(),
+        "tail.stl": stl + np.array(3, "<u4").tobytes() + triangles.tobytes() + b"a tail of other data",
+    }  # fmt: skip
+
+
+def _write_scan(path: Path) -> None:
+    """As scanning programs write an obj: a path in a comment, opacity as Tr, names in another case."""
+    path.with_name("Scan.MTL").write_text(
+        "# C:\\scan\\\nnewmtl skin\nKd 1 1 1\nTr 1\nd 1.0\nmap_Kd .\\K\u00f6 rper.PNG\n"
+    )
+    path.with_name("k\u00f6 rper.png").write_bytes(_image(np.zeros((2, 2, 4), np.uint8), "PNG"))
+    path.write_text(
+        "\ufeff# D:\\\nmtllib scan.mtl\nv 0 0 0 \\\n 1 0 0\nv 2 0 0 1 0 0\nv 2 2 0 1 0 0\nv 1 0.5 0 1 0 0\nv 0 2 0 1 0 0\n"
+        "vt 0 0\nvt 1 1\nusemtl Skin\nf 1/1 2/2 3/2 4/1 5/1\n"
+    )
+
+
+def _write_textured_ply(path: Path, wedges: bool) -> None:
+    """A square with coordinates of corners or of vertices."""
+    path.with_name("a b.png").write_bytes(_image(np.zeros((2, 2, 4), np.uint8), "PNG"))
+    own = "" if wedges else "property float s\nproperty float t\n"
+    more = "property list uchar float texcoord\nproperty int texnumber\n" if wedges else ""
+    path.write_text(
+        f"ply\nformat ascii 1.0\ncomment TextureFile A%20b.png\nelement vertex 4\nproperty double x\nproperty double y\n"
+        f"property double z\n{own}element face 2\nproperty list uchar int vertex_indices\n{more}end_header\n"
+        + "".join(f"{x} {y} 0{'' if wedges else f' {x} {y}'}\n" for x in (0, 1) for y in (0, 1))
+        + "".join(f"3 {row}{' 6 0 0 1 0 0 1 0' if wedges else ''}\n" for row in ("0 2 1", "1 2 3"))
+    )
 
 
 def _write_poses(path: Path) -> None:
@@ -218,7 +282,7 @@ def _pcd() -> bytes:
 
 
 def _skinned() -> dict[str, Any]:
-    """A square with two joints, a texture, and a mesh that stands twice."""
+    """A square with two joints, a texture, and a mesh that stands far away, is instanced, and is hidden."""
     parts = [
         np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "<f4"), np.array([0, 1, 2, 1, 3, 2], "<u2"),
         np.array([[0, 1, 0, 0]] * 4, "<u2"), np.array([[0.75, 0.25, 0, 0]] * 4, "<f4"), np.ones((4, 3), "<f4"),
@@ -235,11 +299,14 @@ def _skinned() -> dict[str, Any]:
     texture = {"index": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2], "rotation": 1}}}
     attributes = {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3, "COLOR_0": 4, "TEXCOORD_0": 5}
     return {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 2, 3]}],
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 2, 3, 4]}],
         "nodes": [
             {"name": "hip", "children": [1], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}, {"name": "knee"},
-            {"name": "body", "mesh": 0, "skin": 0}, {"name": "stone", "mesh": 1, "translation": [5, 0, 0]},
+            {"name": "body", "mesh": 0, "skin": 0}, {"name": "stone", "mesh": 1, "translation": [5e5, 4e6, 1],
+                "extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}},
+            {"name": "ghost", "mesh": 1, "extensions": {"KHR_node_visibility": {"visible": False}}},
         ],
+        "extensionsRequired": ["EXT_mesh_gpu_instancing", "KHR_materials_unlit"],
         "meshes": [
             {"name": "skin", "primitives": [{"attributes": attributes, "indices": 1, "material": 0}]},
             {"primitives": [{"attributes": {"POSITION": 0}, "mode": 5}]},
