@@ -106,9 +106,9 @@ def build_field(points: ArrayLike, nodes: ArrayLike, radius: ArrayLike, kernel: 
     Points (P, 3), nodes (K, 3) and the nodes' support radius (of all, or (K,) of each) are in one unit and frame. The
     kernel is the model's: vectors learned with one mean something else with another.
 
-    `TemplateError` names the points that have fewer than four non-coplanar nodes in reach; where the absolute shape functions
-    sum to more than `AMPLIFIED`, that is a warning (`MeshmatchWarning`). `InputError` for positions or radii that are not
-    finite numbers of these shapes, `OptionError` for a kernel that is not known.
+    `TemplateError` names the points that have fewer than four non-coplanar nodes in reach; where the absolute shape
+    functions sum to more than `AMPLIFIED`, that is a warning (`MeshmatchWarning`). `InputError` for positions or radii that
+    are not finite numbers of these shapes, `OptionError` for a kernel that is not known.
     """
     if kernel not in KERNELS:
         raise OptionError(f"invalid kernel {kernel!r}", f"choose one of {', '.join(KERNELS)}")
