@@ -23,14 +23,12 @@ from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.checkpoint import save_weights as save_network
 from meshmatch.models.implicit_card import ImplicitCard, write_implicit_card
-from meshmatch.models.registry import load_model
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats import Textured
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import save_textured
 from meshmatch.templates.location import bundled_folder
-from meshmatch.templates.template import load_template
 from meshmatch.transfer.label_files import Labels, save_labels
 from meshmatch.transfer.landmarks import at_vertices, save_landmarks
 from meshmatch.transfer.vertex_files import SkinWeights, Values, save_colors, save_values, save_weights
@@ -77,7 +75,8 @@ def make_samples(folder: Path) -> list[Sample]:
         add("shapes", f"a{suffix}", lambda path: save_shape(path, cloud))
     for name, data in _texts().items():
         add("shapes", name, Path.write_bytes, data)
-    add("shapes", "a.pcd", lambda path: path.write_bytes(_pcd()))
+    head = b"FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 8\nHEIGHT 1\nPOINTS 8\nDATA binary\n"
+    add("shapes", "a.pcd", Path.write_bytes, head + np.random.default_rng(6).random((8, 4)).astype("<f4").tobytes())
     add("shapes", "skin.gltf", lambda path: path.write_text(json.dumps(_skinned())))
     add("shapes", "apart.gltf", _write_apart)
     add("shapes", "scan.obj", _write_scan)
@@ -96,12 +95,8 @@ def make_samples(folder: Path) -> list[Sample]:
     for suffix in (".npy", ".csv"):
         add("tables", f"v{suffix}", lambda path: save_values(path, values, shape))
     add("tables", "c.csv", lambda path: save_colors(path, shape, colors))
-    add(
-        "tables",
-        "v.csv",
-        Path.write_text,
-        "vertex;a\n" + "".join(f"{k};{k / 7:.3f}\n".replace(".", ",") for k in range(shape.V)),
-    )
+    commas = "".join(f"{k};{k / 7:.3f}\n".replace(".", ",") for k in range(shape.V))
+    add("tables", "v.csv", Path.write_text, "vertex;a\n" + commas)
     add("lists", "p.txt", lambda path: path.write_text("# pairs\n" + "".join(f"{k} {k + 1}\n" for k in range(40))))
     add("lists", "p.npy", lambda path: np.save(path, np.arange(60).reshape(-1, 2)))
     add("known points", "k.npy", lambda path: np.save(path, shape.verts[:9]))
@@ -111,8 +106,10 @@ def make_samples(folder: Path) -> list[Sample]:
         add("names", f"group{suffix}", Path.write_text, "egg0\negg1.ply\negg 2\n")
     for suffix in (".npz", ".json", ".csv"):
         add("poses", f"p{suffix}", _write_poses)
-    for known in ("distances", "normals"):
-        add("samples", "s.npz", _write_distances, known)
+    points = np.random.default_rng(10).standard_normal((200, 3))  # in and around a ball, or on it
+    length = np.linalg.norm(points, axis=1, keepdims=True)
+    add("samples", "s.npz", lambda path: np.savez(path, points=points, distances=length[:, 0] - 1))
+    add("samples", "s.npz", lambda path: np.savez(path, points=points / length, normals=points / length))
     for words in (False, True):
         names = ("arm", "leg", "head") if words else (3, 5, 9)
         labels = Labels(np.arange(shape.V) % 3, names, "vertices")
@@ -125,24 +122,20 @@ def make_samples(folder: Path) -> list[Sample]:
         add("weights", f"w{suffix}", lambda path: save_weights(path, SkinWeights(matrix, tuple("abcd"))))
     for name in ("k.csv", "k.json", "k.pp", "k.fcsv", "k.mrk.json"):
         add("landmarks", name, save_landmarks, at_vertices(shape, np.arange(5), ("nose", "knee", "l", "r", "x")))
-    points = [" ".join(map(str, point)) for point in shape.verts[:4].tolist()]
-    add("landmarks", "k.pts", Path.write_text, "version: 1\nn_points: 4\n{\n" + "\n".join(points) + "\n}\n")
-    add("landmarks", "k.tps", Path.write_text, "LM3=4\n" + "\n".join(points) + "\nID=small\nSCALE=1\n")
-    add(
-        "landmarks",
-        "k.txt",
-        Path.write_text,
-        "".join(f"p{k}\t{point}\n".replace(" ", "\t") for k, point in enumerate(points)),
-    )
+    lines = [" ".join(map(str, point)) for point in shape.verts[:4].tolist()]
+    add("landmarks", "k.pts", Path.write_text, "version: 1\nn_points: 4\n{\n" + "\n".join(lines) + "\n}\n")
+    add("landmarks", "k.tps", Path.write_text, "LM3=4\n" + "\n".join(lines) + "\nID=small\nSCALE=1\n")
+    add("landmarks", "k.txt", Path.write_text, "".join(f"p\t{point}\n".replace(" ", "\t") for point in lines))
     add("landmarks", "k.npy", lambda path: np.save(path, np.append(shape.verts[:3], [[np.nan] * 3], axis=0)))
     for suffix, kind in IMAGES.items():
         add("images", f"i.{suffix}", Path.write_bytes, _image(paint, kind))
     built_in = bundled_folder() / "models" / "human"
     add("cards", "card.json", lambda path: shutil.copyfile(built_in / "card.json", path))
     add("cards", "implicit.json", lambda path: write_implicit_card(_implicit(), path.parent))
+    state = {"a.weight": np.random.default_rng(4).random((4, 70)), "a.bias": np.zeros(4)}
     for storage in ("int8", "float16", "float32"):
-        add("safetensors", "w.safetensors", _save_network, storage)
-    add("templates", "t.safetensors", lambda path: _small_template(path, built_in / "template.safetensors"))
+        add("safetensors", "w.safetensors", lambda path, kind: save_network(state, path, storage=kind), storage)
+    add("templates", "t.safetensors", lambda path: shutil.copyfile(built_in / "template.safetensors", path))
     for family, place, name in learned_samples(folder / "learned"):
         held = sorted(str(path.relative_to(place)) for path in place.rglob("*") if path.is_file())
         found.append(Sample(family, place, (name, *(other for other in held if other != name))))
@@ -152,22 +145,9 @@ def make_samples(folder: Path) -> list[Sample]:
 def write_small_model(folder: Path) -> None:
     """A copy of a model that ships."""
     built_in = bundled_folder() / "models" / "hand"
-    folder.mkdir(parents=True)
-    for name in ("template.safetensors", "weights.safetensors"):
-        shutil.copyfile(built_in / name, folder / name)
-    card = json.loads((built_in / "card.json").read_text(encoding="utf-8")) | {"name": folder.name}
+    shutil.copytree(built_in, folder)
+    card = json.loads((built_in / "card.json").read_bytes()) | {"name": folder.name}
     (folder / "card.json").write_text(json.dumps(card), encoding="utf-8")
-    load_model(folder)
-
-
-def _save_network(path: Path, storage: str) -> None:
-    state = {"a.weight": np.random.default_rng(4).random((4, 70)), "a.bias": np.zeros(4)}
-    save_network(state, path, storage=storage)
-
-
-def _small_template(path: Path, source: Path) -> None:
-    load_template(source)
-    shutil.copyfile(source, path)
 
 
 def _image(paint: np.ndarray, kind: str) -> bytes:
@@ -188,9 +168,7 @@ def _texts() -> dict[str, bytes]:
     """What other programs write, and ours does not: text, big-endian, strips, polygons, colors and counts of many kinds."""
     places = np.random.default_rng(5).random((9, 3))
     rows = "".join(" ".join(f"{x:.4f}" for x in row) + "\n" for row in places)
-    head = "ply\nformat {} 1.0\ncomment made by hand\nelement vertex 9\n" + "".join(
-        f"property float {c}\n" for c in "xyz"
-    )
+    head = "ply\nformat {} 1.0\nelement vertex 9\nproperty float x\nproperty float y\nproperty float z\n"
     faces = "element face 3\nproperty list uchar int vertex_indices\n"
     strips = "element tristrips {}\nproperty list int int vertex_indices\nend_header\n"
     painted = "property uchar diffuse_red\nproperty uchar diffuse_green\nproperty uchar diffuse_blue\n"
@@ -222,9 +200,7 @@ def _texts() -> dict[str, bytes]:
 
 def _write_scan(path: Path) -> None:
     """As scanning programs write an obj: a path in a comment, opacity as Tr, names in another case."""
-    path.with_name("Scan.MTL").write_text(
-        "# C:\\scan\\\nnewmtl skin\nKd 1 1 1\nTr 1\nd 1.0\nmap_Kd .\\K\u00f6 rper.PNG\n"
-    )
+    path.with_name("Scan.MTL").write_text("# C:\\scan\\\nnewmtl skin\nTr 1\nd 1.0\nmap_Kd .\\K\u00f6 rper.PNG\n")
     path.with_name("k\u00f6 rper.png").write_bytes(_image(np.zeros((2, 2, 4), np.uint8), "PNG"))
     path.write_text(
         "\ufeff# D:\\\nmtllib scan.mtl\nv 0 0 0 \\\n 1 0 0\nv 2 0 0 1 0 0\nv 2 2 0 1 0 0\nv 1 0.5 0 1 0 0\nv 0 2 0 1 0 0\n"
@@ -256,17 +232,6 @@ def _write_poses(path: Path) -> None:
         path.write_text("pose,joint,x,y,z\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
 
 
-def _write_distances(path: Path, known: str) -> None:
-    """Points in and around a ball, or on it."""
-    points = np.random.default_rng(10).standard_normal((200, 3))
-    length = np.linalg.norm(points, axis=1)
-    if known == "distances":
-        np.savez(path, points=points, distances=length - 1)
-    else:
-        ball = points / length[:, None]
-        np.savez(path, points=ball, normals=ball)
-
-
 def _write_apart(path: Path) -> None:
     """A gltf whose buffer and image are files beside it."""
     words = _skinned()
@@ -274,11 +239,6 @@ def _write_apart(path: Path) -> None:
         path.with_name(name).write_bytes(base64.b64decode(part["uri"].partition("base64,")[2]))
         part["uri"] = name
     path.write_text(json.dumps(words))
-
-
-def _pcd() -> bytes:
-    head = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 8\nHEIGHT 1\nPOINTS 8\nDATA {}\n"
-    return head.format("binary").encode() + np.random.default_rng(6).random((8, 4)).astype("<f4").tobytes()
 
 
 def _skinned() -> dict[str, Any]:
