@@ -36,7 +36,8 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import save_textured
 from meshmatch.templates.location import bundled_folder
 
-Files, Outputs = Callable[[Path], None], Callable[[Path], list[Path]]
+Files = Callable[[Path], None]
+Outputs = Callable[[Path], list[Path]]
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
 
