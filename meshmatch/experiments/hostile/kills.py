@@ -1,6 +1,4 @@
-"""Commands that are killed at random moments, or find the disk full: afterwards the old or the new is there, whole, and
-nothing else.
-"""
+"""Commands killed at random moments, or on a full disk: afterwards the old or the new is there, whole, and nothing else."""
 
 from __future__ import annotations
 
