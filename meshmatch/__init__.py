@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from meshmatch.collections.collection import Collection as Collection
     from meshmatch.collections.measures import measure_atlas as measure_atlas
     from meshmatch.errors import MeshmatchError as MeshmatchError
+    from meshmatch.errors import MeshmatchWarning as MeshmatchWarning
     from meshmatch.fitting.fit import Fit as Fit
     from meshmatch.fitting.fit_config import FitConfig as FitConfig
     from meshmatch.geometry.frames import Frame as Frame
@@ -70,6 +71,7 @@ _HOMES = {
     "MatchResult": "meshmatch.api.results",
     "Matcher": "meshmatch.api.matching",
     "MeshmatchError": "meshmatch.errors",
+    "MeshmatchWarning": "meshmatch.errors",
     "Shape": "meshmatch.shapes.shape",
     "TexturedResult": "meshmatch.api.texture",
     "Transferred": "meshmatch.api.results",

@@ -68,11 +68,11 @@ def find_alone(
         return None
     parts = Parts.of(whole)
     sets, clean = [], []
-    for chosen in tries(parts):
+    for numbers in tries(parts):
         with suppress(InputError):  # too few faces to be fitted
-            rest = usable(without_parts(whole, parts, parts.others(chosen)))
+            rest = usable(without_parts(whole, parts, parts.others(numbers)))
             if not rest.far_parts:
-                sets.append(chosen)
+                sets.append(numbers)
                 clean.append(rest)
     if not sets:
         return None

@@ -163,7 +163,7 @@ def choose_model(
     found = _told(models, readings, shapes, configs, progress)
     clean = list(clean)
     tried = [told.kind is None or each.far_parts > 0 for told, each in zip(found, clean, strict=True)]
-    for number in np.flatnonzero(tried):
+    for number in np.flatnonzero(tried).tolist():
         config = configs[number]
         loaders, whole = [model.load for model in models], clean[number].original
         if (alone := find_alone(loaders, whole, config, _order(models), progress)) is not None:

@@ -21,7 +21,7 @@ from meshmatch.render.facing import facing, facing_alike
 from meshmatch.render.picture import Look, check_picture
 from meshmatch.render.viewer.looks import share_look
 from meshmatch.render.viewer.page import PageReport, write_page
-from meshmatch.shapes.appearance import Appearance
+from meshmatch.shapes.appearance import Appearance, vertex_colors_alone
 from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_coordinates
@@ -177,4 +177,5 @@ def _read_look(source: ShapeLike, shape: Shape) -> tuple[Appearance | None, Floa
     try:
         return find_appearance(source, shape), load_coordinates(source, shape), ""
     except InputError as error:
-        return None, None, f"shown without its look: {error.message}"
+        colors = None if shape.colors is None else vertex_colors_alone(shape)
+        return colors, None, f"shown without its {'look' if colors is None else 'texture'}: {error.message}"

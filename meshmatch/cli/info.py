@@ -33,14 +33,15 @@ def info(
         about = _template
     elif suffix in MAP_SUFFIXES and (suffix != ".npy" or _is_list(file)):
         about = _map
-    record = {"file": str(file)} | about(file)
+    record: Json = {"file": str(file)} | about(file)
     if json:
         print_json(record)
         return
     rows = []
     for key, value in record.items():
         values = value if key in ("repair", "reasons", "meshes") else [value]  # a line each
-        values = _part_lines(value, record["parts"]) if key == "largest_parts" else values
+        if key == "largest_parts":
+            values = _part_lines(value, record["parts"])
         shown = [_shown(item) for item in values] or ["nothing to do" if key == "repair" else "none"]
         rows += [(key.replace("_", " ") if n == 0 else "", text) for n, text in enumerate(shown)]
     print_rows(rows)
@@ -88,7 +89,7 @@ def _parts(parts: "Parts", meshes: list[tuple[str, int]]) -> list[Json]:
     found: list[Json] = []
     for k in range(min(len(parts), _MOST_PARTS)):
         low, high = parts.bounds[k]
-        about = {"part": k + 1, "vertices": int(parts.counts[k]), "share_of_area": float(parts.shares[k])}
+        about: Json = {"part": k + 1, "vertices": int(parts.counts[k]), "share_of_area": float(parts.shares[k])}
         about["size"] = [float(length) for length in high - low]
         if meshes:
             about["mesh"] = meshes[bisect_right(ends, int(parts.first_vertices[k]))][0]

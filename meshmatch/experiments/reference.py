@@ -36,7 +36,7 @@ API = {
     ),
     "Shapes and files": (
         *("Shape", "Frame", "load_shape", "save_shape", "load_map", "save_map", "load_model"),
-        *("MeshmatchError",),
+        *("MeshmatchError", "MeshmatchWarning"),
     ),
     "Sequences, pictures and pages": ("interpolate", "InterpolationOptions", "Interpolation", "picture", "view"),
     "Collections": ("Collection", "Atlas", "measure_atlas"),

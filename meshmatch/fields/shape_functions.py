@@ -31,12 +31,15 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_matrix
 
 from meshmatch.arrays import Float, Floats, Int, Ints, as_numbers
-from meshmatch.errors import InputError, OptionError, TemplateError
+from meshmatch.errors import InputError, OptionError, TemplateError, warn
 from meshmatch.geometry.kernels import KERNELS, MINIMUM_EIGENVALUE, Kernel, support_pairs, support_scale
 
 FieldName = Literal["mls", "rbf", "pointwise"]
 FIELDS: tuple[FieldName, ...] = get_args(FieldName)
 CONSTANT, STEEPNESS = 1.0, 50.0  # of the multiquadric
+AMPLIFIED = 50.0
+"""Sum of the absolute shape functions at a point from which on it is told that nodes are placed badly. Of the models that
+ship it is at most 22; above 1 / sqrt(`MINIMUM_EIGENVALUE`), 1,000, nodes are refused anyway."""
 _MAX_CONDITION = 1e13
 _BLOCK = 4096
 
@@ -103,8 +106,9 @@ def build_field(points: ArrayLike, nodes: ArrayLike, radius: ArrayLike, kernel: 
     Points (P, 3), nodes (K, 3) and the nodes' support radius (of all, or (K,) of each) are in one unit and frame. The
     kernel is the model's: vectors learned with one mean something else with another.
 
-    `TemplateError` names the points that have fewer than four non-coplanar nodes in reach. `InputError` for positions or
-    radii that are not finite numbers of these shapes, `OptionError` for a kernel that is not known.
+    `TemplateError` names the points that have fewer than four non-coplanar nodes in reach; where the absolute shape
+    functions sum to more than `AMPLIFIED`, that is a warning (`MeshmatchWarning`). `InputError` for positions or radii that
+    are not finite numbers of these shapes, `OptionError` for a kernel that is not known.
     """
     if kernel not in KERNELS:
         raise OptionError(f"invalid kernel {kernel!r}", f"choose one of {', '.join(KERNELS)}")
@@ -116,6 +120,7 @@ def build_field(points: ArrayLike, nodes: ArrayLike, radius: ArrayLike, kernel: 
     radii = np.broadcast_to(radii, (len(nodes),))
     fit = _LocalFits.of(points, nodes, radii, kernel)
     phi = (fit.weight * fit.along).astype(np.float32)
+    _tell_amplification(np.bincount(fit.at, np.abs(phi), len(points)).astype(np.float64))
     values = csr_matrix((phi, (fit.at, fit.of_node)), (len(points), len(nodes)))
     return ShapeFunctions(values, lambda some: _slopes(points[some], nodes, radii, kernel))
 
@@ -197,6 +202,16 @@ def _check_support(moment: Float[Floats, "P 4 4"]) -> None:
         some = ", ".join([*map(str, bad[:5]), *(["..."] if len(bad) > 5 else [])])
         problem = f"{len(bad)} points have fewer than four non-coplanar nodes in reach (points {some})"
         raise TemplateError(problem, "use more nodes or a larger radius")
+
+
+def _tell_amplification(total: Float[Floats, " P"]) -> None:
+    """Warn of nodes from which a point is extrapolated, by the sum of its absolute shape functions (whose maximum is the
+    Lebesgue constant): an error in the nodes' vectors can grow by so much on its way there.
+    """
+    worst = int(total.argmax())
+    if total[worst] > AMPLIFIED:
+        what = f"point {worst} may move by {total[worst]:,.0f} times as much as the nodes around it"
+        warn(f"{what}, which lie nearly in a plane or on one side: use more nodes or a larger radius")
 
 
 def build_rbf(points: ArrayLike, nodes: ArrayLike) -> ShapeFunctions:

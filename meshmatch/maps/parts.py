@@ -56,9 +56,9 @@ def kept_together(source: Places, target: Places, found: Footpoints, workers: in
     for part in np.unique(own[astray]).tolist():
         alike.setdefault(_row(counterparts, part).tobytes(), []).append(part)
     rows, again = [], []
-    for parts in alike.values():
-        faces = np.sort(np.concatenate([fitted[faces_of(part)] for part in _row(counterparts, parts[0]).tolist()]))
-        rows.append(astray[np.sort(np.concatenate([rows_of(part) for part in parts]))])
+    for same in alike.values():
+        faces = np.sort(np.concatenate([fitted[faces_of(part)] for part in _row(counterparts, same[0]).tolist()]))
+        rows.append(astray[np.sort(np.concatenate([rows_of(part) for part in same]))])
         again.append(target.nearest(source.resting[rows[-1]], workers, faces))
     return found.updated(np.concatenate(rows), joined(again))
 

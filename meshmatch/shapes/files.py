@@ -224,12 +224,12 @@ ShapeLike: TypeAlias = Shape | str | Path | NDArray[np.generic] | tuple[ArrayLik
 def as_shape(source: ShapeLike, name: str = "") -> Shape:
     """The shape that is meant: a `Shape` as it is, a file read, everything else copied.
 
-    Read are meshes and clouds of trimesh (its scenes as one shape, each mesh where its node puts it), Open3D, vedo, PyVista,
-    meshio, PyMeshLab and PyTorch3D (one at a time), and other objects with ``vertices`` or ``points`` and ``faces`` or
-    ``triangles``; with vertex colors of trimesh and Open3D. Polygons become fans of triangles. Tensors of torch are copied
-    from whatever device they are on, without their gradient; masked values are invalid positions. Faces may be floats if
-    they are whole numbers. What connects its points in another way (volumes, lines, strips) is refused, and never taken
-    for a cloud. `name` is for messages, where the source has none of its own.
+    Read are meshes and clouds of trimesh (its scenes as one shape, each mesh where its node puts it), Open3D, vedo,
+    PyVista, meshio, PyMeshLab and PyTorch3D (one at a time), and other objects with ``vertices`` or ``points`` and
+    ``faces`` or ``triangles``; with vertex colors of trimesh and Open3D. Polygons become triangles, as those of files do.
+    Tensors of torch are copied from whatever device they are on, without their gradient; masked values are invalid
+    positions. Faces may be floats if they are whole numbers. What connects its points in another way (volumes, lines,
+    strips) is refused, and never taken for a cloud. `name` is for messages, where the source has none of its own.
 
     `InputError`: the file cannot be read, or the source is none of these.
     """
@@ -241,7 +241,7 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
     if found is not None:
         return _from_arrays(found.verts, found.faces, name, found.colors)
     if isinstance(source, tuple | list) and len(source) == 2 and _is_table(source[0]):
-        return _from_arrays(source[0], as_faces(source[1], name or "the shape"), name)
+        return _from_arrays(source[0], as_faces(source[1], source[0], name or "the shape"), name)
     if hasattr(source, "__array__") or isinstance(source, tuple | list):
         return _from_arrays(source, None, name)
     raise InputError(f"cannot make a shape of {type(source).__name__}", HINT)

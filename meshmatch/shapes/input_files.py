@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, warn
 
 LARGEST_FILE = 1 << 32
 """Bytes: a hundred million vertices, more than anything here can work on. Larger files are refused unread."""
@@ -104,17 +104,21 @@ def read_text(path: Path, line: int, cell: int = 0) -> str:
     """
     data = read_bytes(path, largest=LARGEST_TEXT // 2)
     check_memory(path.name, len(data), line * sum(map(data.count, _LINE_ENDS)) + cell * sum(map(data.count, b",;")))
-    return _decoded(data)
+    return _decoded(path.name, data)
 
 
-def _decoded(data: bytes) -> str:
-    """Text in UTF-8, UTF-16 with a byte order mark, or else in Windows' Latin letters; `ValueError` for what is no text."""
+def _decoded(name: str, data: bytes) -> str:
+    """Text in UTF-8, UTF-16 with a byte order mark, or else, which is said, in Windows' Latin letters; `ValueError` for what
+    is no text.
+    """
     try:
         return data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
     except UnicodeDecodeError:
         if _NO_TEXT.search(data):
             raise
-        return data.decode("cp1252")
+        text = data.decode("cp1252")
+        warn(f"{name} is not in UTF-8; it is read as Windows' Latin letters (cp1252)")
+        return text
 
 
 def check_text(name: str, data: bytes) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints, off_torch
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import fan, painted, runs
+from meshmatch.shapes.formats.polygons import triangles_of
 
 HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
 _SURFACE = "pass its surface, such as (points, triangles)"
@@ -34,6 +35,13 @@ _OTHER_LINKS = (
     "regions",
 )
 """Attributes by which libraries connect vertices in ways that are not read."""
+
+
+class _Polygons(NamedTuple):
+    """Corners of polygons, one after the other, and how many each has."""
+
+    corners: Ints
+    sizes: Ints
 
 
 class Arrays(NamedTuple):
@@ -57,27 +65,39 @@ def arrays_of(source: Any, name: str) -> Arrays | None:
     if callable(getattr(source, "verts_packed", None)) or callable(getattr(source, "points_packed", None)):
         return _batch(source, label)
     if callable(getattr(source, "vertex_matrix", None)) and callable(getattr(source, "face_matrix", None)):
-        return Arrays(source.vertex_matrix(), _rows(source.face_matrix(), label))
+        points = source.vertex_matrix()
+        return Arrays(points, _triangles(points, _rows(source.face_matrix(), label), label))
     points = _value(source, "vertices", "points")
     if points is None:
         return None
-    return Arrays(points, _faces(source, label), _colors(source))
+    return Arrays(points, _triangles(points, _faces(source, label), label), _colors(source))
 
 
-def as_faces(values: Any, label: str) -> Any:
-    """Faces as an array (F, 3) where that can be: lists of polygons become fans, whole numbers are taken for integers.
+def as_faces(values: Any, points: Any, label: str) -> Any:
+    """Faces of vertices as an array (F, 3) where that can be: polygons in lists are split into triangles, whole numbers are
+    taken for integers.
 
     `InputError` for faces of four corners, which may be quads or tetrahedra, and for anything else that is no array.
     """
     if values is None:
         return None
     if _ragged(values):
-        return _polygons(values, label)
+        return _triangles(points, _polygons(values, label), label)
     found = _array(values, label)
     if found.ndim == 2 and found.shape[1] == 4:
         hint = f"split quads into triangles, or pass them as lists; of tetrahedra, {_SURFACE}"
         raise InputError(f"{label}: faces have four corners, which may be quads or tetrahedra", hint)
     return _whole(found, label)
+
+
+def _triangles(points: Any, faces: Any, label: str) -> Any:
+    """Faces, those that are polygons split into triangles: as files are, where their vertices are points in space."""
+    if not isinstance(faces, _Polygons):
+        return faces
+    verts = _array(points, label)
+    if verts.ndim != 2 or verts.shape[1] != 3 or verts.dtype.kind not in "fiu":
+        return fan(faces.corners, faces.sizes)  # refused later
+    return faces.corners[triangles_of(label, verts.astype(np.float64), faces.corners, faces.sizes)]
 
 
 def _value(source: Any, *names: str) -> Any:
@@ -122,13 +142,13 @@ def _ragged(values: Any) -> bool:
     return len({len(each) for each in values}) > 1
 
 
-def _polygons(values: Any, label: str) -> Ints:
-    """Triangles of lists of corners, or of rows with the same number of corners."""
+def _polygons(values: Any, label: str) -> _Polygons:
+    """Polygons of lists of corners, or of rows with the same number of corners."""
     sizes = np.array([len(each) for each in values], np.int64)
     corners = [_whole(_array(each, label), label) for each in values if len(each)]
     if any(each.ndim != 1 for each in corners):
         raise InputError(f"{label}: each face must be a list of vertices", HINT)
-    return fan(np.concatenate(corners).astype(np.int64), sizes)
+    return _Polygons(np.concatenate(corners).astype(np.int64), sizes)
 
 
 def _counted(values: np.ndarray, label: str) -> tuple[Ints, Ints]:
@@ -144,18 +164,18 @@ def _counted(values: np.ndarray, label: str) -> tuple[Ints, Ints]:
     return begins, values[begins - 1].astype(np.int64)
 
 
-def _flat_polygons(values: np.ndarray, label: str, chosen: Bools | None = None) -> Ints:
-    """Triangles of VTK's flat list, or of the chosen cells of it."""
+def _flat_polygons(values: np.ndarray, label: str, chosen: Bools | None = None) -> _Polygons:
+    """Polygons of VTK's flat list, or of the chosen cells of it."""
     starts, sizes = _counted(_whole(values, label), label)
     if chosen is not None:
         if len(chosen) != len(starts):
             raise InputError(f"{label} has {len(starts)} cells and {len(chosen)} types of cells", HINT)
         starts, sizes = starts[chosen], sizes[chosen]
-    return fan(values[runs(starts, sizes)].astype(np.int64), sizes)
+    return _Polygons(values[runs(starts, sizes)].astype(np.int64), sizes)
 
 
 def _faces(source: Any, label: str) -> Any:
-    """The triangles of an object, None if it is a cloud."""
+    """The faces of an object, triangles or polygons, None if it is a cloud."""
     types = _value(source, "celltypes", "cell_types_array")
     cells = _value(source, "cells")
     if types is not None:
@@ -188,7 +208,7 @@ def _rows(faces: Any, label: str) -> Any:
     return _whole(found, label)
 
 
-def _grid(cells: Any, types: Ints, label: str) -> Ints | None:
+def _grid(cells: Any, types: Ints, label: str) -> _Polygons | None:
     """The faces of a VTK grid, if it has no volumes."""
     if not np.isin(types, _VTK_FACES + _VTK_LOOSE).all():
         raise InputError(f"{label} is made of volumes or of curved cells", "pass its surface, .extract_surface()")
@@ -211,7 +231,7 @@ def _cells(source: Any, cells: Any, label: str) -> Any:
         if wrong:
             hint = "pass its surface, such as (mesh.points, mesh.cells_dict['triangle'])"
             raise InputError(f"{label} has cells of type {wrong[0]}, of which no surface is made", hint)
-        return np.concatenate(parts) if parts else None
+        return _Polygons(*(np.concatenate(each) for each in zip(*parts, strict=True))) if parts else None
     if not _ragged(cells):
         found = _array(cells, label)
         surface = type(getattr(source, "dataset", None)).__name__ == "vtkPolyData"  # vedo: these are faces
@@ -263,7 +283,8 @@ def _batch(source: Any, label: str) -> Arrays:
     if len(source) != 1:
         raise InputError(f"{label} is a batch of {len(source)} shapes", "pass one of them: shapes[0]")
     if callable(getattr(source, "verts_packed", None)):
-        return Arrays(source.verts_packed(), _rows(source.faces_packed(), label))
+        points = source.verts_packed()
+        return Arrays(points, _triangles(points, _rows(source.faces_packed(), label), label))
     return Arrays(source.points_packed())
 
 

@@ -61,7 +61,7 @@ class Parts:
         if not len(usable):
             return cls(shape, number, of_face, np.empty(0))
         label = triangles.face_parts(twin[corners], shape.V)
-        areas = np.bincount(label, shape.face_areas[usable])
+        areas = np.bincount(label, shape.face_areas[usable]).astype(np.float64)
         first = np.full(len(areas), shape.V)
         np.minimum.at(first, label, corners.min(axis=1))
         order = np.lexsort((first, -np.log(np.maximum(areas, 1e-300)).round(6)))

@@ -18,7 +18,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
-from meshmatch.errors import InputError, OptionError
+from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.progress import Progress
@@ -196,12 +196,15 @@ def read_known_points(file: Path, clean: Repaired, space: Space = "") -> KnownPo
             f"{file.name}: landmarks are not read from '{file.suffix}' files", f"they are read from {known}"
         )
     try:
-        found = read_landmark_file(file, clean.original.name).in_space(space)
+        found = read_landmark_file(file, clean.original.name)
     except InputError as error:
         words = error.message if error.message.startswith(file.name) else f"{file.name}: {error.message}"
         raise InputError(words, error.hint or _LANDMARKS_HINT) from error
     except (OSError, ValueError, TypeError, LookupError, ArithmeticError, csv.Error) as error:
         raise InputError(f"{file.name} holds no landmarks that can be read: {error}", _LANDMARKS_HINT) from error
+    if found.turns_to(space):
+        warn(f"{file.name} is in {found.space}, {clean.original.name} is in {space}: x and y change their signs")
+        found = found.in_space(space)
     original, points = clean.original, np.full((len(found.places), 3), np.nan)
     for k, place in enumerate(found.places):
         if place.kind == "position":

@@ -112,8 +112,10 @@ def joined(parts: Sequence[Landmarks], order: Ints | None = None) -> Landmarks:
     names = [name for part in parts for name in part.names]
     order = np.arange(len(names)) if order is None else order
     fields = ("points", "vertex", "face", "barycentric", "confidence")
-    arrays = [np.concatenate([getattr(part, field) for part in parts])[order] for field in fields]
-    return Landmarks(tuple(names[k] for k in order.tolist()), *arrays)
+    points, vertex, face, weights, confidence = (
+        np.concatenate([getattr(part, field) for part in parts])[order] for field in fields
+    )
+    return Landmarks(tuple(names[k] for k in order.tolist()), points, vertex, face, weights, confidence)
 
 
 def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: Landmarks) -> Landmarks:

@@ -191,6 +191,18 @@ def test_a_texture_that_is_missing_is_said_and_the_rest_shown(
     assert words_of(page)["look"] is None
 
 
+def test_vertex_colors_are_shown_where_the_materials_are_missing(run: Run, known: tuple[Path, Path, Path]) -> None:
+    source, page = known[0].with_suffix(".obj"), known[0].with_name("page.html")
+    shape = load_shape(known[0])
+    save_shape(source, Shape(shape.verts, shape.faces, "", np.full((shape.V, 4), 0.5)))
+    source.write_text(source.read_text().replace("f ", "vt 0 0\nmtllib a.mtl\nusemtl skin\nf ", 1))
+    for name, missing in (("map_Kd skin.png", "skin.png"), ("", "")):
+        source.with_name("a.mtl").write_text(f"newmtl skin\n{name}\n")
+        answer = run("view", source, known[1], "--map", known[2], "-o", page)
+        assert answer.status == 0 and missing in answer.err
+        assert words_of(page)["look"] == {"kind": "colors", "side": "source"}
+
+
 def test_a_map_the_wrong_way_round_or_of_others_is_refused(run: Run, known: tuple[Path, Path, Path]) -> None:
     a, b, path = known
     page = a.with_name("page.html")

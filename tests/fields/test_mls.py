@@ -1,15 +1,17 @@
 """Moving least squares: a slow textbook oracle, finite differences in float64, and the laws."""
 
+import warnings
+from contextlib import nullcontext, suppress
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from meshmatch.errors import InputError, MeshmatchError, OptionError, TemplateError
+from meshmatch.errors import InputError, MeshmatchError, MeshmatchWarning, OptionError, TemplateError
 from meshmatch.fields.field import Field, arap_energy, determinant, volume_energy
 from meshmatch.fields.shape_functions import build_field
-from meshmatch.geometry.kernels import KERNELS, poorly_supported
+from meshmatch.geometry.kernels import KERNELS, MINIMUM_EIGENVALUE, poorly_supported
 
 
 def weight(x, q, r, kernel):
@@ -130,6 +132,27 @@ def test_coplanar_nodes_are_not_enough():
     flat = np.random.default_rng(0).uniform(-1, 1, (100, 3)) * [1, 1, 0]
     with pytest.raises(TemplateError, match="non-coplanar"):
         Field.of(build_field(np.zeros((1, 3)), flat, 0.8, "smooth"))
+
+
+@pytest.mark.parametrize(("lift", "told"), [(0.5, False), (0.02, True)])
+def test_nodes_nearly_in_a_plane_are_told(lift, told):
+    """A point above three nodes and one a little above these moves by the quotient of the heights."""
+    nodes = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.4, 0.4, lift]], float)
+    largest = np.abs(np.linalg.solve(np.concatenate([nodes.T, np.ones((1, 4))]), [0.3, 0.3, 0.6, 1.0])).sum()
+    with pytest.warns(MeshmatchWarning, match=f"may move by {largest:,.0f} times") if told else nullcontext():
+        field = build_field([[0.3, 0.3, 0.6]], nodes, 2.0, "smooth")
+    assert abs(field.phi).sum() == pytest.approx(largest, rel=1e-3)
+
+
+def test_what_is_told_is_bounded():
+    """Whatever nodes are accepted, the sum of the absolute shape functions is at most 1 / sqrt(MINIMUM_EIGENVALUE)."""
+    rng, accepted = np.random.default_rng(0), []
+    for height in np.geomspace(0.2, 1e-3, 40):
+        nodes = rng.uniform(-1, 1, (8, 3)) * [1, 1, height]
+        with suppress(TemplateError), warnings.catch_warnings(record=True):
+            warnings.simplefilter("always")
+            accepted.append(abs(build_field([[0.2, 0.1, 0.9]], nodes, 2.0, "smooth").phi).sum())
+    assert 10 < len(accepted) < 40 and 50 < max(accepted) <= MINIMUM_EIGENVALUE**-0.5
 
 
 def test_wide_nodes_among_narrow_ones_are_as_well_conditioned():

@@ -155,6 +155,25 @@ def test_meshes_of_other_libraries_keep_their_faces(library: str) -> None:
     assert sorted(map(tuple, shape.faces)) == sorted(map(tuple, FANS))
 
 
+@pytest.mark.parametrize("library", ["vedo", "PyVista", "meshio", "lists"])
+def test_concave_faces_of_other_libraries_stay_inside(library: str) -> None:
+    """An arrow and an L, of 2 and 3 squares: fans would run across their bays."""
+    verts = np.array([[0, 0], [2, -1], [1, 0], [2, 1], [9, 0], [11, 0], [11, 1], [10, 1], [10, 2], [9, 2]], float)
+    verts = np.insert(verts, 2, 1.0, axis=1)
+    cells = [[1, 2, 3, 0], [5, 6, 7, 8, 9, 4]]
+    flat = np.concatenate([[len(cell), *cell] for cell in cells])
+    blocks = [thing(type="quad", data=np.array(cells[:1])), thing(type="polygon", data=np.array(cells[1:]))]
+    shape = as_shape(
+        {
+            "vedo": thing(vertices=verts, points=verts, cells=cells, lines=[], dataset=dataset("vtkPolyData")),
+            "PyVista": thing(points=verts, faces=flat, verts=np.empty(0, int), lines=[], n_cells=2),
+            "meshio": thing(points=verts, cells=blocks),
+            "lists": (verts.tolist(), cells),
+        }[library]
+    )
+    assert (shape.V, shape.F) == (10, 6) and shape.area == pytest.approx(1.0 + 3.0)
+
+
 @pytest.mark.parametrize(
     "cloud",
     [

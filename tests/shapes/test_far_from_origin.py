@@ -9,7 +9,7 @@ from PIL import Image
 
 from meshmatch.api.pictures import picture
 from meshmatch.api.texture import transfer_texture
-from meshmatch.errors import MeshmatchWarning
+from meshmatch.errors import MeshmatchWarning, OutputError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.picture import Look
 from meshmatch.shapes.files import load_shape, save_shape
@@ -136,3 +136,14 @@ def test_a_page_does_not_depend_on_the_place(tmp_path: Path, make_sphere, place:
     for name in ("source.position", "target.position", "source.normal", "target.normal", "source.place"):
         one, other = (page[name].astype(int) for page in pages)
         assert np.abs(one - other).max() <= 1, name
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".stl"])
+def test_what_32_bits_cannot_hold_is_refused(sphere: Shape, tmp_path: Path, suffix: str) -> None:
+    """Infinite numbers make no file that others can read."""
+    huge = Shape(sphere.verts * 1e39, sphere.faces)
+    with pytest.raises(OutputError, match=f"beyond 3.4e\\+38, the largest number of a {suffix} file"):
+        save_shape(tmp_path / f"huge{suffix}", huge)
+    assert list(tmp_path.iterdir()) == []
+    save_shape(tmp_path / "huge.ply", huge)
+    assert np.array_equal(load_shape(tmp_path / "huge.ply").verts, huge.verts)

@@ -1,5 +1,6 @@
 """How programs write obj and mtl (and off) that is not in the books, and what is made of it."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,27 @@ def test_what_would_not_be_seen_is_opaque(tmp_path: Path, lines: str, image: str
     with pytest.warns(MeshmatchWarning, match=r"material skin of a\.obj is wholly transparent"):
         look = load_appearance(path, load_shape(path))
     assert [(m.alpha, m.factor[3]) for m in look.materials] == [("opaque", 1.0)] * 2
+
+
+def test_decimal_commas_in_materials(tmp_path: Path) -> None:
+    """As numbers, and never without the word where something else is meant."""
+    text, mtl = HEAD + BODY, "newmtl skin\nKd 0{0}25 0{0}5 1\nd 0{0}5\nmap_Kd -s 0{0}5 2 -o 0{0}25 0 t.png\n"
+    with_commas, with_points = (find_appearance(p, load_shape(p)) for p in _folders(tmp_path, text, mtl, ",."))
+    assert with_commas is not None and with_points is not None
+    assert np.array_equal(with_commas.uv, with_points.uv)
+    for mine, theirs in zip(with_commas.materials, with_points.materials, strict=True):
+        assert (mine.factor, mine.name) == (theirs.factor, theirs.name) and mine.factor[3] == 0.5
+    for wrong in ("Kd 1,000.5 1 1", "d 1,2,3"):
+        path = write(tmp_path, f"newmtl skin\n{wrong}\n")
+        with pytest.raises(InputError, match=r"a\.mtl: cannot make sense") as caught:
+            load_appearance(path, load_shape(path))
+        assert "decimal comma" in caught.value.hint
+
+
+def _folders(folder: Path, text: str, mtl: str, marks: str) -> Iterator[Path]:
+    for k, mark in enumerate(marks):
+        (folder / str(k)).mkdir()
+        yield write(folder / str(k), mtl.format(mark), text)
 
 
 @pytest.mark.parametrize("mtl", ["map_Kd t.png\n", "map_Kd k.png\nmap_d t.png\n", "Tr 1\nmap_Kd t.png\n"])

@@ -1,18 +1,17 @@
 """A hostile user: damaged files of every kind that is read, and commands killed at random moments.
 
 Samples of all formats are made, damaged at random (bytes, numbers, words, JSON, archives, headers) and read as the product
-reads them, each within 20 s and a gigabyte; commands are ended by SIGKILL, SIGTERM, SIGHUP and SIGINT, or find the disk full
-after some bytes. A failure is anything but a result or one of our errors: a traceback, the end of the interpreter, too much
-time or memory, something printed raw, a message that is long or commands a terminal; after a kill anything that is neither
-the old nor the new. Each failure is kept in the output folder, with the file. The same seed gives the same inputs; the same
-command goes on where it was stopped.
+reads them, each in 20 s of CPU and a gigabyte; commands are ended by SIGKILL, SIGTERM, SIGHUP and SIGINT, or find the disk
+full after some bytes. A failure is anything but a result or one of our errors: a traceback, the end of the interpreter, too
+much time or memory, something printed raw, a message that is long or commands a terminal; after a kill anything that is
+neither the old nor the new. Each failure is kept in the output folder, with the file. The same seed gives the same inputs;
+the same command goes on where it was stopped.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -23,8 +22,7 @@ from typer import Option
 
 from meshmatch.errors import MeshmatchError
 from meshmatch.experiments import runner
-from meshmatch.experiments.hostile import inputs as inputs
-from meshmatch.experiments.hostile import kills as kills
+from meshmatch.experiments.hostile import inputs, kills
 from meshmatch.experiments.hostile.samples import make_samples
 from meshmatch.outputs import make_folder, replace_on_success
 
@@ -98,7 +96,7 @@ def _killed(state: dict[str, Any]) -> int:
 def main(
     minutes: Annotated[float, Option(min=0.0, help="how long; the same command goes on later")] = 2.0,
     seed: runner.Seed = 0,
-    output: Annotated[Path, Option(help="folder of the counts and of all that failed")] = Path("../shared/hostile"),
+    output: Annotated[Path, Option(help="folder of the counts and of all that failed")] = Path("out/hostile"),
     killing: Annotated[float, Option(min=0.0, max=1.0, help="share of the time for kills")] = 0.25,
     training: Annotated[bool, Option("--train/--no-train", help="kill trainings too, which need torch")] = True,
     inputs_each: Annotated[int, Option("--inputs", min=0, help="go on until so many of each family were read")] = 0,
@@ -128,7 +126,3 @@ def main(
     record = {"inputs": state["next"], "families": rows, "kills": killed, "failures": wrong}
     stopped = MeshmatchError(f"{wrong} failures", f"each is kept in {output}") if wrong else None
     return runner.Report(record, tables, stopped=stopped)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -14,70 +14,39 @@ import numpy as np
 
 Damage = Callable[[bytes, np.random.Generator], bytes]
 WORDS = (
-    *(
-        b"nan",
-        b"inf",
-        b"-inf",
-        b"-1",
-        b"0",
-        b"1",
-        b"1e308",
-        b"-1e308",
-        b"1e-320",
-        b"1e59",
-        b"4294967295",
-        b"2147483648",
+    *b"nan inf -inf -1 0 1 1e308 -1e308 1e-320 1e59 1e400 4294967295 2147483648 9223372036854775808".split(),
+    *b"99999999999999999999999 -nan(ind) 1_000 0x10 0,5 -1,25e3 ,5 5, 1;2 N/A 1.#QNAN 1.000e+00 end_header list".split(),
+    *b'uchar double null true / // 1/ /1 1//2 { } [ [0.5] " <a> <!ENTITY </script> ../../etc/passwd /dev/zero'.split(),
+    *rb"%2e%2e/x a%20b.png a.png?v=3 #a C:\\t\a.png \\\\host\a.png file:///etc/passwd ~nobody \ \\".split(),
+    *(b"9" * 5000, b"x" * 300, b"", b"\0", b"\n", b"\r", b"\x1b]0;pwned\x07\x1b[31m", b"\xc2\x9b31m", b"\xff\xfe"),
+    *(b"\xe2\x80\xae", b"\xef\xbb\xbf", b"\xed\xa0\x80", b"\xd9\xa3", b"k\xc3\xb6rper.png", b"ko\xcc\x88rper.png"),
+    *(b"[" * 2000, b"{" * 2000),
+)
+LINES = (
+    *rb"# D:\scans\|#\|Tr 1|d 0|d|Kd 0,5 0,5 0,5|map_Kd textures\T.PNG|map_d a.png|usemtl|usemtl A|newmtl a\ ".split(
+        b"|"
     ),
-    *(
-        b"9223372036854775808",
-        b"99999999999999999999999",
-        b"9" * 5000,
-        b"x" * 300,
-        b"",
-        b"-nan(ind)",
-        b"1_000",
-        b"0x10",
+    *b"mtllib A.MTL b.mtl|f 1 2 3 4 5 6|f 1 / 1 2 / 2 3 / 3|f 1/|#MRGB ffff0000ff00ff00|#MRGB f|vt 0,5 0,5|solid".split(
+        b"|"
     ),
-    *(
-        b"\x1b]0;pwned\x07\x1b[31m",
-        b"\xc2\x9b31m",
-        b"\xff\xfe",
-        b"\0",
-        b"\n",
-        b"\r",
-        b"\xe2\x80\xae",
-        b"../../etc/passwd",
+    *b"v 512345.678 4612345.678 120|vc 1 2 3|comment TextureFile ../a.png|comment SPACE=RAS|element tristrips 3".split(
+        b"|"
     ),
-    *(
-        b"/dev/zero",
-        b"%2e%2e/x",
-        b"file:///etc/passwd",
-        b"~nobody",
-        b"end_header",
-        b"list",
-        b"uchar",
-        b"double",
-        b"null",
+    *b"property list uchar float texcoord|property int texnumber|property uchar diffuse_red|property float s".split(
+        b"|"
     ),
-    *(
-        b"true",
-        b"[" * 2000,
-        b"{" * 2000,
-        b'"',
-        b"<a>",
-        b"<!ENTITY",
-        b"</script>",
-        b"\xed\xa0\x80",
-        b"1e400",
-        b"\xd9\xa3",
-    ),
+    *b"# CoordinateSystem = 3|# columns = x,y|LM3=4|ID=a|SCALE=0,5|vertex;label|name\tx\ty\tz|//X Y Z|9|;;".split(b"|"),
+    *(b"", b"nan,nan,nan", b'"a""b"', b"0,5\t1,5"),
 )
 VALUES: tuple[Any, ...] = (
     *(None, True, False, -1, 0, 1, 2, 3, 255, 2**31, 2**32, 2**63, 10**30, -(2**63), 0.5, -0.5, 1e308, 1e-320, "", "x"),
     *("x" * 400, "\x1b]0;pwned\x07", "\u202e", "a\nb", "\ud800", [], {}, [[]], [1, 2], [None], {"a": 1}, [[1], [1, 2]]),
+    *("C:\\a.png", "a%20b.bin?v=3", "K\u00f6.png", "0,5", "LPS", "undefined", "EXT_meshopt_compression", 512345.678),
+    *(["KHR_unknown"], {"KHR_node_visibility": {"visible": False}}, {"EXT_mesh_gpu_instancing": {"attributes": {}}}),
     *(["a"], [1e308] * 4, [0.5] * 3, [[0.5] * 3] * 3, "../x", "/dev/zero", "data:,", "data:;base64,AAAA", "~nobody/x"),
 )
 NUMBERS = (0, 1, 2, 3, 127, 128, 255, 256, 65535, 2**24, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)
+_KEYS = ["x", "matrix", "sparse", "uri", "extensions", "extensionsRequired", "mode", "markups", "position", "\x1b[31m"]
 _NUMBER = re.compile(rb"-?\d+\.?\d*(?:e[+-]?\d+)?")
 _WORD = re.compile(rb"[^\s,;\"]+")
 
@@ -159,12 +128,41 @@ def _line(data: bytes, rng: np.random.Generator) -> bytes:
     return b"\n".join(lines)
 
 
-WAYS: list[Damage] = [_flip, _cut, _remove, _repeat, _insert, _integer, _number_of(_NUMBER), _number_of(_WORD), _line]
+def _added(data: bytes, rng: np.random.Generator) -> bytes:
+    """A line of some format or habit is put between two others."""
+    at = data.find(b"\n", _place(data, rng)) + 1
+    return data[:at] + LINES[int(rng.integers(len(LINES)))] + b"\n" + data[at:]
+
+
+def _habit(data: bytes, rng: np.random.Generator) -> bytes:
+    """The text as another program or country would write it."""
+    return _HABITS[int(rng.integers(len(_HABITS)))](data)
+
+
+_HABITS: tuple[Callable[[bytes], bytes], ...] = (
+    lambda data: b"\xef\xbb\xbf" + data,
+    lambda data: data.decode("latin-1").encode("utf-16"),
+    lambda data: b"\xfe\xff" + data.decode("latin-1").encode("utf-16-be"),
+    lambda data: re.sub(rb"(\d)\.(\d)", rb"\1,\2", data),
+    lambda data: re.sub(rb"(\d)\.(\d)", rb"\1,\2", data.replace(b",", b";")),
+    lambda data: data.replace(b",", b"\t"),
+    lambda data: data.replace(b" ", b";"),
+    lambda data: data.replace(b"\n", b"\r"),
+    lambda data: data.replace(b"\n", b"\r\n"),
+    lambda data: data.replace(b"\n", b"\\\n"),
+    lambda data: re.sub(rb"(?m)^(?=[vfmn])", rb"# C:\\\n", data),
+    lambda data: data.replace(b"/", b"\\"),
+    bytes.upper,
+    bytes.swapcase,
+)
+WAYS: list[Damage] = [
+    *(_flip, _cut, _remove, _repeat, _insert, _integer, _number_of(_NUMBER), _number_of(_WORD), _line, _added, _habit)
+]
 
 
 def _json(data: bytes, rng: np.random.Generator) -> bytes:
     """A value somewhere in the JSON of a file, of a glb or of a safetensors header becomes another one, or goes."""
-    for part in (_whole, _glb, _tensors):
+    for part in (lambda whole: (whole, bytes), _glb, _tensors):
         try:
             text, put_back = part(data)
             found = json.loads(text)
@@ -191,17 +189,13 @@ def _changed(found: Any, rng: np.random.Generator) -> Any:
     if way < 0.1:
         del inner[key]
     elif way < 0.2 and isinstance(inner, dict):
-        inner[str(rng.choice(["x", "matrix", "sparse", "uri", "extensions", "mode", "\x1b[31m"]))] = inner.pop(key)
+        inner[str(rng.choice(_KEYS))] = inner.pop(key)
     elif way < 0.25:
         for _ in range(500):
             inner[key] = [inner[key]]
     else:
         inner[key] = VALUES[int(rng.integers(len(VALUES)))]
     return found
-
-
-def _whole(data: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:
-    return data, lambda text: text
 
 
 def _glb(data: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:
@@ -235,13 +229,10 @@ def _archive(data: bytes, rng: np.random.Generator) -> bytes:
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for number, (name, content) in enumerate(held):
             if number == chosen:
-                content = bytes(3_000_000) if rng.random() < 0.05 else _inside(content, rng)
+                zeros, way = rng.random() < 0.05, _header if rng.random() < 0.6 else WAYS[int(rng.integers(len(WAYS)))]
+                content = bytes(3_000_000) if zeros else way(content, rng)
             archive.writestr(name, content)
     return out.getvalue()
-
-
-def _inside(content: bytes, rng: np.random.Generator) -> bytes:
-    return (_header if rng.random() < 0.6 else WAYS[int(rng.integers(len(WAYS)))])(content, rng)
 
 
 def _header(data: bytes, rng: np.random.Generator) -> bytes:
@@ -250,18 +241,7 @@ def _header(data: bytes, rng: np.random.Generator) -> bytes:
     if data[:6] != b"\x93NUMPY" or not 10 < end < 1000:
         return _flip(data, rng)
     kinds = ["<f8", "|i1", "<i8", "|O", "<U9", "|S3", "<c16", "|b1", "<f2", ">i4", "<M8[s]", "|V8"]
-    shapes = [
-        "(1,)",
-        "()",
-        "(0,)",
-        "(2, 3)",
-        "(-1,)",
-        "(99999999999,)",
-        "(1, 1, 1)",
-        "(300000000, 0)",
-        "3",
-        "(4294967296,)",
-    ]
+    shapes = ["(1,)", "()", "(0,)", "(2, 3)", "(-1,)", "(99999999999,)", "(300000000, 0)", "3", "(4294967296,)"]
     kind, shape = str(rng.choice(kinds)), str(rng.choice(shapes))
     old = data[10:end]
     if rng.random() < 0.6:

@@ -10,11 +10,12 @@ import signal
 import sys
 import tempfile
 import traceback
+import unicodedata
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import IO
 
@@ -28,16 +29,17 @@ from meshmatch.experiments.hostile.samples import Sample, small_shape
 from meshmatch.shapes.shape import Shape
 
 KINDS = ("traceback", "crash", "time", "memory", "printed", "message")
-"""What can fail: another exception than ours, the end of the process, more than `SECONDS`, more memory than four times the
-file and a gigabyte, something printed that is no message, and a message that is long or could command a terminal."""
+"""What can fail: another exception than ours, the end of the process, more than `SECONDS` of the processor, more memory than
+four times the file and a gigabyte, something printed that is no message, a message that is long or commands a terminal."""
 SECONDS = 20.0
 BATCH = 200  # inputs of one process
-_SIGNED = (
-    "models",
-    "implicit models",
-    "templates",
-)  # with hashes that whoever damages a file on purpose would write too
-_PATIENCE = 15.0  # seconds beyond, for a library that hears no signal
+# With hashes that whoever damages a file on purpose would write too.
+_SIGNED = ("models", "implicit models", "templates")
+_NAMES: tuple[Callable[[str], str], ...] = (
+    *(str.swapcase, str.upper, lambda name: name.replace(" ", "%20"), lambda name: f"textures\\{name}"),
+    *(partial(unicodedata.normalize, form) for form in ("NFC", "NFD")),
+)  # what a file beside another may be called on its way through other systems
+_PATIENCE = 300.0  # seconds by the clock, for what sleeps, or hears no signal
 _ROOM = 1 << 30
 
 
@@ -49,6 +51,9 @@ class Failure:
     family: str
     kind: str
     what: str
+
+
+_shape = cache(small_shape)
 
 
 class _Late(BaseException):
@@ -70,6 +75,10 @@ def make_input(samples: Sequence[Sample], seed: int, number: int, folder: Path) 
     (folder / chosen).write_bytes(damaged(data, (other.folder / other.files[0]).read_bytes(), rng))
     if family in _SIGNED and rng.random() < 0.5:
         sign(folder)
+    if family == "shapes" and len(sample.files) > 1 and rng.random() < 0.3:
+        other_name = str(rng.choice(sample.files[1:]))
+        rename = _NAMES[int(rng.integers(len(_NAMES)))]
+        os.replace(folder / other_name, folder / rename(other_name))
     return sample, folder / sample.files[0]
 
 
@@ -126,13 +135,12 @@ def run_batch(samples: Sequence[Sample], seed: int, numbers: range, keep: Path) 
         failures += found
         left = range(at + 1, left.stop)
     for failure in failures:
-        _keep(samples, seed, failure, keep)
+        place = keep / f"{failure.kind}-{failure.family}-{failure.number}"
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        make_input(samples, seed, failure.number, place)
+        (place / "what.txt").write_text(failure.what, encoding="utf-8", errors="replace")
     return failures
-
-
-@cache
-def _shape() -> Shape:
-    return small_shape()
 
 
 def _listen(ready: int, child: int, first: int) -> tuple[int, list[Failure]]:
@@ -142,7 +150,7 @@ def _listen(ready: int, child: int, first: int) -> tuple[int, list[Failure]]:
     found, at, family, text = [], first - 1, "", b""
     late = False
     while True:
-        heard, _, _ = select.select([ready], [], [], SECONDS + _PATIENCE)
+        heard, _, _ = select.select([ready], [], [], _PATIENCE)
         late = not heard
         more = b"" if late else os.read(ready, 1 << 16)
         if not more:
@@ -173,7 +181,7 @@ def _work(samples: Sequence[Sample], seed: int, numbers: range, out: IO[str]) ->
     def late(number: int, frame: object) -> None:
         raise _Late
 
-    signal.signal(signal.SIGALRM, late)
+    signal.signal(signal.SIGPROF, late)
     shape = _shape()
     with tempfile.TemporaryFile() as printed, tempfile.TemporaryDirectory() as place:
         os.dup2(printed.fileno(), 2)
@@ -187,30 +195,16 @@ def _work(samples: Sequence[Sample], seed: int, numbers: range, out: IO[str]) ->
             sample, path = make_input(samples, seed, number, folder)
             print(json.dumps({"begun": sample.family}), file=out, flush=True)
             kind, what = "", ""
-            with suppress(_Late), _alarm(SECONDS):
+            with suppress(_Late):
                 kind, what = "time", "it took too long, and swallowed the alarm"
+                signal.setitimer(signal.ITIMER_PROF, SECONDS)
                 try:
                     kind, what = judge(sample.family, path, shape, printed)
                 except Exception:
                     kind, what = "crash", traceback.format_exc()
+                finally:
+                    signal.setitimer(signal.ITIMER_PROF, 0)
             printed.seek(0)
             printed.truncate()
             print(json.dumps(asdict(Failure(number, sample.family, kind, what[-4000:]))), file=out, flush=True)
             shutil.rmtree(folder)
-
-
-@contextmanager
-def _alarm(seconds: float) -> Iterator[None]:
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-
-
-def _keep(samples: Sequence[Sample], seed: int, failure: Failure, keep: Path) -> None:
-    folder = keep / f"{failure.kind}-{failure.family}-{failure.number}"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    make_input(samples, seed, failure.number, folder)
-    (folder / "what.txt").write_text(failure.what, encoding="utf-8", errors="replace")

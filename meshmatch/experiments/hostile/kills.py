@@ -1,6 +1,4 @@
-"""Commands that are killed at random moments, or find the disk full: afterwards the old or the new is there, whole, and
-nothing else.
-"""
+"""Commands killed at random moments, or on a full disk: afterwards the old or the new is there, whole, and nothing else."""
 
 from __future__ import annotations
 
@@ -36,16 +34,16 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import save_textured
 from meshmatch.templates.location import bundled_folder
 
+Files = Callable[[Path], None]
+Outputs = Callable[[Path], list[Path]]
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A command in a folder of its own.
-
-    Before each kill `reset` brings back the old. `outputs` are the files that are looked at afterwards, and `states` what
-    they may be: the old and the new; `apart` if each file appears by itself. Then a command follows, `after`, which goes on
-    with what was begun or clears up what was left. `seconds` is what a run takes.
+    """A command in a folder of its own. Before each kill `reset` brings back the old. `outputs` are the files that are
+    looked at afterwards, and `states` what they may be: the old and the new; `apart` if each file appears by itself. Then a
+    command follows, `after`, which goes on with what was begun or clears up what was left. A run takes some `seconds`.
     """
 
     name: str
@@ -71,14 +69,7 @@ def make_cases(folder: Path, training: bool) -> list[Case]:
     """Cheap commands come more often in a turn. Each is run once to its end, to know what the new is."""
     shape = small_shape()
 
-    def case(
-        name: str,
-        words: str,
-        files: Callable[[Path], None],
-        outputs: Callable[[Path], list[Path]],
-        after: str = "",
-        apart: bool = False,
-    ) -> Case:
+    def case(name: str, words: str, files: Files, outputs: Outputs, after: str = "", apart: bool = False) -> Case:
         place = folder / name.replace(" ", "-")
         place.mkdir(parents=True)
         files(place)
@@ -136,8 +127,10 @@ def make_cases(folder: Path, training: bool) -> list[Case]:
         return lambda place: sorted(path for part in parts for path in (place / part).rglob("*") if path.is_file())
 
     def trained(place: Path) -> list[Path]:
-        made = place / "m"
-        return [made / "weights.safetensors", made / "template.safetensors"] if (made / "card.json").exists() else []
+        """The files of a model that has a card."""
+        if not any((place / "m" / card).exists() for card in ("card.json", IMPLICIT)):
+            return []
+        return [path for name in ("weights", "template") for path in (place / "m").glob(f"{name}.safetensors")]
 
     def prepared(place: Path) -> list[Path]:
         """Without the picture, which is drawn last, for people."""
@@ -150,12 +143,7 @@ def make_cases(folder: Path, training: bool) -> list[Case]:
     def fitted(place: Path) -> None:
         shutil.copytree(fit.folder / "fits", place / "fits")
 
-    def learned(place: Path) -> list[Path]:
-        return [place / "m" / "weights.safetensors"] if (place / "m" / IMPLICIT).exists() else []
-
-    add = case(
-        "models add", "models add new/blob --replace", model, all_of("home/models"), "models add new/blob"
-    )  # fmt: skip
+    add = case("models add", "models add new/blob --replace", model, all_of("home/models"), "models add new/blob")
     obj = case(
         "transfer-texture", "transfer-texture a.obj b.ply --map m.npz -o o.obj --size 64 -q", texture,
         lambda place: [place / name for name in ("o.obj", "o.mtl", "o.png")], apart=True,
@@ -172,7 +160,7 @@ def make_cases(folder: Path, training: bool) -> list[Case]:
         learn = "train --shapes out -o m --steps 3 --workers 0 -q"
         long.append(case("train", learn, ready, trained, learn))
         implicit = "train --implicit --shapes in -o m --steps 3 -q"
-        long.append(case("train --implicit", implicit, lambda place: write_eggs(place / "in"), learned, implicit))
+        long.append(case("train --implicit", implicit, lambda place: write_eggs(place / "in"), trained, implicit))
     return [one for last in long for one in (*[add, obj, mapping, add, mapping, add] * 2, last)]
 
 

@@ -68,16 +68,6 @@ def prepare_eggs(eggs: Path, output: Path) -> None:
     prepare(eggs, output, PrepareConfig(NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)))
 
 
-def learn_eggs(prepared: Path, output: Path, training: TrainConfig = RECIPE.train) -> None:
-    """A model of a prepared folder."""
-    train(output, shapes=prepared, recipe=replace(RECIPE, train=training))
-
-
-def learn_implicitly(eggs: Path, output: Path, training: TrainConfig = IMPLICIT_TRAINING) -> None:
-    """An implicit model."""
-    train_implicit(output, eggs, config=_IMPLICIT_NETWORK, training=training)
-
-
 @cache
 def trainers() -> tuple[Trainer, Trainer]:
     """What reads the checkpoints of both kinds."""
@@ -98,22 +88,18 @@ def learned_samples(folder: Path) -> Iterator[tuple[str, Path, str]]:
     write_eggs(eggs)
     collection = Collection(folder / "fits", workers=1)
     collection.fit(eggs, model="none")
-    for unused in ("first", "first.safetensors", ".lock", "fits.csv"):
-        path = folder / "fits" / unused
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    _remove(folder / "fits", "first", "first.safetensors", ".lock", "fits.csv")
     for state in ("fits", "alone"):
         yield "fits", folder / "fits", f"{state}/egg0.safetensors"
     (folder / "atlas").mkdir()
     collection.atlas(modes=2).save(folder / "atlas" / "atlas.npz")
     yield "atlases", folder / "atlas", "atlas.npz"
     prepare_eggs(eggs, folder / "prepared")
-    for unused in ("nodes.png", "normalised"):
-        path = folder / "prepared" / unused
-        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    _remove(folder / "prepared", "nodes.png", "normalised")
     for name in ("prepared.json", "points.safetensors", "shapes.safetensors"):
         yield "prepared", folder / "prepared", name
-    learn_eggs(folder / "prepared", folder / "model")
-    learn_implicitly(eggs, folder / "chair")
+    train(folder / "model", shapes=folder / "prepared", recipe=RECIPE)
+    train_implicit(folder / "chair", eggs, config=_IMPLICIT_NETWORK, training=IMPLICIT_TRAINING)
     for model in ("model", "chair"):
         checkpoint = folder / model / CHECKPOINT
         kept = folder / f"{model}-checkpoint"
@@ -125,6 +111,11 @@ def learned_samples(folder: Path) -> Iterator[tuple[str, Path, str]]:
         yield "models", folder / "model", name
     for name in (WEIGHTS, IMPLICIT):
         yield "implicit models", folder / "chair", name
+
+
+def _remove(folder: Path, *names: str) -> None:
+    for path in (folder / name for name in names):
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def sign(folder: Path) -> None:

@@ -29,7 +29,8 @@ from meshmatch.models.checkpoint import load_weights as load_network
 from meshmatch.models.implicit_card import IMPLICIT, read_implicit_card
 from meshmatch.models.registry import TEMPLATE, verify_model
 from meshmatch.shapes.appearance import ImageReader
-from meshmatch.shapes.files import load_shape
+from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.parts import Parts
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_coordinates
@@ -56,6 +57,8 @@ def readers(family: str, path: Path, shape: Shape) -> Iterator[Callable[[], obje
     """All that the product does with a file of a family while it is read."""
     if family == "shapes":
         yield lambda: _look_at(path)
+        yield lambda: _choose(path)
+        yield lambda: _write_again(path)
         if path.suffix in (".glb", ".gltf"):
             yield lambda: load_weights(path, load_shape(path))
     simple: dict[str, tuple[Callable[[], object], ...]] = {
@@ -93,6 +96,27 @@ def _look_at(path: Path) -> None:
             found.append(look(path, shape))
         except MeshmatchError as error:
             check(error.message, error.hint)
+
+
+def _choose(path: Path) -> None:
+    """Parts of a shape by number or name."""
+    for only, without in (("1", ()), ((), ("2", "sto*")), (("body", "1"), "*")):
+        try:
+            load_shape(path, only=only, without=without)
+        except MeshmatchError as error:
+            check(error.message, error.hint)
+    Parts.of(load_shape(path))
+
+
+def _write_again(path: Path) -> None:
+    """What is read can be written, and what was written can be read."""
+    shape = load_shape(path)
+    for suffix in (".ply", ".glb") if shape.is_cloud else (".ply", ".obj", ".off", ".glb", ".stl"):
+        out = path.with_name(f"again{suffix}")
+        save_shape(out, shape)
+        again = load_shape(out)
+        if suffix != ".stl" and (again.V, again.F) != (shape.V, shape.F):
+            raise AssertionError(f"{suffix} has {again.V} vertices and {again.F} faces, not {shape.V} and {shape.F}")
 
 
 def _map_all(path: Path) -> None:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, OutputError
 from meshmatch.shapes.colors import light, seen
 
 NO_FACES = np.empty((0, 3), np.int64)
@@ -118,6 +118,16 @@ def painted(channels: Float[Floats, "N C"]) -> Float[Floats, "N 4"]:
         largest = 255.0 if (channels[:, some] > 1).any() else 1.0
         colors[:, some] = np.clip(channels[:, some] / largest, 0.0, 1.0)
     return colors
+
+
+def as_float32(values: Floats, suffix: str) -> NDArray[np.float32]:
+    """Values for a file of 32-bit floats; `OutputError` for finite ones that are too large for these."""
+    with np.errstate(over="ignore"):
+        written = values.astype("<f4")
+    if not np.isfinite(written).all() and (np.isinf(written) & np.isfinite(values)).any():
+        what = f"the shape reaches beyond {np.finfo(np.float32).max:.1e}, the largest number of a {suffix} file"
+        raise OutputError(what, "save it as .ply, .obj or .off, or scale it first")
+    return written
 
 
 def colors_of_faces(count: int, faces: Int[Ints, "F 3"], colors: Float[Floats, "F 4"]) -> Float[Floats, "count 4"]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import dot, same_rows, vertex_normals
 from meshmatch.shapes.colors import light
-from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats import Textured, as_float32
 from meshmatch.shapes.shape import Shape
 
 # Coincident vertices whose normals are further than this cosine (32 degrees) from their mean are an edge of the shape,
@@ -100,7 +100,7 @@ def _write(
     """Arrays and an image one after the other, each at a multiple of four bytes, behind what describes them."""
     center = center_of(attributes["POSITION"])
     attributes = attributes | {"POSITION": attributes["POSITION"] - center}
-    arrays: list[NDArray[Any]] = [values.astype("<f4") for values in attributes.values()]
+    arrays: list[NDArray[Any]] = [as_float32(values, ".glb") for values in attributes.values()]
     primitive: dict[str, Any] = {"attributes": {key: k for k, key in enumerate(attributes)}, "mode": _POINTS}
     if len(faces):
         primitive |= {"mode": _TRIANGLES, "indices": len(arrays)}
@@ -113,7 +113,7 @@ def _write(
     for move in (moves or {}).values():
         places.append(len(arrays))
         primitive["targets"].append({key: len(arrays) + k for k, key in enumerate(move)})
-        arrays += [values.astype("<f4") for values in move.values()]
+        arrays += [as_float32(values, ".glb") for values in move.values()]
     chunks = [*(values.tobytes() for values in arrays), *([png] if png else [])]
     padded = [chunk + b"\0" * (-len(chunk) % 4) for chunk in chunks]
     starts = np.cumsum([0, *map(len, padded)]).tolist()

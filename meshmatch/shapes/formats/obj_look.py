@@ -18,7 +18,7 @@ from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap
 from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.companions import beside, folded
-from meshmatch.shapes.formats import columns, damaged, lines_of, numbers, words_per_line
+from meshmatch.shapes.formats import DECIMAL_COMMA, columns, damaged, lines_of, numbers, words_per_line
 from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines, vertices_of_corners
 from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import read_bytes
@@ -26,7 +26,7 @@ from meshmatch.shapes.shape import Shape
 
 _LARGEST_MTL = 10_000_000  # bytes
 _MOST_LIBRARIES = 100  # names in one line
-_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
+_NUMBER = r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:e[+-]?\d+)?"
 _OPTION = re.compile(
     rf"(?:(-o|-s|-t)((?:\s+{_NUMBER}(?!\S)){{0,3}})|-mm\s+\S+\s+\S+|(-clamp)\s+(\S+)|"
     r"-(?:blendu|blendv|cc|bm|boost|texres|imfchan|type)\s+\S+)(?:\s+|\Z)",
@@ -193,19 +193,25 @@ def _parse(file: Path) -> dict[str, _Entry]:
             if word == "newmtl":
                 entry = entries[rest] = _Entry(folder=file.parent)
             elif word == "kd" and not rest.startswith(("spectral", "xyz")):
-                values = [float(number) for number in rest.split()[:3]]
+                values = [_number(word) for word in rest.split()[:3]]
                 entry.color = (values[0], values[1], values[2]) if len(values) == 3 else (values[0],) * 3
             elif word == "d":
-                entry.dissolve = float(rest.split()[-1])  # d -halo 0.5
+                entry.dissolve = _number(rest.split()[-1])  # d -halo 0.5
             elif word == "tr":
-                entry.transparency = float(rest.split()[-1])
+                entry.transparency = _number(rest.split()[-1])
             elif word == "map_kd":
                 entry.image = _map(rest)
             elif word == "map_d":
                 entry.alpha = _map(rest)
         except (ValueError, LookupError) as error:
-            raise damaged(file.name, f"cannot make sense of the line '{line.strip()[:60]}'") from error
+            odd = damaged(file.name, f"cannot make sense of the line '{line.strip()[:60]}'")
+            raise InputError(odd.message, DECIMAL_COMMA if "," in rest else odd.hint) from error
     return entries
+
+
+def _number(word: str) -> float:
+    """A number, with a decimal point or comma: words of an mtl are split by spaces."""
+    return float(word.replace(",", ".") if word.count(",") == 1 and "." not in word else word)
 
 
 def _map(text: str) -> _Map:
@@ -217,7 +223,7 @@ def _map(text: str) -> _Map:
             raise ValueError("an unknown option")
         option, words, clamp, state = (group.lower() for group in found.groups(""))
         if option in ("-o", "-s"):
-            u, v = [*map(float, words.split()), 0.0 if option == "-o" else 1.0][:2]
+            u, v = [*map(_number, words.split()), 0.0 if option == "-o" else 1.0][:2]
             made = replace(made, offset=(u, v)) if option == "-o" else replace(made, scale=(u, v))
         elif clamp:
             made.clamp = state == "on"

@@ -248,9 +248,9 @@ def _ears(flat: Floats, sizes: Ints) -> tuple[Ints, Bools]:
             tail[again] += left[again]
             alive &= patience < 3
         if alive.sum() < 0.75 * len(number):
-            number, sizes, after, before, there, queue, head, tail, left, patience, x, y = (
-                each[alive] for each in (number, sizes, after, before, there, queue, head, tail, left, patience, x, y)
-            )
+            number, sizes, head, tail, left, patience = (e[alive] for e in (number, sizes, head, tail, left, patience))
+            after, before, queue = after[alive], before[alive], queue[alive]
+            there, x, y = there[alive], x[alive], y[alive]
             alive, keys = np.ones(len(number), bool), _keys(x)
     return out, whole
 

@@ -14,7 +14,17 @@ import numpy as np
 from meshmatch.arrays import Bools, Float, Floats
 from meshmatch.errors import InputError, warn
 from meshmatch.geometry.triangles import triangle_vectors
-from meshmatch.shapes.formats import WRONG_SUFFIX, Raw, check_places, damaged, fan, lines_of, numbers, words_per_line
+from meshmatch.shapes.formats import (
+    WRONG_SUFFIX,
+    Raw,
+    as_float32,
+    check_places,
+    damaged,
+    fan,
+    lines_of,
+    numbers,
+    words_per_line,
+)
 from meshmatch.shapes.input_files import check_text
 from meshmatch.shapes.shape import Shape
 
@@ -113,8 +123,7 @@ def write(path: Path, shape: Shape) -> None:
     """Binary, 32-bit floats; with a warning where these move vertices by what can be seen."""
     corners = shape.verts[shape.faces]
     rows = np.zeros(shape.F, _ROWS)
-    with np.errstate(over="ignore"):  # of positions beyond 1e38
-        rows["corners"] = corners
+    rows["corners"] = as_float32(corners, ".stl")
     lengths = np.linalg.norm(shape.face_vectors, axis=1)
     rows["normal"] = shape.face_vectors / np.where(lengths > 0, lengths, 1.0)[:, None]
     moved = float(np.abs(rows["corners"] - corners).max())
