@@ -89,8 +89,8 @@ def _unmarked(name: str, data: bytes) -> bytes:
     """Text without a byte order mark, and in UTF-8 where the mark is that of UTF-16."""
     if name.lower().endswith(".stl") and b"solid" not in data[:16].replace(b"\0", b"").lower():
         return data  # binary, with a header that may hold anything
-    if data.startswith(codecs.BOM_UTF8):
-        return data[len(codecs.BOM_UTF8) :]
+    if data.startswith(codecs.BOM_UTF8):  # sometimes two: a program wrote one before what had one
+        return data.removeprefix(codecs.BOM_UTF8).removeprefix(codecs.BOM_UTF8)
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         if len(data) > LARGEST_TEXT:
             raise _much_text(name, len(data), LARGEST_TEXT)

@@ -10,7 +10,7 @@ import csv
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any, Literal
 from xml.etree import ElementTree
 
@@ -228,7 +228,7 @@ def _record(value: Any) -> Record:
         if {"x", "y", "z"} <= set(axes) and "position" not in value:
             return value | {"position": [axes[axis] for axis in "xyz"]}
         return value
-    return {"vertex" if isinstance(value, int) else "position": value}
+    return {"vertex" if isinstance(value, int | float) else "position": value}
 
 
 def _markups(path: Path, lists: list[Any]) -> tuple[list[Record], Space]:
@@ -236,7 +236,7 @@ def _markups(path: Path, lists: list[Any]) -> tuple[list[Record], Space]:
     records: list[Record] = []
     spaces = set()
     for markup in lists:
-        points = markup.get("controlPoints") if isinstance(markup, dict) else None
+        points = markup.get("controlPoints", []) if isinstance(markup, dict) else None  # a region has none
         if not isinstance(points, list) or not all(isinstance(point, dict) for point in points):
             raise InputError("its markups hold no list of control points")
         check_memory(path.name, path.stat().st_size, _RECORD * (len(records) + len(points)))
@@ -244,7 +244,8 @@ def _markups(path: Path, lists: list[Any]) -> tuple[list[Record], Space]:
             spaces.add(_SPACES.get(str(markup.get("coordinateSystem", "")).upper(), ""))
         for point in points:
             is_set = point.get("positionStatus", "defined") == "defined"
-            records.append({"name": point.get("label"), "position": point.get("position") if is_set else None})
+            position = point.get("position") if is_set else None
+            records.append({"name": point.get("label"), "position": position or None})
     if len(spaces) > 1:
         raise InputError("its markups are in several coordinate systems", "save each list in a file of its own")
     return records, next(iter(spaces), "")
@@ -257,12 +258,19 @@ def _read_fcsv(path: Path) -> tuple[list[Record], Space]:
     if space and space[1].upper() not in _SPACES:
         raise InputError(f"its coordinate system is {space[1][:20]}, not LPS or RAS")
     columns = re.search(r"^#\s*columns\s*=\s*(.+)$", text, re.MULTILINE)
-    head = [name.strip() for name in (columns[1] if columns else _FCSV_COLUMNS).split(",")]
+    names = columns[1] if columns else _FCSV_COLUMNS
+    mark = ";" if ";" in names else ","
+    head = [name.strip() for name in names.split(mark)]
     if not {"x", "y", "z"} <= set(head):
         raise InputError("its columns have no x, y and z")
     records = []
-    for row in csv.reader(line for line in text.splitlines() if line.strip() and not line.startswith("#")):
+    lines = (line for line in text.splitlines() if line.strip(" \t;,") and not line.startswith("#"))
+    for row in csv.reader(lines, delimiter=mark):
         cell = dict(zip(head, row, strict=False))  # later columns may be left out
+        if len(row) == len(head) + 3 and mark == ",":
+            raise InputError(
+                f"landmark {len(records)} has {len(row)} cells, but there are {len(head)} columns", DECIMAL_COMMA
+            )
         name = cell.get("label") or cell.get("id")
         records.append({"name": name, "position": [number(cell.get(axis, "")) for axis in "xyz"]})
     return records, _SPACES[space[1].upper()] if space else ""
@@ -272,7 +280,7 @@ def _read_pts(path: Path) -> tuple[list[Record], Space]:
     """Points a line, with or without a name before the three coordinates, among lines that count them."""
     records = []
     for line in read_text(path, _RECORD).splitlines():
-        words = line.replace("\t", " ").split()
+        words = re.sub(r"[,;](?=\s|$)|\t", " ", line).split()
         counts = len(words) == 1 and (words[0].isdigit() or words[0] in "{}")
         declares = words and re.fullmatch(r"(version|n_points|points|dim|landmarks)\b.*", line.strip(), re.IGNORECASE)
         if not words or words[0].startswith(("#", "//")) or counts or declares:
@@ -295,8 +303,6 @@ def _read_tps(path: Path, shape: str) -> tuple[list[Record], Space]:
         key, has_value, value = (part.strip() for part in line.partition("="))
         key = key.upper()
         if key == "LM" or key == "LM3":
-            if key == "LM" and value != "0":
-                raise InputError("its landmarks lie in a plane (LM=)", "those of a shape have three coordinates: LM3=")
             specimens.append(([], {}))
         elif not line.strip():
             continue
@@ -305,8 +311,12 @@ def _read_tps(path: Path, shape: str) -> tuple[list[Record], Space]:
         elif has_value:
             specimens[-1][1][key] = value
         else:
-            specimens[-1][0].append(_three(line.split(), str(len(specimens[-1][0]))))
-    own = [one for one in specimens if shape and shape in (Path(one[1].get(key, "")).stem for key in ("ID", "IMAGE"))]
+            words = line.split()
+            if len(words) == 2:
+                raise InputError("its landmarks lie in a plane", "those of a shape have three coordinates: LM3=")
+            specimens[-1][0].append(_three(words, str(len(specimens[-1][0]))))
+    named = [{PureWindowsPath(facts.get(key, "")).stem for key in ("ID", "IMAGE")} for _, facts in specimens]
+    own = [one for one, names in zip(specimens, named, strict=True) if shape and shape in names]
     chosen = own if len(specimens) > 1 else specimens
     if specimens and len(chosen) != 1:
         problem = f"it holds landmarks of {len(specimens)} shapes, {len(chosen)} of them of {shape or 'this one'}"

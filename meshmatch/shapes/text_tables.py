@@ -27,7 +27,8 @@ from meshmatch.shapes.input_files import check_memory, read_text
 
 DECIMAL_COMMA = "for a decimal comma: put semicolons or tabs between the cells (0,5;1,25), or write points (0.5)"
 _WORDS = (
-    "na n/a nan -nan +nan null none #n/a #num! #div/0! #value! #ref! #name? 1.#qnan 1.#ind -1.#ind nan(ind) -nan(ind)"
+    "na n/a nan -nan +nan null none 1.#qnan 1.#ind -1.#ind nan(ind) -nan(ind) #n/a #num! #div/0! #value! #ref! #name? "
+    "#nv #zahl! #wert! #bezug! #nombre! #valeur! #n/d #valor! #nome?"
 )
 _MISSING = frozenset((*_WORDS.split(), ""))
 _SIGN = "[+\N{MINUS SIGN}-]?"  # some locales write the mathematical sign
@@ -36,7 +37,7 @@ _NUMBER = re.compile(rf"{_SIGN}(?:[0-9]+\.?[0-9]*|[0-9]+,[0-9]+|[.,][0-9]+){_EXP
 _INFINITE = re.compile(r"[+-]?inf(?:inity)?", re.IGNORECASE)
 _GROUPED = re.compile(rf"{_SIGN}[1-9][0-9]{{0,2}},[0-9]{{3}}")  # 1,234: of a thousand and more, or of less than ten
 # A mark begins a comment, but not in what spreadsheets and C write for a value that is none.
-_COMMENT = r"#(?!(?:N/A|NUM!|DIV/0!|VALUE!|REF!|NAME\?|QNAN|IND|SNAN))"
+_COMMENT = r"#(?!(?:N/[AD]|NV|[A-Z/0]+[!?]|QNAN|IND|SNAN)(?:[\t;,)\"\s]|$))"
 _WHOLE_LINE = re.compile(rf"^[ \t]*{_COMMENT}.*$", re.MULTILINE)
 _TO_THE_END = re.compile(rf"{_COMMENT}.*$", re.MULTILINE)
 # Lines of a single column with decimal commas: is there another line; and signs for and against such a column.
@@ -242,10 +243,10 @@ def read_table(
                 break
             comment = line.strip().lstrip("#").strip() or comment
         text = (_WHOLE_LINE if comments == "lines" else _TO_THE_END).sub("", text)
-    declared = re.match(r"\s*sep=([\t;,])[ \t]*\n", text)  # how Excel is told
+    declared = re.match(r"\s*(\"?)sep=([\t;,])\1[ \t]*\n", text)  # how Excel is told
     if declared:
         text = "\n" * declared[0].count("\n") + text[declared.end() :]
-        separator = declared[1]
+        separator = declared[2]
     else:
         separator = _separator(text, blanks)
     doubt = False

@@ -191,6 +191,10 @@ def _from_rows(rows: list[list[str]], counts: tuple[int, int]) -> tuple[list[str
     column = head.index("label") if "label" in head else len(head) - 1
     if len(head) > 2 and "label" not in head:
         raise InputError(f"it has {len(head)} columns and none is called label", "use vertex,label")
+    if re.fullmatch(r"(vertex|face)\W+label", head[0]):
+        raise InputError(f"{rows[0][0]!r} names two columns", "put a comma, a semicolon or a tab between columns")
+    if head == ["", "label"] and table_files.is_numbered(["0", *(row[0] for row in rows)]):
+        return [row[1] for row in rows], written  # as R numbers rows
     if written is not None or (len(head) == 2 and column == 1):
         table_files.check_numbered([row[0] for row in rows])
     return [row[column] for row in rows], written

@@ -125,8 +125,9 @@ def test_what_a_file_may_require(tmp_path: Path, extension: str, fine: bool) -> 
         load_shape(path)
 
 
-def test_compression_that_is_not_listed_as_required(tmp_path: Path) -> None:
-    draco = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
+@pytest.mark.parametrize("extension", ["KHR_draco_mesh_compression", "MADE_up_compression"])
+def test_compression_that_is_not_listed_as_required(tmp_path: Path, extension: str) -> None:
+    draco = {extension: {"bufferView": 0, "attributes": {"POSITION": 0}}}
     meshes = [{"primitives": [{"attributes": {"POSITION": 0}, "extensions": draco}]}]
     assert load_shape(scene(tmp_path, meshes=meshes)).V == 3  # plain data is there as well
     bare = [{"componentType": 5126, "count": 3, "type": "VEC3"}]

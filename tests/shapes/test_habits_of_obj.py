@@ -345,3 +345,25 @@ def test_images_beside_the_obj_where_the_mtl_lies_below(tmp_path: Path) -> None:
     (tmp_path / "materials" / "a.mtl").write_text("newmtl skin\nmap_Kd ..\\textures\\T.PNG\n")
     (tmp_path / "t.png").rename(tmp_path / "Textures" / "t.png")
     assert textured(path, load_shape(path)) == ["skin"]
+
+
+@pytest.mark.parametrize(
+    ("use", "mtl"),
+    [
+        ("Material #2", "newmtl Material #1\nKd 1 0 0\nnewmtl Material #2\nmap_Kd t.png\n"),
+        ("skin # of the body", "newmtl skin # smooth\nd 1.0 # opaque\nKd 1 1 1 # white\nmap_Kd t.png # the image\n"),
+        ("skin", "newmtl skin\nKd # none\nmap_Kd t.png\nmap_d\nTr\n"),
+    ],
+)
+def test_a_mark_ends_a_name_or_begins_a_comment(tmp_path: Path, use: str, mtl: str) -> None:
+    path = write(
+        tmp_path, mtl, (HEAD + BODY).replace("usemtl skin", f"usemtl {use}").replace("a.mtl", "a.mtl # materials")
+    )
+    [made] = load_appearance(path, load_shape(path)).materials
+    np.testing.assert_array_equal(made.image, PAINT)
+    assert made.alpha == "opaque"
+
+
+def test_two_byte_order_marks(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("\ufeff\ufeff" + BODY, encoding="utf-8")
+    assert load_shape(tmp_path / "a.obj").V == 4

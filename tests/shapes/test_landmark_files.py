@@ -62,6 +62,22 @@ FILES = {
         "a.pp",
         "<PickedPoints>" + rows('<point x="{2}" y="{3}" z="{4}" name="{1}"/>', comma=True) + "</PickedPoints>",
     ),
+    "Slicer's fiducials with semicolons": (
+        "a.fcsv",
+        FCSV.format("LPS").replace(",", ";") + rows('{0};{2};{3};{4};0;0;0;1;1;1;0;"{1}";;', comma=True) + ";;;\n",
+    ),
+    "Slicer's markups beside a region": (
+        "a.mrk.json",
+        markups().replace(
+            '{"markups": [', '{"markups": [{"type": "ROI", "coordinateSystem": "LPS", "center": [0, 0, 0]}, '
+        ),
+    ),
+    "points with commas": ("a.pts", rows("{2}, {3}, {4}")),
+    "tps of a Windows folder": (
+        "a.tps",
+        "LM3=1\n0 0 9\nID=other\nLM=3\n" + rows("{2} {3} {4}") + "IMAGE=D:\\in\\sphere1.ply\n",
+    ),
+    "vertices as floats": ("a.json", json.dumps(VERTICES.astype(float).tolist())),
     "json by axes": ("a.json", json.dumps([dict(zip("xyz", p, strict=True)) for p in POINTS.tolist()])),
 }
 
@@ -134,6 +150,7 @@ def test_what_slicer_gets_states_its_frame(tmp_path: Path, suffix: str, space: s
         ("a.pts", "version: 1\nn_points: 1\n{\n1 2\n}\n", "lie in a plane"),
         ("a.pts", "0 0 1 255 255 255 255\n", "is not a point"),
         ("a.fcsv", "# CoordinateSystem = IJK\n1,0,0,1\n", "not LPS or RAS"),
+        ("a.fcsv", "# columns = id,x,y,z,label\n1,0,46,1,2,3,4,L\n", "8 cells, but there are 5 columns"),
         ("a.json", '{"markups": [{"controlPoints": 7}]}', "no list of control points"),
         ("a.json", '{"nose": [0,46, 1,2, 3,4]}', "three numbers are needed"),
         ("a.csv", "name,x,y,z\nnose,0,46,1,2,3,4\n", "line 2 has 7 cells, the first 4"),

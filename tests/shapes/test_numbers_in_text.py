@@ -30,6 +30,8 @@ def read(folder: Path, name: str, text: str) -> np.ndarray:
     [
         "//X Y Z\n3\n" + table(" "),
         "3\n//X Y Z\n" + table(" "),
+        "//\n//X Y Z\n" + table(" "),
+        "% written by MATLAB\n! and another\n" + table(" "),
         "X Y Z\n" + table(" "),
         "x,y,z\n" + table(","),
         '"x","y","z"\n' + table('","').replace("\n", '"\n'),

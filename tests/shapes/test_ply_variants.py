@@ -78,14 +78,6 @@ def test_faces_that_cannot_be_found_are_no_cloud(tmp_path: Path, lines: list[str
         load_shape(tmp_path / "a.ply")
 
 
-def test_faces_of_two_corners_are_said(tmp_path: Path) -> None:
-    (tmp_path / "a.ply").write_text(
-        head("element face 1", "property list uchar int vertex_indices") + rows(POINTS) + "2 0 1\n"
-    )
-    with pytest.warns(MeshmatchWarning, match="none of its 1 faces"):
-        assert load_shape(tmp_path / "a.ply").is_cloud
-
-
 @pytest.mark.parametrize(
     ("names", "kind", "scale"),
     [
@@ -169,7 +161,11 @@ def test_coordinates_of_corners(tmp_path: Path, polygons: str, name: str, spelle
 
 
 @pytest.mark.parametrize(
-    ("u", "v"), [("texture_u", "texture_v"), ("s", "t"), ("u", "v"), ("texcoord_x", "texcoord_y"), ("tx", "ty")]
+    ("u", "v"),
+    [
+        *(("texture_u", "texture_v"), ("s", "t"), ("u", "v"), ("texcoord_x", "texcoord_y"), ("tx", "ty")),
+        *(("uv1", "uv2"), ("TEXCOORD_0_U", "TEXCOORD_0_V"), ("texture_coord_s", "texture_coord_t"), ("u0", "v0")),
+    ],
 )
 def test_coordinates_of_vertices(tmp_path: Path, u: str, v: str) -> None:
     (tmp_path / "my tex.png").write_bytes(encoded(quarters()))
@@ -202,6 +198,8 @@ def test_the_other_image_and_what_is_missing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"needs the image gone\.png"):
         find_appearance(path, shape)
     path.write_text(vertex_pairs("a", "b", "comment TextureFile other.png\n"))
+    with pytest.warns(MeshmatchWarning, match=r"names the image other\.png, but no texture coordinates"):
+        assert find_appearance(path, load_shape(path)) is None
     assert load_coordinates(path, load_shape(path)) is None
     with pytest.raises(InputError, match="no texture coordinates"):
         load_appearance(path, load_shape(path), tmp_path / "other.png")
@@ -226,3 +224,60 @@ def test_a_picture_shows_the_image(tmp_path: Path) -> None:
     picture([tmp_path / "a.ply"], tmp_path / "a.png", look=Look(size=(100, 100)))
     pixels = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
     assert (pixels[..., 0] - pixels[..., 1:].max(axis=-1)).max() > 80
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["comment texture file: t.png", "comment TextureFile=t.png", "comment Texture t.png", "obj_info TextureFile t.png"],
+)
+def test_ways_to_name_an_image(tmp_path: Path, line: str) -> None:
+    (tmp_path / "t.png").write_bytes(encoded(quarters()))
+    (tmp_path / "a.ply").write_text(vertex_pairs("s", "t", f"{line}\n"))
+    look = load_appearance(tmp_path / "a.ply", load_shape(tmp_path / "a.ply"))
+    np.testing.assert_array_equal(look.materials[0].image, quarters())
+
+
+def test_the_axes_of_a_tangent_are_no_texture_coordinates(tmp_path: Path) -> None:
+    (tmp_path / "t.png").write_bytes(encoded(quarters()))
+    names = ("tx", "ty", "u", "v")
+    vertex = "".join(f"property float {name}\n" for name in names)
+    text = vertex_pairs("a", "b", "comment TextureFile t.png\n").replace("property float a\nproperty float b\n", vertex)
+    at = text.index("end_header\n") + len("end_header\n")
+    lines = text[at:].splitlines()
+    lines[:4] = [" ".join([*line.split()[:3], "9", "9", *line.split()[3:]]) for line in lines[:4]]
+    (tmp_path / "a.ply").write_text(text[:at] + "\n".join(lines) + "\n")
+    np.testing.assert_array_equal(load_appearance(tmp_path / "a.ply", load_shape(tmp_path / "a.ply")).uv, CORNERS)
+
+
+@pytest.mark.parametrize("kind", ["uint", "float"])
+def test_colors_packed_into_one_number(tmp_path: Path, kind: str) -> None:
+    packed = np.array([0x00FF8000 + k for k in range(6)], "<u4")
+    body = b"".join(p.tobytes() + c.tobytes() for p, c in zip(POINTS.astype("<f4"), packed, strict=True))
+    header = head(order="binary_little_endian", vertex=(f"{kind} rgb",))
+    (tmp_path / "a.ply").write_bytes(header.encode() + body)
+    found = load_shape(tmp_path / "a.ply").colors
+    assert found is not None
+    np.testing.assert_allclose(found * 255, [[255, 128, k, 255] for k in range(6)])
+
+
+@pytest.mark.parametrize("element", ["facet", "tri_strips", "trifans"])
+def test_faces_of_other_elements_are_read_or_said(tmp_path: Path, element: str) -> None:
+    text = head(f"element {element} 2", "property list uchar int vertex_indices") + rows(POINTS) + "3 0 1 2\n3 2 1 3\n"
+    (tmp_path / "a.ply").write_text(text)
+    if element == "trifans":
+        with pytest.warns(MeshmatchWarning, match="its 2 trifans are not read"):
+            assert load_shape(tmp_path / "a.ply").F == 0
+    else:
+        assert {turned(face) for face in load_shape(tmp_path / "a.ply").faces} == {(0, 1, 2), (1, 3, 2)}
+
+
+@pytest.mark.parametrize("suffix", ["obj", "off", "ply"])
+def test_faces_of_two_corners_are_said(tmp_path: Path, suffix: str) -> None:
+    texts = {
+        "obj": rows(POINTS, "v ") + "f 1 2\nf 2 3\n",
+        "off": "OFF\n6 2 0\n" + rows(POINTS) + "2 0 1\n2 1 2\n",
+        "ply": head("element face 2", "property list uchar int vertex_indices") + rows(POINTS) + "2 0 1\n2 1 2\n",
+    }
+    (tmp_path / f"a.{suffix}").write_text(texts[suffix])
+    with pytest.warns(MeshmatchWarning, match="none of its 2 faces has three corners"):
+        assert load_shape(tmp_path / f"a.{suffix}").V == 6

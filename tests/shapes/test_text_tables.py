@@ -80,7 +80,7 @@ def test_one_column(tmp_path: Path, spell: str, head: str, decimal: str) -> None
     assert np.allclose(load_values(tmp_path / "v.csv", SHAPE).numbers, COLUMN, atol=1e-4)
 
 
-@pytest.mark.parametrize("word", ["", "NA", "N/A", "nan", "NaN", "#N/A", "null", "#DIV/0!", "1.#QNAN"])
+@pytest.mark.parametrize("word", ["", "NA", "N/A", "nan", "NaN", "#N/A", "null", "#DIV/0!", "#NV", "#WERT!", "1.#QNAN"])
 @pytest.mark.parametrize("mark", [",", ";", "\t"])
 def test_missing_numbers(tmp_path: Path, word: str, mark: str) -> None:
     (tmp_path / "v.csv").write_text(text(TABLE[:-1], mark) + f"{word}{mark}7\n")

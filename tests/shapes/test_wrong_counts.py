@@ -77,6 +77,7 @@ def test_a_right_count_says_nothing(tmp_path: Path, ball: np.ndarray, head: byte
         lambda ball: text(ball).upper(),
         lambda ball: b"\n\n  " + text(ball),
         lambda ball: text(ball, line=" ").replace(b" ball ", b" ball\n", 1),  # but for the name, all in one line
+        lambda ball: text(ball, line=" "),
         lambda ball: text(ball[:30], end="endsolid\n") + text(ball[30:], "other"),
         lambda ball: text(ball, end="endsolid"),
     ],

@@ -92,6 +92,8 @@ READABLE: dict[str, tuple[str, str]] = {
     "csv with a header of its own": ("a.csv", "part\n{rows}"),
     "numbered csv without a header": ("a.csv", "{numbered}"),
     "csv with more columns": ("a.csv", "Vertex,area,LABEL\n{wide}"),
+    "rows numbered from 1, as R does": ("a.csv", '"","label"\n{from_one}'),
+    "what Excel is told, in quotes": ("a.csv", '"sep=,"\nvertex,label\n{numbered}'),
     "txt with spaces": ("a.txt", "\ufeff{spaced}\n\n"),
     "bare json": ("a.json", "{list}"),
     "json of labels": ("a.json", '{{"labels": {list}}}'),
@@ -105,6 +107,7 @@ def test_what_people_have_is_read(tmp_path: Path, case: str) -> None:
     filled = text.format(
         rows="\n".join(words),
         numbered="\n".join(f"{k},{word}" for k, word in enumerate(words)),
+        from_one="\n".join(f'"{k}",{word}' for k, word in enumerate(words, 1)),
         wide="\n".join(f"{k},0.5,{word}" for k, word in enumerate(words)),
         spaced="\r\n".join(f"  {word} " for word in words),
         list=json.dumps(words),
@@ -177,6 +180,21 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
         "a.csv",
         lambda path: path.write_text("vertex,label\n" + "".join(f"{41 - k},a\n" for k in range(42))),
         "in order",
+    ),
+    "csv that counts from 1": (
+        "a.csv",
+        lambda path: path.write_text("vertex,label\n" + "".join(f"{k + 1},a\n" for k in range(42))),
+        "in order",
+    ),
+    "columns split by spaces": (
+        "a.csv",
+        lambda path: path.write_text("vertex label\n" + "".join(f"{k} 1\n" for k in range(42))),
+        "names two columns",
+    ),
+    "columns split by bars": (
+        "a.txt",
+        lambda path: path.write_text("vertex|label\n" + "".join(f"{k}|1\n" for k in range(42))),
+        "names two columns",
     ),
     "nameless csv": ("a.csv", lambda path: path.write_text("1,2,3\n" * 42), "none is called label"),
     "not text": ("a.txt", lambda path: path.write_bytes(b"\xff\xfe\x00"), "can be read"),

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.errors import InputError, OutputError
+from meshmatch.errors import InputError, OutputError, warn
 from meshmatch.shapes.colors import light, seen
 
 NO_FACES = np.empty((0, 3), np.int64)
@@ -68,6 +68,12 @@ class Textured:
     alpha: Literal["opaque", "mask", "blend"] = "opaque"
     cutoff: float = 0.5
     wrap: Literal["clamp", "repeat"] = "clamp"
+
+
+def tell_lost_faces(name: str, listed: int, faces: Int[Ints, "F 3"]) -> None:
+    """Say that a file has faces, but none with three corners."""
+    if listed and not len(faces):
+        warn(f"{name}: none of its {listed} faces has three corners, so it is read as a point cloud")
 
 
 def damaged(name: str, what: str) -> InputError:

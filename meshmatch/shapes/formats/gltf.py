@@ -203,8 +203,8 @@ class Document:
 
     def _placed(self, number: int, primitive: dict[str, Any], place: Floats) -> Floats:
         """(V, 3) positions in the scene."""
-        for extension in _COMPRESSED:  # there may be plain data as well
-            if extension in primitive.get("extensions", {}) and not self._has_data(primitive["attributes"]["POSITION"]):
+        for extension in primitive.get("extensions", {}):  # there may be plain data as well
+            if not _HARMLESS.fullmatch(extension) and not self._has_data(primitive["attributes"]["POSITION"]):
                 raise self._compressed(extension)
         node, attributes = self.nodes[number], primitive["attributes"]
         own = np.hstack([self.accessor(attributes["POSITION"]), np.ones((self.count(attributes["POSITION"]), 1))])

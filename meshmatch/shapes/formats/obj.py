@@ -48,6 +48,7 @@ def read(path: Path, data: bytes) -> Raw:
     verts = columns(values, counts, 0, 3)
     corner = vertices_of_corners(name, faces_text, sizes, vertex_lines, face_lines)
     faces = corner[triangles_of(name, verts, corner, sizes)]
+    formats.tell_lost_faces(name, len(sizes), faces)
     return Raw(verts, faces, _colors(name, data, values, counts))
 
 

@@ -26,6 +26,7 @@ from meshmatch.shapes.shape import Shape
 
 _LARGEST_MTL = 10_000_000  # bytes
 _MOST_LIBRARIES = 100  # names in one line
+_COMMENT = re.compile(r"\s#.*")  # or the end of a name, such as Material #25
 _NUMBER = r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:e[+-]?\d+)?"
 _OPTION = re.compile(
     rf"(?:(-o|-s|-t)((?:\s+{_NUMBER}(?!\S)){{0,3}})|-mm\s+\S+\s+\S+|(-clamp)\s+(\S+)|"
@@ -111,8 +112,13 @@ def second_index(text: bytes) -> bytes:
 
 
 def _words(text: bytes, lines: Ints) -> list[tuple[str, int]]:
-    names = [re.split(r"\s#", row.decode("utf-8", "surrogateescape"))[0].strip() for row in text.split(b"\n")]
+    names = [row.decode("utf-8", "surrogateescape").strip() for row in text.split(b"\n")]
     return list(zip(names, lines.tolist(), strict=False))
+
+
+def _uncommented(words: str) -> str:
+    """Words without the comment that may follow them."""
+    return _COMMENT.sub("", words).strip()
 
 
 def _coordinates(name: str, data: bytes, shape: Shape) -> tuple[Floats, Bools, Ints]:
@@ -142,12 +148,15 @@ def _coordinates(name: str, data: bytes, shape: Shape) -> tuple[Floats, Bools, I
 
 def _materials_meant(file: str, wanted: set[str], known: Collection[str]) -> dict[str, str]:
     """For each name that faces use ("" for none at all) that of a material: the same, or one that differs in nothing but
-    case; where there is but one material, that one for faces without a name. Names without a material are said.
+    case or a comment behind it; where there is but one material, that one for faces without a name. Names without a
+    material are said.
     """
     alike: dict[str, str] = {}
-    for name in known:
-        alike.setdefault(folded(name), name)
-    meant = {name: name if name in known else alike.get(folded(name), name) for name in wanted}
+    for likeness in (folded, lambda name: folded(_uncommented(name))):
+        for name in known:
+            alike.setdefault(likeness(name), name)
+    bare = {name: alike.get(folded(_uncommented(name)), name) for name in wanted}
+    meant = {name: name if name in known else alike.get(folded(name), bare[name]) for name in wanted}
     if "" in wanted and len(known) == 1:
         [meant[""]] = known
     elif wanted == {""}:
@@ -164,7 +173,8 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
     """The materials of all mtl files that are named. A shape with vertex colors may miss them."""
     entries: dict[str, _Entry] = {}
     for name in dict.fromkeys(names):
-        for file in _named(path.parent, name):
+        whole = beside(path.parent, name)
+        for file in [whole] if whole is not None else _named(path.parent, _uncommented(name)):
             if file is not None:
                 entries |= _parse(file)
             elif shape.colors is None:
@@ -189,6 +199,10 @@ def _parse(file: Path) -> dict[str, _Entry]:
     for line in data.decode("utf-8", "surrogateescape").split("\n"):
         word, rest = (*line.split(None, 1), "", "")[:2]
         word, rest = word.lower(), rest.strip()
+        if word not in ("newmtl", "map_kd", "map_d"):
+            rest = _uncommented(f" {rest}")
+        if not rest and word != "newmtl":
+            continue  # a word alone says nothing
         try:
             if word == "newmtl":
                 entry = entries[rest] = _Entry(folder=file.parent)
@@ -246,8 +260,13 @@ def _material(name: str, entry: _Entry, image: Pixels | None) -> Material:
 def _image(path: Path, name: str, entry: _Entry, reader: ImageReader, laid: bool) -> Pixels | None:
     """The image of a material; if it is `laid` on, with the alpha of map_d: of that its own, else how bright it is."""
 
+    folders = (entry.folder, path.parent)
+
     def decode(wanted: _Map) -> Pixels:
-        file = beside(entry.folder, wanted.file) or beside(path.parent, wanted.file)
+        named = [
+            (folder, name) for name in dict.fromkeys((wanted.file, _uncommented(wanted.file))) for folder in folders
+        ]
+        file = next((found for each in named if (found := beside(*each)) is not None), None)
         if file is None:
             what = f"{path.name} needs the image {wanted.file[:200]} of its material {name}, which is not there"
             raise InputError(what, f"copy it to {entry.folder}, or name another with --image")

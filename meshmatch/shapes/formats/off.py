@@ -58,6 +58,7 @@ def read(path: Path, data: bytes) -> Raw:
     formats.check_places(name, len(data), V, max(int(many.sum()) - 2 * F, 0), text=True)
     corner = formats.indices(name, faces[formats.runs(starts + 1, many)])
     triangles = corner[triangles_of(name, verts, corner, many)]
+    formats.tell_lost_faces(name, F, triangles)
     if colors is None and len(triangles) and 0 <= triangles.min() and triangles.max() < V:
         found = _face_colors(faces, starts + 1 + many, sizes - 1 - many)
         if found is not None:

@@ -14,7 +14,9 @@ from meshmatch.shapes.input_files import check_text, read_npy
 from meshmatch.shapes.shape import Shape
 
 _MOST_HEADERS = 30
-_WORDS = re.compile(rb"\s*(\d+[ \t]*\n\s*)?(?![+-]?(?:nan|inf))(/*[ \t]*[a-z_][^\n]{,2000})(?=\n|\Z)", re.IGNORECASE)
+_WORDS = re.compile(
+    rb"\s*(\d+[ \t]*\n\s*)?(?![+-]?(?:nan|inf))([/%!]*[ \t]*[a-z_][^\n]{,2000}|//+[ \t]*)(?=\n|\Z)", re.IGNORECASE
+)
 _AXES = ((b"x", b"y", b"z"), (b"points:0", b"points:1", b"points:2"))
 _DECIMAL_COMMA = re.compile(rb"(?<!\S)[+-]?\d*,\d+(?:[eE][+-]?\d+)?(?!\S)")
 _UNCLEAR_COMMA = re.compile(rb"[+-]?[\d.]*,\d+(?:[eE][+-]?\d+)?|[+-]?\d{1,3},\d{3}\.\d*")
@@ -60,7 +62,7 @@ def _without_header(text: bytes) -> tuple[bytes, list[bytes]]:
             break
         line, text = found[2], (found[1] or b"") + text[found.end() :]
         split = next((mark for mark in (b";", b",", b"\t") if mark in line), None)
-        labels = [cell.strip(b" \t/").lower() for cell in line.strip(b"/ ").split(split)]
+        labels = [cell.strip(b" \t/").lower() for cell in line.strip(b"/%! ").split(split)]
     return text, labels
 
 

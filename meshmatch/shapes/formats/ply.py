@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes.colors import to_linear, to_srgb
-from meshmatch.shapes.formats import NO_FACES, NO_MESH, WRONG_SUFFIX, Raw, check_places, damaged, indices
+from meshmatch.shapes.formats import (
+    NO_FACES,
+    NO_MESH,
+    WRONG_SUFFIX,
+    Raw,
+    check_places,
+    damaged,
+    indices,
+    tell_lost_faces,
+)
 from meshmatch.shapes.formats.ply_rows import TYPES, Body, Element, Property
 from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.shape import Shape
@@ -25,13 +34,13 @@ _FACE_LISTS = ("vertexindices", "vertexindex", "vertexindexes", "vertices")  # w
 _FACE_HINT = "export its faces as 'property list uchar int vertex_indices'"
 _NAMES = {
     "vertex": ("vertices", "point", "points"),
-    "face": ("faces", "triangle", "triangles", "polygon", "polygons"),
-    "tristrips": ("tristrip",),
+    "face": ("faces", "triangle", "triangles", "polygon", "polygons", "facet", "facets", "cell", "cells"),
+    "tristrips": ("tristrip", "tri_strips", "tri_strip", "triangle_strips", "triangle_strip"),
 }
 _END = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:\r\n|[\r\n]|\Z)")
 _DATA = re.compile(rb"^DATA[ \t]+(ascii|binary)[ \t]*\r?\n", re.MULTILINE)
 _CHANNELS = ("red", "green", "blue", "alpha")
-_PREFIXES = ("", "diffuse_", "color_", "vertex_", "face_", "ambient_")
+_PREFIXES = ("", "diffuse_", "color_", "vertex_", "vertex_color_", "face_", "face_color_", "ambient_")
 Table: TypeAlias = dict[str, Any]
 Columns: TypeAlias = Mapping[str, NDArray[Any]]
 _NONE: Columns = MappingProxyType({})
@@ -46,6 +55,7 @@ class Content:
     vertices: tuple[Element, Table]
     faces: list[tuple[Element, Table]]
     strips: list[tuple[Element, Table]]
+    unread: list[Element]  # others whose lists look like those of faces
 
 
 def read(path: Path, data: bytes) -> Raw:
@@ -59,9 +69,10 @@ def read(path: Path, data: bytes) -> Raw:
     faces = [corners[triangles_of(name, verts, corners, sizes)] for corners, sizes in lists]
     faces += [faces_of(*corners_of(name, *each)) for each in content.strips]
     joined = np.concatenate([NO_FACES, *faces])
+    for other in content.unread:
+        warn(f"{name}: its {other.count} {other.name} are not read; faces should be an element face")
     listed = sum(element.count for element, _ in [*content.faces, *content.strips])
-    if listed and not len(joined):
-        warn(f"{name}: none of its {listed} faces has three corners, so it is read as a point cloud")
+    tell_lost_faces(name, listed, joined)
     for (corners, sizes), (faced, own) in zip(lists, content.faces, strict=True) if colors is None else ():
         painted = _colors(faced, own)
         if painted is not None and len(painted):
@@ -96,7 +107,9 @@ def parsed(name: str, data: bytes) -> Content:
     if not found["vertex"] or not set("xyz") <= set(found["vertex"][0][1]):
         raise InputError(f"{name}: the vertices have no x, y and z", NO_MESH)
     faces, strips = ([each for each in found[role] if each[0].count] for role in ("face", "tristrips"))
-    return Content(comments, found["vertex"][0], faces, strips)
+    others = [element for element, role in zip(elements, roles, strict=True) if element.count and not role]
+    unread = [element for element in others if any(p.count_kind and _is_usual(p) for p in element.properties)]
+    return Content(comments, found["vertex"][0], faces, strips, unread)
 
 
 def _roles(elements: Sequence[Element]) -> list[str]:
@@ -112,12 +125,17 @@ def _roles(elements: Sequence[Element]) -> list[str]:
     return [role if role != "vertex" or k == first else "" for k, role in enumerate(roles)]
 
 
+def _is_usual(listed: Property) -> bool:
+    """Whether a list is called as those of the corners of faces are."""
+    return listed.name.lower().replace("_", "") in _FACE_LISTS
+
+
 def corners_of(name: str, element: Element, table: Table) -> tuple[Ints, Ints]:
     """Vertices of polygons or strips, one after the other, and how many each has: the list with a usual name, or else
     the only list of whole numbers. `InputError` where no list is that, for faces must not be lost without a word.
     """
     lists = [p for p in element.properties if p.count_kind]
-    usual = [p for p in lists if p.name.lower().replace("_", "") in _FACE_LISTS]
+    usual = [p for p in lists if _is_usual(p)]
     whole = [p for p in lists if p.kind[0] != "f"]
     chosen = next((few for few in (usual, whole) if len(few) == 1), usual[:1])
     if not chosen:
@@ -155,10 +173,15 @@ def read_pcd(path: Path, data: bytes) -> Raw:
     elif held > points.count:
         warn(f"{name} holds more than its {points.count} points, which is not read")
     for p in points.properties:
-        if p.name in ("rgb", "rgba"):  # of a float its bits count, not its value
-            packed = table[p.name].astype(p.kind[0] + "4").view(np.uint32)[:, None]
-            colors = np.insert((packed >> np.array([16, 8, 0], np.uint32) & 255) / 255.0, 3, 1.0, axis=1)
+        if p.name in ("rgb", "rgba"):
+            colors = _unpacked(p, table)
     return Raw(verts, NO_FACES, colors)
+
+
+def _unpacked(p: Property, table: Table) -> Floats:
+    """(N, 4) opaque colors from numbers that hold red, green and blue in a byte each: of a float its bits count."""
+    packed = table[p.name].astype(p.kind[0] + "4").view(np.uint32)[:, None]
+    return np.insert((packed >> np.array([16, 8, 0], np.uint32) & 255) / 255.0, 3, 1.0, axis=1)
 
 
 def write(
@@ -215,8 +238,8 @@ def _header(name: str, data: bytes) -> tuple[str | None, list[Element], int, lis
     try:
         for line in data[: end.start()].decode("latin-1").replace("\r\n", "\n").replace("\r", "\n").split("\n"):
             match line.split():
-                case ["comment", *_]:
-                    text = line.strip()[len("comment") :].encode("latin-1")
+                case [("comment" | "obj_info") as word, *_]:
+                    text = line.strip()[len(word) :].encode("latin-1")
                     comments.append(text.decode("utf-8", "surrogateescape").strip())
                 case ["format", kind, *_]:
                     order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}[kind]
@@ -263,7 +286,8 @@ def _colors(element: Element, table: Table) -> Floats | None:
     prefix = next((p for p in _PREFIXES if all(p + channel in kinds for channel in _CHANNELS[:3])), None)
     names = [f"{prefix}{channel}" for channel in _CHANNELS] if prefix is not None else list("rgba")
     if not all(name in kinds for name in names[:3]):
-        return None
+        packed = next((kinds[name] for name in ("rgb", "rgba") if name in kinds and kinds[name].kind[1:] == "4"), None)
+        return None if packed is None else _unpacked(packed, table)
     alpha = next((name for name in (names[3], "alpha", "a") if name in kinds), None)
     out = np.ones((element.count, 4))
     for first, last, group in ((0, 3, names[:3]), (3, 4, [alpha] if alpha else [])):

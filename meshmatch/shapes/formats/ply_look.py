@@ -24,21 +24,10 @@ from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
-_TEXTURE = re.compile(r"texture_?file\b:?\s*(.+)", re.IGNORECASE)
+_TEXTURE = re.compile(r"texture[ _]?file\b\s*[:=]?\s*(.+)|texture\b\s*[:=]?\s*(.+\.\w{3,4})", re.IGNORECASE)
 _LISTS = ("texcoord", "texcoords", "texturecoords", "texturecoordinates", "textureuv", "uv", "uvs", "st")
-_PAIRS = (
-    ("textureu", "texturev"),
-    ("textures", "texturet"),
-    ("texcoordu", "texcoordv"),
-    ("texcoords", "texcoordt"),
-    ("texcoordx", "texcoordy"),
-    ("texu", "texv"),
-    ("s", "t"),
-    ("u", "v"),
-    ("tu", "tv"),
-    ("tx", "ty"),
-    ("u0", "v0"),
-)
+_COORDINATE = re.compile(r"(?:tex(?:ture)?(?:coord(?:inate)?s?)?|uv|tc)(?:0(?=.))?([uvstxy012])|([uvst]|t[uvxy])0?")
+_PAIRS = ("uv", "st", "xy", "01", "12")
 _NUMBERS = ("texnumber", "textureid", "textureindex", "texindex")
 
 
@@ -49,11 +38,13 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     """
     content = parsed(path.name, data)
     uv, laid, number = _coordinates(path.name, content, shape)
-    names = [found[1].strip() for comment in content.comments if (found := _TEXTURE.match(comment))]
+    names = [(found[1] or found[2]).strip() for comment in content.comments if (found := _TEXTURE.match(comment))]
     if picture is not None:
         if not laid.any():
             raise appearance.no_coordinates(path.name)
         number, names = np.zeros_like(number), [""]
+    elif names and not laid.any():
+        warn(f"{path.name} names the image {names[0][:200]}, but no texture coordinates by a name that is known")
     laid &= (number >= 0) & (number < len(names))
     if not laid.any():
         return appearance.vertex_colors_alone(shape)
@@ -128,9 +119,16 @@ def _whole(values: Floats | Ints) -> Ints:
 
 def _of_vertices(element: Element, table: Table) -> Floats | None:
     """(V, 2) coordinates, v up, of the vertices; None if they have none."""
-    known = {_plain(p.name): p.name for p in element.properties if not p.count_kind}
-    pair = next((pair for pair in _PAIRS if all(axis in known for axis in pair)), None)
-    return None if pair is None else np.stack([table[known[axis]].astype(np.float64) for axis in pair], axis=1)
+    known: dict[str, dict[str, str]] = {}  # what a name begins with, its axis, the name itself
+    for p in element.properties:
+        if not p.count_kind and (found := _COORDINATE.fullmatch(_plain(p.name))):
+            axis = (found[1] or found[2])[-1]
+            known.setdefault(found[0].removesuffix("0" if found[2] else "")[:-1], {})[axis] = p.name
+    for pair in _PAIRS:
+        for names in known.values():
+            if set(pair) <= set(names):
+                return np.stack([table[names[axis]].astype(np.float64) for axis in pair], axis=1)
+    return None
 
 
 def _at(own: Floats | None, faces: Ints) -> Floats:

@@ -30,9 +30,9 @@ from meshmatch.shapes.shape import Shape
 
 _HEADER, _ROW = 84, 50  # bytes
 _ROWS = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_NAMES = re.compile(rb"^[ \t]*((?:end)?solid)\b[^\n]*", re.MULTILINE)
+_NAMES = re.compile(rb"^[ \t]*((?:end)?solid)\b[^\n]*?(?=\bfacet[ \t]+normal\b|$)", re.MULTILINE)
 _WORDS = re.compile(rb"\b(?=(?:vertex|facet|endloop|endfacet|endsolid)\b)")
-_END = re.compile(rb"^[ \t]*endsolid\b", re.MULTILINE)
+_END = re.compile(rb"(?:^|\bendfacet)[ \t]*endsolid\b", re.MULTILINE)
 _SMALLEST, _LARGEST = 1e-30, 1e30
 _REACH = 100.0
 """How far from the triangles that are counted, in their size, others may be that are not."""
